@@ -1,0 +1,33 @@
+"""neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
+
+from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPlanner, collect, oracle
+from neuroprior.plans import Plans
+from neuroprior.priors import GRUPrior, MarkovPrior, Prior, TransformerPrior, UniformPrior, load, save
+from neuroprior.sampling import sample, sample_in_world
+from neuroprior.worlds import GridWorld, Rollout, TabularWorld, World, gridworld
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Decision",
+    "ExhaustivePlanner",
+    "GRUPrior",
+    "GridWorld",
+    "MarkovPrior",
+    "Planner",
+    "Plans",
+    "Prior",
+    "Rollout",
+    "SamplingPlanner",
+    "TabularWorld",
+    "TransformerPrior",
+    "UniformPrior",
+    "World",
+    "collect",
+    "gridworld",
+    "load",
+    "oracle",
+    "sample",
+    "sample_in_world",
+    "save",
+]

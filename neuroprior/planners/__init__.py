@@ -1,0 +1,9 @@
+"""Planners: they choose, for each start, a plan with a high score."""
+
+from neuroprior.planners.collect import collect
+from neuroprior.planners.exhaustive import ExhaustivePlanner
+from neuroprior.planners.oracle import oracle
+from neuroprior.planners.planner import Decision, Planner
+from neuroprior.planners.sampling import SamplingPlanner
+
+__all__ = ["Decision", "ExhaustivePlanner", "Planner", "SamplingPlanner", "collect", "oracle"]

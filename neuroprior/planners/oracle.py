@@ -1,0 +1,55 @@
+"""The oracle: the best that any plan of a length can reach in a table, by dynamic programming."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neuroprior.planners.planner import check_objective
+from neuroprior.worlds.tabular import TabularWorld
+
+
+def oracle(
+    world: TabularWorld,
+    state: Tensor,
+    length: int,
+    *,
+    objective: Literal["terminal", "return"] = "terminal",
+    discount: float = 1.0,
+    value: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
+    """The exact highest score of all legal plans of `length` actions: finite-horizon dynamic programming.
+
+    Args:
+        world: a table.
+        state: starts `[B]`.
+        length: number of actions, at least 1.
+        objective, discount, value: what is optimised; see `Planner`.
+
+    Returns:
+        `[B]` floating point. Takes `length * W * S * A` operations whatever B is.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    if length < 1:
+        raise ValueError(f"length: at least 1 is expected, not {length}")
+    check_objective(objective, discount)
+    world.check_state(state)
+    maps, states, actions = world.num_maps, world.num_states, world.num_actions
+    reward = world.reward if world.reward.dim() == 3 else world.reward[:, world.next_state]
+    every = torch.arange(maps * states, device=world.device)
+    best = torch.zeros(maps, states, device=world.device, dtype=reward.dtype)
+    if value is not None:
+        best = value(every).view(maps, states).to(reward.dtype)
+    for left in range(length):
+        after = best[:, world.next_state]
+        if objective == "return":
+            after = reward + discount * after
+        elif left == 0:
+            after = reward + after
+        if world.legal_actions is not None:
+            after = after.masked_fill(~world.legal_actions, -torch.inf)
+        best = after.view(maps, states, actions).amax(-1)
+    return best.view(-1)[state]

@@ -1,0 +1,153 @@
+"""Executed plans: the action sequences that were chosen before, from which a prior is learned."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuroprior.randomness import generator_on
+from neuroprior.worlds.world import check_range, is_integer
+
+
+@dataclass(frozen=True, eq=False)
+class Plans:
+    """N executed plans of up to L actions.
+
+    Attributes:
+        actions: integers `[N, L]` between 0 and `num_actions` - 1; stored as uint8 where `num_actions` <= 256, else
+            int64. Beyond a plan's length they count for nothing (stored as 0).
+        num_actions: the number of actions, A; never guessed from the data.
+        lengths: integers `[N]`, the number of actions of each plan; None where all have L.
+        action_names: A names, or None.
+        context: what the agent saw: indices (integers) `[N]` a plan or `[N, L]` a step, or features (floating point)
+            `[N, C]` or `[N, L, C]`; None for nothing.
+        group: integers `[N]` (subject, session, world): plans of one group are never split between training and
+            validation; None where each plan stands alone.
+
+    Raises:
+        ValueError: a shape, dtype or value is wrong; the message says which and where.
+    """
+
+    actions: Tensor
+    num_actions: int
+    lengths: Tensor | None = None
+    action_names: Sequence[str] | None = None
+    context: Tensor | None = None
+    group: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if self.num_actions < 1:
+            raise ValueError(f"num_actions: at least 1 is expected, not {self.num_actions}")
+        actions = torch.as_tensor(self.actions)
+        if actions.dim() != 2:
+            raise ValueError(f"actions: shape [N, L] is expected, not {list(actions.shape)}")
+        num, length = actions.shape
+        if self.lengths is not None:
+            lengths = torch.as_tensor(self.lengths)
+            _check_shape("lengths", lengths, (num,))
+            check_range("lengths", lengths, length + 1, "possible lengths")
+            object.__setattr__(self, "lengths", lengths.long())
+            actions = actions.masked_fill(~self.mask(), 0) if is_integer(actions) else actions
+        check_range("actions", actions, self.num_actions, "actions")
+        object.__setattr__(self, "actions", actions.to(action_dtype(self.num_actions)))
+        if self.action_names is not None and len(self.action_names) != self.num_actions:
+            raise ValueError(f"action_names: {self.num_actions} are expected, not {len(self.action_names)}")
+        if self.group is not None:
+            object.__setattr__(self, "group", torch.as_tensor(self.group))
+            if not is_integer(self.group):
+                raise ValueError(f"group: integers are expected, not {str(self.group.dtype).removeprefix('torch.')}")
+            _check_shape("group", self.group, (num,))
+        if self.context is not None:
+            object.__setattr__(self, "context", torch.as_tensor(self.context))
+            check_context(self.context, num, length)
+
+    def __len__(self) -> int:
+        """The number of plans, N."""
+        return self.actions.shape[0]
+
+    @property
+    def max_length(self) -> int:
+        """The number of columns of `actions`, L."""
+        return self.actions.shape[1]
+
+    def mask(self) -> Tensor:
+        """`[N, L]` bool: True where a plan has an action."""
+        steps = torch.arange(torch.as_tensor(self.actions).shape[1], device=torch.as_tensor(self.actions).device)
+        if self.lengths is None:
+            return torch.ones_like(torch.as_tensor(self.actions), dtype=torch.bool)
+        return steps < self.lengths[:, None]
+
+    def __getitem__(self, index: Tensor | slice) -> "Plans":
+        """The plans at `index` (a slice, integers or a bool mask)."""
+
+        def pick(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values[index]
+
+        return Plans(
+            self.actions[index],
+            self.num_actions,
+            pick(self.lengths),
+            self.action_names,
+            pick(self.context),
+            pick(self.group),
+        )
+
+    def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple["Plans", "Plans"]:
+        """Split at random into plans for training and plans for validation; groups stay together.
+
+        Args:
+            validation: the share of plans (of groups, where there are any) held out, between 0 and 1; at least one
+                plan or group is kept on each side.
+            generator: draws the split.
+
+        Raises:
+            ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups.
+        """
+        if not 0 < validation < 1:
+            raise ValueError(f"validation: a share between 0 and 1 is expected, not {validation}")
+        unit = torch.arange(len(self)) if self.group is None else self.group.unique(return_inverse=True)[1].cpu()
+        units = int(unit.max()) + 1 if len(unit) else 0
+        if units < 2:
+            raise ValueError(f"plans: {units} {'plans' if self.group is None else 'groups'} cannot be split in two")
+        held_out = min(max(round(units * validation), 1), units - 1)
+        order = torch.randperm(units, generator=generator_on(generator, "cpu"))
+        chosen = torch.zeros(units, dtype=torch.bool)
+        chosen[order[:held_out]] = True
+        index = chosen[unit].to(self.actions.device)
+        return self[~index], self[index]
+
+
+def action_dtype(num_actions: int) -> torch.dtype:
+    """How actions are stored: uint8 where it suffices, else int64."""
+    return torch.uint8 if num_actions <= 256 else torch.int64
+
+
+def check_context(context: Tensor, num_plans: int, length: int) -> None:
+    """Raise ValueError unless `context` is `[N]`, `[N, L]` integers or `[N, C]`, `[N, L, C]` finite floating point."""
+    shape = tuple(context.shape)
+    if is_integer(context):
+        if shape not in ((num_plans,), (num_plans, length)):
+            raise ValueError(
+                f"context: indices of shape [{num_plans}] or [{num_plans}, {length}] are expected, not {list(shape)}"
+            )
+        return
+    if not context.is_floating_point():
+        raise ValueError(f"context: indices or floating point features are expected, not {context.dtype}")
+    if len(shape) not in (2, 3) or shape[0] != num_plans or (len(shape) == 3 and shape[1] != length):
+        raise ValueError(
+            f"context: features of shape [{num_plans}, C] or [{num_plans}, {length}, C] are expected, not {list(shape)}"
+        )
+    if not context.isfinite().all():
+        where = (~context.isfinite()).nonzero()[0].tolist()
+        raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
+
+
+def sees_each_step(context: Tensor | None) -> bool:
+    """True for a context a step (`[N, L]`, `[N, L, C]`), False for none or one a plan (`[N]`, `[N, C]`)."""
+    return context is not None and context.dim() == (2 if is_integer(context) else 3)
+
+
+def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(values.shape) != shape:
+        raise ValueError(f"{name}: shape {list(shape)} is expected, not {list(values.shape)}")

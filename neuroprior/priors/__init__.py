@@ -1,0 +1,10 @@
+"""Priors: distributions over action sequences that samplers step through."""
+
+from neuroprior.priors.folders import load, save
+from neuroprior.priors.gru import GRUPrior
+from neuroprior.priors.markov import MarkovPrior
+from neuroprior.priors.prior import Prior
+from neuroprior.priors.transformer import TransformerPrior
+from neuroprior.priors.uniform import UniformPrior
+
+__all__ = ["GRUPrior", "MarkovPrior", "Prior", "TransformerPrior", "UniformPrior", "load", "save"]

@@ -1,0 +1,60 @@
+"""The GRU prior: a recurrent network over the actions so far."""
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from neuroprior.priors.neural import Embedding, NeuralPrior
+
+
+class GRUPrior(NeuralPrior):
+    """A gated recurrent network (Cho et al. 2014) as a prior.
+
+    Args:
+        num_actions: A.
+        hidden_size: width of the hidden state and of the input vectors.
+        num_layers: number of layers.
+        window: how many past actions are read; None: set by `fit`; see `NeuralPrior`.
+        num_contexts, context_size: what it sees; see `Prior`.
+        seed: draws the initial weights.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        num_actions: int,
+        hidden_size: int = 64,
+        num_layers: int = 1,
+        window: int | None = None,
+        num_contexts: int | None = None,
+        context_size: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        if hidden_size < 1 or num_layers < 1:
+            raise ValueError(f"hidden_size and num_layers must be at least 1, not {hidden_size} and {num_layers}")
+        self.hidden_size, self.num_layers = hidden_size, num_layers
+        super().__init__(num_actions, window, num_contexts, context_size, seed)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return super().config | {"hidden_size": self.hidden_size, "num_layers": self.num_layers}
+
+    def build(self) -> None:
+        width = self.hidden_size
+        self.embedding = Embedding(self.num_actions, width, self.num_contexts, self.context_size)
+        self.gru = nn.GRU(width, width, self.num_layers, batch_first=True)
+        self.head = nn.Linear(width, self.num_actions)
+
+    def encode(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        out, hidden = self.gru(self.embedding(inputs))
+        return self.head(out), hidden.transpose(0, 1).flatten(1)
+
+    def advance(self, inputs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        hidden = memory.view(-1, self.num_layers, self.hidden_size).transpose(0, 1).contiguous()
+        out, hidden = self.gru(self.embedding(inputs)[:, None], hidden)
+        return self.head(out[:, 0]), hidden.transpose(0, 1).flatten(1)
+
+    def memory_size(self, state_size: int) -> int:
+        return self.num_layers * self.hidden_size

@@ -1,0 +1,33 @@
+"""The uniform prior: every action equally probable; sampling from it is random search."""
+
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import Plans
+from neuroprior.priors.prior import Prior
+
+
+class UniformPrior(Prior):
+    """Every plan of a length equally probable: the prior of a planner that has learned nothing.
+
+    Args:
+        num_actions: A.
+    """
+
+    def __init__(self, num_actions: int) -> None:
+        super().__init__(num_actions)
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return torch.zeros(batch_size, self.num_actions, device=self.device), torch.empty(
+            batch_size, 0, device=self.device
+        )
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return self.start(len(action))
+
+    def fit(self, plans: Plans | Tensor) -> Self:
+        """Nothing to learn; checks `plans` and returns self."""
+        self.training_plans(plans)
+        return self

@@ -1,0 +1,29 @@
+"""Random generators: every random function draws from the one it is given, never from torch's global state."""
+
+import torch
+
+
+def generator_on(generator: torch.Generator | None, device: torch.device | str) -> torch.Generator:
+    """The generator to draw from on `device`.
+
+    Args:
+        generator: the caller's generator. None gives a new one, seeded from the operating system.
+        device: where the numbers will be drawn.
+
+    Returns:
+        `generator` itself where it lives on the same kind of device; else one on `device` that is seeded by a draw from
+        it, so that a CPU generator makes a GPU's draws reproducible too.
+    """
+    device = torch.device(device)
+    if generator is None:
+        fresh = torch.Generator(device)
+        fresh.seed()
+        return fresh
+    if generator.device.type == device.type:
+        return generator
+    return torch.Generator(device).manual_seed(draw_seed(generator))
+
+
+def draw_seed(generator: torch.Generator) -> int:
+    """An integer seed in [0, 2**62), drawn from `generator`, for code that takes seeds only."""
+    return int(torch.randint(2**62, (), generator=generator, device=generator.device))

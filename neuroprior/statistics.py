@@ -1,0 +1,92 @@
+"""Statistics of comparisons: shares of best, confidence intervals, paired differences. Needs scipy (`[programs]`)."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from scipy import stats
+from torch import Tensor
+
+
+class Interval(NamedTuple):
+    """An estimate with its confidence interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+class Difference(NamedTuple):
+    """A mean difference of pairs with its confidence interval, and the p-value of no difference (two-sided)."""
+
+    mean: float
+    low: float
+    high: float
+    p_value: float
+
+
+def best_of(scores: Tensor, rivals: Sequence[int] | None = None) -> Tensor:
+    """Where each planner was best: at least as good as every rival, so that ties count for each (Hyvärinen, Table 1).
+
+    Args:
+        scores: `[K, ...]`: the scores of K planners on the same starts.
+        rivals: the planners to be compared with; None: all K.
+
+    Returns:
+        `[K, ...]` bool.
+    """
+    return scores >= (scores if rivals is None else scores[list(rivals)]).amax(0)
+
+
+def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
+    """The mean of independent values `[G]`, G >= 2, with Student's interval.
+
+    Args:
+        values: one number a world, a subject or a fold: whatever is independent.
+        level: of confidence.
+
+    Raises:
+        ValueError: fewer than two values.
+    """
+    values = _vector("values", values)
+    mean, error = float(values.mean()), float(stats.sem(values))
+    half = float(stats.t.ppf((1 + level) / 2, len(values) - 1)) * error
+    return Interval(mean, mean - half, mean + half)
+
+
+def share_interval(successes: int, trials: int, level: float = 0.95) -> Interval:
+    """A share of independent trials, with Wilson's interval.
+
+    Raises:
+        ValueError: no trials, or more successes than trials.
+    """
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"share_interval: {successes} successes of {trials} trials")
+    low, high = stats.binomtest(successes, trials).proportion_ci(level, method="wilson")
+    return Interval(successes / trials, float(low), float(high))
+
+
+def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) -> Difference:
+    """The mean of `first - second`, values `[G]` of the same G worlds (subjects, folds), with Student's paired test.
+
+    Raises:
+        ValueError: different numbers of values, or fewer than two.
+    """
+    a, b = _vector("first", first), _vector("second", second)
+    if len(a) != len(b):
+        raise ValueError(f"paired_difference: {len(a)} and {len(b)} values are no pairs")
+    mean, low, high = mean_interval(a - b, level)
+    if np.ptp(a - b) == 0:
+        return Difference(mean, low, high, 1.0 if mean == 0 else 0.0)
+    return Difference(mean, low, high, float(stats.ttest_rel(a, b).pvalue))
+
+
+def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    if isinstance(values, torch.Tensor):
+        values = values.cpu().numpy()
+    vector = np.asarray(values, dtype=np.float64)
+    if vector.ndim != 1 or len(vector) < 2:
+        raise ValueError(f"{name}: at least two values, shape [G], are expected, not {list(vector.shape)}")
+    return vector

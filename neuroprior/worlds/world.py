@@ -1,0 +1,114 @@
+"""The interface of a world: a batched simulator in which a planner tries its plans."""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Rollout(NamedTuple):
+    """What happened when plans were tried: B starts, P plans a start, L steps.
+
+    Attributes:
+        final_state: `[B, P]` (and the state's own dimensions, if it has any): where each plan ended.
+        rewards: `[B, P, L]` floating point: the reward of each step.
+    """
+
+    final_state: Tensor
+    rewards: Tensor
+
+
+class World(ABC):
+    """A batched simulator with a finite set of actions, numbered from 0.
+
+    A state is one tensor whose first dimensions are the batch; what the others mean is the world's own affair.
+    A subclass sets `num_actions` and writes `reset` and `step`; the rest has defaults.
+
+    Attributes:
+        num_actions: the number of actions, A.
+        all_legal: True where every action exists in every state, so that nobody need ask `legal`.
+    """
+
+    num_actions: int
+    all_legal: bool = True
+
+    @abstractmethod
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        """`batch_size` random states from which planning may start: `[batch_size, ...]`."""
+
+    @abstractmethod
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """One step.
+
+        Args:
+            state: `[N, ...]`.
+            action: int64 `[N]` between 0 and A - 1.
+            generator: draws what is random in the world.
+
+        Returns:
+            The next state `[N, ...]` and the reward of the step, `[N]` floating point.
+        """
+
+    def rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None) -> Rollout:
+        """Try P plans from each of B starts. Shapes, dtypes and ranges are checked once, here, not at every step.
+
+        Args:
+            state: `[B, ...]`.
+            plans: integers `[B, P, L]` between 0 and A - 1.
+            generator: draws what is random in the world.
+
+        Raises:
+            ValueError: a shape, dtype or value is wrong; the message says which.
+        """
+        self.check_state(state)
+        check_plans(plans, state.shape[0], self.num_actions)
+        batch, num_plans, length = plans.shape
+        now = state.repeat_interleave(num_plans, 0)
+        rewards = []
+        for t in range(length):
+            now, reward = self.step(now, plans[:, :, t].reshape(-1).long(), generator)
+            rewards.append(reward.view(batch, num_plans))
+        empty = torch.zeros(batch, num_plans, 0, device=state.device)
+        return Rollout(now.view(batch, num_plans, *state.shape[1:]), torch.stack(rewards, -1) if rewards else empty)
+
+    def observe(self, state: Tensor) -> Tensor:
+        """What an agent sees in `state [N, ...]`: indices `[N]` or features `[N, C]`. Default: the state itself."""
+        return state
+
+    def legal(self, state: Tensor) -> Tensor:
+        """Which actions exist in `state [N, ...]`: `[N, A]` bool, at least one a row. Default: all."""
+        return torch.ones(state.shape[0], self.num_actions, dtype=torch.bool, device=state.device)
+
+    def check_state(self, state: Tensor) -> None:
+        """Raise ValueError where `state` cannot be a batch of this world's states. Default: it must have a batch."""
+        if state.dim() == 0:
+            raise ValueError("state: a batch of states is expected, shape [B, ...], not a single number")
+
+
+def is_integer(values: Tensor) -> bool:
+    """True for a tensor of whole numbers (bool is not one)."""
+    return not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
+
+
+def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:
+    """Raise ValueError unless `plans` is an integer tensor `[batch_size, P, L]` of actions below `num_actions`."""
+    if plans.dim() != 3 or plans.shape[0] != batch_size:
+        raise ValueError(
+            f"plans: shape [B, P, L] with B = {batch_size} starts is expected, not {list(plans.shape)}"
+            " (for one plan a start, use plans[:, None])"
+        )
+    check_range("plans", plans, num_actions, "actions")
+
+
+def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
+    """Raise ValueError unless `values` are integers from 0 to `stop` - 1; the message names the first that is not."""
+    if not is_integer(values):
+        raise ValueError(f"{name}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
+    if values.numel() == 0:
+        return
+    low, high = (int(v) for v in torch.aminmax(values))
+    if low < 0 or high >= stop:
+        where = ((values < 0) | (values.long() >= stop)).nonzero()[0].tolist()
+        value = int(values[tuple(where)])
+        raise ValueError(f"{name}{where}: {value} is out of range: there are {stop} {what}, 0 to {stop - 1}")

@@ -1,0 +1,164 @@
+"""Neural priors: fitting, the exact divergence from a known source, reproducibility, and what is refused."""
+
+import random
+
+import numpy as np
+import pytest
+import torch
+
+from neuroprior import GRUPrior, Plans, TransformerPrior
+from tests.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
+
+BOTH = pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
+QUICK = {"max_steps": 30, "progress": False}
+
+
+def small(kind, num_actions=3, **arguments):
+    size = {"hidden_size": 8} if kind is GRUPrior else {"width": 8, "num_layers": 1, "num_heads": 2}
+    return kind(num_actions, **size, **arguments)
+
+
+def weights(prior):
+    return torch.cat([weight.detach().flatten() for weight in prior.parameters()])
+
+
+@pytest.fixture(scope="module")
+def torus_plans():
+    return Plans(best_plans(100_000, seed=0), 4)
+
+
+@BOTH
+def test_divergence_from_the_torus_source(kind, torus_plans):
+    """With default settings, in bits per action over all 256 plans; Markov-2, which cannot know it, is at .01387."""
+    prior = kind(4).fit(torus_plans, generator=seeded(0), progress=False)
+    with torch.no_grad():
+        log_probs = prior.log_prob(every_plan(4, 4))
+    assert float(log_probs.exp().sum()) == pytest.approx(1, abs=1e-4)
+    assert bits_per_action(best_plan_distribution(), log_probs, 4) < 0.005
+    assert prior.window == 3
+    assert not prior.training
+
+
+@BOTH
+def test_same_seed_same_weights_whatever_the_global_seed(kind):
+    plans = Plans(torch.randint(3, (300, 5), generator=seeded(0)), 3)
+    fitted = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        fitted.append(weights(small(kind).fit(plans, generator=seeded(5), **QUICK)))
+    assert torch.equal(*fitted)
+    assert not torch.equal(fitted[0], weights(small(kind)))
+    assert not torch.equal(fitted[0], weights(small(kind).fit(plans, generator=seeded(6), **QUICK)))
+
+
+@BOTH
+def test_global_generators_are_left_alone(kind):
+    before = torch.get_rng_state(), random.getstate(), np.random.get_state()[1].copy()  # noqa: NPY002
+    prior = small(kind)
+    prior.sample(50, 4)
+    prior.sample(50, 4, method="ancestral")
+    prior.fit(torch.randint(3, (50, 4), generator=seeded(0)), **QUICK)
+    assert torch.equal(before[0], torch.get_rng_state())
+    assert before[1] == random.getstate()
+    assert (before[2] == np.random.get_state()[1]).all()  # noqa: NPY002
+
+
+@BOTH
+def test_seed_of_the_weights(kind):
+    assert torch.equal(weights(small(kind, seed=3)), weights(small(kind, seed=3)))
+    assert not torch.equal(weights(small(kind, seed=3)), weights(small(kind, seed=4)))
+
+
+@BOTH
+@pytest.mark.parametrize("per", ["plan", "step"])
+@pytest.mark.parametrize("what", ["index", "features"])
+def test_learns_from_each_kind_of_context(kind, what, per):
+    """Actions are what the context says: a prior that sees it knows them, all in all, far better than chance."""
+    context = torch.randint(3, (600, 4) if per == "step" else (600, 1), generator=seeded(0))
+    actions = context.expand(600, 4)
+    context = context if per == "step" else context[:, 0]
+    arguments = {"num_contexts": 3}
+    if what == "features":
+        context, arguments = torch.nn.functional.one_hot(context, 3).float(), {"context_size": 3}
+    prior = small(kind, **arguments)
+    prior.fit(Plans(actions, 3, context=context), generator=seeded(0), max_steps=60, learning_rate=0.03, progress=False)
+    assert prior.context_per == per
+    assert prior.log_prob(actions, context).exp().mean() > 0.7  # chance: 1/81
+    wrong = context.roll(1, -1) if what == "features" else (context + 1) % 3
+    assert prior.log_prob(actions, wrong).exp().mean() < 1 / 81
+
+
+@BOTH
+def test_lengths_mask_the_loss(kind):
+    """Beyond a plan's length nothing is learned: there action 0 is stored, but 1 and 2 are all that is ever done."""
+    actions = torch.randint(1, 3, (400, 6), generator=seeded(0))
+    lengths = torch.randint(7, (400,), generator=seeded(1))
+    prior = small(kind).fit(Plans(actions, 3, lengths), seeded(0), max_steps=60, learning_rate=0.03, progress=False)
+    with torch.no_grad():
+        first = prior(torch.randint(1, 3, (50, 6), generator=seeded(2))).softmax(-1)[..., 0]
+    assert first.max() < 0.05
+
+
+@BOTH
+@pytest.mark.parametrize("lengths", [None, torch.tensor([1, 3] * 10)])
+def test_fit_sets_the_window_to_the_longest_plan(kind, lengths):
+    plans = Plans(torch.randint(3, (20, 5), generator=seeded(0)), 3, lengths)
+    assert small(kind).fit(plans, **QUICK).window == (4 if lengths is None else 2)
+    assert small(kind, window=1).fit(plans, **QUICK).window == 1
+
+
+@BOTH
+def test_plans_of_one_action(kind):
+    prior = small(kind).fit(torch.tensor([[1], [1], [1], [2]] * 50), seeded(0), progress=False, max_steps=200)
+    probs = prior(torch.zeros(1, 4, dtype=torch.long)).softmax(-1)[0]
+    torch.testing.assert_close(probs, torch.tensor([[0, 0.75, 0.25]]).expand(4, 3), atol=0.1, rtol=0)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "plans",
+    [
+        torch.zeros(1, 4).long(),
+        torch.zeros(0, 4).long(),
+        torch.zeros(9, 0).long(),
+        Plans(torch.zeros(9, 4).long(), 3, lengths=torch.zeros(9).long()),
+        Plans(torch.zeros(9, 4).long(), 3, group=torch.zeros(9).long()),
+    ],
+)
+def test_refuses_too_few_plans(kind, plans):
+    with refuses("plans"):
+        small(kind).fit(plans, **QUICK)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        ({"num_actions": 0}, "num_actions"),
+        ({"window": -1}, "window"),
+        ({"window": 1.5}, "window"),
+        ({"num_contexts": 0}, "num_contexts"),
+        ({"context_size": 0}, "context_size"),
+        ({"num_contexts": 2, "context_size": 2}, "not both"),
+        ({"num_layers": 0}, "num_layers"),
+    ],
+)
+def test_refuses_arguments(kind, arguments, word):
+    with refuses(word):
+        kind(**({"num_actions": 3} | arguments))
+
+
+@pytest.mark.parametrize("arguments", [{"width": 10, "num_heads": 4}, {"width": 12, "num_heads": 4}, {"num_heads": 0}])
+def test_refuses_a_width_that_the_heads_cannot_share(arguments):
+    with refuses("num_heads"):
+        TransformerPrior(3, **arguments)
+
+
+@pytest.mark.parametrize(
+    "name", ["max_steps", "batch_size", "learning_rate", "gradient_clip", "check_every", "patience"]
+)
+def test_refuses_settings(name):
+    with refuses(name):
+        small(GRUPrior).fit(torch.zeros(9, 4).long(), progress=False, **{name: 0})
