@@ -1,0 +1,299 @@
+"""State values to plan by, right or wrong: Q-learning, value iteration, approximations over coordinates, exact reach.
+
+The ways in which a planner's values can be wrong (Hyvärinen, second simulation), and what gives them:
+
+- learned or computed too little: `q_learning(world, goal).amax(-1)`, `value_iteration(world, goal=goal, sweeps=5)`;
+- the rewards changed after learning: `value_iteration(world, goal=old_goal)`, used where another goal holds;
+- generalised: `tile_approximation` or `network_approximation` of the true values over coordinates.
+
+With a goal, the reward is 1 for reaching it and 0 for all else, whatever rewards the world has. A cell at distance d is
+then worth discount ** (d - 1), and the goal itself 1 / discount: a planner that is scored by the value of the cell it
+ends in must find the goal better than the cells beside it. Put 0 there (`values[:, goal] = 0`) where the reward of
+reaching the goal is added up apart.
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from neuroprior.randomness import generator_on
+from neuroprior.worlds.tabular import TabularWorld
+
+
+@torch.no_grad()
+def q_learning(
+    world: TabularWorld,
+    goal: int,
+    *,
+    num_agents: int = 1,
+    steps: int = 10_000,
+    step_size: float = 0.5,
+    discount: float = 0.9,
+    initial_scale: float = 0.01,
+    epsilon: float = 0.0,
+    generator: torch.Generator | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Tensor:
+    """Action values that independent agents learn while they look for a goal (Hyvärinen, second simulation).
+
+    An agent starts in a random cell and always takes the action it values most; on reaching the goal it bounces to a
+    random cell. With `epsilon` 0 its random initial values are all that makes it explore. The update is Q-learning's
+    (Watkins & Dayan 1992); reaching the goal is terminal. State values are the result's `.amax(-1)`.
+
+    Args:
+        world: gives the transitions and the legal actions; its own rewards are not used (see the module).
+        goal: the goal's cell.
+        num_agents: number of agents, N, none of which sees what another does.
+        steps: steps that each agent takes.
+        step_size: how far a value moves towards its target, above 0 and at most 1.
+        discount: what a reward one step later is worth, between 0 and 1 exclusive.
+        initial_scale: initial values are uniform between 0 and this.
+        epsilon: share of steps whose action is drawn from all legal ones. Without it values need never become right.
+        generator: draws initial values, starts and bounces (uniform over all cells but the goal), and which of the
+            actions of exactly equal value is taken (hardly ever needed, unless `initial_scale` is 0).
+        progress: called after every step with the number of steps done and `steps`.
+
+    Returns:
+        `[N, S, A]` float64: the value of each action; -inf where it is not legal, 1 / discount in the goal.
+
+    Raises:
+        ValueError: an argument is out of range, or the goal is the only cell.
+    """
+    goal = _check_goal(world, goal)
+    _require(world.num_states > 1, "world", "a cell that is not the goal", "the goal alone")
+    _require(num_agents >= 1, "num_agents", "at least 1", num_agents)
+    _require(steps >= 0, "steps", "a number that is not negative", steps)
+    _require(0 < step_size <= 1, "step_size", "a number above 0 and at most 1", step_size)
+    _require(0 < discount < 1, "discount", "a number above 0 and below 1", discount)
+    _require(0 <= initial_scale < math.inf, "initial_scale", "a finite number, at least 0,", initial_scale)
+    _require(0 <= epsilon <= 1, "epsilon", "a share between 0 and 1", epsilon)
+    generator = generator_on(generator, world.device)
+    device, size = world.device, (num_agents, *world.next_state.shape)
+    values = torch.rand(size, generator=generator, device=device, dtype=torch.float64) * initial_scale
+    values[:, goal] = 1 / discount
+    values.masked_fill_(~world.legal(torch.arange(world.num_states, device=device)), -torch.inf)
+    agent = torch.arange(num_agents, device=device)
+    cell = _other_cells(goal, world.num_states, num_agents, generator)
+    for step in range(steps):
+        here = values[agent, cell]
+        action = _choose(here, epsilon, generator)
+        after = world.next_state[cell, action]
+        # The goal is worth 1 / discount, so that the target is 1 there, the reward, without a case of its own.
+        values[agent, cell, action] = here[agent, action].lerp(discount * values[agent, after].amax(1), step_size)
+        cell = torch.where(after == goal, _other_cells(goal, world.num_states, num_agents, generator), after)
+        if progress is not None:
+            progress(step + 1, steps)
+    return values
+
+
+def _choose(values: Tensor, epsilon: float, generator: torch.Generator) -> Tensor:
+    """An action `[N]` of the largest value in each row `[N, A]`; in a share `epsilon` of the rows, any legal one."""
+    candidate = values == values.amax(1, keepdim=True)
+    if epsilon > 0:
+        explore = torch.rand(len(values), 1, generator=generator, device=values.device) < epsilon
+        candidate |= explore & (values > -torch.inf)
+    return candidate.float().multinomial(1, generator=generator)[:, 0]
+
+
+def _other_cells(goal: int, num_states: int, number: int, generator: torch.Generator) -> Tensor:
+    """Cells `[number]`, uniform over all but the goal."""
+    cell = torch.randint(num_states - 1, (number,), generator=generator, device=generator.device)
+    return cell + (cell >= goal)
+
+
+@torch.no_grad()
+def value_iteration(
+    world: TabularWorld,
+    *,
+    discount: float = 0.9,
+    goal: int | None = None,
+    sweeps: int | None = None,
+    tolerance: float = 1e-9,
+) -> Tensor:
+    """Optimal state values, exact or cut short.
+
+    Args:
+        world: gives the transitions, the legal actions and, without a goal, the rewards of its W reward maps.
+        discount: what a reward one step later is worth: at least 0 (with a goal: above 0) and below 1.
+        goal: the goal's cell, for the values of reaching it (see the module); None: the world's own rewards, unending.
+        sweeps: stop after so many synchronous sweeps from values of 0: with a goal, cells farther from it than that
+            are then still worth 0. None goes on to the end.
+        tolerance: the end, without a goal, is where no value changes by more than this; values are then within
+            tolerance * discount / (1 - discount) of the true ones. With a goal it is where nothing changes at all.
+
+    Returns:
+        `[W, S]` float64; with a goal `[1, S]`.
+
+    Raises:
+        ValueError: an argument is out of range, or the reward of a legal action is infinite.
+    """
+    _require(sweeps is None or sweeps >= 0, "sweeps", "a number that is not negative", sweeps)
+    _require(tolerance > 0, "tolerance", "a positive number", tolerance)
+    _require(0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
+    if goal is not None:
+        _require(discount > 0, "discount", "with a goal, a number above 0", discount)
+        goal, tolerance = _check_goal(world, goal), 0.0
+    rewards = _action_rewards(world, goal is not None)
+    values = rewards.new_zeros(rewards.shape[0], world.num_states)
+    if goal is not None:
+        values[:, goal] = 1 / discount
+    most = math.inf
+    for _ in itertools.count() if sweeps is None else range(sweeps):
+        before, values = values, (rewards + discount * values[:, world.next_state]).amax(-1)
+        if goal is not None:
+            values[:, goal] = 1 / discount
+        # Each sweep shrinks the largest change by the discount at least, which rounding must not hide forever.
+        most = min(float((values - before).abs().max()), most * discount)
+        if sweeps is None and not most > tolerance:
+            break
+    return values
+
+
+def _action_rewards(world: TabularWorld, none: bool) -> Tensor:
+    """The reward of each action in each cell, `[W, S, A]` float64, or 0 `[1, S, A]`; -inf where it is not legal."""
+    rewards = world.reward.new_zeros(1, world.num_states) if none else world.reward
+    rewards = (rewards[:, world.next_state] if rewards.dim() == 2 else rewards).double()
+    legal = world.legal(torch.arange(world.num_states, device=world.device))
+    for where in (rewards.isinf() & legal).nonzero().tolist()[:1]:
+        raise ValueError(f"world: the reward of [map, cell, action] {where} is infinite; values need finite ones")
+    return rewards.masked_fill(~legal, -torch.inf)
+
+
+def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, within: bool = False) -> Tensor:
+    """Which starts can reach the goal at all: the ceiling for every planner, by dynamic programming over the table.
+
+    Args:
+        world: gives the transitions and the legal actions.
+        state: integers `[B]`: the states to start from.
+        goal: the goal's cell. A plan may pass through it and go on.
+        length: number of steps, 0 or more.
+        within: False: some plan of exactly `length` steps ends on the goal. True: some plan is on the goal after at
+            most `length` steps; a start on the goal is, after 0.
+
+    Returns:
+        `[B]` bool.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    world.check_state(state)
+    goal = _check_goal(world, goal)
+    _require(length >= 0, "length", "a number of steps that is not negative", length)
+    cells = torch.arange(world.num_states, device=world.device)
+    ends, legal = cells == goal, world.legal(cells)
+    for _ in range(length):
+        one_more = (ends[world.next_state] & legal).any(1)
+        ends = ends | one_more if within else one_more
+    return ends[world.cell(state)]
+
+
+@torch.no_grad()
+def tile_approximation(values: Tensor, coordinates: Tensor, tile_size: float, num_tilings: int = 1) -> Tensor:
+    """The closest to given values, in least squares, that a linear function of tile features can come.
+
+    Args:
+        values: floating point `[K, S]`: K functions, each approximated by itself.
+        coordinates: numbers `[S, D]`: where the S cells are, as from `GridWorld.coordinates`.
+        tile_size: side of a tile, in units of the coordinates. The first tiling starts at their least values.
+        num_tilings: number of tilings, each moved by tile_size / num_tilings along every axis from the one before. One
+            gives each cell the mean of its tile, and so the values themselves where a tile holds one cell.
+
+    Returns:
+        Approximate values `[K, S]`, of the dtype of `values`. Time grows as S times the square of the number of tiles.
+
+    Raises:
+        ValueError: a shape, dtype or number is wrong.
+    """
+    _check_fit(values, coordinates)
+    _require(0 < tile_size < math.inf, "tile_size", "a positive, finite number", tile_size)
+    _require(num_tilings >= 1, "num_tilings", "at least 1", num_tilings)
+    place = (coordinates - coordinates.amin(0)).double().cpu() / tile_size
+    tilings = [(place + tiling / num_tilings).floor() for tiling in range(num_tilings)]
+    tiles = [torch.unique(tiling, dim=0, return_inverse=True)[1] for tiling in tilings]
+    active = torch.cat([torch.nn.functional.one_hot(tile) for tile in tiles], 1).double()
+    # Tilings are linearly dependent: a GPU's lstsq forbids that, and a cut-off as small as rounding would miss it.
+    weights = torch.linalg.lstsq(active, values.double().cpu().T, rcond=1e-9, driver="gelsd").solution
+    return torch.mm(active, weights).T.to(values)
+
+
+@torch.enable_grad()
+def network_approximation(
+    values: Tensor,
+    coordinates: Tensor,
+    *,
+    hidden_size: int = 32,
+    steps: int = 500,
+    learning_rate: float = 0.01,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """What small neural networks (two hidden layers of tanh units) learn of given values, in float32 by Adam.
+
+    Args:
+        values: floating point `[K, S]`: K functions, each approximated by a network of its own; all learn at once.
+        coordinates: numbers `[S, D]`: where the S cells are, as from `GridWorld.coordinates`.
+        hidden_size: units in a hidden layer.
+        steps: gradient steps on the mean squared error over all cells; few leave the values smooth and wrong.
+        learning_rate: of Adam.
+        generator: draws the initial weights; the same seed gives the same approximation.
+
+    Returns:
+        Approximate values `[K, S]`, of the dtype of `values`.
+
+    Raises:
+        ValueError: a shape, dtype or number is wrong.
+    """
+    _check_fit(values, coordinates)
+    for name, number in (("hidden_size", hidden_size), ("steps", steps), ("learning_rate", learning_rate)):
+        _require(0 < number < math.inf, name, "a positive, finite number", number)
+    generator = generator_on(generator, values.device)
+    target, mean, scale = _standardised(values.detach())
+    inputs = _standardised(coordinates.to(values.device).T)[0].T.expand(len(values), -1, -1)
+    weights = []  # [K, 1 + inputs, outputs] a layer, the bias first
+    for fan_in, fan_out in itertools.pairwise((inputs.shape[-1], hidden_size, hidden_size, 1)):
+        uniform = torch.rand(len(values), 1 + fan_in, fan_out, generator=generator, device=values.device)
+        weights.append(((2 * uniform - 1) / math.sqrt(fan_in)).requires_grad_())
+    optimizer = torch.optim.Adam(weights, lr=learning_rate)
+    for _ in range(steps):
+        # A sum over networks: the gradient, and so the learning, of each is then its own.
+        loss = (_network(weights, inputs) - target).square().mean(1).sum()
+        for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
+            weight.grad = gradient
+        optimizer.step()
+    return (_network(weights, inputs).detach() * scale + mean).to(values)
+
+
+def _network(weights: list[Tensor], inputs: Tensor) -> Tensor:
+    """Outputs `[K, S]` of K networks for inputs `[K, S, D]`."""
+    for layer, weight in enumerate(weights):
+        inputs = torch.baddbmm(weight[:, :1], inputs.tanh() if layer else inputs, weight[:, 1:])
+    return inputs[..., 0]
+
+
+def _standardised(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Each row with mean 0 and standard deviation 1, float32; the means and deviations that were, `[N, 1]`."""
+    rows = rows.double()
+    mean, scale = rows.mean(1, keepdim=True), rows.std(1, correction=0, keepdim=True).clamp(min=1e-12)
+    return ((rows - mean) / scale).float(), mean, scale
+
+
+def _require(holds: bool, name: str, wanted: str, given: object) -> None:
+    if not holds:
+        raise ValueError(f"{name}: {wanted} is expected, not {given}")
+
+
+def _check_goal(world: TabularWorld, goal: int) -> int:
+    _require(goal in range(world.num_states), "goal", f"a cell from 0 to {world.num_states - 1}", goal)
+    return int(goal)
+
+
+def _check_fit(values: Tensor, coordinates: Tensor) -> None:
+    _require(values.is_floating_point(), "values", "floating point", values.dtype)
+    _require(values.dim() == 2 and 0 not in values.shape, "values", "shape [K, S]", list(values.shape))
+    fits = coordinates.dim() == 2 and coordinates.shape[0] == values.shape[1] and coordinates.shape[1] > 0
+    _require(fits, "coordinates", f"shape [S, D] with S = {values.shape[1]}", list(coordinates.shape))
+    for name, tensor in (("values", values), ("coordinates", coordinates)):
+        for where in (~tensor.isfinite()).nonzero().tolist()[:1]:
+            raise ValueError(f"{name}{where}: a finite number is expected, not {tensor[tuple(where)]}")
