@@ -1,0 +1,1 @@
+"""The program that compares priors: `python -m eval`."""

@@ -1,0 +1,178 @@
+"""`python -m eval bench`: speed against plain code, in the same run."""
+
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from eval.output import versions, write_csv, write_json
+from neuroprior import (
+    ExhaustivePlanner,
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    SamplingPlanner,
+    TransformerPrior,
+    UniformPrior,
+    collect,
+    gridworld,
+)
+from neuroprior.sampling import sample
+
+
+def bench(repetitions: int = 5, million_starts: bool = False, out: str = "runs/bench") -> None:
+    """Measure the library against plain code; prints a table, writes CSV and results.json.
+
+    Args:
+        repetitions: how often each job is timed, in turn with its peer.
+        million_starts: also plan from 1,000,000 starts with 256 plans each and report the peak memory (minutes).
+        out: folder to write to.
+    """
+    if repetitions < 1:
+        raise ValueError(f"repetitions: at least 1 is expected, not {repetitions}")
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    console = Console()
+    rows = []
+    for name, job, peer, rival in track(_jobs(), description="measuring", console=console, transient=True):
+        job(), rival()
+        times = [(_seconds(job), _seconds(rival)) for _ in range(repetitions)]
+        ratios = sorted(theirs / ours for ours, theirs in times)
+        rows.append(
+            {
+                "job": name,
+                "seconds": median(ours for ours, _ in times),
+                "peer": peer,
+                "ratio": median(ratios),
+                "low": ratios[0],
+                "high": ratios[-1],
+            }
+        )
+    results: dict[str, Any] = {"versions": versions(), "threads": torch.get_num_threads(), "rows": rows}
+    console.print(_table(rows))
+    if million_starts:
+        results["million_starts"] = _million_starts(console)
+    write_csv(folder / "bench.csv", rows)
+    write_json(folder / "results.json", results)
+    console.print(f"written to {folder}")
+
+
+Job = Callable[[], object]
+
+
+def _jobs() -> list[tuple[str, Job, str, Job]]:
+    """What is measured: a job's name, the job, the peer's name, and the peer's job."""
+    world = gridworld(20, 20, "torus", num_worlds=10)
+    generator = torch.Generator().manual_seed(0)
+    plans = collect(ExhaustivePlanner(4), world, 10_000, generator=generator)
+    markov = MarkovPrior(4, 2).fit(plans)
+    neural = [
+        prior.fit(plans, generator=generator, progress=False, max_steps=100)
+        for prior in (GRUPrior(4), TransformerPrior(4))
+    ]
+    jobs: list[tuple[str, Job, str, Job]] = []
+    for name, prior in (("markov-2", markov), ("gru", neural[0]), ("transformer", neural[1])):
+        jobs.append(
+            (
+                f"sample 2.56 M plans of length 8, {name}",
+                partial(sample, prior, 2_560_000, 8),
+                "plan by plan",
+                partial(sample, prior, 2_560_000, 8, method="ancestral"),
+            )
+        )
+    tables = markov.log_probs.exp().double().numpy(), markov.next_node.numpy(), int(markov.start_node)
+    starts = world.reset(10_000, generator)
+    candidates = UniformPrior(4).sample(2_560_000, 8, generator=generator).view(10_000, 256, 8)
+    return [
+        *jobs,
+        (
+            "sample 2.56 M plans of length 8, markov-2",
+            partial(sample, markov, 2_560_000, 8),
+            "numpy, inverse CDF a step",
+            partial(_numpy_sample, *tables, 2_560_000, 8),
+        ),
+        (
+            "evaluate 10,000 starts x 256 plans x 8 steps",
+            partial(world.rollout, starts, candidates),
+            "plain torch indexing",
+            partial(_plain_rollout, world.next_state, world.reward, starts, candidates),
+        ),
+        (
+            "fit a GRU on 10,000 plans of length 4",
+            partial(_fit, GRUPrior, plans),
+            "fit a transformer",
+            partial(_fit, TransformerPrior, plans),
+        ),
+    ]
+
+
+def _fit(make: type[GRUPrior] | type[TransformerPrior], plans: Plans) -> object:
+    return make(4).fit(plans, generator=torch.Generator().manual_seed(0), progress=False)
+
+
+def _seconds(job: Job) -> float:
+    begin = time.perf_counter()
+    job()
+    return time.perf_counter() - begin
+
+
+def _numpy_sample(probs: Any, follow: Any, start: int, num_plans: int, length: int) -> Any:
+    """A Markov chain in numpy, vectorised over plans."""
+    generator = np.random.default_rng(0)
+    cumulative = probs.cumsum(1)
+    node = np.full(num_plans, start)
+    plans = np.empty((num_plans, length), np.uint8)
+    for t in range(length):
+        action = (generator.random((num_plans, 1)) > cumulative[node, :-1]).sum(1)
+        plans[:, t] = action
+        node = follow[node, action]
+    return plans
+
+
+def _plain_rollout(next_state: torch.Tensor, reward: torch.Tensor, state: torch.Tensor, plans: torch.Tensor) -> Any:
+    """What one writes first: index two tables at every step."""
+    cell, world = state % len(next_state), state // len(next_state)
+    cell = cell[:, None].expand(plans.shape[:2])
+    world = world[:, None].expand(plans.shape[:2])
+    rewards = []
+    for t in range(plans.shape[2]):
+        cell = next_state[cell, plans[:, :, t].long()]
+        rewards.append(reward[world, cell])
+    return cell, torch.stack(rewards, -1)
+
+
+def _million_starts(console: Console) -> dict[str, float]:
+    """Time and peak memory of planning from 1,000,000 starts with 256 plans of 8 moves each."""
+    import resource  # not on every platform, and needed here alone
+
+    world = gridworld(20, 20, "torus", num_worlds=100)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    states = world.reset(1_000_000)
+    seconds = _seconds(lambda: SamplingPlanner(UniformPrior(4), 8, 256).plan(world, states))
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = {"seconds": seconds, "peak_gb": peak * unit / 1e9, "peak_before_gb": before * unit / 1e9}
+    console.print(
+        f"1,000,000 starts x 256 plans x 8 moves: {seconds:.1f} s, peak memory of the process"
+        f" {found['peak_gb']:.2f} GB ({found['peak_before_gb']:.2f} GB before)"
+    )
+    return found
+
+
+def _table(rows: list[dict[str, Any]]) -> Table:
+    table = Table(title=f"Speed on {torch.get_num_threads()} threads (medians; ratio: peer's time / ours, min to max)")
+    for heading in ("job", "seconds", "peer", "ratio", "min", "max"):
+        table.add_column(heading, justify="left" if heading in ("job", "peer") else "right")
+    for row in rows:
+        figures = (f"{row[key]:.1f}" for key in ("ratio", "low", "high"))
+        table.add_row(row["job"], f"{row['seconds']:.3f}", row["peer"], *figures)
+    return table

@@ -1,0 +1,48 @@
+"""Writing results: CSV and JSON, each to a temporary name first and renamed when whole."""
+
+import csv
+import json
+import os
+import platform
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy
+import torch
+
+import neuroprior
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write an object as JSON."""
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write rows with the same keys as CSV with a heading."""
+    text = StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file so that it is there whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+def versions() -> dict[str, str]:
+    """The versions that results depend on."""
+    return {
+        "neuroprior": neuroprior.__version__,
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "numpy": numpy.__version__,
+        "lightning": str(lightning.__version__),
+    }

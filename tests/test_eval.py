@@ -1,0 +1,122 @@
+"""The program `python -m eval`, end to end on small cases, and its answers to bad input."""
+
+import csv
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from eval.__main__ import main
+from eval.first_simulation import PAPER_BEST, Protocol, training_plans
+from neuroprior import gridworld
+
+SMALL = ["--worlds", "3", "--starts", "20", "--training-plans", "200", "--size", "8", "--num-plans", "16"]
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paper")
+    assert main(["paper", *SMALL, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_paper_writes_results(small_run: Path) -> None:
+    results = json.loads((small_run / "results.json").read_text())
+    assert results["settings"]["worlds"] == 3
+    assert results["seed"] == 0
+    assert results["versions"]["torch"] == str(torch.__version__)
+    rows = {row["planner"]: row for row in results["simulation_1"]["rows"]}
+    assert list(rows) == ["deterministic", "random", "markov-1", "markov-2", "markov-3", "gru", "transformer", "oracle"]
+    for name, row in rows.items():
+        assert 0 <= row["low"] <= row["best"] <= row["high"] <= 1
+        assert row["paper"] == PAPER_BEST.get(name)
+        assert row["mean_reward"] <= rows["oracle"]["mean_reward"] + 1e-9
+        assert row["oracle_share"] <= 1 + 1e-9
+    assert rows["oracle"]["best"] == 1
+    # At least one of the paper's four is best at every start.
+    assert sum(rows[name]["best"] for name in PAPER_BEST) >= 1
+    matrix = torch.tensor(results["simulation_1"]["transition_matrix"])
+    assert torch.allclose(matrix.sum(1), torch.ones(4))
+
+
+def test_paper_writes_tables_and_figures(small_run: Path) -> None:
+    with open(small_run / "table_1.csv") as file:
+        assert [row["planner"] for row in csv.DictReader(file)][:2] == ["deterministic", "random"]
+    for name in ("table_1.png", "transition_matrix.png", "world.png"):
+        assert (small_run / name).read_bytes().startswith(b"\x89PNG")
+    assert not list(small_run.glob(".*"))
+
+
+def test_same_seed_same_results(small_run: Path, tmp_path: Path) -> None:
+    assert main(["paper", *SMALL, "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "table_1.csv").read_text() == (small_run / "table_1.csv").read_text()
+
+
+def test_all_protocols_and_one_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["paper", *SMALL, "--worlds", "1", "--protocols", "all", "--out", str(tmp_path)]) == 0
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert len(results["protocols"]) == 8
+    distances = [row["table_distance"] for row in results["protocols"]]
+    nearest = results["protocols"][distances.index(min(distances))]
+    assert all(nearest[key] == value for key, value in results["nearest"]["table"].items())
+    assert "nearest to the paper's matrix" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("edges", ["torus", "wall"])
+def test_protocols_choose_the_plans_they_say(edges: str) -> None:
+    world = gridworld(9, 9, edges, num_worlds=2, seed=3)
+    states = world.reset(300, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(1)
+    first = training_plans(world, states, 3, Protocol(edges, "first", "all"), generator)
+    uniform = training_plans(world, states, 3, Protocol(edges, "uniform", "all"), generator)
+    for plans in (first, uniform):
+        rewards = world.rollout(states, plans.actions[:, None]).rewards[:, 0, -1]
+        every = torch.cartesian_prod(*[torch.arange(4)] * 3)
+        scores = world.rollout(states, every.expand(300, -1, -1)).rewards[..., -1]
+        assert rewards.equal(scores.amax(1))
+    assert first.actions.long().equal(every[(scores == scores.amax(1, keepdim=True)).int().argmax(1)])
+    shortest = training_plans(world, states, 3, Protocol(edges, "uniform", "shortest"), generator)
+    assert 0 < len(shortest) < 300
+    # A plan of three moves is a shortest one exactly if it never reverses a move that it made (or bumps).
+    for plan in shortest.actions.tolist():
+        assert not any((a + 2) % 4 in plan for a in plan)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["paper", "--worlds", "0"], "worlds"),
+        (["paper", "--edges", "cliff"], "edges"),
+        (["paper", "--worlds", "many"], "worlds"),
+        (["paper", "--no-such-option", "1"], "no_such_option"),
+        (["papers"], "papers"),
+        (["paper", "--depth", "20", "--worlds", "1", "--starts", "2", "--training-plans", "2"], "depth"),
+        (["bench", "--repetitions", "0"], "repetitions"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main([*arguments, *(["--out", str(tmp_path)] if arguments != ["papers"] else [])]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert words in error
+
+
+def test_unwritable_folder_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["paper", *SMALL, "--out", str(tmp_path / "file" / "below")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_help_is_readable() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "eval", "paper", "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    assert "reward maps to compare in" in shown
+    assert re.search(r"--learn_from.*\{all,shortest\}", shown)
