@@ -3,16 +3,9 @@
 import sys
 from collections.abc import Sequence
 
-from jsonargparse import ArgumentParser, Namespace
-
-from eval.bench import bench
-from eval.paper import paper
-
-COMMANDS = {"paper": paper, "bench": bench}
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; bad input gives one line on stderr and exit code 2.
+    """Run a command; bad input gives one line on stderr and exit code 2, Ctrl-C one line and 130.
 
     Args:
         arguments: of the command line; None: those of the process. Dashes and underscores in option names are the same.
@@ -20,30 +13,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code.
     """
-    given = [_with_underscores(argument) for argument in (sys.argv[1:] if arguments is None else arguments)]
-    parser = ArgumentParser(prog="python -m eval", description="Compare behavioural priors.", exit_on_error=False)
+    try:
+        return _run(sys.argv[1:] if arguments is None else arguments)
+    except KeyboardInterrupt:
+        return _fail("interrupted; what was not yet written is lost", 130)
+    except (ValueError, OSError) as error:
+        return _fail(f"error: {error}", 2)
+
+
+def _run(arguments: Sequence[str]) -> int:
+    # Imported here, so that Ctrl-C is answered while the libraries load too.
+    from jsonargparse import ArgumentError, ArgumentParser
+
+    from eval.bench import bench
+    from eval.paper import paper
+
+    about = "Compare behavioural priors. Dashes and underscores in option names are the same."
+    parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False)
     commands = parser.add_subcommands()
-    for name, command in COMMANDS.items():
+    by_name = {"paper": paper, "bench": bench}
+    for name, command in by_name.items():
         sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False)
         sub.add_function_arguments(command, as_group=False)
         commands.add_subcommand(name, sub)
     try:
-        settings = parser.parse_args(given)
-        name = settings.subcommand
-        if name is None:
-            parser.print_help()
-            return 2
-        chosen: Namespace = settings[name]
-        COMMANDS[name](**chosen.as_dict())
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
-        return _fail(error)
-    except Exception as error:
-        if type(error).__name__ != "ArgumentError":
-            raise
-        return _fail(error)
+        settings = parser.parse_args([_with_underscores(argument) for argument in arguments])
+    except ArgumentError as error:
+        raise ValueError(str(error)) from error
+    by_name[settings.subcommand](**settings[settings.subcommand].as_dict())
     return 0
 
 
@@ -54,9 +51,9 @@ def _with_underscores(argument: str) -> str:
     return "--" + name[2:].replace("-", "_") + equals + value
 
 
-def _fail(error: Exception) -> int:
-    print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-    return 2
+def _fail(message: str, code: int) -> int:
+    print(" ".join(message.split()), file=sys.stderr)
+    return code
 
 
 if __name__ == "__main__":

@@ -10,18 +10,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from eval import second_simulation
 from eval.first_simulation import Outcome
 from neuroprior import GridWorld
 from neuroprior.worlds.grid import MOVES
 
 COLORS = {
-    "deterministic": "#7f7f7f",
+    "deterministic": "#31a354",
     "random": "#d9a441",
     "markov-1": "#6baed6",
     "markov-2": "#2171b5",
     "markov-3": "#08306b",
     "gru": "#e6550d",
-    "transformer": "#a63603",
+    "transformer": "#88419d",
 }
 """The colour of each planner, the same in every figure."""
 
@@ -127,3 +128,53 @@ def _draw_plan(axes: Axes, world: GridWorld, start: Tensor, plan: Tensor, color:
     places = torch.stack([place.double() for place in path]) + shift
     axes.plot(*places.T.flip(0).numpy(), color=color, linewidth=1.8, label=label, solid_capstyle="round")
     axes.plot(*places[-1:].T.flip(0).numpy(), "s", color=color, markersize=5)
+
+
+def values_and_stuck(path: Path, outcome: second_simulation.Outcome, task: second_simulation.Task) -> None:
+    """The first approximate value function, the exact one, and where each planner gets stuck.
+
+    Only starts count that can end on the goal with whole plans.
+    """
+    names = [name for name in outcome.names if not name.endswith(second_simulation.ANY_PREFIX)]
+    figure = Figure(figsize=(11, 7.6))
+    panels = figure.subplots(3, 3).flatten()
+    size = task.size
+    maps = {"approximate values": outcome.values[0], "exact values": outcome.exact}
+    for axes, (title, values) in zip(panels, maps.items(), strict=False):
+        values = values.clone()
+        values[task.goal] = outcome.exact[outcome.exact < outcome.exact[task.goal]].max()
+        axes.imshow(values.view(size, size).numpy(), cmap="Greys_r", vmin=0)
+        axes.set_title(title)
+    for axes, name in zip(panels[len(maps) :], names, strict=True):
+        k = outcome.names.index(name)
+        able = outcome.ceiling[0]
+        stuck = able & ~outcome.reached[k, 0]
+        cells = outcome.world.cell(outcome.final_state[k, 0][stuck]).bincount(minlength=size**2)
+        axes.imshow((cells / able.sum()).sqrt().view(size, size).numpy(), cmap="Reds", vmin=0, vmax=0.5)
+        axes.set_title(f"{name}: {100 * int(stuck.sum()) / max(int(able.sum()), 1):.0f} % stuck")
+    for axes in panels:
+        axes.plot(size // 2, size // 2, "*", color="gold", markeredgecolor="black", markersize=12)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.spines[:].set_visible(True)
+    figure.tight_layout()
+    save(figure, path)
+
+
+def success_against_quality(path: Path, rows: list[dict[str, Any]]) -> None:
+    """How often each planner reached the goal against the quality of the values, a panel for each way to be wrong."""
+    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    figure = Figure(figsize=(2.6 * len(kinds) + 1, 3.4))
+    for axes, kind in zip(figure.subplots(1, len(kinds), sharey=True), kinds, strict=True):
+        some = sorted((row for row in rows if row["kind"] == kind), key=lambda row: row["quality"])
+        quality = [row["quality"] for row in some]
+        axes.plot(quality, [100 * row["ceiling"] for row in some], color="black", linestyle=":", label="ceiling")
+        for name, color in COLORS.items():
+            axes.plot(quality, [100 * row[name] for row in some], "o-", color=color, markersize=4, label=name)
+        axes.set_title({"sweeps": "value iteration cut short"}.get(kind, kind), fontsize=10)
+        axes.set_xlabel("quality of the values")
+    first, last = figure.axes[0], figure.axes[-1]
+    first.set_ylabel("goal reached, % of starts")
+    first.set_ylim(0, None)
+    last.legend(frameon=False, loc="center left", bbox_to_anchor=(1.02, 0.5))
+    save(figure, path)

@@ -120,7 +120,7 @@ def simulate(protocol: Protocol, size: Size, neural: bool, report: Report) -> Ou
     learn_in = more * cells + torch.randint(size.worlds * cells, (size.training_plans,), generator=generator)
     report("collecting plans")
     plans = training_plans(everywhere, learn_in, size.depth, protocol, generator)
-    planners = make_planners(plans, size, neural, generator, report)
+    planners = make_planners(learn_priors(plans, size.seed, neural, generator, report), size)
     start = torch.randint(cells, (size.worlds, size.starts), generator=generator)
     states = start + torch.arange(size.worlds)[:, None] * cells
     scores, chosen, steps = [], [], []
@@ -161,13 +161,17 @@ def training_plans(
         kept = _distance(world, states, decision.final_state) == depth
     if int(kept.sum()) < 2:
         raise ValueError("training_plans: too few plans to learn from; give more")
-    return Plans(actions[kept], 4, action_names=world.action_names, group=world.reward_map(states)[kept])
+    return Plans(actions[kept], 4, action_names=world.action_names, group=groups(world, states[kept]))
 
 
-def make_planners(
-    plans: Plans, size: Size, neural: bool, generator: torch.Generator, report: Report
-) -> dict[str, Planner]:
-    """The planners of Table 1 by name, and those with neural priors.
+def groups(world: GridWorld, states: Tensor) -> Tensor | None:
+    """The reward map of each state as its plan's group; None for one map: a single group cannot be split in two."""
+    maps = world.reward_map(states)
+    return maps if len(maps.unique()) > 1 else None
+
+
+def learn_priors(plans: Plans, seed: int, neural: bool, generator: torch.Generator, report: Report) -> dict[str, Prior]:
+    """The priors of the tables by name, with neural ones or without.
 
     Order 3, which the paper does not have, is the highest that plans of four moves can teach: the neural priors' rival.
     """
@@ -175,11 +179,14 @@ def make_planners(
     for order in (1, 2, 3):
         priors[f"markov-{order}"] = MarkovPrior(4, order).fit(plans)
     if neural:
-        # One world is one group, which cannot be split in two.
-        ungrouped = Plans(plans.actions, 4) if size.worlds == 1 else plans
         for name, make in (("gru", GRUPrior), ("transformer", TransformerPrior)):
             report(f"training: {name}")
-            priors[name] = make(4, seed=size.seed).fit(ungrouped, generator=generator, progress=False)
+            priors[name] = make(4, seed=seed).fit(plans, generator=generator, progress=False)
+    return priors
+
+
+def make_planners(priors: dict[str, Prior], size: Size) -> dict[str, Planner]:
+    """The planners of Table 1 by name, and those with the other priors."""
     planners: dict[str, Planner] = {"deterministic": ExhaustivePlanner(size.depth)}
     for name, prior in priors.items():
         planners[name] = SamplingPlanner(prior, size.length, size.num_plans)

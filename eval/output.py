@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import os
 import platform
 from collections.abc import Sequence
@@ -17,8 +18,16 @@ import neuroprior
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write an object as JSON."""
-    write_text(path, json.dumps(content, indent=2) + "\n")
+    """Write an object as JSON; numbers that are not finite, which JSON does not have, become null."""
+    write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:

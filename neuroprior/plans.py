@@ -37,8 +37,8 @@ class Plans:
     group: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if self.num_actions < 1:
-            raise ValueError(f"num_actions: at least 1 is expected, not {self.num_actions}")
+        if not isinstance(self.num_actions, int) or self.num_actions < 1:
+            raise ValueError(f"num_actions: an integer of at least 1 is expected, not {self.num_actions!r}")
         actions = torch.as_tensor(self.actions)
         if actions.dim() != 2:
             raise ValueError(f"actions: shape [N, L] is expected, not {list(actions.shape)}")
@@ -78,8 +78,12 @@ class Plans:
             return torch.ones_like(torch.as_tensor(self.actions), dtype=torch.bool)
         return steps < self.lengths[:, None]
 
-    def __getitem__(self, index: Tensor | slice) -> "Plans":
-        """The plans at `index` (a slice, integers or a bool mask)."""
+    def __getitem__(self, index: Tensor | slice | int) -> "Plans":
+        """The plans at `index` (a slice, integers or a bool mask), as `Plans`."""
+        if isinstance(index, int):
+            raise IndexError(
+                f"plans[{index}]: a slice or a tensor is expected; plans[{index} : {index + 1}] is one plan"
+            )
 
         def pick(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[index]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuroprior.plans import action_dtype, sees_each_step
 from neuroprior.randomness import generator_on
-from neuroprior.worlds.world import Rollout, World, is_integer
+from neuroprior.worlds.world import Rollout, World, is_integer, join_states
 
 
 class Steppable(Protocol):
@@ -62,6 +62,7 @@ def sample(
         ValueError: an argument is out of range.
     """
     _check(num_plans, length, temperature, batch_size)
+    context = None if context is None else torch.as_tensor(context, device=prior.device)
     if method not in ("auto", "ancestral", "tree"):
         raise ValueError(f'method: "auto", "ancestral" or "tree" is expected, not {method!r}')
     if context is not None and context.shape[0] != num_plans:
@@ -93,6 +94,7 @@ def sample_in_world(
     *,
     temperature: float = 1.0,
     generator: torch.Generator | None = None,
+    keep_states: bool = False,
 ) -> tuple[Tensor, Rollout]:
     """Sample plans and try them in the same pass: the prior sees each state before it acts there.
 
@@ -107,6 +109,7 @@ def sample_in_world(
         length: number of actions in a plan, L.
         temperature: divides the logits.
         generator: draws actions and, in a world with chance, its steps.
+        keep_states: also return the state after each step, in the rollout.
 
     Returns:
         Plans `[B, P, L]` and their `Rollout`.
@@ -123,24 +126,26 @@ def sample_in_world(
     batch = state.shape[0]
     now = state.repeat_interleave(num_plans, 0)
     seen = world.observe(now) if prior.context_per is not None else None
+    if seen is not None and sees_each_step(seen):
+        raise ValueError(f"observe: indices [N] or features [N, C] are expected, not {seen.dtype} {list(seen.shape)}")
     prior.check_context_of(seen, len(now))
     logits, memory = prior.start(len(now), seen)
-    actions, rewards = [], []
+    actions, states = [torch.zeros(len(now), 0, dtype=draw.dtype, device=state.device)], []
+    rewards = [torch.zeros(len(now), 0, device=state.device)]
     for t in range(length):
         if not world.all_legal:
             logits = logits.masked_fill(~world.legal(now), -torch.inf)
         action = draw.actions(logits)
         now, reward = world.step(now, action, generator)
-        actions.append(action)
-        rewards.append(reward.view(batch, num_plans))
+        actions.append(action[:, None].to(draw.dtype))
+        rewards.append(reward[:, None])
+        states.append(now)
         if t + 1 < length:
             logits, memory = prior.step(action, memory, world.observe(now) if prior.context_per == "step" else None)
-    final = now.view(batch, num_plans, *state.shape[1:])
-    if length == 0:
-        none = torch.zeros(batch, num_plans, 0, device=state.device)
-        return none.to(draw.dtype), Rollout(final, none)
-    plans = torch.stack(actions, -1).view(batch, num_plans, length).to(draw.dtype)
-    return plans, Rollout(final, torch.stack(rewards, -1))
+    shape = (batch, num_plans, *state.shape[1:])
+    course = join_states(states, state, shape) if keep_states else None
+    gained = torch.cat(rewards, 1).view(batch, num_plans, length)
+    return torch.cat(actions, 1).view(batch, num_plans, length), Rollout(now.view(shape), gained, course)
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:

@@ -17,6 +17,12 @@ from torch.utils.data import BatchSampler, DataLoader, Dataset, RandomSampler, S
 
 from neuroprior.plans import Plans
 
+MOST_DISTINCT = 1024
+"""Distinct plans that one training step takes together, each weighted by its number."""
+
+SMALL_STEP = 1e9
+"""Operations in a training step below which it runs on one thread."""
+
 Batch = tuple[Tensor, Tensor, Tensor | None]  # actions [N, L], weight of each action [N, L], context
 
 
@@ -85,21 +91,21 @@ class PriorModule(lightning.LightningModule):
 class PlansModule(lightning.LightningDataModule):
     """Plans for training and for validation, in batches.
 
-    Plans that can take few distinct values are trained on all at once, each distinct one weighted by its number: the
-    exact gradient in one small step.
+    Where at most `MOST_DISTINCT` plans are distinct, and few enough of them, each step takes them all, each weighted by
+    its number: the exact gradient. Otherwise steps take batches of plans.
     """
 
     def __init__(self, training: Plans, validation: Plans, settings: Settings, seed: int) -> None:
         super().__init__()
         self.training, self.validation = _Rows(training), _Rows(validation)
-        self.settings, self.seed = settings, seed
+        self.batch_size = len(self.training) if self.training.merged else settings.batch_size
+        self.seed = seed
 
     def train_dataloader(self) -> DataLoader[Batch]:
         generator = torch.Generator().manual_seed(self.seed)
         sampler = RandomSampler(self.training, generator=generator)
-        return DataLoader(
-            self.training, batch_size=None, sampler=BatchSampler(sampler, self.settings.batch_size, drop_last=False)
-        )
+        batches = BatchSampler(sampler, self.batch_size, drop_last=False)
+        return DataLoader(self.training, batch_size=None, sampler=batches)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         sampler = SequentialSampler(self.validation)
@@ -107,18 +113,18 @@ class PlansModule(lightning.LightningDataModule):
 
 
 class _Rows(Dataset[Batch]):
-    """Plans as rows with weights; equal plans merged into one row where few are distinct."""
+    """Plans as rows with weights; equal plans are merged into one row where few are distinct."""
 
     def __init__(self, plans: Plans) -> None:
-        weight = torch.ones(len(plans), device=plans.actions.device)
+        weight, merged = torch.ones(len(plans), device=plans.actions.device), False
         if plans.context is None and (plans.num_actions + 1) ** plans.max_length <= 2**20:
             key = plans.actions.long().masked_fill(~plans.mask(), plans.num_actions)
             base = (plans.num_actions + 1) ** torch.arange(plans.max_length, device=key.device)
             _, which, counts = (key * base).sum(1).unique(return_inverse=True, return_counts=True)
-            if 2 * len(counts) <= len(plans):
+            if len(counts) <= min(MOST_DISTINCT, len(plans) // 2):
                 first = torch.empty_like(counts).scatter_(0, which, torch.arange(len(plans), device=key.device))
-                plans, weight = plans[first], counts.float()
-        self.plans = plans
+                plans, weight, merged = plans[first], counts.float(), True
+        self.plans, self.merged = plans, merged
         self.weight = plans.mask() * weight[:, None]
 
     def __len__(self) -> int:
@@ -156,7 +162,8 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
     device = next(prior.parameters()).device
     training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
     devices = [device.index or 0] if device.type == "cuda" else 1
-    with _quiet(), tempfile.TemporaryDirectory() as folder, torch.random.fork_rng():
+    rows = PlansModule(training, validation, settings, seed)
+    with _quiet(), _few_threads(prior, rows), tempfile.TemporaryDirectory() as folder, torch.random.fork_rng():
         torch.manual_seed(seed)
         best = ModelCheckpoint(folder, monitor="validation_bits", save_weights_only=True)
         stop = EarlyStopping("validation_bits", patience=settings.patience, min_delta=1e-4)
@@ -175,7 +182,11 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
             enable_progress_bar=settings.progress,
         )
         module = PriorModule(prior, settings)
-        trainer.fit(module, datamodule=PlansModule(training, validation, settings, seed))
+        try:
+            trainer.fit(module, datamodule=rows)
+        except SystemExit as interrupted:
+            # Lightning turns Ctrl-C into this; a script or program above should see what it was.
+            raise KeyboardInterrupt from interrupted
         if best.best_model_score is None or not best.best_model_score.isfinite():
             raise ValueError(f"training diverged; a learning_rate below {settings.learning_rate} may help")
         checkpoint = torch.load(best.best_model_path, weights_only=True, map_location=device)
@@ -187,6 +198,21 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
 def _rate(done: float) -> float:
     """Share of the learning rate after a share `done` of the steps: a linear rise over a tenth, then half a cosine."""
     return min((done + 1e-3) / 0.1, 0.5 * (1 + cos(pi * min(done, 1.0))))
+
+
+@contextmanager
+def _few_threads(prior: nn.Module, rows: PlansModule) -> Iterator[None]:
+    """One thread for small steps: there, more gain little, and on a busy machine they wait for one another."""
+    plans = rows.training.plans
+    tokens = min(len(plans), rows.batch_size) * plans.max_length
+    operations = 6 * tokens * sum(weight.numel() for weight in prior.parameters())
+    threads = torch.get_num_threads()
+    if operations < SMALL_STEP:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @contextmanager

@@ -3,8 +3,10 @@
 import csv
 import json
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -12,9 +14,12 @@ import torch
 
 from eval.__main__ import main
 from eval.first_simulation import PAPER_BEST, Protocol, training_plans
+from eval.output import write_json
+from eval.second_simulation import PAPER_REACHED
 from neuroprior import gridworld
 
-SMALL = ["--worlds", "3", "--starts", "20", "--training-plans", "200", "--size", "8", "--num-plans", "16"]
+SMALL = ["--worlds=3", "--starts=20", "--training-plans=200", "--size=8", "--num-plans=16"]
+SMALL += ["--value-functions=2", "--q-steps=300", "--max-plans=2"]
 
 
 @pytest.fixture(scope="module")
@@ -43,17 +48,31 @@ def test_paper_writes_results(small_run: Path) -> None:
     assert torch.allclose(matrix.sum(1), torch.ones(4))
 
 
+def test_paper_writes_table_2(small_run: Path) -> None:
+    found = json.loads((small_run / "results.json").read_text())["simulation_2"]
+    rows = {row["planner"]: row for row in found["rows"]}
+    whole = ["deterministic", "random", "markov-1", "markov-2", "markov-3", "gru", "transformer"]
+    assert list(rows) == whole + [name + " (any prefix)" for name in whole]
+    assert all(0 <= row["low"] <= row["reached"] <= row["high"] <= 1 for row in rows.values())
+    assert all(row["paper"] == PAPER_REACHED.get(name) for name, row in rows.items())
+    assert max(rows[name]["reached"] for name in whole) <= found["ceiling"] + 1e-9
+    assert found["ceiling"] <= found["ceiling_any_prefix"] <= 1
+    with open(small_run / "table_2.csv") as file:
+        assert len(list(csv.DictReader(file))) == 14
+
+
 def test_paper_writes_tables_and_figures(small_run: Path) -> None:
     with open(small_run / "table_1.csv") as file:
         assert [row["planner"] for row in csv.DictReader(file)][:2] == ["deterministic", "random"]
-    for name in ("table_1.png", "transition_matrix.png", "world.png"):
+    for name in ("table_1.png", "transition_matrix.png", "world.png", "figure_1.png", "value_quality.png"):
         assert (small_run / name).read_bytes().startswith(b"\x89PNG")
     assert not list(small_run.glob(".*"))
 
 
 def test_same_seed_same_results(small_run: Path, tmp_path: Path) -> None:
     assert main(["paper", *SMALL, "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "table_1.csv").read_text() == (small_run / "table_1.csv").read_text()
+    for name in ("table_1.csv", "table_2.csv", "value_quality.csv"):
+        assert (tmp_path / name).read_text() == (small_run / name).read_text()
 
 
 def test_all_protocols_and_one_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,6 +82,7 @@ def test_all_protocols_and_one_world(tmp_path: Path, capsys: pytest.CaptureFixtu
     distances = [row["table_distance"] for row in results["protocols"]]
     nearest = results["protocols"][distances.index(min(distances))]
     assert all(nearest[key] == value for key, value in results["nearest"]["table"].items())
+    assert [(row["edges"], row["initial_scale"]) for row in results["scales"]][:2] == [("torus", 1e-4), ("torus", 0.01)]
     assert "nearest to the paper's matrix" in capsys.readouterr().out
 
 
@@ -120,3 +140,33 @@ def test_help_is_readable() -> None:
     ).stdout
     assert "reward maps to compare in" in shown
     assert re.search(r"--learn_from.*\{all,shortest\}", shown)
+
+
+def test_tables_fit_80_columns(small_run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["paper", *SMALL, "--protocols=all", "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= 80
+
+
+def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
+    write_json(tmp_path / "x.json", {"a": [float("nan"), 1.5], "b": {"c": float("inf")}})
+    assert json.loads((tmp_path / "x.json").read_text()) == {"a": [None, 1.5], "b": {"c": None}}
+
+
+@pytest.mark.parametrize("seconds", [0.4, 2.0, 6.0])
+def test_ctrl_c_is_one_line(seconds: float, tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "eval", "paper", "--worlds=50", "--out", str(tmp_path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parent.parent,
+    )
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert error.count("\n") == 1
+    assert error.startswith("interrupted")

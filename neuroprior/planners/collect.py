@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.planners.planner import Planner
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, sees_each_step
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import World
 
@@ -47,8 +47,10 @@ def collect(
         if num_plans < 1:
             raise ValueError(f"num_plans: at least 1 is expected, not {num_plans}")
         state = world.reset(num_plans, generator)
-    plan = planner.plan(world, state, generator).plan
+    plan, _, _, _, lengths = planner.plan(world, state, generator)
     seen = None
+    if context is not None and sees_each_step(world.observe(state[:1])):
+        raise ValueError("observe: indices [N] or floating point features [N, C] are expected of a world")
     if context == "plan":
         seen = world.observe(state)
     elif context == "step":
@@ -56,7 +58,7 @@ def collect(
     group, names = None, None
     if isinstance(world, TabularWorld):
         group, names = (world.reward_map(state) if world.num_maps > 1 else None), world.action_names
-    return Plans(plan, world.num_actions, action_names=names, context=seen, group=group)
+    return Plans(plan, world.num_actions, lengths, names, seen, group)
 
 
 def _observations(world: World, state: Tensor, plan: Tensor, generator: torch.Generator | None) -> Iterator[Tensor]:

@@ -21,7 +21,7 @@ class ExhaustivePlanner(Planner):
 
     Args:
         depth: number of actions in a plan, at least 1; A**depth may be at most 2**24.
-        objective, discount, value: see `Planner`.
+        objective, discount, value, any_prefix: see `Planner`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -34,8 +34,9 @@ class ExhaustivePlanner(Planner):
         objective: Literal["terminal", "return"] = "terminal",
         discount: float = 1.0,
         value: Callable[[Tensor], Tensor] | None = None,
+        any_prefix: bool = False,
     ) -> None:
-        super().__init__(objective, discount, value)
+        super().__init__(objective, discount, value, any_prefix)
         if depth < 1:
             raise ValueError(f"depth: at least 1 is expected, not {depth}")
         self.depth = depth
@@ -58,16 +59,29 @@ class ExhaustivePlanner(Planner):
         every = torch.arange(actions, device=state.device)
         now, rewards = state, torch.zeros(batch, 0, device=state.device)
         legal = torch.ones(batch, dtype=torch.bool, device=state.device)
-        for _ in range(self.depth):
+        found = []  # of each depth at which a plan may end: scores, states and legality, [B, A**depth]
+        for depth in range(1, self.depth + 1):
             legal = (legal[:, None] & world.legal(now)).flatten()
             before = now.repeat_interleave(actions, 0)
             now, reward = world.step(before, every.repeat(len(before) // actions), generator)
             rewards = torch.cat([rewards.repeat_interleave(actions, 0), reward[:, None]], 1)
-        score = self.score(rewards, now)
-        plans = actions**self.depth
-        best = random_best(score.view(batch, plans), generator, legal.view(batch, plans))
-        row = best + torch.arange(batch, device=state.device) * plans
-        # The number of a plan, written in base A, is the plan.
+            if self.any_prefix or depth == self.depth:
+                ends = (self.score(rewards, now), now, legal)
+                found.append([values.view(batch, actions**depth, *values.shape[1:]) for values in ends])
+        score, final_state, legal = (torch.cat(values, 1) for values in zip(*found, strict=True))
+        best = random_best(score, generator, legal)
+        row = torch.arange(batch, device=state.device)
+        depths = torch.arange(self.depth - len(found) + 1, self.depth + 1, device=state.device)
+        past = (actions**depths).cumsum(0)
+        length = depths[torch.searchsorted(past, best, right=True)]
+        # The number of a plan among those of its length, written in base A, is the plan; zeros fill it up.
+        number = (best - past[length - depths[0]] + actions**length) * actions ** (self.depth - length)
         base = actions ** torch.arange(self.depth - 1, -1, -1, device=state.device)
-        plan = best[:, None].div(base, rounding_mode="floor") % actions
-        return Decision(plan.to(action_dtype(actions)), score[row], now[row], steps)
+        plan = number[:, None].div(base, rounding_mode="floor") % actions
+        return Decision(
+            plan.to(action_dtype(actions)),
+            score[row, best],
+            final_state[row, best],
+            steps,
+            length if self.any_prefix else None,
+        )

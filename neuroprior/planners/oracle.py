@@ -18,6 +18,7 @@ def oracle(
     objective: Literal["terminal", "return"] = "terminal",
     discount: float = 1.0,
     value: Callable[[Tensor], Tensor] | None = None,
+    any_prefix: bool = False,
 ) -> Tensor:
     """The exact highest score of all legal plans of `length` actions: finite-horizon dynamic programming.
 
@@ -25,7 +26,7 @@ def oracle(
         world: a table.
         state: starts `[B]`.
         length: number of actions, at least 1.
-        objective, discount, value: what is optimised; see `Planner`.
+        objective, discount, value, any_prefix: what is optimised; see `Planner`.
 
     Returns:
         `[B]` floating point. Takes `length * W * S * A` operations whatever B is.
@@ -43,6 +44,7 @@ def oracle(
     best = torch.zeros(maps, states, device=world.device, dtype=reward.dtype)
     if value is not None:
         best = value(every).view(maps, states).to(reward.dtype)
+    prefix = torch.full_like(best, -torch.inf)
     for left in range(length):
         after = best[:, world.next_state]
         if objective == "return":
@@ -52,4 +54,5 @@ def oracle(
         if world.legal_actions is not None:
             after = after.masked_fill(~world.legal_actions, -torch.inf)
         best = after.view(maps, states, actions).amax(-1)
-    return best.view(-1)[state]
+        prefix = torch.maximum(prefix, best)
+    return (prefix if any_prefix else best).view(-1)[state]

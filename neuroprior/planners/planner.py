@@ -21,12 +21,14 @@ class Decision(NamedTuple):
         score: `[B]`: what its objective gives for that plan.
         final_state: `[B, ...]`: where the plan ends.
         model_steps: single simulator steps that it took for each start.
+        lengths: `[B]`: how many actions of each plan are to be executed; None: all.
     """
 
     plan: Tensor
     score: Tensor
     final_state: Tensor
     model_steps: int
+    lengths: Tensor | None = None
 
 
 class Planner(ABC):
@@ -38,6 +40,8 @@ class Planner(ABC):
         discount: above 0, at most 1; for "return" alone.
         value: adds the value of the final state: a function from final states `[N, ...]` to `[N]`; with "return" times
             `discount ** L`.
+        any_prefix: the agent may end a plan after any of its actions (at least one), so that a plan counts as its best
+            prefix: L is then that prefix's length.
 
     Raises:
         ValueError: an argument is out of range.
@@ -48,9 +52,10 @@ class Planner(ABC):
         objective: Literal["terminal", "return"] = "terminal",
         discount: float = 1.0,
         value: Callable[[Tensor], Tensor] | None = None,
+        any_prefix: bool = False,
     ) -> None:
         check_objective(objective, discount)
-        self.objective, self.discount, self.value = objective, discount, value
+        self.objective, self.discount, self.value, self.any_prefix = objective, discount, value, any_prefix
 
     @abstractmethod
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
@@ -69,19 +74,27 @@ class Planner(ABC):
         """The scores `[...]` of plans with `rewards [..., L]` that end in `final_state` (`[...]` and its own shape)."""
         length = rewards.shape[-1]
         if self.objective == "terminal":
-            score = rewards[..., -1]
-            weight = 1.0
-        else:
-            weights = self.discount ** torch.arange(length, device=rewards.device, dtype=rewards.dtype)
-            score = (rewards * weights).sum(-1)
-            weight = self.discount**length
+            return self._add_value(rewards[..., -1], final_state)
+        return self._add_value((rewards * self._weights(rewards)).sum(-1), final_state, self.discount**length)
+
+    def prefix_scores(self, rewards: Tensor, states: Tensor) -> Tensor:
+        """The scores `[..., L]` of all prefixes of plans that have `rewards [..., L]` and lead to `states [..., L]`."""
+        if self.objective == "terminal":
+            return self._add_value(rewards, states)
+        weights = self._weights(rewards)
+        return self._add_value((rewards * weights).cumsum(-1), states, self.discount * weights)
+
+    def _weights(self, rewards: Tensor) -> Tensor:
+        return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=rewards.dtype)
+
+    def _add_value(self, score: Tensor, state: Tensor, weight: Tensor | float = 1.0) -> Tensor:
+        """`score [...]` plus the weighted value of `state` (`[...]` and its own shape)."""
         if self.value is None:
             return score
-        value = self.value(final_state.reshape(-1, *final_state.shape[score.dim() :]))
-        if value.numel() != score.numel() or value.isnan().any():
+        value = self.value(state.reshape(-1, *state.shape[score.dim() :]))
+        if value.numel() != score.numel():
             raise ValueError(
-                f"value: one number for each of {score.numel()} states is expected, none of them NaN,"
-                f" not {list(value.shape)}" + (" with NaN" if value.isnan().any() else "")
+                f"value: one number for each of {score.numel()} states is expected, not {list(value.shape)}"
             )
         return score + weight * value.view_as(score).to(score.dtype)
 
@@ -101,6 +114,8 @@ def random_best(score: Tensor, generator: torch.Generator, legal: Tensor | None 
 
     Where `legal [B, P]` is given, only scores that it marks count; it marks at least one in each row.
     """
+    if score.isnan().any():
+        raise ValueError("score: NaN; a reward of the world, or its value, is not a number")
     if legal is not None:
         score = score.masked_fill(~legal, -torch.inf)
     best = score == score.amax(1, keepdim=True)
@@ -113,8 +128,22 @@ def random_best(score: Tensor, generator: torch.Generator, legal: Tensor | None 
 def in_chunks(plan_some: Callable[[Tensor], Decision], state: Tensor, steps_per_start: int) -> Decision:
     """`plan_some` applied to as many starts at a time as memory allows, put together again."""
     size = max(STEPS_AT_ONCE // max(steps_per_start, 1), 1)
-    parts = [plan_some(state[at : at + size]) for at in range(0, len(state), size)] or [plan_some(state)]
-    if len(parts) == 1:
-        return parts[0]
-    plan, score, final_state = (torch.cat(column) for column in list(zip(*parts, strict=True))[:3])
-    return Decision(plan, score, final_state, parts[0].model_steps)
+    first = plan_some(state[:size])
+    if len(state) <= size:
+        return first
+    # Room for all is made once: small results between large blocks that come and go would keep memory from being freed.
+    plan, score, final_state = (part.new_empty(len(state), *part.shape[1:]) for part in first[:3])
+    whole = Decision(
+        plan,
+        score,
+        final_state,
+        first.model_steps,
+        None if first.lengths is None else first.lengths.new_empty(len(state)),
+    )
+    for at in range(0, len(state), size):
+        part = plan_some(state[at : at + size]) if at else first
+        for result, some in ((whole.plan, part.plan), (whole.score, part.score), (whole.final_state, part.final_state)):
+            result[at : at + size] = some
+        if whole.lengths is not None and part.lengths is not None:
+            whole.lengths[at : at + size] = part.lengths
+    return whole

@@ -23,7 +23,7 @@ class SamplingPlanner(Planner):
         prior: what proposes; `UniformPrior(A)` makes the random planner.
         length: number of actions in a plan, at least 1.
         num_plans: number of candidate plans for each start, at least 1.
-        objective, discount, value: see `Planner`.
+        objective, discount, value, any_prefix: see `Planner`.
         temperature: of sampling.
 
     Raises:
@@ -39,11 +39,14 @@ class SamplingPlanner(Planner):
         objective: Literal["terminal", "return"] = "terminal",
         discount: float = 1.0,
         value: Callable[[Tensor], Tensor] | None = None,
+        any_prefix: bool = False,
         temperature: float = 1.0,
     ) -> None:
-        super().__init__(objective, discount, value)
+        super().__init__(objective, discount, value, any_prefix)
         if length < 1 or num_plans < 1:
             raise ValueError(f"length and num_plans must be at least 1, not {length} and {num_plans}")
+        if not 0 < temperature < float("inf"):
+            raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
@@ -59,12 +62,16 @@ class SamplingPlanner(Planner):
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
         plans, rollout = self.candidates(world, state, generator)
-        score = self.score(rollout.rewards, rollout.final_state)
-        best = random_best(score, generator)
         row = torch.arange(len(state), device=state.device)
-        return Decision(
-            plans[row, best], score[row, best], rollout.final_state[row, best], self.num_plans * self.length
-        )
+        steps = self.num_plans * self.length
+        if rollout.states is None:
+            score = self.score(rollout.rewards, rollout.final_state)
+            best = random_best(score, generator)
+            return Decision(plans[row, best], score[row, best], rollout.final_state[row, best], steps)
+        score = self.prefix_scores(rollout.rewards, rollout.states).flatten(1)
+        chosen = random_best(score, generator)
+        best, last = chosen.div(self.length, rounding_mode="floor"), chosen % self.length
+        return Decision(plans[row, best], score[row, chosen], rollout.states[row, best, last], steps, last + 1)
 
     def candidates(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Rollout]:
         """The candidate plans `[B, P, L]` for starts `[B, ...]`, and what comes of them."""
@@ -77,9 +84,10 @@ class SamplingPlanner(Planner):
                 self.length,
                 temperature=self.temperature,
                 generator=generator,
+                keep_states=self.any_prefix,
             )
         batch = len(state)
         plans = self.prior.sample(
             batch * self.num_plans, self.length, temperature=self.temperature, generator=generator
         ).view(batch, self.num_plans, self.length)
-        return plans, world.rollout(state, plans, generator)
+        return plans, world.rollout(state, plans, generator, self.any_prefix)

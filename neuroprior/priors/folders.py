@@ -60,7 +60,8 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
 
     Raises:
         FileNotFoundError: the folder or one of its two files is not there.
-        ValueError: a file is damaged or not of this kind, or the prior's class is not known (import it first).
+        ValueError: a file is damaged or not of this kind, the prior's class is not known (import it first), or there is
+            no such device.
     """
     folder = Path(folder)
     config = _read_config(folder / "config.json")
@@ -82,7 +83,10 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
         prior.load_state_dict(read_tensors(data))
     except (SafetensorError, RuntimeError) as error:
         raise ValueError(f"{folder / 'model.safetensors'}: does not fit the prior that config.json tells of") from error
-    return prior.to(device).eval()
+    try:
+        return prior.to(device).eval()
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device: {str(device)!r} cannot be used here ({str(error).splitlines()[0][:200]})") from error
 
 
 def _read_config(path: Path) -> dict[str, Any]:

@@ -141,7 +141,7 @@ class MarkovPrior(Prior):
         for generation in range(int(tree.generation.max()) + 1):
             rows = (tree.generation.to(device)[node] == generation).nonzero()[:, 0]
             probs[rows] = _blend(counts[rows].double(), probs[above[rows]], self.smoothing)
-        values = (tree.next_node, tree.parent, tree.start, row_code, counts, probs.log().float())
+        values = (tree.next_node, tree.parent, tree.start, row_code, counts, probs.clamp(min=1e-300).log().float())
         for name, value in zip(_TABLES, values, strict=True):
             self.register_buffer(name, value.to(device))
 

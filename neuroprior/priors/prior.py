@@ -52,7 +52,7 @@ class Prior(nn.Module, ABC):
             ("num_contexts", num_contexts),
             ("context_size", context_size),
         ):
-            if value is not None and (not isinstance(value, int) or value < 1):
+            if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
                 raise ValueError(f"{name}: an integer of at least 1 is expected, not {value!r}")
         if num_contexts is not None and context_size is not None:
             raise ValueError("num_contexts and context_size: a prior sees an index or features, not both")
@@ -162,11 +162,12 @@ class Prior(nn.Module, ABC):
         """
         data = Plans(plans, self.num_actions, lengths, context=context)
         self.check_context_of(data)
-        if min(plans.shape) == 0:
-            return torch.zeros(len(plans), device=self.device)
+        if min(data.actions.shape) == 0:
+            return torch.zeros(len(data), device=self.device)
         parts = []
-        for at in range(0, len(plans), max(TOKENS_AT_ONCE // plans.shape[1], 1)):
-            part = data[at : at + max(TOKENS_AT_ONCE // plans.shape[1], 1)]
+        size = max(TOKENS_AT_ONCE // data.max_length, 1)
+        for at in range(0, len(data), size):
+            part = data[at : at + size]
             logits = self(part.actions, part.context)
             taken = torch.log_softmax(logits, -1).gather(-1, part.actions.long()[..., None])[..., 0]
             parts.append(taken.masked_fill(~part.mask(), 0).sum(-1))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.randomness import generator_on
-from neuroprior.worlds.world import Rollout, World, check_plans, check_range, is_integer
+from neuroprior.worlds.world import Rollout, World, check_plans, check_range, is_integer, join_states
 
 
 class TabularWorld(World):
@@ -90,7 +90,9 @@ class TabularWorld(World):
             return after, self.reward.view(-1)[after]
         return after, self.reward.view(-1)[offset * self.num_actions + taken]
 
-    def rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None) -> Rollout:
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
         """See `World.rollout`. One gather a step for the transitions and one for the rewards, on int32 tables."""
         self.check_state(state)
         check_plans(plans, state.shape[0], self.num_actions)
@@ -102,12 +104,18 @@ class TabularWorld(World):
         offset = (state - cell).int()[:, None]
         cell = cell.int()[:, None].expand(batch, num_plans)
         rewards = self.reward.new_empty(length, batch, num_plans)
+        cells = []
         for t in range(length):
             taken = torch.add(plans[:, :, t].int(), cell, alpha=actions)
             cell = table.index_select(0, taken.reshape(-1)).view(batch, num_plans)
             at = taken + offset * actions if per_action else cell + offset
             torch.index_select(flat_reward, 0, at.reshape(-1), out=rewards[t].view(-1))
-        return Rollout((cell + offset).long(), rewards.permute(1, 2, 0))
+            if keep_states:
+                cells.append(cell)
+        course = None
+        if keep_states:
+            course = join_states(cells, state, (batch, num_plans)).to(state) + (state - self.cell(state))[:, None, None]
+        return Rollout((cell + offset).long(), rewards.permute(1, 2, 0), course)
 
     def observe(self, state: Tensor) -> Tensor:
         """The cell of each state: an agent sees where it is, not which reward map holds."""
@@ -121,6 +129,10 @@ class TabularWorld(World):
     def check_state(self, state: Tensor) -> None:
         if state.dim() != 1:
             raise ValueError(f"state: shape [B] is expected, not {list(state.shape)}")
+        if state.dtype != torch.int64:
+            raise ValueError(
+                f"state: int64 is expected, not {str(state.dtype).removeprefix('torch.')}; use state.long()"
+            )
         check_range("state", state, self.num_maps * self.num_states, "states (reward maps x cells)")
 
 

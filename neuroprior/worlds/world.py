@@ -13,10 +13,12 @@ class Rollout(NamedTuple):
     Attributes:
         final_state: `[B, P]` (and the state's own dimensions, if it has any): where each plan ended.
         rewards: `[B, P, L]` floating point: the reward of each step.
+        states: `[B, P, L]` (and the state's own dimensions): where each step led; None where it was not asked for.
     """
 
     final_state: Tensor
     rewards: Tensor
+    states: Tensor | None = None
 
 
 class World(ABC):
@@ -50,13 +52,16 @@ class World(ABC):
             The next state `[N, ...]` and the reward of the step, `[N]` floating point.
         """
 
-    def rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None) -> Rollout:
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
         """Try P plans from each of B starts. Shapes, dtypes and ranges are checked once, here, not at every step.
 
         Args:
             state: `[B, ...]`.
             plans: integers `[B, P, L]` between 0 and A - 1.
             generator: draws what is random in the world.
+            keep_states: also return the state after each step.
 
         Raises:
             ValueError: a shape, dtype or value is wrong; the message says which.
@@ -65,15 +70,20 @@ class World(ABC):
         check_plans(plans, state.shape[0], self.num_actions)
         batch, num_plans, length = plans.shape
         now = state.repeat_interleave(num_plans, 0)
-        rewards = []
+        rewards, states = [torch.zeros(batch, num_plans, 0, device=state.device)], []
         for t in range(length):
             now, reward = self.step(now, plans[:, :, t].reshape(-1).long(), generator)
-            rewards.append(reward.view(batch, num_plans))
-        empty = torch.zeros(batch, num_plans, 0, device=state.device)
-        return Rollout(now.view(batch, num_plans, *state.shape[1:]), torch.stack(rewards, -1) if rewards else empty)
+            rewards.append(reward.view(batch, num_plans, 1))
+            states.append(now)
+        shape = (batch, num_plans, *state.shape[1:])
+        course = join_states(states, state, shape) if keep_states else None
+        return Rollout(now.view(shape), torch.cat(rewards, -1), course)
 
     def observe(self, state: Tensor) -> Tensor:
-        """What an agent sees in `state [N, ...]`: indices `[N]` or features `[N, C]`. Default: the state itself."""
+        """What an agent sees in `state [N, ...]`: integers `[N]` (indices) or floating point `[N, C]` (features).
+
+        Default: the state itself.
+        """
         return state
 
     def legal(self, state: Tensor) -> Tensor:
@@ -82,8 +92,15 @@ class World(ABC):
 
     def check_state(self, state: Tensor) -> None:
         """Raise ValueError where `state` cannot be a batch of this world's states. Default: it must have a batch."""
-        if state.dim() == 0:
-            raise ValueError("state: a batch of states is expected, shape [B, ...], not a single number")
+        if not isinstance(state, Tensor) or state.dim() == 0:
+            raise ValueError("state: a tensor of shape [B, ...] is expected, not a single number or another type")
+
+
+def join_states(states: list[Tensor], start: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """The states of L >= 0 steps from `start`, each of `shape` `[B, P, ...]` in some view, as `[B, P, L, ...]`."""
+    if not states:
+        return start.new_zeros(*shape[:2], 0, *shape[2:])
+    return torch.stack([state.view(shape) for state in states], 2)
 
 
 def is_integer(values: Tensor) -> bool:
@@ -107,6 +124,8 @@ def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
         raise ValueError(f"{name}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
     if values.numel() == 0:
         return
+    # torch cannot compare the wider unsigned types.
+    values = values.long() if values.dtype in (torch.uint16, torch.uint32, torch.uint64) else values
     low, high = (int(v) for v in torch.aminmax(values))
     if low < 0 or high >= stop:
         where = ((values < 0) | (values.long() >= stop)).nonzero()[0].tolist()
