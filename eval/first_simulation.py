@@ -21,6 +21,7 @@ from neuroprior import (
     gridworld,
     oracle,
 )
+from neuroprior.plans import all_plans
 from neuroprior.statistics import Interval, best_of, mean_interval, share_interval
 
 PAPER_BEST = {"deterministic": 0.321, "random": 0.537, "markov-1": 0.841, "markov-2": 0.844}
@@ -238,8 +239,7 @@ def _over_worlds(hits: Tensor) -> Interval:
 
 def _first_of_equals(world: GridWorld, states: Tensor, score: Tensor, depth: int) -> Tensor:
     """For each start the first, in the order of their numbers, of the plans with `score`: `[N, depth]`."""
-    base = 4 ** torch.arange(depth - 1, -1, -1)
-    every = torch.arange(4**depth)[:, None].div(base, rounding_mode="floor") % 4
+    every = all_plans(4, depth)
     chosen = []
     for some, best in zip(states.split(4096), score.split(4096), strict=True):
         rewards = world.rollout(some, every.expand(len(some), *every.shape)).rewards[..., -1]

@@ -122,6 +122,12 @@ class Plans:
         return self[~index], self[index]
 
 
+def all_plans(num_actions: int, length: int) -> Tensor:
+    """All A**L plans `[A**L, L]`, int64; row n is n written in base A."""
+    base = num_actions ** torch.arange(length - 1, -1, -1)
+    return torch.arange(num_actions**length)[:, None].div(base, rounding_mode="floor") % num_actions
+
+
 def action_dtype(num_actions: int) -> torch.dtype:
     """How actions are stored: uint8 where it suffices, else int64."""
     return torch.uint8 if num_actions <= 256 else torch.int64

@@ -9,10 +9,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.plans import sees_each_step
+from neuroprior.plans import all_plans, sees_each_step
 from neuroprior.priors import Prior, load, save
 from neuroprior.sampling import sample
-from neuroprior.worlds import TabularWorld, World
+from neuroprior.worlds import World
 from neuroprior.worlds.world import is_integer
 
 FALSE_ALARM = 1e-6
@@ -142,7 +142,6 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
     whole = whole.log_softmax(-1)
     seen = _at(context, 0)
     logits, state = prior.start(num, seen)
-    _require(logits.device.type == prior.device.type, f"start: logits on {logits.device}, the prior on {prior.device}")
     order = torch.arange(num - 1, -1, -1, device=plans.device)
     for t in range(length):
         kind = "no context" if context is None else f"context {list(context.shape)}"
@@ -163,16 +162,8 @@ def _at(context: Tensor | None, t: int) -> Tensor | None:
     return context[:, t] if context is not None and sees_each_step(context) else context
 
 
-def _all_plans(prior: Prior, length: int) -> Tensor:
-    """All A**L plans, in the order of their numbers in base A."""
-    base = prior.num_actions ** torch.arange(length - 1, -1, -1)
-    return (torch.arange(prior.num_actions**length)[:, None].div(base, rounding_mode="floor") % prior.num_actions).to(
-        prior.device
-    )
-
-
 def _all_log_probs(prior: Prior, length: int, context: Tensor | None) -> Tensor:
-    plans = _all_plans(prior, length)
+    plans = all_plans(prior.num_actions, length).to(prior.device)
     return prior.log_prob(plans, None if context is None else context.expand(len(plans), *context.shape[1:])).detach()
 
 
@@ -283,8 +274,6 @@ def _check_views(world: World, state: Tensor) -> None:
     _require(bool(legal.any(1).all()), "legal: a state without any legal action")
     if world.all_legal:
         _require(bool(legal.all()), "all_legal is True, but legal leaves actions out")
-    if isinstance(world, TabularWorld):
-        _require(int(world.cell(state).max()) < world.num_states, "cell: past the last")
 
 
 def _step_through(world: World, state: Tensor, plans: Tensor, seed: int) -> tuple[Tensor, Tensor, bool]:

@@ -178,3 +178,19 @@ def refuses(*words: str, error: type[Exception] = ValueError) -> Iterator[None]:
     with pytest.raises(error) as caught:
         yield
     assert says(caught.value, *words)
+
+
+CORRIDOR = torch.tensor([[0, 1], [0, 2], [1, 3], [2, 3]])  # four cells in a row; actions left, right; walls at the ends
+
+
+def corridor(reward=(0.0, 0.0, 0.0, 0.0), legal=None):
+    return TabularWorld(CORRIDOR, torch.as_tensor(reward), legal)
+
+
+def distances(height, width, goal, torus):
+    """Steps to the goal from each cell `[height * width]`, from the coordinates alone."""
+    cell = torch.arange(height * width)
+    rows, columns = (cell // width - goal // width).abs(), (cell % width - goal % width).abs()
+    if torus:
+        rows, columns = torch.minimum(rows, height - rows), torch.minimum(columns, width - columns)
+    return rows + columns
