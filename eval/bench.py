@@ -21,6 +21,7 @@ from neuroprior import (
     GRUPrior,
     MarkovPrior,
     Plans,
+    Prior,
     SamplingPlanner,
     TransformerPrior,
     UniformPrior,
@@ -28,6 +29,7 @@ from neuroprior import (
     gridworld,
 )
 from neuroprior.sampling import sample
+from neuroprior.values import q_learning
 
 
 def bench(repetitions: int = 5, starts: int = 0, out: str = "runs/bench") -> None:
@@ -72,42 +74,28 @@ def bench(repetitions: int = 5, starts: int = 0, out: str = "runs/bench") -> Non
 Job = Callable[[], object]
 
 
-def _jobs() -> list[tuple[str, Job, str, Job]]:
-    """What is measured: a job's name, the job, the peer's name, and the peer's job."""
+Measured = tuple[str, Job, str, Job]  # a job's name, the job, its peer's name, the peer's job
+
+
+def _jobs() -> list[Measured]:
     world = gridworld(20, 20, "torus", num_worlds=10)
     generator = torch.Generator().manual_seed(0)
     plans = collect(ExhaustivePlanner(4), world, 10_000, generator=generator)
-    markov = MarkovPrior(4, 2).fit(plans)
-    neural = [
-        prior.fit(plans, generator=generator, progress=False, max_steps=100)
-        for prior in (GRUPrior(4), TransformerPrior(4))
-    ]
-    jobs: list[tuple[str, Job, str, Job]] = []
-    for name, prior in (("markov-2", markov), ("gru", neural[0]), ("transformer", neural[1])):
-        jobs.append(
-            (
-                f"sample 2.56 M plans of length 8, {name}",
-                partial(sample, prior, 2_560_000, 8),
-                "plan by plan",
-                partial(sample, prior, 2_560_000, 8, method="ancestral"),
-            )
-        )
-    tables = markov.log_probs.exp().double().numpy(), markov.next_node.numpy(), int(markov.start_node)
     starts = world.reset(10_000, generator)
     candidates = UniformPrior(4).sample(2_560_000, 8, generator=generator).view(10_000, 256, 8)
     return [
-        *jobs,
-        (
-            "sample 2.56 M plans of length 8, markov-2",
-            partial(sample, markov, 2_560_000, 8),
-            "numpy, inverse CDF a step",
-            partial(_numpy_sample, *tables, 2_560_000, 8),
-        ),
+        *_sampling_jobs(plans, generator),
         (
             "evaluate 10,000 starts x 256 plans x 8 steps",
             partial(world.rollout, starts, candidates),
             "plain torch indexing",
             partial(_plain_rollout, world.next_state, world.reward, starts, candidates),
+        ),
+        (
+            "Q-learning, 200 agents x 10,000 steps",
+            partial(q_learning, world, 210, num_agents=200),
+            "numpy over agents",
+            partial(_numpy_q_learning, world.next_state.numpy(), 210, 200, 10_000),
         ),
         (
             "fit a GRU on 10,000 plans of length 4",
@@ -116,6 +104,42 @@ def _jobs() -> list[tuple[str, Job, str, Job]]:
             partial(_fit, TransformerPrior, plans),
         ),
     ]
+
+
+def _sampling_jobs(plans: Plans, generator: torch.Generator) -> list[Measured]:
+    markov = MarkovPrior(4, 2).fit(plans)
+    priors: dict[str, Prior] = {"markov-2": markov}
+    for name, make in (("gru", GRUPrior), ("transformer", TransformerPrior)):
+        priors[name] = make(4).fit(plans, generator=generator, progress=False, max_steps=100)
+    number, length = 2_560_000, 8
+    jobs: list[Measured] = [
+        (
+            f"sample 2.56 M plans of length 8, {name}",
+            partial(sample, prior, number, length),
+            "plan by plan",
+            partial(sample, prior, number, length, method="ancestral"),
+        )
+        for name, prior in priors.items()
+    ]
+    tables = markov.log_probs.exp().double().numpy(), markov.next_node.numpy(), int(markov.start_node)
+    rival = partial(_numpy_sample, *tables, number, length)
+    return [*jobs, (jobs[0][0], jobs[0][1], "numpy, inverse CDF a step", rival)]
+
+
+def _numpy_q_learning(next_state: Any, goal: int, agents: int, steps: int) -> Any:
+    """Greedy Q-learning in numpy, vectorised over agents."""
+    generator = np.random.default_rng(0)
+    values = generator.random((agents, *next_state.shape)) * 0.01
+    values[:, goal] = 0
+    agent = np.arange(agents)
+    cell = generator.integers(len(next_state), size=agents)
+    for _ in range(steps):
+        action = values[agent, cell].argmax(1)
+        after = next_state[cell, action]
+        target = (after == goal) + 0.9 * values[agent, after].max(1)
+        values[agent, cell, action] += 0.5 * (target - values[agent, cell, action])
+        cell = np.where(after == goal, generator.integers(len(next_state), size=agents), after)
+    return values
 
 
 def _fit(make: type[GRUPrior] | type[TransformerPrior], plans: Plans) -> object:
