@@ -17,8 +17,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run(sys.argv[1:] if arguments is None else arguments)
     except KeyboardInterrupt:
         return _fail("interrupted; what was not yet written is lost", 130)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError, OverflowError) as error:
         return _fail(f"error: {error}", 2)
+    except RuntimeError as error:
+        # torch has no exception of its own for memory that it could not get.
+        if "memory" not in str(error):
+            raise
+        return _fail(f"error: out of memory; a smaller run may fit ({str(error).splitlines()[0]})", 2)
 
 
 def _run(arguments: Sequence[str]) -> int:

@@ -171,6 +171,8 @@ def success_against_quality(path: Path, rows: list[dict[str, Any]]) -> None:
         axes.plot(quality, [100 * row["ceiling"] for row in some], color="black", linestyle=":", label="ceiling")
         for name, color in COLORS.items():
             axes.plot(quality, [100 * row[name] for row in some], "o-", color=color, markersize=4, label=name)
+            low, high = ([100 * row[f"{name} {end}"] for row in some] for end in ("low", "high"))
+            axes.fill_between(quality, low, high, color=color, alpha=0.12, linewidth=0)
         axes.set_title({"sweeps": "value iteration cut short"}.get(kind, kind), fontsize=10)
         axes.set_xlabel("quality of the values")
     first, last = figure.axes[0], figure.axes[-1]

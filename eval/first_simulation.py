@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -82,7 +82,6 @@ class Outcome(NamedTuple):
         world: in which the planners were compared.
         model_steps: single simulator steps for each start, by planner.
         transition_matrix: `[A, A]` of the Markov prior of order 1.
-        training_plans: number of plans that the priors learned from.
     """
 
     names: list[str]
@@ -93,7 +92,6 @@ class Outcome(NamedTuple):
     world: GridWorld
     model_steps: list[int]
     transition_matrix: Tensor
-    training_plans: int
 
 
 def simulate(protocol: Protocol, size: Size, neural: bool, report: Report) -> Outcome:
@@ -145,7 +143,6 @@ def simulate(protocol: Protocol, size: Size, neural: bool, report: Report) -> Ou
         everywhere,
         steps,
         MarkovPrior(4, 1).fit(plans).transition_matrix(),
-        len(plans),
     )
 
 
@@ -161,7 +158,7 @@ def training_plans(
     if protocol.learn_from == "shortest":
         kept = _distance(world, states, decision.final_state) == depth
     if int(kept.sum()) < 2:
-        raise ValueError("training_plans: too few plans to learn from; give more")
+        raise ValueError("training_plans: too few plans to learn from; give more, or a larger grid")
     return Plans(actions[kept], 4, action_names=world.action_names, group=groups(world, states[kept]))
 
 
@@ -194,14 +191,14 @@ def make_planners(priors: dict[str, Prior], size: Size) -> dict[str, Planner]:
     return planners
 
 
-def rows_of(outcome: Outcome) -> list[dict[str, object]]:
+def rows_of(outcome: Outcome) -> list[dict[str, Any]]:
     """A row a planner: the share of starts where it was best of the paper's four, its rewards, and the oracle's."""
     rivals = [outcome.names.index(name) for name in PAPER_BEST]
     scores = torch.cat([outcome.scores, outcome.oracle[None]])
     best = best_of(scores, rivals)
-    rows: list[dict[str, object]] = []
+    rows: list[dict[str, Any]] = []
     for k, name in enumerate([*outcome.names, "oracle"]):
-        share = _over_worlds(best[k])
+        share = over_groups(best[k])
         rows.append(
             {
                 "planner": name,
@@ -218,9 +215,9 @@ def rows_of(outcome: Outcome) -> list[dict[str, object]]:
     return rows
 
 
-def table_distance(rows: list[dict[str, object]]) -> float:
-    """The root mean square difference between `best` and the paper's figures, over its four planners."""
-    gaps = [float(str(row["best"])) - PAPER_BEST[str(row["planner"])] for row in rows if row["paper"] is not None]
+def table_distance(rows: list[dict[str, Any]], column: str) -> float:
+    """The root mean square difference between a column and the paper's figures, over its four planners."""
+    gaps = [row[column] - row["paper"] for row in rows if row["paper"] is not None]
     return float(torch.tensor(gaps).square().mean().sqrt())
 
 
@@ -229,8 +226,11 @@ def matrix_distance(matrix: Tensor) -> float:
     return float((matrix - PAPER_MATRIX).square().mean().sqrt())
 
 
-def _over_worlds(hits: Tensor) -> Interval:
-    """The share of True in `hits [W, n]` with an interval over worlds (over starts, where there is one world)."""
+def over_groups(hits: Tensor) -> Interval:
+    """The share of True in `hits [G, n]` with an interval over the G worlds or value functions.
+
+    Where there is one alone, the interval is over its starts.
+    """
     if len(hits) == 1:
         return share_interval(int(hits.sum()), hits.numel())
     share, low, high = mean_interval(hits.double().mean(1))

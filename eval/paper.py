@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,7 +56,7 @@ def paper(
         learn_from: first simulation: all executed plans, or only the shortest, those that end as many cells away as
             they have moves.
         protocols: one: what the other options say. all: every combination of edges, ties and learn_from, and of edges
-            and initial_scale, with the Markov priors, and which is nearest to the paper.
+            and initial_scale (whatever those options say), with the Markov priors, and which is nearest to the paper.
         reward_power: first simulation: rewards are uniform numbers raised to this power.
         value_functions: second simulation: independent Q-learners to compare with; intervals are over them. The priors
             learn under as many others.
@@ -71,26 +71,13 @@ def paper(
     """
     settings = dict(locals())
     least = {"worlds": 1, "starts": 2, "training_plans": 2, "value_functions": 2, "max_plans": 1, "size": 2}
+    least |= {"depth": 1, "length": 1, "num_plans": 1, "q_steps": 0, "initial_scale": 0}
     for name, value in least.items():
-        if settings[name] < value:
+        if not value <= settings[name] < float("inf"):
             raise ValueError(f"{name}: at least {value} is expected, not {settings[name]}")
     if not 0 <= seed < 2**62:
         raise ValueError(f"seed: an integer from 0 to 2**62 - 1 is expected, not {seed}")
-    amount = Size(worlds, starts, training_plans, size, reward_power, depth, length, num_plans, seed)
-    task = Task(
-        edges,
-        value_functions,
-        starts,
-        size,
-        q_steps,
-        initial_scale,
-        max_plans,
-        training_plans,
-        depth,
-        length,
-        num_plans,
-        seed,
-    )
+    amount, task = (kind(**{field.name: settings[field.name] for field in fields(kind)}) for kind in (Size, Task))
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     console = Console()
@@ -130,13 +117,16 @@ def _second(task: Task, console: Console, folder: Path) -> dict[str, Any]:
         quality = value_quality.measure(task, priors, report)
     rows = second_simulation.rows_of(outcome)
     ceilings = second_simulation.ceilings_of(outcome)
+    paired = second_simulation.findings(outcome)
     console.print(tables.table_2(task, rows, ceilings))
+    console.print(tables.paired_table(paired))
     console.print(tables.quality_table(quality))
     write_csv(folder / "table_2.csv", rows)
     write_csv(folder / "value_quality.csv", quality)
     figures.values_and_stuck(folder / "figure_1.png", outcome, task)
     figures.success_against_quality(folder / "value_quality.png", quality)
-    return {"simulation_2": {"task": asdict(task), "rows": rows, **ceilings, "value_quality": quality}}
+    found = {"task": asdict(task), "rows": rows, **ceilings, "paired": paired, "value_quality": quality}
+    return {"simulation_2": found}
 
 
 def _all_protocols(amount: Size, console: Console, folder: Path) -> dict[str, Any]:
@@ -165,15 +155,22 @@ def _all_scales(task: Task, console: Console, folder: Path) -> dict[str, Any]:
             outcome, _ = second_simulation.simulate(changed, full=False, report=_prefixed(report, (edges, scale)))
             rows = second_simulation.rows_of(outcome)
             row: dict[str, Any] = {"edges": edges, "initial_scale": scale}
-            row |= {str(r["planner"]): r["reached"] for r in rows} | second_simulation.ceilings_of(outcome)
-            flat.append(row | {"table_distance": second_simulation.table_distance(rows)})
+            row |= {r["planner"]: r["reached"] for r in rows} | second_simulation.ceilings_of(outcome)
+            distance, low, high = second_simulation.distance_interval(outcome)
+            flat.append(row | {"table_distance": distance, "low": low, "high": high})
     console.print(tables.scales_table(flat))
     best = min(flat, key=lambda row: row["table_distance"])
+    alike = [row for row in flat if row["low"] <= best["high"]]
     console.print(
-        f"nearest to the paper's Table 2: [bold]{best['edges']}, initial values up to {best['initial_scale']:g}[/bold]"
+        f"nearest to the paper's Table 2: [bold]{_setting(best)}[/bold]; not told apart from it (intervals overlap): "
+        + "; ".join(_setting(row) for row in alike if row is not best)
     )
     write_csv(folder / "scales.csv", flat)
-    return {"scales": flat}
+    return {"scales": flat, "nearest_scale": {name: best[name] for name in ("edges", "initial_scale")}}
+
+
+def _setting(row: dict[str, Any]) -> str:
+    return f"{row['edges']}, values up to {row['initial_scale']:g}"
 
 
 def _prefixed(report: Report, what: object) -> Report:

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from eval.first_simulation import Report, groups, learn_priors
+from eval.first_simulation import Report, groups, learn_priors, over_groups
 from neuroprior import ExhaustivePlanner, GridWorld, Planner, Plans, Prior, SamplingPlanner
-from neuroprior.statistics import Interval, mean_interval
+from neuroprior.statistics import Interval, paired_difference
 from neuroprior.values import can_reach, q_learning, value_iteration
 
 PAPER_REACHED = {"deterministic": 0.2422, "random": 0.3952, "markov-1": 0.4961, "markov-2": 0.4733}
@@ -51,6 +51,7 @@ class Pursuit(NamedTuple):
         plans: the plans that led somewhere else than where they began: `[M, L]`.
         lengths: `[M]`, or None where all have L actions.
         start: `[M]`: the index of the start that each plan belongs to.
+        model_steps: single simulator steps for each plan.
     """
 
     reached: Tensor
@@ -58,6 +59,7 @@ class Pursuit(NamedTuple):
     plans: Tensor
     lengths: Tensor | None
     start: Tensor
+    model_steps: int
 
 
 class Outcome(NamedTuple):
@@ -72,7 +74,7 @@ class Outcome(NamedTuple):
         values: `[V, S]`: the value functions, without the goal's infinity.
         exact: `[S]`: the true values.
         world: with a map of rewards, all 0, for each value function.
-        training_plans: number of plans that the priors learned from.
+        model_steps: single simulator steps for each plan, by planner.
     """
 
     names: list[str]
@@ -83,7 +85,7 @@ class Outcome(NamedTuple):
     values: Tensor
     exact: Tensor
     world: GridWorld
-    training_plans: int
+    model_steps: list[int]
 
 
 def pursue(
@@ -96,13 +98,13 @@ def pursue(
 ) -> Pursuit:
     """Plan, go where the plan ends, and plan again from there, up to `max_plans` times or until on the goal."""
     state = state.clone()
-    plans, lengths, start = [], [], []
+    plans, lengths, start, model_steps = [], [], [], 0
     for _ in range(max_plans):
         active = (world.cell(state) != goal).nonzero()[:, 0]
         if len(active) == 0:
             break
         decision = planner.plan(world, state[active], generator)
-        moved = decision.final_state != state[active]
+        moved, model_steps = decision.final_state != state[active], decision.model_steps
         plans.append(decision.plan[moved])
         start.append(active[moved])
         if decision.lengths is not None:
@@ -114,6 +116,7 @@ def pursue(
         torch.cat(plans) if plans else torch.empty(0, 0, dtype=torch.uint8),
         torch.cat(lengths) if lengths else None,
         torch.cat(start) if start else torch.empty(0, dtype=torch.long),
+        model_steps,
     )
 
 
@@ -147,10 +150,8 @@ def make_planners(
     return {name + (ANY_PREFIX if any_prefix else ""): planner for name, planner in planners.items()}
 
 
-def learn(
-    task: Task, values: Tensor, neural: bool, generator: torch.Generator, report: Report
-) -> tuple[Plans, dict[str, Prior]]:
-    """What the deterministic planner executes under `values [V, S]`, and the priors that learn from it."""
+def learn(task: Task, values: Tensor, neural: bool, generator: torch.Generator, report: Report) -> dict[str, Prior]:
+    """The priors that learn from the whole plans that the deterministic planner executes under `values [V, S]`."""
     world = empty_world(task, len(values))
     number = -(-task.training_plans // len(values))
     states = random_starts(task, len(values), number, generator).flatten()
@@ -162,7 +163,7 @@ def learn(
     kept = torch.randperm(len(done.plans), generator=generator)[: task.training_plans]
     group = groups(world, states[done.start[kept]])
     plans = Plans(done.plans[kept], 4, action_names=world.action_names, group=group)
-    return plans, learn_priors(plans, task.seed, neural, generator, lambda what: report(f"second simulation: {what}"))
+    return learn_priors(plans, task.seed, neural, generator, lambda what: report(f"second simulation: {what}"))
 
 
 def simulate(task: Task, full: bool, report: Report) -> tuple[Outcome, dict[str, Prior]]:
@@ -188,47 +189,55 @@ def simulate(task: Task, full: bool, report: Report) -> tuple[Outcome, dict[str,
         generator=generator,
     ).amax(-1)
     values, others = learned[:number], learned[number:]
-    plans, priors = learn(task, others, full, generator, report)
+    priors = learn(task, others, full, generator, report)
     world = empty_world(task, number)
     states = random_starts(task, number, task.starts, generator)
     value = objective(values, task.goal)
     planners = make_planners(priors, task, value)
     if full:
         planners |= make_planners(priors, task, value, any_prefix=True)
-    reached, final_state = [], []
+    reached, final_state, model_steps = [], [], []
     for name, planner in planners.items():
         report(f"second simulation: {name}")
         done = pursue(planner, world, states.flatten(), task.goal, task.max_plans, generator)
         reached.append(done.reached.view(states.shape))
         final_state.append(done.final_state.view(states.shape))
+        model_steps.append(done.model_steps)
     exact = value_iteration(world, goal=task.goal)[0]
     return Outcome(
         list(planners),
         torch.stack(reached),
         torch.stack(final_state),
         ceiling(world, states, task),
-        can_reach(world, states.flatten(), task.goal, task.length * task.max_plans, within=True).view(states.shape),
+        ceiling(world, states, task, any_prefix=True),
         values,
         exact,
         world,
-        len(plans),
+        model_steps,
     ), priors
 
 
-def ceiling(world: GridWorld, states: Tensor, task: Task) -> Tensor:
-    """Which starts can end exactly on the goal with some number of whole plans: bool, in the shape of `states`."""
+def ceiling(world: GridWorld, states: Tensor, task: Task, any_prefix: bool = False) -> Tensor:
+    """Which starts can end on the goal at all, with plans of either length: bool, in the shape of `states`.
+
+    With whole plans, that is after some number of them; with any prefix of plans, after at most all their moves.
+    """
     flat = states.flatten()
-    whole = [can_reach(world, flat, task.goal, task.length * n) for n in range(1, task.max_plans + 1)]
+    lengths = {task.depth, task.length}
+    if any_prefix:
+        most = task.max_plans * max(lengths)
+        return can_reach(world, flat, task.goal, most, within=True).view(states.shape)
+    whole = [can_reach(world, flat, task.goal, n * moves) for n in range(1, task.max_plans + 1) for moves in lengths]
     return torch.stack(whole).any(0).view(states.shape)
 
 
-def rows_of(outcome: Outcome) -> list[dict[str, object]]:
-    """A row a planner: the share of starts from which it reached the goal."""
-    rows: list[dict[str, object]] = []
-    for name, reached in zip(outcome.names, outcome.reached, strict=True):
-        share = over_functions(reached)
+def rows_of(outcome: Outcome) -> list[dict[str, Any]]:
+    """A row a planner: the share of starts from which it reached the goal, and its simulator steps a plan."""
+    rows: list[dict[str, Any]] = []
+    for name, reached, steps in zip(outcome.names, outcome.reached, outcome.model_steps, strict=True):
+        share = over_groups(reached)
         row = {"planner": name, "reached": share.mean, "low": share.low, "high": share.high}
-        rows.append(row | {"paper": PAPER_REACHED.get(name)})
+        rows.append(row | {"paper": PAPER_REACHED.get(name), "model_steps": steps})
     return rows
 
 
@@ -240,13 +249,25 @@ def ceilings_of(outcome: Outcome) -> dict[str, float]:
     }
 
 
-def table_distance(rows: list[dict[str, object]]) -> float:
-    """The root mean square difference between `reached` and the paper's figures, over its four planners."""
-    gaps = [float(str(row["reached"])) - PAPER_REACHED[str(row["planner"])] for row in rows if row["paper"] is not None]
-    return float(torch.tensor(gaps).square().mean().sqrt())
+def distance_interval(outcome: Outcome, resamples: int = 2000) -> Interval:
+    """The root mean square difference from the paper's Table 2, with a bootstrap interval over value functions."""
+    shares = torch.stack([outcome.reached[outcome.names.index(name)].double().mean(1) for name in PAPER_REACHED])
+    paper = torch.tensor(list(PAPER_REACHED.values()), dtype=torch.double)[:, None]
+    functions = shares.shape[1]
+    again = torch.randint(functions, (resamples, functions), generator=torch.Generator().manual_seed(0))
+    distances = (shares[:, again].mean(2) - paper).square().mean(0).sqrt()
+    low, high = distances.quantile(torch.tensor([0.025, 0.975], dtype=torch.double)).tolist()
+    return Interval(float((shares.mean(1, keepdim=True) - paper).square().mean().sqrt()), low, high)
 
 
-def over_functions(reached: Tensor) -> Interval:
-    """The share of True in `reached [V, n]` with an interval over value functions."""
-    share, low, high = mean_interval(reached.double().mean(1))
-    return Interval(share, max(low, 0.0), min(high, 1.0))
+def findings(outcome: Outcome) -> list[dict[str, Any]]:
+    """Paired comparisons over value functions: priors with none, neural ones with the best Markov prior."""
+    share = dict(zip(outcome.names, outcome.reached.double().mean(2), strict=True))
+    found = []
+    for suffix in ("", ANY_PREFIX):
+        markov = max((f"markov-{k}{suffix}" for k in (1, 2, 3)), key=lambda name: float(share[name].mean()))
+        pairs = [("random", "deterministic"), ("markov-1", "random"), ("markov-2", "random")]
+        named = [(first + suffix, second + suffix) for first, second in pairs]
+        for first, second in [*named, ("gru" + suffix, markov), ("transformer" + suffix, markov)]:
+            found.append({"first": first, "second": second, **paired_difference(share[first], share[second])._asdict()})
+    return found

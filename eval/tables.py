@@ -69,12 +69,7 @@ def findings(outcome: Outcome) -> Iterator[str]:
 
 
 def matrix_table(matrix: torch.Tensor) -> Table:
-    table = Table(
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-        title="Transition matrix, markov-1 (in brackets: the paper's, about)",
-    )
+    table = _titled("Transition matrix, markov-1 (in brackets: the paper's, about)")
     _columns(table, ("after", *MOVES), 1)
     for a, name in enumerate(MOVES):
         table.add_row(name, *(f"{float(matrix[a, b]):.3f} ({float(PAPER_MATRIX[a, b]):.2f})" for b in range(4)))
@@ -93,7 +88,7 @@ def matrix_rows(outcome: Outcome) -> list[dict[str, Any]]:
 def protocol_row(protocol: Protocol, rows: list[dict[str, Any]], matrix: torch.Tensor) -> dict[str, Any]:
     """What one protocol gives, and how far that is from the paper."""
     shares = {str(row["planner"]): row["best"] for row in rows if row["paper"] is not None}
-    distances = {"table_distance": table_distance(rows), "matrix_distance": matrix_distance(matrix)}
+    distances = {"table_distance": table_distance(rows, "best"), "matrix_distance": matrix_distance(matrix)}
     return asdict(protocol) | shares | structure(matrix) | distances
 
 
@@ -122,11 +117,12 @@ def scales_table(rows: list[dict[str, Any]]) -> Table:
     """Table 2 under every scale of initial values and both edges."""
     names = list(second_simulation.PAPER_REACHED)
     table = _titled("Table 2 under every setting: goal reached, % of starts")
-    _columns(table, ("edges", "initial\nvalues", "determin-\nistic", *names[1:], "ceiling", "off"), 1)
-    table.caption = "off: root mean square difference from the paper's table, points."
+    _columns(table, ("edges", "initial\nvalues", "det.", "random", "m-1", "m-2", "ceiling", "off", "95 %"), 1)
+    table.caption = "off: root mean square difference from the paper's table, points (interval over value functions)."
     for row in rows:
         shares = [f"{100 * row[name]:.1f}" for name in (*names, "ceiling", "table_distance")]
-        table.add_row(row["edges"], f"{row['initial_scale']:g}", *shares)
+        interval = f"{100 * row['low']:.1f}-{100 * row['high']:.1f}"
+        table.add_row(row["edges"], f"{row['initial_scale']:g}", *shares, interval)
     table.add_row("paper", "", *(f"{100 * reached:.1f}" for reached in second_simulation.PAPER_REACHED.values()))
     return table
 
@@ -137,32 +133,40 @@ def table_2(task: second_simulation.Task, rows: list[dict[str, Any]], ceilings: 
         f"{task.edges}; {task.value_functions} value functions x {task.starts:,} starts, up to {task.max_plans} plans"
     )
     table = _titled(f"Table 2 ({what})")
-    _columns(table, ("planner", "goal reached, %", "95 % interval", "paper, %"), 1)
+    _columns(table, ("planner", "reached, %", "95 % interval", "paper, %", "steps"), 1)
     for row in rows:
-        if row["planner"].endswith(second_simulation.ANY_PREFIX) and row["planner"].startswith("deterministic"):
+        if row["planner"] == "deterministic" + second_simulation.ANY_PREFIX:
             table.add_section()
         interval = f"{100 * row['low']:.1f}-{100 * row['high']:.1f}"
         paper = "" if row["paper"] is None else f"{100 * row['paper']:.1f}"
-        table.add_row(row["planner"], f"{100 * row['reached']:.1f}", interval, paper)
+        table.add_row(row["planner"], f"{100 * row['reached']:.1f}", interval, paper, f"{row['model_steps']:,}")
     table.add_section()
     table.add_row("ceiling", f"{100 * ceilings['ceiling']:.1f}", "", "")
     table.add_row("ceiling" + second_simulation.ANY_PREFIX, f"{100 * ceilings['ceiling_any_prefix']:.1f}", "", "")
-    table.caption = "ceiling: starts from which some plans of that length end on the goal at all."
+    table.caption = (
+        "reached: starts from which the goal was reached. steps: simulator steps for each plan. any prefix: plans may"
+        " end after any move. ceiling: starts from which some plans of these lengths end on the goal at all."
+    )
+    return table
+
+
+def paired_table(rows: list[dict[str, Any]]) -> Table:
+    """Planners compared on the same value functions."""
+    table = _titled("Table 2, paired over value functions: goal reached, points")
+    _columns(table, ("", "minus", "gain", "95 % interval", "p"), 2)
+    for row in rows:
+        interval = f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
+        first, second = (row[end].replace(second_simulation.ANY_PREFIX, ", any") for end in ("first", "second"))
+        table.add_row(first, second, f"{100 * row['mean']:+.1f}", interval, f"{row['p_value']:.1g}")
     return table
 
 
 def quality_table(rows: list[dict[str, Any]]) -> Table:
     """Success against the quality of the values."""
-    names = [name for name in rows[0] if name not in ("kind", "level", "quality", "ceiling")]
-    short = [
-        name.replace("deterministic", "det.").replace("markov", "m").replace("transformer", "trans.") for name in names
-    ]
-    table = Table(
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-        title="How wrong the values are, and the goal reached, % of starts",
-    )
+    names = [name for name in rows[0] if f"{name} low" in rows[0]]
+    shorter = {"deterministic": "det.", "random": "rand.", "transformer": "trans."}
+    short = [shorter.get(name, name.replace("markov", "m")) for name in names]
+    table = _titled("How wrong the values are, and the goal reached, % of starts")
     _columns(table, ("values", "level", "qual.", *short, "ceil."), 1)
     table.caption = (
         "values: of Q-learning after so many steps; of value iteration cut short after so many sweeps; true ones"

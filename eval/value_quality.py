@@ -6,20 +6,20 @@ import torch
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from eval.first_simulation import Report
+from eval.first_simulation import Report, over_groups
 from eval.second_simulation import Task, ceiling, empty_world, make_planners, objective, pursue, random_starts
 from neuroprior import Prior
 from neuroprior.values import network_approximation, q_learning, tile_approximation, value_iteration
 
-STARTS = 500
+STARTS = 600
 """Starts for each level, at the most."""
 
-AGENTS = 5
-"""Value functions of each kind and level that has any chance in it."""
+AGENTS = 20
+"""Value functions of each kind and level that has any chance in it; they share the starts."""
 
 
 def families(task: Task, generator: torch.Generator) -> dict[str, dict[str, Tensor]]:
-    """Value functions `[V, S]` of each kind, from worse to better: kind -> level -> values."""
+    """Value functions `[V, S]` of each kind, from what should be worse to better: kind -> level -> values."""
     world = empty_world(task, 1)
     exact = value_iteration(world, goal=task.goal)
     places = world.coordinates(torch.arange(world.num_states)).double()
@@ -42,15 +42,14 @@ def families(task: Task, generator: torch.Generator) -> dict[str, dict[str, Tens
         return value_iteration(world, goal=int(old.nonzero()[0]))
 
     half = task.size // 2
+    distances = sorted({half, half * 3 // 4, half // 2, 1} - {0}, reverse=True)
     q_steps = [max(round(task.q_steps * share), 1) for share in (0.1, 0.3, 1, 3)]
     return {
         "Q-learning": {f"{steps:,}": learned(steps) for steps in q_steps},
         "sweeps": {f"{sweeps}": value_iteration(world, goal=task.goal, sweeps=sweeps) for sweeps in (2, 5, 8, 12)},
-        "tiles": {f"{side}": tile_approximation(exact, places, side) for side in (10, 7, 5, 3)},
+        "tiles": {f"{side}": tile_approximation(exact, places, side).round(decimals=9) for side in (10, 7, 5, 3)},
         "network": {f"{steps}": network(steps) for steps in (2, 3, 5, 10)},
-        "moved goal": {
-            f"{distance}": moved(distance) for distance in sorted({half, half * 3 // 4, half // 2, 1}, reverse=True)
-        },
+        "moved goal": {f"{distance}": moved(distance) for distance in distances},
     }
 
 
@@ -58,9 +57,11 @@ def measure(task: Task, priors: dict[str, Prior], report: Report) -> list[dict[s
     """Success of each planner under each value function, and how good the value functions are.
 
     Quality is the rank correlation (Spearman) between the approximate and the true values of all cells but the goal:
-    what a planner that compares values can see of them.
+    what a planner that compares values can see of them. Intervals are over value functions, or over starts where there
+    is but one.
     """
-    generator = torch.Generator().manual_seed(task.seed)
+    # Not the learners of the table over again.
+    generator = torch.Generator().manual_seed(task.seed + 1)
     exact = value_iteration(empty_world(task, 1), goal=task.goal)[0]
     other = torch.arange(len(exact)) != task.goal
     rows = []
@@ -72,14 +73,15 @@ def measure(task: Task, priors: dict[str, Prior], report: Report) -> list[dict[s
             world = empty_world(task, len(values))
             # The same starting cells for every level, so that levels differ by their values alone.
             states = random_starts(task, len(values), number, torch.Generator().manual_seed(task.seed))
-            row = {"kind": kind, "level": level, "quality": quality}
+            row: dict[str, Any] = {"kind": kind, "level": level, "quality": quality}
             for name, planner in make_planners(priors, task, objective(values, task.goal)).items():
                 done = pursue(planner, world, states.flatten(), task.goal, task.max_plans, generator)
-                row[name] = float(done.reached.double().mean())
+                share = over_groups(done.reached.view(states.shape))
+                row |= {name: share.mean, f"{name} low": share.low, f"{name} high": share.high}
             rows.append(row | {"ceiling": float(ceiling(world, states, task).double().mean())})
     return rows
 
 
 def _rank_correlation(first: Tensor, second: Tensor) -> float:
     # Values that are all the same order nothing: a correlation of 0.
-    return float(torch.tensor(spearmanr(first, second).statistic).nan_to_num(0)) if float(first.std()) > 0 else 0.0
+    return 0.0 if float(first.std()) < 1e-9 else float(spearmanr(first, second).statistic)

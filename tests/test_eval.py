@@ -69,8 +69,14 @@ def test_paper_writes_tables_and_figures(small_run: Path) -> None:
     assert not list(small_run.glob(".*"))
 
 
-def test_same_seed_same_results(small_run: Path, tmp_path: Path) -> None:
+def test_same_seed_same_results_in_80_columns(
+    small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     assert main(["paper", *SMALL, "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= 80
     for name in ("table_1.csv", "table_2.csv", "value_quality.csv"):
         assert (tmp_path / name).read_text() == (small_run / name).read_text()
 
@@ -113,6 +119,11 @@ def test_protocols_choose_the_plans_they_say(edges: str) -> None:
         (["paper", "--edges", "cliff"], "edges"),
         (["paper", "--worlds", "many"], "worlds"),
         (["paper", "--no-such-option", "1"], "no_such_option"),
+        (["paper", "--q-steps", "-1"], "q_steps"),
+        (["paper", "--initial-scale", "-1"], "initial_scale"),
+        (["paper", "--num-plans", "0"], "num_plans"),
+        (["paper", "--seed", "-1"], "seed"),
+        (["paper", "--size", "100000"], "memory"),
         (["papers"], "papers"),
         (["paper", "--depth", "20", "--worlds", "1", "--starts", "2", "--training-plans", "2"], "depth"),
         (["bench", "--repetitions", "0"], "repetitions"),
@@ -155,7 +166,7 @@ def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "x.json").read_text()) == {"a": [None, 1.5], "b": {"c": None}}
 
 
-@pytest.mark.parametrize("seconds", [0.4, 2.0, 6.0])
+@pytest.mark.parametrize("seconds", [2.0, 6.0])
 def test_ctrl_c_is_one_line(seconds: float, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "eval", "paper", "--worlds=50", "--out", str(tmp_path)],

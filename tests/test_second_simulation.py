@@ -36,7 +36,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 @pytest.mark.parametrize(("edges", "any_prefix"), [("torus", False), ("torus", True), ("wall", True)])
 def test_exact_values_lead_every_start_that_can_to_the_goal(edges: str, any_prefix: bool) -> None:
-    t = task(edges=edges, max_plans=6)
+    t = task(edges=edges, max_plans=6, depth=4)
     world = empty_world(t, 1)
     states = random_starts(t, 1, 200, generator())[0]
     values = value_iteration(world, goal=t.goal)
@@ -88,13 +88,14 @@ def test_starts_are_uniform_over_all_cells_but_the_goal() -> None:
 
 
 @pytest.mark.parametrize("edges", ["torus", "wall"])
-def test_ceiling_by_brute_force(edges: str) -> None:
-    t = task(edges=edges, size=4, length=2, max_plans=3)
+@pytest.mark.parametrize("depth", [1, 2])
+def test_ceiling_by_brute_force(edges: str, depth: int) -> None:
+    t = task(edges=edges, size=4, depth=depth, length=2, max_plans=3)
     world = empty_world(t, 1)
     states = torch.arange(16)
     reached = torch.zeros(16, dtype=torch.bool)
-    for plans in (1, 2, 3):
-        every = torch.tensor(list(itertools.product(range(4), repeat=2 * plans)))
+    for moves in {plans * length for plans in (1, 2, 3) for length in (depth, 2)}:
+        every = torch.tensor(list(itertools.product(range(4), repeat=moves)))
         ends = world.rollout(states, every.expand(16, -1, -1)).final_state
         reached |= (ends == t.goal).any(1)
     assert ceiling(world, states, t).equal(reached)

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.planners.planner import check_objective
+from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.worlds.tabular import TabularWorld
 
 
@@ -43,7 +43,7 @@ def oracle(
     every = torch.arange(maps * states, device=world.device)
     best = torch.zeros(maps, states, device=world.device, dtype=reward.dtype)
     if value is not None:
-        best = value(every).view(maps, states).to(reward.dtype)
+        best = value_of(value, every).view(maps, states).to(reward.dtype)
     prefix = torch.full_like(best, -torch.inf)
     for left in range(length):
         after = best[:, world.next_state]

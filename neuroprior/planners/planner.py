@@ -17,9 +17,9 @@ class Decision(NamedTuple):
     """What a planner decided for B starts.
 
     Attributes:
-        plan: `[B, L]`: the best plan that it found.
+        plan: `[B, L]`: the best plan that it found; 0 beyond `lengths`.
         score: `[B]`: what its objective gives for that plan.
-        final_state: `[B, ...]`: where the plan ends.
+        final_state: `[B, ...]`: where the plan ends (its executed part, where there are `lengths`).
         model_steps: single simulator steps that it took for each start.
         lengths: `[B]`: how many actions of each plan are to be executed; None: all.
     """
@@ -41,7 +41,7 @@ class Planner(ABC):
         value: adds the value of the final state: a function from final states `[N, ...]` to `[N]`; with "return" times
             `discount ** L`.
         any_prefix: the agent may end a plan after any of its actions (at least one), so that a plan counts as its best
-            prefix: L is then that prefix's length.
+            prefix, and a shorter prefix with the same score as a longer one is as good.
 
     Raises:
         ValueError: an argument is out of range.
@@ -91,12 +91,18 @@ class Planner(ABC):
         """`score [...]` plus the weighted value of `state` (`[...]` and its own shape)."""
         if self.value is None:
             return score
-        value = self.value(state.reshape(-1, *state.shape[score.dim() :]))
-        if value.numel() != score.numel():
-            raise ValueError(
-                f"value: one number for each of {score.numel()} states is expected, not {list(value.shape)}"
-            )
+        value = value_of(self.value, state.reshape(-1, *state.shape[score.dim() :]))
         return score + weight * value.view_as(score).to(score.dtype)
+
+
+def value_of(value: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
+    """The values `[N]` of `state [N, ...]`; raises ValueError where there are more, fewer, or a NaN among them."""
+    values = value(state)
+    if values.numel() != len(state) or values.isnan().any():
+        raise ValueError(
+            f"value: one number for each of {len(state)} states is expected, none NaN; got {values.numel()}"
+        )
+    return values.view(-1)
 
 
 def check_objective(objective: str, discount: float) -> None:

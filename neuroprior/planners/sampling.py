@@ -71,7 +71,9 @@ class SamplingPlanner(Planner):
         score = self.prefix_scores(rollout.rewards, rollout.states).flatten(1)
         chosen = random_best(score, generator)
         best, last = chosen.div(self.length, rounding_mode="floor"), chosen % self.length
-        return Decision(plans[row, best], score[row, chosen], rollout.states[row, best, last], steps, last + 1)
+        beyond = torch.arange(self.length, device=state.device) > last[:, None]
+        plan = plans[row, best].masked_fill(beyond, 0)
+        return Decision(plan, score[row, chosen], rollout.states[row, best, last], steps, last + 1)
 
     def candidates(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Rollout]:
         """The candidate plans `[B, P, L]` for starts `[B, ...]`, and what comes of them."""

@@ -16,6 +16,10 @@ _ROW_COLUMN = torch.tensor([[-1, 0], [0, 1], [1, 0], [0, -1]])
 class GridWorld(TabularWorld):
     """A `TabularWorld` whose cells are the squares of a rectangle, row by row from the top left; see `gridworld`.
 
+    Args:
+        height, width, edges: see `gridworld`.
+        reward: floating point `[W, S]`: the rewards of arriving in each cell, for W reward maps.
+
     Attributes:
         height, width: its size in cells.
         edges: "wall" or "torus".
@@ -23,7 +27,9 @@ class GridWorld(TabularWorld):
 
     def __init__(self, height: int, width: int, edges: Literal["wall", "torus"], reward: Tensor) -> None:
         self.height, self.width, self.edges = height, width, edges
-        super().__init__(_moves(height, width, edges), reward, action_names=MOVES)
+        # One map cannot be mistaken for rewards of actions, as four maps of four cells could be.
+        super().__init__(_moves(height, width, edges), reward[:1], action_names=MOVES)
+        self._set_maps(reward)
 
     def coordinates(self, state: Tensor) -> Tensor:
         """Row and column of each state: `[..., 2]`."""
@@ -62,11 +68,7 @@ def gridworld(
     if edges not in ("wall", "torus"):
         raise ValueError(f'gridworld: edges must be "wall" or "torus", not {edges!r}')
     uniform = torch.rand(num_worlds, height * width, generator=torch.Generator().manual_seed(seed))
-    reward = uniform.pow(reward_power)
-    if height * width == num_worlds == len(MOVES):
-        # [4, 4] could mean rewards of actions too; three dimensions cannot be mistaken.
-        reward = reward[:, _moves(height, width, edges)]
-    return GridWorld(height, width, edges, reward)
+    return GridWorld(height, width, edges, uniform.pow(reward_power))
 
 
 def _moves(height: int, width: int, edges: str) -> Tensor:

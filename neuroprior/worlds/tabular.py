@@ -39,16 +39,19 @@ class TabularWorld(World):
             raise ValueError(f"next_state: shape [S, A] is expected, not {list(next_state.shape)}")
         self.num_states, self.num_actions = next_state.shape
         check_range("next_state", next_state, self.num_states, "states")
-        self.reward = _reward_maps(torch.as_tensor(reward, device=next_state.device), *next_state.shape)
-        self.num_maps = self.reward.shape[0]
-        if self.num_maps * self.num_states * self.num_actions >= 2**31:
-            raise ValueError("reward: maps x states x actions must be below 2**31; use fewer maps in one world")
+        self._set_maps(_reward_maps(torch.as_tensor(reward, device=next_state.device), *next_state.shape))
         self.next_state = next_state.long()
         self.legal_actions = None if legal is None else _legal_table(torch.as_tensor(legal), self.next_state)
         self.all_legal = self.legal_actions is None
         if action_names is not None and len(action_names) != self.num_actions:
             raise ValueError(f"action_names: {self.num_actions} names are expected, not {len(action_names)}")
         self.action_names = None if action_names is None else tuple(action_names)
+
+    def _set_maps(self, reward: Tensor) -> None:
+        """Take over `reward`, `[W, S]` (on arrival) or `[W, S, A]` (on acting)."""
+        self.reward, self.num_maps = reward, len(reward)
+        if self.num_maps * self.num_states * self.num_actions >= 2**31:
+            raise ValueError("reward: maps x states x actions must be below 2**31; use fewer maps in one world")
 
     @property
     def device(self) -> torch.device:
