@@ -82,17 +82,19 @@ class MarkovPrior(Prior):
     def fit(self, plans: Plans | Tensor) -> Self:
         """Count; whatever was learned before is forgotten. Returns self."""
         plans = self.training_plans(plans)
-        actions, mask = plans.actions.to(self.device).long(), plans.mask().to(self.device)
+        actions = plans.actions.to(self.device).long()
+        mask = None if plans.lengths is None else plans.mask().to(self.device)
         context = None if plans.context is None else plans.context.to(self.device).long()
         if context is not None and not sees_each_step(context):
             context = context[:, None].expand_as(actions)
         tree, nodes = _grow_tree(actions, mask, self.num_actions, self.order, self.initial == "joint")
         codes, tables = [], []
         for first, node in nodes:
-            here = mask[:, first : first + node.shape[1]]
-            seen = 0 if context is None else context[:, first : first + node.shape[1]][here]
-            distinct, row = _number(node[here] * (self.num_contexts or 1) + seen)
-            pair = row * self.num_actions + actions[:, first : first + node.shape[1]][here]
+            columns = slice(first, first + node.shape[1])
+            here = None if mask is None else mask[:, columns]
+            seen = 0 if context is None else _take(context[:, columns], here)
+            distinct, row = _number(_take(node, here) * (self.num_contexts or 1) + seen)
+            pair = row * self.num_actions + _take(actions[:, columns], here)
             codes.append(distinct)
             tables.append(pair.bincount(minlength=len(distinct) * self.num_actions).view(-1, self.num_actions))
         self._set_tables(tree, torch.cat(codes), torch.cat(tables).float())
@@ -196,29 +198,29 @@ def _number(codes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _grow_tree(
-    actions: Tensor, mask: Tensor, num_actions: int, order: int, joint: bool
+    actions: Tensor, mask: Tensor | None, num_actions: int, order: int, joint: bool
 ) -> tuple[_Tree, list[tuple[int, Tensor]]]:
     """The tree of the histories in `actions [N, L]`, and, level by level, the node `[N, n]` of each of n positions.
 
+    `mask [N, L]` tells which actions count; None: all.
     A level's list entry is the first position that it covers and the nodes from there on.
     """
     node = torch.zeros_like(actions)
     levels = [(0, node)]
-    if not mask.any():
+    if actions.numel() == 0 or (mask is not None and not mask.any()):
         return _Tree.empty(num_actions), levels
     parents = [torch.zeros(1, dtype=torch.long, device=actions.device)]
     follow = torch.zeros(1, num_actions, dtype=torch.long, device=actions.device)
     for depth in range(1, order + 1):
-        here = mask[:, depth:]
-        if not here.any():
+        here = None if mask is None else mask[:, depth:]
+        if depth >= actions.shape[1] or (here is not None and not here.any()):
             break
         # A history of this length is the one before its last action, and that action.
         above = levels[-1][1]
-        distinct, rank = _number((above[:, :-1] * num_actions + actions[:, depth - 1 : -1])[here])
-        node = torch.zeros_like(above[:, 1:])
-        node[here] = rank + len(follow)
+        distinct, rank = _number(_take(above[:, :-1] * num_actions + actions[:, depth - 1 : -1], here))
+        node = _put(rank + len(follow), above[:, 1:], here)
         parent = torch.empty_like(distinct)
-        parent[rank] = above[:, 1:][here]
+        parent[rank] = _take(above[:, 1:], here)
         levels.append((depth, node))
         parents.append(parent)
         follow = _extend(follow, distinct, parent)
@@ -226,17 +228,27 @@ def _grow_tree(
     start = torch.tensor(len(follow) if openings else 0)
     before = torch.zeros_like(actions[:, 0])
     for depth in range(openings):
-        here = mask[:, depth]
-        code = (before * num_actions + actions[:, depth - 1])[here] if depth else before[here]
-        distinct, rank = _number(code)
-        before = torch.zeros_like(before).masked_scatter(here, rank + len(follow))
+        here = None if mask is None else mask[:, depth]
+        code = before * num_actions + actions[:, depth - 1] if depth else before
+        distinct, rank = _number(_take(code, here))
+        before = _put(rank + len(follow), before, here)
         parent = torch.empty_like(distinct)
-        parent[rank] = levels[depth][1][here, 0]
+        parent[rank] = _take(levels[depth][1][:, 0], here)
         levels.append((depth, before[:, None]))
         parents.append(parent)
         follow = _extend(follow, distinct if depth else distinct[:0], parent)
     generation = torch.cat([torch.full_like(p, g) for g, p in enumerate(parents)])
     return _Tree(follow, torch.cat(parents), generation, start), levels
+
+
+def _take(values: Tensor, here: Tensor | None) -> Tensor:
+    """`values` where `here` is True, in one dimension; None: all of them, which is far faster than a mask of True."""
+    return values.reshape(-1) if here is None else values[here]
+
+
+def _put(values: Tensor, like: Tensor, here: Tensor | None) -> Tensor:
+    """The inverse of `_take`, in the shape of `like`; 0 elsewhere."""
+    return values.view(like.shape) if here is None else torch.zeros_like(like).masked_scatter(here, values)
 
 
 def _extend(follow: Tensor, codes: Tensor, parent: Tensor) -> Tensor:
