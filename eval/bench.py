@@ -48,10 +48,10 @@ def bench(repetitions: int = 5, starts: int = 0, out: str = "runs/bench") -> Non
     # Memory first: the process's peak never falls again.
     many = _many_starts(starts, console) if starts else None
     rows = []
-    for name, job, peer, rival in track(_jobs(), description="measuring", console=console, transient=True):
+    for name, job, peer, rival, share in track(_jobs(), description="measuring", console=console, transient=True):
         job(), rival()
         times = [(_seconds(job), _seconds(rival)) for _ in range(repetitions)]
-        ratios = sorted(theirs / ours for ours, theirs in times)
+        ratios = sorted(theirs / share / ours for ours, theirs in times)
         rows.append(
             {
                 "job": name,
@@ -74,7 +74,7 @@ def bench(repetitions: int = 5, starts: int = 0, out: str = "runs/bench") -> Non
 Job = Callable[[], object]
 
 
-Measured = tuple[str, Job, str, Job]  # a job's name, the job, its peer's name, the peer's job
+Measured = tuple[str, Job, str, Job, float]  # a job's name, the job, its peer's name and job, the share that it does
 
 
 def _jobs() -> list[Measured]:
@@ -90,18 +90,21 @@ def _jobs() -> list[Measured]:
             partial(world.rollout, starts, candidates),
             "plain torch indexing",
             partial(_plain_rollout, world.next_state, world.reward, starts, candidates),
+            1,
         ),
         (
             "Q-learning, 200 agents x 10,000 steps",
             partial(q_learning, world, 210, num_agents=200),
             "numpy over agents",
             partial(_numpy_q_learning, world.next_state.numpy(), 210, 200, 10_000),
+            1,
         ),
         (
             "fit a GRU on 10,000 plans of length 4",
             partial(_fit, GRUPrior, plans),
             "fit a transformer",
             partial(_fit, TransformerPrior, plans),
+            1,
         ),
     ]
 
@@ -116,14 +119,15 @@ def _sampling_jobs(plans: Plans, generator: torch.Generator) -> list[Measured]:
         (
             f"sample 2.56 M plans of length 8, {name}",
             partial(sample, prior, number, length),
-            "plan by plan",
-            partial(sample, prior, number, length, method="ancestral"),
+            "plan by plan (a tenth of them)",
+            partial(sample, prior, number // 10, length, method="ancestral"),
+            0.1,
         )
         for name, prior in priors.items()
     ]
     tables = markov.log_probs.exp().double().numpy(), markov.next_node.numpy(), int(markov.start_node)
     rival = partial(_numpy_sample, *tables, number, length)
-    return [*jobs, (jobs[0][0], jobs[0][1], "numpy, inverse CDF a step", rival)]
+    return [*jobs, (jobs[0][0], jobs[0][1], "numpy, inverse CDF a step", rival, 1)]
 
 
 def _numpy_q_learning(next_state: Any, goal: int, agents: int, steps: int) -> Any:
