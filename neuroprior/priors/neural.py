@@ -17,9 +17,9 @@ class NeuralPrior(Prior):
     Past the training length a network meets positions and memories that it has never seen. So each action is predicted
     from at most the last `window` actions, read as if they opened the plan: with plans of length T in training,
     `window = T - 1`, the most that was ever seen before an action. Up to length T nothing changes. Measured on a chain
-    of order 2 (1.285 bits an action) at actions 20 to 32, after training on plans of length 8: the transformer takes
-    1.290 bits with this window and 2.278 without one, the GRU 1.290 with and without; windows of 5 and 3 do no better,
-    and on the paper's grid a window of 2 does worse (`python -m pytest -m slow -k past_the_training_length -s`).
+    of order 2 (1.288 bits an action) at actions 20 to 32, after training on plans of length 8: the transformer takes
+    1.291 bits with this window and 2.171 without one, the GRU 1.291 with and without; windows of 5 and 3 are no worse
+    there, since they still hold the order (`python -m pytest -m slow -k past_the_training_length -s` prints this).
 
     The state holds, beside the network's memory, the inputs that the window may still need: `[N, memory + (t + 1) * D]`
     for t actions so far, D = 1 + (1 for a context index, C for features); past the window those inputs alone,
