@@ -166,7 +166,21 @@ def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "x.json").read_text()) == {"a": [None, 1.5], "b": {"c": None}}
 
 
-@pytest.mark.parametrize("seconds", [2.0, 6.0])
+def test_an_interrupted_command_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def interrupted(*args: object, **settings: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("eval.first_simulation.simulate", interrupted)
+    assert main(["paper", *SMALL, "--out", str(tmp_path)]) == 130
+    error = capsys.readouterr().err
+    assert error.startswith("interrupted")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [2.0, 6.0, 20.0])
 def test_ctrl_c_is_one_line(seconds: float, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "eval", "paper", "--worlds=50", "--out", str(tmp_path)],
