@@ -1,6 +1,6 @@
 """Figures of the paper's simulations, as PNG."""
 
-import os
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from eval import second_simulation
 from eval.first_simulation import Outcome
+from eval.output import write_whole
 from neuroprior import GridWorld
 from neuroprior.worlds.grid import MOVES
 
@@ -31,9 +32,9 @@ mpl.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.rig
 
 def save(figure: Figure, path: Path) -> None:
     """Save as PNG: whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial")
-    figure.savefig(partial, format="png", dpi=150, bbox_inches="tight", facecolor="white")
-    os.replace(partial, path)
+    picture = BytesIO()
+    figure.savefig(picture, format="png", dpi=150, bbox_inches="tight", facecolor="white")
+    write_whole(path, picture.getvalue())
 
 
 def best_bars(path: Path, rows: list[dict[str, Any]]) -> None:

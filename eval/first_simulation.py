@@ -119,15 +119,15 @@ def simulate(protocol: Protocol, size: Size, neural: bool, report: Report) -> Ou
     learn_in = more * cells + torch.randint(size.worlds * cells, (size.training_plans,), generator=generator)
     report("collecting plans")
     plans = training_plans(everywhere, learn_in, size.depth, protocol, generator)
-    planners = make_planners(learn_priors(plans, size.seed, neural, generator, report), size)
+    priors = learn_priors(plans, size.seed, neural, generator, report)
+    planners = make_planners(priors, size.depth, size.length, size.num_plans)
     start = torch.randint(cells, (size.worlds, size.starts), generator=generator)
     states = start + torch.arange(size.worlds)[:, None] * cells
     scores, chosen, steps = [], [], []
     for name, planner in planners.items():
         report(f"planning: {name}")
         decision = planner.plan(everywhere, states.flatten(), generator)
-        padding = size.length - decision.plan.shape[1]
-        chosen.append(torch.nn.functional.pad(decision.plan.long(), (0, max(padding, 0)), value=-1))
+        chosen.append(decision.plan.long())
         scores.append(decision.score)
         steps.append(decision.model_steps)
     width = max(plan.shape[1] for plan in chosen)
@@ -183,11 +183,18 @@ def learn_priors(plans: Plans, seed: int, neural: bool, generator: torch.Generat
     return priors
 
 
-def make_planners(priors: dict[str, Prior], size: Size) -> dict[str, Planner]:
-    """The planners of Table 1 by name, and those with the other priors."""
-    planners: dict[str, Planner] = {"deterministic": ExhaustivePlanner(size.depth)}
+def make_planners(
+    priors: dict[str, Prior],
+    depth: int,
+    length: int,
+    num_plans: int,
+    value: Callable[[Tensor], Tensor] | None = None,
+    any_prefix: bool = False,
+) -> dict[str, Planner]:
+    """The planners of the tables by name: the deterministic one, and one for each prior."""
+    planners: dict[str, Planner] = {"deterministic": ExhaustivePlanner(depth, value=value, any_prefix=any_prefix)}
     for name, prior in priors.items():
-        planners[name] = SamplingPlanner(prior, size.length, size.num_plans)
+        planners[name] = SamplingPlanner(prior, length, num_plans, value=value, any_prefix=any_prefix)
     return planners
 
 

@@ -19,7 +19,7 @@ import neuroprior
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write an object as JSON; numbers that are not finite, which JSON does not have, become null."""
-    write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(_finite(content), indent=2, allow_nan=False).encode() + b"\n")
 
 
 def _finite(value: Any) -> Any:
@@ -36,13 +36,13 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    write_text(path, text.getvalue())
+    write_whole(path, text.getvalue().encode())
 
 
-def write_text(path: Path, text: str) -> None:
+def write_whole(path: Path, content: bytes) -> None:
     """Write a file so that it is there whole or not at all."""
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
+    partial.write_bytes(content)
     os.replace(partial, path)
 
 

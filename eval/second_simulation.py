@@ -7,8 +7,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from eval.first_simulation import Report, groups, learn_priors, over_groups
-from neuroprior import ExhaustivePlanner, GridWorld, Planner, Plans, Prior, SamplingPlanner
+from eval.first_simulation import Report, groups, learn_priors, make_planners, over_groups
+from neuroprior import ExhaustivePlanner, GridWorld, Planner, Plans, Prior
 from neuroprior.statistics import Interval, paired_difference
 from neuroprior.values import can_reach, q_learning, value_iteration
 
@@ -140,13 +140,11 @@ def random_starts(task: Task, num_maps: int, number: int, generator: torch.Gener
     return cell + torch.arange(num_maps)[:, None] * task.size**2
 
 
-def make_planners(
+def planners_for(
     priors: dict[str, Prior], task: Task, value: Callable[[Tensor], Tensor], any_prefix: bool = False
 ) -> dict[str, Planner]:
     """The planners of the table by name."""
-    planners: dict[str, Planner] = {"deterministic": ExhaustivePlanner(task.depth, value=value, any_prefix=any_prefix)}
-    for name, prior in priors.items():
-        planners[name] = SamplingPlanner(prior, task.length, task.num_plans, value=value, any_prefix=any_prefix)
+    planners = make_planners(priors, task.depth, task.length, task.num_plans, value, any_prefix)
     return {name + (ANY_PREFIX if any_prefix else ""): planner for name, planner in planners.items()}
 
 
@@ -193,9 +191,9 @@ def simulate(task: Task, full: bool, report: Report) -> tuple[Outcome, dict[str,
     world = empty_world(task, number)
     states = random_starts(task, number, task.starts, generator)
     value = objective(values, task.goal)
-    planners = make_planners(priors, task, value)
+    planners = planners_for(priors, task, value)
     if full:
-        planners |= make_planners(priors, task, value, any_prefix=True)
+        planners |= planners_for(priors, task, value, any_prefix=True)
     reached, final_state, model_steps = [], [], []
     for name, planner in planners.items():
         report(f"second simulation: {name}")

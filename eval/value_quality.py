@@ -7,7 +7,7 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from eval.first_simulation import Report, over_groups
-from eval.second_simulation import Task, ceiling, empty_world, make_planners, objective, pursue, random_starts
+from eval.second_simulation import Task, ceiling, empty_world, objective, planners_for, pursue, random_starts
 from neuroprior import Prior
 from neuroprior.values import network_approximation, q_learning, tile_approximation, value_iteration
 
@@ -74,7 +74,7 @@ def measure(task: Task, priors: dict[str, Prior], report: Report) -> list[dict[s
             # The same starting cells for every level, so that levels differ by their values alone.
             states = random_starts(task, len(values), number, torch.Generator().manual_seed(task.seed))
             row: dict[str, Any] = {"kind": kind, "level": level, "quality": quality}
-            for name, planner in make_planners(priors, task, objective(values, task.goal)).items():
+            for name, planner in planners_for(priors, task, objective(values, task.goal)).items():
                 done = pursue(planner, world, states.flatten(), task.goal, task.max_plans, generator)
                 share = over_groups(done.reached.view(states.shape))
                 row |= {name: share.mean, f"{name} low": share.low, f"{name} high": share.high}

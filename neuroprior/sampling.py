@@ -139,7 +139,8 @@ def sample_in_world(
         now, reward = world.step(now, action, generator)
         actions.append(action[:, None].to(draw.dtype))
         rewards.append(reward[:, None])
-        states.append(now)
+        if keep_states:
+            states.append(now)
         if t + 1 < length:
             logits, memory = prior.step(action, memory, world.observe(now) if prior.context_per == "step" else None)
     shape = (batch, num_plans, *state.shape[1:])

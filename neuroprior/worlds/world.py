@@ -74,7 +74,8 @@ class World(ABC):
         for t in range(length):
             now, reward = self.step(now, plans[:, :, t].reshape(-1).long(), generator)
             rewards.append(reward.view(batch, num_plans, 1))
-            states.append(now)
+            if keep_states:
+                states.append(now)
         shape = (batch, num_plans, *state.shape[1:])
         course = join_states(states, state, shape) if keep_states else None
         return Rollout(now.view(shape), torch.cat(rewards, -1), course)
