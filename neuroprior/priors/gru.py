@@ -5,6 +5,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from neuroprior.priors.neural import Embedding, NeuralPrior
+from neuroprior.priors.prior import check_sizes
 
 
 class GRUPrior(NeuralPrior):
@@ -32,8 +33,7 @@ class GRUPrior(NeuralPrior):
         context_size: int | None = None,
         seed: int = 0,
     ) -> None:
-        if hidden_size < 1 or num_layers < 1:
-            raise ValueError(f"hidden_size and num_layers must be at least 1, not {hidden_size} and {num_layers}")
+        check_sizes(hidden_size=hidden_size, num_layers=num_layers)
         self.hidden_size, self.num_layers = hidden_size, num_layers
         super().__init__(num_actions, window, num_contexts, context_size, seed)
 

@@ -57,7 +57,7 @@ class MarkovPrior(Prior):
         num_contexts: int | None = None,
     ) -> None:
         super().__init__(num_actions, num_contexts)
-        if not isinstance(order, int) or order < 0:
+        if not isinstance(order, int) or isinstance(order, bool) or order < 0:
             raise ValueError(f"order: an integer of at least 0 is expected, not {order!r}")
         if not 0 < smoothing < float("inf"):
             raise ValueError(f"smoothing: a positive finite number is expected, not {smoothing!r}")

@@ -36,7 +36,7 @@ class NeuralPrior(Prior):
         self, num_actions: int, window: int | None, num_contexts: int | None, context_size: int | None, seed: int
     ) -> None:
         super().__init__(num_actions, num_contexts, context_size)
-        if window is not None and (not isinstance(window, int) or window < 0):
+        if window is not None and (not isinstance(window, int) or isinstance(window, bool) or window < 0):
             raise ValueError(f"window: an integer of at least 0 is expected, not {window!r}")
         self._given_window = self.window = window
         self.input_size = 1 + (1 if num_contexts is not None else context_size or 0)
@@ -55,7 +55,7 @@ class NeuralPrior(Prior):
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
         window = learned["window"]
-        if window is not None and (not isinstance(window, int) or window < 0):
+        if window is not None and (not isinstance(window, int) or isinstance(window, bool) or window < 0):
             raise ValueError(f"window: an integer of at least 0 is expected, not {window!r}")
         self.window = window
 

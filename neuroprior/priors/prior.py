@@ -15,6 +15,13 @@ TOKENS_AT_ONCE = 2**21
 """Actions that `log_prob` scores together; bounds memory."""
 
 
+def check_sizes(**sizes: object) -> None:
+    """Raise ValueError, naming the argument, unless all are integers of at least 1."""
+    for name, size in sizes.items():
+        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+            raise ValueError(f"{name}: an integer of at least 1 is expected, not {size!r}")
+
+
 class Prior(nn.Module, ABC):
     """A distribution over sequences of A actions, numbered from 0.
 

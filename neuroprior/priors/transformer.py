@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuroprior.priors.neural import Embedding, NeuralPrior
+from neuroprior.priors.prior import check_sizes
 
 
 class TransformerPrior(NeuralPrior):
@@ -38,11 +39,9 @@ class TransformerPrior(NeuralPrior):
         context_size: int | None = None,
         seed: int = 0,
     ) -> None:
-        if min(width, num_layers, num_heads) < 1 or width % (2 * num_heads):
-            raise ValueError(
-                "width, num_layers and num_heads must be at least 1, and width a multiple of 2 * num_heads,"
-                f" not {width}, {num_layers} and {num_heads}"
-            )
+        check_sizes(width=width, num_layers=num_layers, num_heads=num_heads)
+        if width % (2 * num_heads):
+            raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
         self.width, self.num_layers, self.num_heads = width, num_layers, num_heads
         super().__init__(num_actions, window, num_contexts, context_size, seed)
 
