@@ -54,13 +54,9 @@ class Prior(nn.Module, ABC):
 
     def __init__(self, num_actions: int, num_contexts: int | None = None, context_size: int | None = None) -> None:
         super().__init__()
-        for name, value in (
-            ("num_actions", num_actions),
-            ("num_contexts", num_contexts),
-            ("context_size", context_size),
-        ):
-            if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-                raise ValueError(f"{name}: an integer of at least 1 is expected, not {value!r}")
+        sizes = {"num_actions": num_actions, "num_contexts": num_contexts, "context_size": context_size}
+        required = {name: size for name, size in sizes.items() if size is not None or name == "num_actions"}
+        check_sizes(**required)
         if num_contexts is not None and context_size is not None:
             raise ValueError("num_contexts and context_size: a prior sees an index or features, not both")
         self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size
