@@ -1,10 +1,11 @@
-"""Executed plans: the action sequences that were chosen before, from which a prior is learned."""
+"""Executed plans in memory: actions with lengths, contexts and groups."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import check_range, is_integer
@@ -24,6 +25,9 @@ class Plans:
             `[N, C]` or `[N, L, C]`; None for nothing.
         group: integers `[N]` (subject, session, world): plans of one group are never split between training and
             validation; None where each plan stands alone.
+        context_names: names of the context indices, numbered from 0, or None.
+        group_names: names of the groups, numbered from 0, or None.
+        end: the action that stands for the end of the plan (see `with_end`), or None. It may only be a plan's last.
 
     Raises:
         ValueError: a shape, dtype or value is wrong; the message says which and where.
@@ -35,6 +39,9 @@ class Plans:
     action_names: Sequence[str] | None = None
     context: Tensor | None = None
     group: Tensor | None = None
+    context_names: Sequence[str] | None = None
+    group_names: Sequence[str] | None = None
+    end: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.num_actions, int) or self.num_actions < 1:
@@ -42,6 +49,8 @@ class Plans:
         actions = torch.as_tensor(self.actions)
         if actions.dim() != 2:
             raise ValueError(f"actions: shape [N, L] is expected, not {list(actions.shape)}")
+        if self.end is not None:
+            self._check_end(actions)
         num, length = actions.shape
         if self.lengths is not None:
             lengths = torch.as_tensor(self.lengths)
@@ -61,6 +70,20 @@ class Plans:
         if self.context is not None:
             object.__setattr__(self, "context", torch.as_tensor(self.context))
             check_context(self.context, num, length)
+        _check_names("group", self.group, self.group_names)
+        _check_names("context", self.context, self.context_names)
+
+    def _check_end(self, actions: Tensor) -> None:
+        """Check that `end` is an action that closes plans; where lengths are not given, it tells them."""
+        if not isinstance(self.end, int) or not 0 <= self.end < self.num_actions:
+            raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {self.end!r}")
+        position = torch.arange(1, actions.shape[1] + 1, device=actions.device)
+        first = torch.where(actions == self.end, position, actions.shape[1]).amin(1) if actions.shape[1] else None
+        if self.lengths is None:
+            object.__setattr__(self, "lengths", position.new_zeros(len(actions)) if first is None else first)
+        elif first is not None and bool((first < torch.as_tensor(self.lengths)).any()):
+            plan = int((first < torch.as_tensor(self.lengths)).nonzero()[0, 0])
+            raise ValueError(f"actions[{plan}]: goes on after the end symbol {self.end}, at action {int(first[plan])}")
 
     def __len__(self) -> int:
         """The number of plans, N."""
@@ -88,13 +111,69 @@ class Plans:
         def pick(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[index]
 
-        return Plans(
-            self.actions[index],
-            self.num_actions,
-            pick(self.lengths),
-            self.action_names,
-            pick(self.context),
-            pick(self.group),
+        return replace(
+            self,
+            actions=self.actions[index],
+            lengths=pick(self.lengths),
+            context=pick(self.context),
+            group=pick(self.group),
+        )
+
+    def with_end(self, name: str = "end") -> "Plans":
+        """The same plans, each closed by one action more, number A, that stands for the end of the plan.
+
+        A prior that learns from them tells how long plans are, and samples plans that end by themselves. A context a
+        step is repeated for it.
+
+        Args:
+            name: of that action, where actions have names.
+
+        Raises:
+            ValueError: the plans have such an action already.
+        """
+        if self.end is not None:
+            raise ValueError(f"end: these plans have an end symbol already, action {self.end}")
+        lengths = self.mask().sum(1)
+        actions = functional.pad(self.actions.long(), (0, 1)).scatter(1, lengths[:, None], self.num_actions)
+        context = self.context
+        if context is not None and sees_each_step(context):
+            last = (lengths - 1).clamp(min=0)
+            closing = context[torch.arange(len(self), device=context.device), last] if self.max_length else None
+            if closing is None:
+                raise ValueError("context: plans without any action have no context a step to close with")
+            context = torch.cat([context, torch.zeros_like(context[:, :1])], 1)
+            context[torch.arange(len(self), device=context.device), lengths] = closing
+        names = None if self.action_names is None else (*self.action_names, name)
+        return replace(
+            self,
+            actions=actions,
+            num_actions=self.num_actions + 1,
+            lengths=lengths + 1,
+            action_names=names,
+            context=context,
+            end=self.num_actions,
+        )
+
+    def without_end(self) -> "Plans":
+        """The same plans without the end symbol, which must be the last action, and with their lengths.
+
+        Raises:
+            ValueError: the plans have no end symbol, or it is not action A - 1.
+        """
+        if self.end is None or self.end != self.num_actions - 1:
+            raise ValueError(f"end: the last action, {self.num_actions - 1}, is expected, not {self.end!r}")
+        taken = self.mask() & (self.actions != self.end)
+        lengths = taken.sum(1)
+        longest = int(lengths.max()) if len(self) else self.max_length
+        context = self.context
+        return replace(
+            self,
+            actions=self.actions.masked_fill(~taken, 0)[:, :longest],
+            num_actions=self.num_actions - 1,
+            lengths=lengths,
+            action_names=None if self.action_names is None else self.action_names[:-1],
+            context=context[:, :longest] if context is not None and sees_each_step(context) else context,
+            end=None,
         )
 
     def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple["Plans", "Plans"]:
@@ -161,3 +240,11 @@ def sees_each_step(context: Tensor | None) -> bool:
 def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
     if tuple(values.shape) != shape:
         raise ValueError(f"{name}: shape {list(shape)} is expected, not {list(values.shape)}")
+
+
+def _check_names(what: str, numbers: Tensor | None, names: Sequence[str] | None) -> None:
+    if names is None:
+        return
+    if numbers is None or not is_integer(numbers):
+        raise ValueError(f"{what}_names: given without {what} numbers that they could name")
+    check_range(what, numbers, len(names), f"{what} names")
