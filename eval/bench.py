@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from eval.output import versions, write_csv, write_json
 from neuroprior import (
     ExhaustivePlanner,
     GRUPrior,
@@ -28,6 +27,7 @@ from neuroprior import (
     collect,
     gridworld,
 )
+from neuroprior.output import versions, write_csv, write_json
 from neuroprior.sampling import sample
 from neuroprior.values import q_learning
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from eval import second_simulation
 from eval.first_simulation import Outcome
-from eval.output import write_whole
 from neuroprior import GridWorld
+from neuroprior.output import write_whole
 from neuroprior.worlds.grid import MOVES
 
 COLORS = {

@@ -11,8 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from eval import figures, first_simulation, second_simulation, tables, value_quality
 from eval.first_simulation import PAPER_MATRIX, PROTOCOLS, Protocol, Report, Size
-from eval.output import versions, write_csv, write_json
 from eval.second_simulation import Task
+from neuroprior.output import versions, write_csv, write_json
 
 SCALES = (1e-4, 0.01, 0.1, 1.0)
 """Scales of Q-learning's initial values that `--protocols all` compares."""

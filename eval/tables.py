@@ -26,7 +26,7 @@ def amount_of(amount: Size) -> str:
 
 
 def table_1(title: str, rows: list[dict[str, Any]]) -> Table:
-    table = _titled(title)
+    table = titled(title)
     headings = (
         "best,\n%",
         "95 %\ninterval",
@@ -36,7 +36,7 @@ def table_1(title: str, rows: list[dict[str, Any]]) -> Table:
         "at ora-\ncle, %",
         "steps",
     )
-    _columns(table, ("planner", *headings), 1)
+    columns(table, ("planner", *headings), 1)
     for row in rows:
         if row["planner"] == "oracle":
             table.add_section()
@@ -69,8 +69,8 @@ def findings(outcome: Outcome) -> Iterator[str]:
 
 
 def matrix_table(matrix: torch.Tensor) -> Table:
-    table = _titled("Transition matrix, markov-1 (in brackets: the paper's, about)")
-    _columns(table, ("after", *MOVES), 1)
+    table = titled("Transition matrix, markov-1 (in brackets: the paper's, about)")
+    columns(table, ("after", *MOVES), 1)
     for a, name in enumerate(MOVES):
         table.add_row(name, *(f"{float(matrix[a, b]):.3f} ({float(PAPER_MATRIX[a, b]):.2f})" for b in range(4)))
     return table
@@ -94,8 +94,8 @@ def protocol_row(protocol: Protocol, rows: list[dict[str, Any]], matrix: torch.T
 
 def protocols_table(rows: list[dict[str, Any]], amount: str) -> Table:
     """Table 1 under every protocol."""
-    table = _titled(f"Table 1 under every protocol, % of starts ({amount})", gap=1)
-    _columns(
+    table = titled(f"Table 1 under every protocol, % of starts ({amount})", gap=1)
+    columns(
         table,
         ("edges", "ties", "learn from", "det.", "rand.", "m-1", "m-2", "repeat", "turn", "back", "off", "off m."),
         3,
@@ -116,8 +116,8 @@ def protocols_table(rows: list[dict[str, Any]], amount: str) -> Table:
 def scales_table(rows: list[dict[str, Any]]) -> Table:
     """Table 2 under every scale of initial values and both edges."""
     names = list(second_simulation.PAPER_REACHED)
-    table = _titled("Table 2 under every setting: goal reached, % of starts")
-    _columns(table, ("edges", "initial\nvalues", "det.", "random", "m-1", "m-2", "ceiling", "off", "95 %"), 1)
+    table = titled("Table 2 under every setting: goal reached, % of starts")
+    columns(table, ("edges", "initial\nvalues", "det.", "random", "m-1", "m-2", "ceiling", "off", "95 %"), 1)
     table.caption = "off: root mean square difference from the paper's table, points (interval over value functions)."
     for row in rows:
         shares = [f"{100 * row[name]:.1f}" for name in (*names, "ceiling", "table_distance")]
@@ -132,8 +132,8 @@ def table_2(task: second_simulation.Task, rows: list[dict[str, Any]], ceilings: 
     what = (
         f"{task.edges}; {task.value_functions} value functions x {task.starts:,} starts, up to {task.max_plans} plans"
     )
-    table = _titled(f"Table 2 ({what})")
-    _columns(table, ("planner", "reached, %", "95 % interval", "paper, %", "steps"), 1)
+    table = titled(f"Table 2 ({what})")
+    columns(table, ("planner", "reached, %", "95 % interval", "paper, %", "steps"), 1)
     for row in rows:
         if row["planner"] == "deterministic" + second_simulation.ANY_PREFIX:
             table.add_section()
@@ -152,8 +152,8 @@ def table_2(task: second_simulation.Task, rows: list[dict[str, Any]], ceilings: 
 
 def paired_table(rows: list[dict[str, Any]]) -> Table:
     """Planners compared on the same value functions."""
-    table = _titled("Table 2, paired over value functions: goal reached, points")
-    _columns(table, ("", "minus", "gain", "95 % interval", "p"), 2)
+    table = titled("Table 2, paired over value functions: goal reached, points")
+    columns(table, ("", "minus", "gain", "95 % interval", "p"), 2)
     for row in rows:
         interval = f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
         first, second = (row[end].replace(second_simulation.ANY_PREFIX, ", any") for end in ("first", "second"))
@@ -166,8 +166,8 @@ def quality_table(rows: list[dict[str, Any]]) -> Table:
     names = [name for name in rows[0] if f"{name} low" in rows[0]]
     shorter = {"deterministic": "det.", "random": "rand.", "transformer": "trans."}
     short = [shorter.get(name, name.replace("markov", "m")) for name in names]
-    table = _titled("How wrong the values are, and the goal reached, % of starts")
-    _columns(table, ("values", "level", "qual.", *short, "ceil."), 1)
+    table = titled("How wrong the values are, and the goal reached, % of starts")
+    columns(table, ("values", "level", "qual.", *short, "ceil."), 1)
     table.caption = (
         "values: of Q-learning after so many steps; of value iteration cut short after so many sweeps; true ones"
         " averaged over tiles of that side; of a network trained for so many steps; for a goal so many cells away."
@@ -183,12 +183,12 @@ def quality_table(rows: list[dict[str, Any]]) -> Table:
     return table
 
 
-def _titled(title: str, gap: int = 2) -> Table:
+def titled(title: str, gap: int = 2) -> Table:
     """An empty table with `gap` spaces between columns, narrow enough for a terminal of 80."""
     return Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, gap - 1, 0, 0), title=title)
 
 
-def _columns(table: Table, headings: Sequence[str], left: int) -> None:
+def columns(table: Table, headings: Sequence[str], left: int) -> None:
     """Columns with these headings; the first `left` of them aligned on the left, the others on the right."""
     for number, heading in enumerate(headings):
         table.add_column(heading, justify="left" if number < left else "right", no_wrap=True)

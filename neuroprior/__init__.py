@@ -2,13 +2,14 @@
 
 from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPlanner, collect, oracle
 from neuroprior.plans import Plans
-from neuroprior.priors import GRUPrior, MarkovPrior, Prior, TransformerPrior, UniformPrior, load, save
+from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior, TransformerPrior, UniformPrior, load, save
 from neuroprior.sampling import sample, sample_in_world
 from neuroprior.worlds import GridWorld, Rollout, TabularWorld, World, gridworld
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "ContextTreePrior",
     "Decision",
     "ExhaustivePlanner",
     "GRUPrior",

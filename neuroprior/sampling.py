@@ -15,6 +15,7 @@ class Steppable(Protocol):
 
     num_actions: int
     context_per: Literal["plan", "step"] | None
+    end: int | None
 
     @property
     def device(self) -> torch.device: ...
@@ -56,7 +57,8 @@ def sample(
         batch_size: plans drawn together where they are drawn one by one; bounds memory.
 
     Returns:
-        Actions `[N, L]`, uint8 (int64 where there are more than 256 actions).
+        Actions `[N, L]`, uint8 (int64 where there are more than 256 actions). After the end symbol, for a prior that
+        has one, there is nothing but end symbols; `Plans(..., end=...).without_end()` cuts them off.
 
     Raises:
         ValueError: an argument is out of range.
@@ -70,7 +72,7 @@ def sample(
     if context is not None and sees_each_step(context) and context.shape[1] < length:
         raise ValueError(f"context: {length} steps are to be sampled, but it has only {context.shape[1]}")
     prior.check_context_of(context, num_plans, length)
-    draw = _Draw(prior.num_actions, temperature, generator_on(generator, prior.device))
+    draw = _Draw(prior.num_actions, temperature, generator_on(generator, prior.device), prior.end)
     if context is None:
         roots = torch.full((min(num_plans, 1),), num_plans, device=prior.device)
         return _grow(prior, roots, None, length, draw, method, batch_size)
@@ -119,6 +121,8 @@ def sample_in_world(
     """
     _check(num_plans, length, temperature, 1)
     world.check_state(state)
+    if prior.end is not None:
+        raise ValueError("prior: it samples an end symbol, which is no action of the world")
     if prior.num_actions != world.num_actions:
         raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
     generator = generator_on(generator, prior.device)
@@ -149,6 +153,15 @@ def sample_in_world(
     return torch.cat(actions, 1).view(batch, num_plans, length), Rollout(now.view(shape), gained, course)
 
 
+def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:
+    """`logits [..., A]`, but nothing else than the end symbol where the action `before [...]` was that symbol."""
+    if end is None:
+        return logits
+    ended = torch.full_like(logits[..., :1], -torch.inf).repeat_interleave(logits.shape[-1], -1)
+    ended[..., end] = 0
+    return torch.where((before == end)[..., None], ended, logits)
+
+
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
     if num_plans < 0 or length < 0 or batch_size < 1:
         raise ValueError(
@@ -162,8 +175,10 @@ def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> 
 class _Draw:
     """Draws actions from logits."""
 
-    def __init__(self, num_actions: int, temperature: float, generator: torch.Generator) -> None:
-        self.num_actions, self.temperature, self.generator = num_actions, temperature, generator
+    def __init__(
+        self, num_actions: int, temperature: float, generator: torch.Generator, end: int | None = None
+    ) -> None:
+        self.num_actions, self.temperature, self.generator, self.end = num_actions, temperature, generator, end
         self.dtype = action_dtype(num_actions)
 
     def actions(self, logits: Tensor) -> Tensor:
@@ -221,6 +236,7 @@ def _grow(
         root = root[parent]
         if prefix.shape[1] < length:
             logits, state = prior.step(action, state[parent])
+            logits = after_end(logits, action, draw.end)
         else:
             logits, state = logits[parent], state[parent]
     row = _shuffled_rows(counts, root, draw.generator)
@@ -237,6 +253,7 @@ def _grow(
             if t + 1 < length:
                 seen = context[some, t + 1] if context is not None and per_step else None
                 now, memory = prior.step(action, memory, seen)
+                now = after_end(now, action, draw.end)
     return plans
 
 

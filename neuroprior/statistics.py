@@ -19,7 +19,7 @@ class Interval(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """A mean difference of pairs with its confidence interval, and the p-value of no difference (two-sided)."""
+    """A mean with its confidence interval, and the p-value of its being 0 (two-sided)."""
 
     mean: float
     low: float
@@ -81,6 +81,35 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     if np.ptp(a - b) == 0:
         return Difference(mean, low, high, 1.0 if mean == 0 else 0.0)
     return Difference(mean, low, high, float(stats.ttest_rel(a, b).pvalue))
+
+
+def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -> Difference:
+    """The ratio of two sums over independent units, such as bits per action over plans of unlike length.
+
+    The interval is Student's, on the residuals of the units from the common ratio (Cochran 1977, section 6.3).
+
+    Args:
+        totals: `[G]`: what each of G >= 2 units adds to the sum above; of differences, for a paired comparison.
+        sizes: `[G]`: what it adds to the sum below; none negative.
+        level: of confidence.
+
+    Returns:
+        The ratio with its interval, and the p-value of a ratio of 0 (two-sided).
+
+    Raises:
+        ValueError: fewer than two units, unlike numbers of totals and sizes, or sizes that sum to nothing.
+    """
+    above, below = _vector("totals", totals), _vector("sizes", sizes)
+    if len(above) != len(below):
+        raise ValueError(f"ratio_difference: {len(above)} totals and {len(below)} sizes")
+    if (below < 0).any() or below.sum() <= 0:
+        raise ValueError("sizes: numbers of at least 0 with a positive sum are expected")
+    units, ratio = len(above), float(above.sum() / below.sum())
+    error = float(np.sqrt(units / (units - 1) * ((above - ratio * below) ** 2).sum()) / below.sum())
+    half = float(stats.t.ppf((1 + level) / 2, units - 1)) * error
+    if error == 0:
+        return Difference(ratio, ratio, ratio, 1.0 if ratio == 0 else 0.0)
+    return Difference(ratio, ratio - half, ratio + half, float(2 * stats.t.sf(abs(ratio) / error, units - 1)))
 
 
 def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -14,9 +14,9 @@ import torch
 
 from eval.__main__ import main
 from eval.first_simulation import PAPER_BEST, Protocol, training_plans
-from eval.output import write_json
 from eval.second_simulation import PAPER_REACHED
 from neuroprior import gridworld
+from neuroprior.output import write_json
 
 SMALL = ["--worlds=3", "--starts=20", "--training-plans=200", "--size=8", "--num-plans=16"]
 SMALL += ["--value-functions=2", "--q-steps=300", "--max-plans=2"]

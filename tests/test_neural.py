@@ -120,7 +120,7 @@ def test_plans_of_one_action(kind):
 @pytest.mark.parametrize(
     "plans",
     [
-        torch.zeros(1, 4).long(),
+        torch.zeros(1, 1).long(),
         torch.zeros(0, 4).long(),
         torch.zeros(9, 0).long(),
         Plans(torch.zeros(9, 4).long(), 3, lengths=torch.zeros(9).long()),

@@ -131,7 +131,57 @@ def test_split_refuses_a_share(share):
         Plans(ACTIONS, 3).split(share)
 
 
-@pytest.mark.parametrize("plans", [Plans(ACTIONS[:1], 3), Plans(ACTIONS, 3, group=torch.ones(4).long())])
+@pytest.mark.parametrize("plans", [Plans(ACTIONS[:1, :1], 3), Plans(ACTIONS, 3, group=torch.ones(4).long())])
 def test_split_refuses_one_of_a_kind(plans):
     with refuses("1"):
         plans.split()
+
+
+def test_one_plan_is_cut_in_time():
+    plan = Plans(torch.arange(10)[None], 10, lengths=torch.tensor([8]), context=torch.arange(10)[None])
+    first, last = plan.split(0.25)
+    assert first.actions.tolist() == [[0, 1, 2, 3, 4, 5]]
+    assert last.actions.tolist() == last.context.tolist() == [[6, 7]]
+    assert first.lengths.tolist() == [6]
+    assert last.lengths.tolist() == [2]
+
+
+def test_the_end_symbol_closes_every_plan_and_comes_off_again():
+    plans = Plans(ACTIONS, 3, lengths=torch.tensor([0, 1, 2, 3])[: len(ACTIONS)], action_names=("a", "b", "c"))
+    closed = plans.with_end()
+    assert closed.num_actions == 4
+    assert closed.end == 3
+    assert closed.action_names == ("a", "b", "c", "end")
+    assert closed.lengths.tolist() == [1, 2, 3, 4]
+    assert (closed.actions == 3).sum(1).tolist() == [1, 1, 1, 1]
+    opened = closed.without_end()
+    assert opened.lengths.tolist() == [0, 1, 2, 3]
+    assert opened.end is None
+    assert opened.action_names == ("a", "b", "c")
+    assert opened.actions.masked_fill(~opened.mask(), 9).tolist() == (
+        plans.actions[:, :3].masked_fill(~plans.mask()[:, :3], 9).tolist()
+    )
+
+
+def test_where_lengths_are_not_given_the_first_end_symbol_tells_them():
+    sampled = torch.tensor([[0, 2, 2], [2, 2, 2], [0, 1, 0]])
+    assert Plans(sampled, 3, end=2).lengths.tolist() == [2, 1, 3]
+    assert Plans(sampled, 3, end=2).without_end().lengths.tolist() == [1, 0, 3]
+
+
+def test_nothing_comes_after_the_end_symbol():
+    with refuses("end symbol"):
+        Plans(torch.tensor([[2, 0]]), 3, lengths=torch.tensor([2]), end=2)
+    with refuses("already"):
+        Plans(torch.tensor([[0, 2]]), 3, end=2).with_end()
+    with refuses("end"):
+        Plans(torch.tensor([[0, 2]]), 3).without_end()
+    with refuses("end"):
+        Plans(torch.tensor([[0, 2]]), 3, end=3)
+
+
+def test_names_must_name_every_number():
+    with refuses("group"):
+        Plans(ACTIONS, 3, group=torch.tensor([0, 1, 2, 2]), group_names=("a", "b"))
+    with refuses("context_names"):
+        Plans(ACTIONS, 3, context_names=("a",))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from neuroprior import (
+    ContextTreePrior,
     GRUPrior,
     MarkovPrior,
     Plans,
@@ -41,6 +42,18 @@ PRIORS = {
     "markov-2 untrained": lambda: MarkovPrior(4, 2),
     "markov-2, context a plan": lambda: MarkovPrior(3, 2, num_contexts=4).fit(random_plans(3, index_context(60))),
     "markov-2, context a step": lambda: MarkovPrior(3, 2, num_contexts=4).fit(random_plans(3, index_context(60, 5))),
+    "markov-3, witten-bell": lambda: MarkovPrior(4, 3, backoff="witten-bell").fit(random_plans(4)),
+    "markov-3, dirichlet, context a step": lambda: MarkovPrior(
+        3, 3, num_contexts=4, backoff="dirichlet", initial="lower"
+    ).fit(random_plans(3, index_context(60, 5))),
+    "context tree untrained": lambda: ContextTreePrior(4),
+    "context tree": lambda: ContextTreePrior(4, 3).fit(random_plans(4)),
+    "context tree, one action": lambda: ContextTreePrior(1, 2).fit(random_plans(1)),
+    "context tree, 300 actions": lambda: ContextTreePrior(300, 4).fit(random_plans(300)),
+    "context tree, context a plan": lambda: ContextTreePrior(3, num_contexts=4).fit(random_plans(3, index_context(60))),
+    "context tree, context a step": lambda: ContextTreePrior(3, 0, num_contexts=4).fit(
+        random_plans(3, index_context(60, 5))
+    ),
     "gru untrained": lambda: GRUPrior(4),
     "gru": lambda: GRUPrior(4).fit(random_plans(4, length=3), progress=False, max_steps=20),
     "gru, two layers, index": lambda: GRUPrior(3, 16, 2, window=2, num_contexts=3),

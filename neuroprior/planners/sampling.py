@@ -27,7 +27,7 @@ class SamplingPlanner(Planner):
         temperature: of sampling.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: an argument is out of range. `plan` raises it for a prior that samples an end symbol, too.
     """
 
     def __init__(
@@ -51,6 +51,10 @@ class SamplingPlanner(Planner):
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         world.check_state(state)
+        if self.prior.end is not None:
+            raise ValueError(
+                "prior: it samples an end symbol, which is no action of the world; learn from plans without one"
+            )
         if self.prior.num_actions != world.num_actions:
             raise ValueError(f"prior has {self.prior.num_actions} actions, the world {world.num_actions}")
         generator = generator_on(generator, state.device)

@@ -179,16 +179,23 @@ class Plans:
     def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple["Plans", "Plans"]:
         """Split at random into plans for training and plans for validation; groups stay together.
 
+        One plan alone is cut in time: its last actions are held out.
+
         Args:
-            validation: the share of plans (of groups, where there are any) held out, between 0 and 1; at least one
-                plan or group is kept on each side.
+            validation: the share of plans (of groups, where there are any; of the actions of a single plan) held out,
+                between 0 and 1; at least one plan, group or action is kept on each side.
             generator: draws the split.
 
         Raises:
-            ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups.
+            ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups, and not a
+                single plan of at least two actions.
         """
         if not 0 < validation < 1:
             raise ValueError(f"validation: a share between 0 and 1 is expected, not {validation}")
+        length = int(self.mask().sum()) if len(self) == 1 else 0
+        if length > 1:
+            cut = length - min(max(round(length * validation), 1), length - 1)
+            return self._between(0, cut), self._between(cut, length)
         unit = torch.arange(len(self)) if self.group is None else self.group.unique(return_inverse=True)[1].cpu()
         units = int(unit.max()) + 1 if len(unit) else 0
         if units < 2:
@@ -199,6 +206,16 @@ class Plans:
         chosen[order[:held_out]] = True
         index = chosen[unit].to(self.actions.device)
         return self[~index], self[index]
+
+    def _between(self, first: int, stop: int) -> "Plans":
+        """The actions `first` to `stop` - 1 of plans that all have as many."""
+        context = self.context
+        return replace(
+            self,
+            actions=self.actions[:, first:stop],
+            lengths=None if self.lengths is None else torch.full_like(self.lengths, stop - first),
+            context=context[:, first:stop] if context is not None and sees_each_step(context) else context,
+        )
 
 
 def all_plans(num_actions: int, length: int) -> Tensor:

@@ -1,5 +1,6 @@
 """Priors: distributions over action sequences that samplers step through."""
 
+from neuroprior.priors.context_tree import ContextTreePrior, Leaf
 from neuroprior.priors.folders import load, save
 from neuroprior.priors.gru import GRUPrior
 from neuroprior.priors.markov import MarkovPrior
@@ -7,4 +8,14 @@ from neuroprior.priors.prior import Prior
 from neuroprior.priors.transformer import TransformerPrior
 from neuroprior.priors.uniform import UniformPrior
 
-__all__ = ["GRUPrior", "MarkovPrior", "Prior", "TransformerPrior", "UniformPrior", "load", "save"]
+__all__ = [
+    "ContextTreePrior",
+    "GRUPrior",
+    "Leaf",
+    "MarkovPrior",
+    "Prior",
+    "TransformerPrior",
+    "UniformPrior",
+    "load",
+    "save",
+]

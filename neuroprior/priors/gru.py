@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from neuroprior.priors.neural import Embedding, NeuralPrior
@@ -16,6 +17,8 @@ class GRUPrior(NeuralPrior):
         hidden_size: width of the hidden state and of the input vectors.
         num_layers: number of layers.
         window: how many past actions are read; None: set by `fit`; see `NeuralPrior`.
+        lags: past actions that each input shows directly; see `NeuralPrior`.
+        dropout: in training, of the input vectors and of what each layer gives.
         num_contexts, context_size: what it sees; see `Prior`.
         seed: draws the initial weights.
 
@@ -29,13 +32,15 @@ class GRUPrior(NeuralPrior):
         hidden_size: int = 64,
         num_layers: int = 1,
         window: int | None = None,
+        lags: int = 16,
+        dropout: float = 0.0,
         num_contexts: int | None = None,
         context_size: int | None = None,
         seed: int = 0,
     ) -> None:
         check_sizes(hidden_size=hidden_size, num_layers=num_layers)
         self.hidden_size, self.num_layers = hidden_size, num_layers
-        super().__init__(num_actions, window, num_contexts, context_size, seed)
+        super().__init__(num_actions, window, lags, dropout, num_contexts, context_size, seed)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -43,18 +48,19 @@ class GRUPrior(NeuralPrior):
 
     def build(self) -> None:
         width = self.hidden_size
-        self.embedding = Embedding(self.num_actions, width, self.num_contexts, self.context_size)
-        self.gru = nn.GRU(width, width, self.num_layers, batch_first=True)
+        self.embedding = Embedding(self.num_actions, width, self.lags, self.num_contexts, self.context_size)
+        self.gru = nn.GRU(width, width, self.num_layers, batch_first=True, dropout=self.dropout * (self.num_layers > 1))
+        self.drop = nn.Dropout(self.dropout)
         self.head = nn.Linear(width, self.num_actions)
 
-    def encode(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        out, hidden = self.gru(self.embedding(inputs))
-        return self.head(out), hidden.transpose(0, 1).flatten(1)
-
-    def advance(self, inputs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        hidden = memory.view(-1, self.num_layers, self.hidden_size).transpose(0, 1).contiguous()
-        out, hidden = self.gru(self.embedding(inputs)[:, None], hidden)
-        return self.head(out[:, 0]), hidden.transpose(0, 1).flatten(1)
+    def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        hidden, recent, size = None, None, self.num_layers * self.hidden_size
+        if memory is not None:
+            hidden = memory[:, :size].view(-1, self.num_layers, self.hidden_size).transpose(0, 1).contiguous()
+            recent = memory[:, size:]
+        vectors, recent = self.embedding(inputs, recent)
+        out, hidden = self.gru(self.drop(vectors), hidden)
+        return self.head(self.drop(out)), torch.cat([hidden.transpose(0, 1).flatten(1), recent], 1)
 
     def memory_size(self, state_size: int) -> int:
-        return self.num_layers * self.hidden_size
+        return self.num_layers * self.hidden_size + self.lags - 1

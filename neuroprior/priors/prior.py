@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from neuroprior import sampling
 from neuroprior.plans import Plans, check_context, sees_each_step
+from neuroprior.sampling import after_end
 from neuroprior.worlds.world import check_range, is_integer
 
 TOKENS_AT_ONCE = 2**21
@@ -40,6 +41,8 @@ class Prior(nn.Module, ABC):
     Attributes:
         context_per: "plan" or "step", as it was in the plans that the prior learned from ("step" before that); None
             for a prior without context.
+        end: the action that ends a plan, as it was in the plans that the prior learned from (see `Plans.with_end`), or
+            None. After it `log_prob` and samples have nothing but it.
 
     Raises:
         ValueError: an argument is out of range.
@@ -61,6 +64,7 @@ class Prior(nn.Module, ABC):
             raise ValueError("num_contexts and context_size: a prior sees an index or features, not both")
         self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
+        self.end: int | None = None
         self.register_buffer("_anchor", torch.zeros(()), persistent=False)
 
     @property
@@ -84,7 +88,7 @@ class Prior(nn.Module, ABC):
     @property
     def learned(self) -> dict[str, Any]:
         """What `fit` found that is neither weights nor an argument (JSON values); saved with the prior."""
-        return {"context_per": self.context_per}
+        return {"context_per": self.context_per, "end": self.end}
 
     def restore(self, learned: dict[str, Any]) -> None:
         """Take over what `learned` gave when the prior was saved.
@@ -96,6 +100,10 @@ class Prior(nn.Module, ABC):
         if context_per not in (("plan", "step") if self.takes_context else (None,)):
             raise ValueError(f"context_per: {context_per!r} does not fit this prior")
         self.context_per = context_per
+        end = learned["end"]
+        if end is not None and (not isinstance(end, int) or not 0 <= end < self.num_actions):
+            raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {end!r}")
+        self.end = end
 
     @abstractmethod
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -164,16 +172,32 @@ class Prior(nn.Module, ABC):
             ValueError: a shape, dtype or value is wrong.
         """
         data = Plans(plans, self.num_actions, lengths, context=context)
-        self.check_context_of(data)
-        if min(data.actions.shape) == 0:
-            return torch.zeros(len(data), device=self.device)
+        return self.action_log_probs(data).sum(-1)
+
+    def action_log_probs(self, plans: Plans) -> Tensor:
+        """The log-probability of each action given those before it.
+
+        Returns:
+            `[N, L]`, nats; 0 beyond a plan's end.
+
+        Raises:
+            ValueError: other actions or another context than this prior's.
+        """
+        if plans.num_actions != self.num_actions:
+            raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
+        self.check_context_of(plans)
+        if plans.actions.numel() == 0:
+            return torch.zeros(plans.actions.shape, device=self.device)
         parts = []
-        size = max(TOKENS_AT_ONCE // data.max_length, 1)
-        for at in range(0, len(data), size):
-            part = data[at : at + size]
+        size = max(TOKENS_AT_ONCE // plans.max_length, 1)
+        for at in range(0, len(plans), size):
+            part = plans[at : at + size]
+            actions = part.actions.long()
             logits = self(part.actions, part.context)
-            taken = torch.log_softmax(logits, -1).gather(-1, part.actions.long()[..., None])[..., 0]
-            parts.append(taken.masked_fill(~part.mask(), 0).sum(-1))
+            if self.end is not None:
+                logits = torch.cat([logits[:, :1], after_end(logits[:, 1:], actions[:, :-1], self.end)], 1)
+            taken = torch.log_softmax(logits, -1).gather(-1, actions[..., None])[..., 0]
+            parts.append(taken.masked_fill(~part.mask(), 0))
         return torch.cat(parts)
 
     def sample(
@@ -229,8 +253,9 @@ class Prior(nn.Module, ABC):
             plans = Plans(torch.as_tensor(plans), self.num_actions)
         if plans.num_actions != self.num_actions:
             raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
+        self.end = plans.end
         if not self.takes_context:
-            return replace(plans, context=None)
+            return replace(plans, context=None, context_names=None)
         self.check_context_of(plans)
         self.context_per = "step" if sees_each_step(plans.context) else "plan"
         return plans

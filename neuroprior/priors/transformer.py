@@ -13,7 +13,9 @@ from neuroprior.priors.prior import check_sizes
 class TransformerPrior(NeuralPrior):
     """A pre-norm transformer (Vaswani et al. 2017) with rotary positions (Su et al. 2021) as a prior.
 
-    The memory of its state is the key-value cache: `num_layers * 2 * width` numbers for each input so far.
+    The memory of its state is the key-value cache: `num_layers * 2 * width` numbers for each input so far. Trained in
+    windows (see `NeuralPrior`), each layer attends to at most `span` inputs before its own, `span` being the training
+    window, and the cache keeps no more; layer upon layer still sees further back.
 
     Args:
         num_actions: A.
@@ -21,6 +23,8 @@ class TransformerPrior(NeuralPrior):
         num_layers: number of blocks.
         num_heads: attention heads.
         window: how many past actions are read; None: set by `fit`; see `NeuralPrior`.
+        lags: past actions that each input shows directly; see `NeuralPrior`.
+        dropout: in training, of the input vectors and of what each layer adds.
         num_contexts, context_size: what it sees; see `Prior`.
         seed: draws the initial weights.
 
@@ -35,6 +39,8 @@ class TransformerPrior(NeuralPrior):
         num_layers: int = 2,
         num_heads: int = 4,
         window: int | None = None,
+        lags: int = 16,
+        dropout: float = 0.0,
         num_contexts: int | None = None,
         context_size: int | None = None,
         seed: int = 0,
@@ -43,49 +49,72 @@ class TransformerPrior(NeuralPrior):
         if width % (2 * num_heads):
             raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
         self.width, self.num_layers, self.num_heads = width, num_layers, num_heads
-        super().__init__(num_actions, window, num_contexts, context_size, seed)
+        self.span: int | None = None
+        super().__init__(num_actions, window, lags, dropout, num_contexts, context_size, seed)
 
     @property
     def config(self) -> dict[str, Any]:
         return super().config | {"width": self.width, "num_layers": self.num_layers, "num_heads": self.num_heads}
 
+    @property
+    def learned(self) -> dict[str, Any]:
+        return super().learned | {"span": self.span}
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
+        if learned["span"] is not None:
+            check_sizes(span=learned["span"])
+        self.span = learned["span"]
+
+    def carry_over(self, window: int) -> None:
+        super().carry_over(window)
+        self.span = window
+
     def build(self) -> None:
-        self.embedding = Embedding(self.num_actions, self.width, self.num_contexts, self.context_size)
-        self.blocks = nn.ModuleList(_Block(self.width, self.num_heads) for _ in range(self.num_layers))
+        self.embedding = Embedding(self.num_actions, self.width, self.lags, self.num_contexts, self.context_size)
+        self.drop = nn.Dropout(self.dropout)
+        self.blocks = nn.ModuleList(_Block(self.width, self.num_heads, self.dropout) for _ in range(self.num_layers))
         self.norm = nn.LayerNorm(self.width)
         self.head = nn.Linear(self.width, self.num_actions)
 
-    def encode(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        x = self.embedding(inputs)
-        caches = []
-        for block in self.blocks:
-            x, cache = block(x, None)
-            caches.append(cache)
-        return self.head(self.norm(x)), torch.stack(caches, 2).flatten(1)
-
-    def advance(self, inputs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        past = memory.view(len(memory), -1, self.num_layers, 2 * self.width)
-        x = self.embedding(inputs)[:, None]
+    def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        if self.span is not None and inputs.shape[1] > 2 * self.span:
+            return self._encode_in_parts(inputs, memory)
+        past, recent, kept = None, None, self.lags - 1
+        if memory is not None:
+            past = memory[:, kept:].view(len(memory), -1, self.num_layers, 2 * self.width)
+            recent = memory[:, :kept]
+        x, recent = self.embedding(inputs, recent)
+        x = self.drop(x)
         caches = []
         for layer, block in enumerate(self.blocks):
-            x, cache = block(x, past[:, :, layer])
+            x, cache = block(x, None if past is None else past[:, :, layer], self.span)
             caches.append(cache)
-        memory = torch.cat([past, torch.stack(caches, 2)], 1)
-        return self.head(self.norm(x[:, 0])), memory.flatten(1)
+        return self.head(self.norm(x)), torch.cat([recent, torch.stack(caches, 2).flatten(1)], 1)
+
+    def _encode_in_parts(self, inputs: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The same for a long sequence, part by part: attention costs the square of what is read at once."""
+        logits = []
+        for part in inputs.split(self.span or inputs.shape[1], 1):
+            out, memory = self.encode(part, memory)
+            logits.append(out)
+        assert memory is not None
+        return torch.cat(logits, 1), memory
 
     def memory_size(self, state_size: int) -> int:
         cache = self.num_layers * 2 * self.width
         if self.window is None:
             return state_size - self.input_size
-        return state_size // (cache + self.input_size) * cache
+        return (state_size - self.lags + 1) // (cache + self.input_size) * cache + self.lags - 1
 
 
 class _Block(nn.Module):
     """Attention and a two-layer network, each behind a layer norm and added to its input."""
 
-    def __init__(self, width: int, num_heads: int) -> None:
+    def __init__(self, width: int, num_heads: int, dropout: float) -> None:
         super().__init__()
         self.num_heads = num_heads
+        self.drop = nn.Dropout(dropout)
         self.attention_norm = nn.LayerNorm(width)
         self.query_key_value = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
@@ -93,28 +122,46 @@ class _Block(nn.Module):
             nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width)
         )
 
-    def forward(self, x: Tensor, past: Tensor | None) -> tuple[Tensor, Tensor]:
-        """`x [N, T, width]` after `past [N, S, 2 * width]`: the new `x`, and its keys and values `[N, T, 2 * width]`.
+    def forward(self, x: Tensor, past: Tensor | None, span: int | None) -> tuple[Tensor, Tensor]:
+        """`x [N, T, width]` after `past [N, S, 2 * width]`: the new `x`, and the keys and values to be kept.
 
-        Without a past the T inputs attend to those before them; with one, T is 1.
+        Each input attends to itself and those before it, at most `span` back. Positions count from the first of the
+        past; where that moves, because only the last `span` are kept, the kept keys are turned back by as much.
         """
         query, key, value = self.query_key_value(self.attention_norm(x)).chunk(3, -1)
-        offset = 0 if past is None else past.shape[1]
-        query, key = self._rotate(query, offset), self._rotate(key, offset)
-        own = torch.cat([key, value], -1)
+        start = 0 if past is None else past.shape[1]
+        place = torch.arange(start, start + x.shape[1], device=x.device)
+        query, key = self._rotate(query, place), self._rotate(key, place)
         if past is not None:
-            key, value = torch.cat([past, own], 1).chunk(2, -1)
-        query, key, value = (v.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for v in (query, key, value))
-        mixed = functional.scaled_dot_product_attention(query, key, value, is_causal=past is None)
-        x = x + self.out(mixed.transpose(1, 2).flatten(2))
-        return x + self.mlp(x), own
+            # under autocast new keys and values may be of another dtype than kept ones
+            key, value = torch.cat([past.to(key.dtype), torch.cat([key, value], -1)], 1).chunk(2, -1)
+        mixed = self._attend(query, key, value, span)
+        x = x + self.drop(self.out(mixed))
+        excess = 0 if span is None else max(key.shape[1] - span, 0)
+        if excess:
+            key, value = self._rotate(key[:, excess:], torch.full_like(place[:1], -excess)), value[:, excess:]
+        return x + self.drop(self.mlp(x)), torch.cat([key, value], -1)
 
-    def _rotate(self, x: Tensor, offset: int) -> Tensor:
-        """Turn each pair of numbers of each head by an angle proportional to the position (from `offset`)."""
+    def _attend(self, query: Tensor, key: Tensor, value: Tensor, span: int | None) -> Tensor:
+        """`[N, T, width]`: for each query what it finds among keys and values `[N, S + T, width]`."""
+        num, total = query.shape[1], key.shape[1]
+        query, key, value = (v.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for v in (query, key, value))
+        plain = num == total and (span is None or num <= span + 1)
+        mask = None
+        if not plain and num > 1:
+            back = torch.arange(total - num, total, device=query.device)[:, None] - torch.arange(
+                total, device=query.device
+            )
+            mask = (back >= 0) & (back <= (total if span is None else span))
+        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask, is_causal=plain)
+        return mixed.transpose(1, 2).flatten(2)
+
+    def _rotate(self, x: Tensor, place: Tensor) -> Tensor:
+        """Turn each pair of numbers of each head of `x [N, T, width]` by an angle proportional to `place [T]`."""
         pairs = x.unflatten(-1, (self.num_heads, 2, -1))
         half = pairs.shape[-1]
         rate = 10_000 ** -(torch.arange(half, device=x.device) / half)
-        angle = (torch.arange(x.shape[1], device=x.device)[:, None] + offset) * rate
+        angle = place[:, None] * rate
         cos, sin = angle.cos()[:, None], angle.sin()[:, None]
         first, second = pairs[..., 0, :], pairs[..., 1, :]
         return torch.stack([first * cos - second * sin, first * sin + second * cos], -2).flatten(-3)

@@ -6,15 +6,11 @@ import math
 import os
 import platform
 from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
 from typing import Any
-
-import lightning
-import numpy
-import torch
-
-import neuroprior
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -40,18 +36,32 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all."""
+    """Write a file so that it is there whole or not at all.
+
+    Raises:
+        OSError: it cannot be written; whatever was there before still is.
+    """
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
+    try:
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        # A full disk does not tell which file it was.
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def versions() -> dict[str, str]:
     """The versions that results depend on."""
-    return {
-        "neuroprior": neuroprior.__version__,
-        "python": platform.python_version(),
-        "torch": str(torch.__version__),
-        "numpy": numpy.__version__,
-        "lightning": str(lightning.__version__),
+    packages = ("torch", "numpy", "lightning")
+    return {"neuroprior": _own_version(), "python": platform.python_version()} | {
+        name: version(name) for name in packages
     }
+
+
+def _own_version() -> str:
+    # imported here: the package imports this module
+    from neuroprior import __version__
+
+    return __version__

@@ -1,0 +1,73 @@
+"""`python -m eval plans`: saved priors scored on a file of plans."""
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from eval.tables import columns, titled
+from neuroprior import load
+from neuroprior.comparison import Score, score, unit_name
+from neuroprior.output import versions, write_csv, write_json
+from neuroprior.plans import Plans, read_plans
+
+
+def plans(
+    file: str,
+    priors: list[str],
+    num_actions: int | None = None,
+    action_names: list[str] | None = None,
+    out: str = "runs/plans",
+) -> None:
+    """Score saved priors on a file of plans that they have not learned from.
+
+    Args:
+        file: plans: `.npz`, `.jsonl` or `.csv`.
+        priors: model folders, such as `python -m train` writes; the first is what the others are compared with.
+        num_actions: number of actions, where the file does not tell.
+        action_names: names of the actions in the order of their numbers, where the file does not tell.
+        out: folder for `plans.csv` and `results.json`.
+    """
+    if not priors:
+        raise ValueError("priors: at least one model folder is expected")
+    first = load(priors[0])
+    known = first.num_actions - (first.end is not None)
+    read = read_plans(file, num_actions=num_actions or (None if action_names else known), action_names=action_names)
+    scores = [_score(folder, read) for folder in priors]
+    rows = [_row(one, scores[0]) for one in scores]
+    Console().print(_table(rows, read))
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "plans.csv", rows)
+    write_json(folder / "results.json", {"rows": rows, "unit": unit_name(read), "versions": versions()})
+
+
+def _score(folder: str, read: Plans) -> Score:
+    prior = load(folder)
+    try:
+        return score(folder, prior, read if prior.end is None else read.with_end())
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from error
+
+
+def _row(one: Score, first: Score) -> dict[str, Any]:
+    taken = one.bits_per_action()
+    row = {"model": one.model, "sees": one.sees, "bits_per_action": taken.mean, "low": taken.low, "high": taken.high}
+    if len(one.bits) != len(first.bits) or not one.actions.equal(first.actions):
+        # one tells the ends of plans too, the other does not
+        return row | {"more_than_first": None, "more_low": None, "more_high": None}
+    gap = one.minus(first)
+    return row | {"more_than_first": gap.mean, "more_low": gap.low, "more_high": gap.high}
+
+
+def _table(rows: list[dict[str, Any]], read: Plans) -> Any:
+    table = titled(f"Bits per action on {len(read):,} plans ({int(read.mask().sum()):,} actions)")
+    columns(table, ("prior", "sees", "bits", "95 % interval", "more", "95 % interval"), 2)
+    for row in rows:
+        more = ("", "")
+        if row is not rows[0] and row["more_than_first"] is not None:
+            more = (f"{row['more_than_first']:+.4f}", f"{row['more_low']:+.4f} to {row['more_high']:+.4f}")
+        sees = "context" if "context" in row["sees"] else "actions"
+        table.add_row(row["model"], sees, f"{row['bits_per_action']:.4f}", f"{row['low']:.4f}-{row['high']:.4f}", *more)
+    table.caption = f"95 % intervals over {unit_name(read)}; more: bits more than the first takes, paired."
+    return table

@@ -1,0 +1,183 @@
+"""What training steps read: plans in batches, long plans window by window, in an order that the seed alone decides."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import lightning
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from neuroprior.plans import Plans, sees_each_step
+
+MOST_DISTINCT = 1024
+"""Distinct plans that one training step takes together, each weighted by its number."""
+
+MOST_VALIDATION = 2**18
+"""Actions that are looked at in each validation."""
+
+
+class Batch(NamedTuple):
+    """A window of some plans.
+
+    Attributes:
+        actions: `[N, T]`.
+        weight: `[N, T]`, how much each action counts; 0 beyond a plan's end.
+        context: `[N]`, `[N, C]`, `[N, T]`, `[N, T, C]` or None.
+        before: `[N]`, the action before the window, `num_actions` for none; None where all are whole plans.
+        goes_on: whether the rows go on with those of the batch before, whose memory is carried over.
+    """
+
+    actions: Tensor
+    weight: Tensor
+    context: Tensor | None
+    before: Tensor | None
+    goes_on: bool
+
+
+class PlansModule(lightning.LightningDataModule):
+    """Plans for training and for validation, in batches.
+
+    Where at most `MOST_DISTINCT` plans are distinct, and few enough of them, each step takes them all, each weighted by
+    its number: the exact gradient. Otherwise steps take batches of plans.
+
+    An epoch is `steps` steps, and its batches depend on the seed and on its number alone, so that a training that is
+    resumed after an epoch goes on as if it had never stopped. With several processes each takes its part of a batch.
+
+    Args:
+        training: plans to learn from.
+        validation: plans for early stopping; of more than `MOST_VALIDATION` actions some plans are drawn.
+        batch_size: plans, or pieces of plans, a step.
+        window: actions that a step reads of a plan.
+        steps: steps in an epoch.
+        seed: draws the order.
+    """
+
+    def __init__(self, training: Plans, validation: Plans, batch_size: int, window: int, steps: int, seed: int) -> None:
+        super().__init__()
+        few = max(1, MOST_VALIDATION // max(1, validation.max_length))
+        if len(validation) > few:
+            order = torch.randperm(len(validation), generator=torch.Generator().manual_seed(seed))
+            validation = validation[order[:few].to(validation.actions.device)]
+        self.training = Windows(training, window, batch_size)
+        self.validation = Windows(validation, window, 1024)
+        self.steps, self.seed = steps, seed
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.training, batch_size=None, sampler=Walk(self.training, self.steps, self.seed, self.part))
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        return DataLoader(self.validation, batch_size=None, sampler=Walk(self.validation, None, None, self.part))
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """This process's number and the number of processes."""
+        return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
+
+
+class Windows(Dataset[Batch]):
+    """Plans cut into pieces of `windows` windows; equal plans are merged into one row where few are distinct.
+
+    Pieces are walked through together, `group_size` at a time; `groups` such walks take all of them.
+    """
+
+    def __init__(self, plans: Plans, window: int, batch_size: int) -> None:
+        merged = _merge(plans)
+        self.plans = plans if merged is None else merged[0]
+        self.weight = None if merged is None else merged[1]
+        self.window = max(1, min(window, self.plans.max_length))
+        lengths = self.plans.mask().sum(1).cpu()
+        self.windows = _piece_size(lengths, self.window, batch_size)
+        size = self.windows * self.window
+        pieces = (lengths + size - 1).div(size, rounding_mode="floor").clamp(min=1)
+        self.plan = torch.arange(len(lengths)).repeat_interleave(pieces)
+        rank = torch.arange(len(self.plan)) - (pieces.cumsum(0) - pieces).repeat_interleave(pieces)
+        self.first = rank * size
+        batch_size = len(self) if merged is not None else batch_size
+        self.groups = -(-len(self) // batch_size)
+        self.group_size = -(-len(self) // self.groups)
+
+    def __len__(self) -> int:
+        """The number of pieces."""
+        return len(self.plan)
+
+    def __getitem__(self, index: tuple[Tensor, int, bool]) -> Batch:
+        """Window number `index[1]` of the pieces `index[0]`; `index[2]` says whether it goes on."""
+        pieces, number, goes_on = index
+        plans, device = self.plans, self.plans.actions.device
+        plan, first = self.plan[pieces].to(device), (self.first[pieces] + number * self.window).to(device)
+        place = first[:, None] + torch.arange(self.window, device=device)
+        lengths = plans.max_length if plans.lengths is None else plans.lengths[plan][:, None]
+        weight = (place < lengths).float()
+        if self.weight is not None:
+            weight = weight * self.weight[plan][:, None]
+        place = place.clamp(max=plans.max_length - 1)
+        context = plans.context
+        if context is not None:
+            context = context[plan[:, None], place] if sees_each_step(context) else context[plan]
+        before = None
+        if self.window < plans.max_length:
+            last = plans.actions[plan, (first - 1).clamp(0, plans.max_length - 1)].long()
+            before = torch.where(first > 0, last, plans.num_actions)
+        return Batch(plans.actions[plan[:, None], place], weight, context, before, goes_on)
+
+
+class Walk(Sampler[tuple[Tensor, int, bool]]):
+    """The order of the batches of one epoch.
+
+    Args:
+        windows: what is walked through.
+        steps: batches an epoch, in an endless stream of shuffled passes; None: one pass in order.
+        seed: draws the passes.
+        part: this process's number and the number of processes: of each batch it takes every so-many-th piece.
+    """
+
+    def __init__(self, windows: Windows, steps: int | None, seed: int | None, part: tuple[int, int]) -> None:
+        self.windows, self.steps, self.seed, self.part, self.epoch = windows, steps, seed, part, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning tells the number of the epoch that comes."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.steps if self.steps is not None else self.windows.groups * self.windows.windows
+
+    def __iter__(self) -> Iterator[tuple[Tensor, int, bool]]:
+        a_pass = self.windows.groups * self.windows.windows
+        start = 0 if self.steps is None else self.epoch * self.steps
+        order, drawn = torch.arange(len(self.windows)), -1
+        for step in range(start, start + len(self)):
+            if self.seed is not None and step // a_pass != drawn:
+                drawn = step // a_pass
+                # Mixed by a multiplier, so that the passes of one seed are not those of the next.
+                generator = torch.Generator().manual_seed((self.seed * 1_000_003 + drawn) % 2**63)
+                order = torch.randperm(len(self.windows), generator=generator)
+            group, number = divmod(step % a_pass, self.windows.windows)
+            size = self.windows.group_size
+            pieces = order[group * size : (group + 1) * size]
+            mine = pieces[self.part[0] :: self.part[1]]
+            # A process without a piece reads one of the others' again: all must take part in every step.
+            yield mine if len(mine) else pieces[:1], number, number > 0 and step > start
+
+
+def _piece_size(lengths: Tensor, window: int, batch_size: int) -> int:
+    """Windows a piece: long enough to carry memory far, short enough to fill batches and to leave few windows empty."""
+    needed = (lengths + window - 1).div(window, rounding_mode="floor").clamp(min=1)
+    total = int(needed.sum())
+    size = min(int(needed.max()), max(1, -(-total // batch_size)))
+    while size > 1 and size * int(((needed + size - 1) // size).sum()) > 1.5 * total:
+        size = (size + 1) // 2
+    return size
+
+
+def _merge(plans: Plans) -> tuple[Plans, Tensor] | None:
+    """The distinct plans and their numbers, where they are few; None where they are not."""
+    if plans.context is not None or (plans.num_actions + 1) ** plans.max_length > 2**20:
+        return None
+    key = plans.actions.long().masked_fill(~plans.mask(), plans.num_actions)
+    base = (plans.num_actions + 1) ** torch.arange(plans.max_length, device=key.device)
+    _, which, counts = (key * base).sum(1).unique(return_inverse=True, return_counts=True)
+    if len(counts) > min(MOST_DISTINCT, len(plans) // 2):
+        return None
+    first = torch.empty_like(counts).scatter_(0, which, torch.arange(len(plans), device=key.device))
+    return plans[first], counts.float()

@@ -1,0 +1,122 @@
+"""The LightningModule that trains a prior: its loss, bits per action, its optimiser, and its learning curve."""
+
+from math import cos, log, pi
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from neuroprior.training.batches import Batch
+
+
+class PriorModule(lightning.LightningModule):
+    """The loss of a prior, bits per action, and its optimiser.
+
+    Args:
+        prior: any module with `forward(plans, context) -> logits [N, L, A]`; for plans longer than a window it needs
+            `read_on` too, see `NeuralPrior`.
+        learning_rate: of AdamW, after the first tenth of the steps; it falls to 0 with half a cosine.
+        weight_decay: of AdamW.
+        seed: of dropout.
+
+    Attributes:
+        curve: one entry an epoch: step, learning_rate, train_bits and validation_bits (bits per action); saved in
+            checkpoints.
+    """
+
+    def __init__(
+        self, prior: nn.Module, learning_rate: float = 5e-3, weight_decay: float = 0.01, seed: int = 0
+    ) -> None:
+        super().__init__()
+        self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
+        self.curve: list[dict[str, float]] = []
+        self._memory: Tensor | None = None
+        self._lost = 0.0
+
+    def on_train_epoch_start(self) -> None:
+        self.prior.train()
+        self._totals = torch.zeros(2, device=self.device)
+
+    def training_step(self, batch: Batch, batch_index: int) -> Tensor:
+        # Dropout begins anew in each step, so that a resumed training draws the same.
+        torch.manual_seed(hash((self.seed, self.current_epoch, batch_index, self.global_rank)) % 2**63)
+        total, weight, self._memory = bits(self.prior, batch, self._memory)
+        loss = total / weight.clamp(min=1)
+        # Gradients are averaged over processes: each part must count by its share of the actions.
+        if self.trainer.world_size > 1:
+            loss = total * self.trainer.world_size / self._over_processes(weight).clamp(min=1)
+        self._totals += torch.stack([total.detach(), weight])
+        self.log("train_bits", loss, prog_bar=True, batch_size=1)
+        return loss
+
+    def on_validation_epoch_start(self) -> None:
+        self.prior.eval()
+        self._memory, self._seen = None, torch.zeros(2, device=self.device, dtype=torch.double)
+
+    def validation_step(self, batch: Batch, batch_index: int) -> None:
+        total, weight, self._memory = bits(self.prior, batch, self._memory)
+        self._seen += torch.stack([total, weight])
+
+    def on_validation_epoch_end(self) -> None:
+        self._memory = None
+        seen, totals = self._seen, self._totals
+        if self.trainer.world_size > 1:
+            seen, totals = self._over_processes(seen), self._over_processes(totals)
+        held_out = float(seen[0] / seen[1].clamp(min=1))
+        self.log("validation_bits", held_out, prog_bar=True, rank_zero_only=True)
+        rate = self.trainer.optimizers[0].param_groups[0]["lr"]
+        self.log("learning_rate", rate, rank_zero_only=True)
+        trained = float(totals[0] / totals[1].clamp(min=1))
+        self.curve.append(
+            {
+                "step": self.global_step,
+                "learning_rate": rate,
+                "train_bits": trained,
+                "validation_bits": held_out,
+            }
+        )
+
+    def _over_processes(self, value: Tensor) -> Tensor:
+        gathered = self.all_gather(value)
+        assert isinstance(gathered, Tensor)
+        return gathered.sum(0)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["curve"] = list(self.curve)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.curve = list(checkpoint["curve"])
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.AdamW(self.parameters(), lr=self.learning_rate, weight_decay=self.weight_decay)
+        steps = self.trainer.estimated_stepping_batches
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: _rate(step / steps))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def bits(prior: nn.Module, batch: Batch, memory: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """What a prior pays for the actions of a batch.
+
+    Args:
+        prior: the prior.
+        batch: what is read.
+        memory: of the batch before, used where this one goes on with it.
+
+    Returns:
+        The weighted sum of bits, the sum of the weights, and the memory for the next batch (None for whole plans).
+    """
+    if batch.before is None:
+        logits = prior(batch.actions, batch.context)
+    else:
+        read_on: Any = prior.read_on
+        logits, memory = read_on(batch.actions, batch.context, batch.before, memory if batch.goes_on else None)
+        memory = None if memory is None else memory.detach()
+    log_probs = torch.log_softmax(logits.float(), -1)
+    taken = log_probs.gather(-1, batch.actions.long()[..., None])[..., 0]
+    return -(taken * batch.weight).sum() / log(2), batch.weight.sum(), memory
+
+
+def _rate(done: float) -> float:
+    """Share of the learning rate after a share `done` of the steps: a linear rise over a tenth, then half a cosine."""
+    return min((done + 1e-3) / 0.1, 0.5 * (1 + cos(pi * min(done, 1.0))))

@@ -1,0 +1,205 @@
+"""The command line of `python -m train`, by LightningCLI's conventions, and the order of what a run does."""
+
+import sys
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+from jsonargparse import ArgumentError
+from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import RichProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
+
+from neuroprior.output import write_whole
+from neuroprior.plans import write_plans
+from neuroprior.training import few_threads, quiet
+from neuroprior.training.fitting import WholeCheckpoints, checkpoints_and_stopping, take_best
+from train.data import PlansData
+from train.model import PriorModel
+from train.report import report
+
+USAGE = """python -m train fit --config train/gru.yaml [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
+       python -m train fit --resume FOLDER"""
+CONFIG, PLANS, LAST = "run.yaml", "plans.npz", "checkpoints/last.ckpt"
+
+
+def run(arguments: list[str]) -> None:
+    """Train as the arguments say.
+
+    Raises:
+        ValueError: an argument, a file or a training that went wrong.
+        OSError: a file that cannot be read or written.
+        KeyboardInterrupt: Ctrl-C; the message says how to go on.
+    """
+    with quiet():
+        try:
+            TrainCLI(arguments)
+        except ArgumentError as error:
+            raise ValueError(str(error)) from error
+        except MisconfigurationException as error:
+            raise ValueError(str(error)) from error
+
+
+def make_trainer(
+    folder: str = "",
+    max_epochs: int = 20,
+    patience: int = 4,
+    accelerator: str = "auto",
+    devices: int | str | list[int] = 1,
+    num_nodes: int = 1,
+    strategy: str = "auto",
+    precision: str | int = "32-true",
+    gradient_clip_val: float = 1.0,
+    accumulate_grad_batches: int = 1,
+    max_time: str | None = None,
+    enable_progress_bar: bool = True,
+    callbacks: list[Callback] | None = None,
+) -> Trainer:
+    """Lightning's trainer, with the logs and checkpoints of a run.
+
+    Args:
+        folder: of the run.
+        max_epochs: an epoch is `data.steps_per_epoch` steps; the validation plans are looked at after each.
+        patience: epochs without better validation bits after which training stops.
+        accelerator: "cpu", "gpu", or "auto".
+        devices: number of devices, or their numbers.
+        num_nodes: machines.
+        strategy: "ddp" for several devices (processes, on a CPU).
+        precision: "bf16-mixed" on a GPU that has it.
+        gradient_clip_val: the largest norm of a gradient.
+        accumulate_grad_batches: batches for one step of the optimiser.
+        max_time: stop after so much time, DD:HH:MM:SS.
+        enable_progress_bar: show it.
+        callbacks: further callbacks of Lightning's.
+    """
+    own: list[Callback] = checkpoints_and_stopping(Path(folder) / "checkpoints", patience)
+    bar: list[Callback] = [RichProgressBar()] if enable_progress_bar and sys.stdout.isatty() else []
+    return Trainer(
+        max_epochs=max_epochs,
+        accelerator=accelerator,
+        devices=devices,
+        num_nodes=num_nodes,
+        strategy=strategy,
+        precision=precision,  # type: ignore[arg-type]
+        gradient_clip_val=gradient_clip_val,
+        accumulate_grad_batches=accumulate_grad_batches,
+        max_time=max_time,
+        enable_progress_bar=bool(bar),
+        callbacks=[*own, *bar, *(callbacks or [])],
+        logger=[CSVLogger(folder, "logs"), TensorBoardLogger(folder, "tensorboard", "")],
+        plugins=[WholeCheckpoints()],
+        num_sanity_val_steps=0,
+        log_every_n_steps=10,
+        use_distributed_sampler=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+    )
+
+
+class TrainCLI(LightningCLI):
+    """`fit` alone, with `--out` and `--resume`."""
+
+    def __init__(self, arguments: list[str]) -> None:
+        super().__init__(
+            PriorModel,
+            PlansData,
+            save_config_callback=None,
+            trainer_class=make_trainer,
+            seed_everything_default=0,
+            auto_configure_optimizers=False,
+            load_from_checkpoint_support=False,
+            parser_kwargs={
+                "prog": "python -m train",
+                "description": "Train prior models.",
+                "exit_on_error": False,
+                "fit": {
+                    "usage": USAGE,
+                    "description": "Train a prior on executed plans, and compare it with count-based ones.",
+                    "exit_on_error": False,
+                },
+            },
+            args=_with_saved_config(arguments),
+        )
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        return {"fit": {"model", "train_dataloaders", "val_dataloaders", "datamodule", "ckpt_path", "weights_only"}}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_argument("--out", type=str, default="runs/prior", help="Folder of the run; made, must be new.")
+        parser.add_argument("--resume", type=str | None, default=None, help="Folder of a run to go on with.")
+        parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
+        parser.link_arguments(("out", "resume"), "trainer.folder", compute_fn=lambda out, resume: resume or out)
+        parser.link_arguments("data", "model.data", apply_on="instantiate")
+
+    def before_instantiate_classes(self) -> None:
+        fit = self.config.fit
+        self.folder = Path(fit.resume or fit.out)
+        if rank_zero_only.rank != 0:
+            return
+        if fit.resume is None:
+            if (self.folder / CONFIG).exists() or (self.folder / "model.safetensors").exists():
+                raise ValueError(
+                    f"{self.folder}: holds a run already; --resume {self.folder} goes on with it, or give another --out"
+                )
+            self.folder.mkdir(parents=True, exist_ok=True)
+            text = self._parser("fit").dump(fit)
+            write_whole(self.folder / CONFIG, text.encode())
+
+    def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
+        """Train, or count; then compare and save."""
+        if self.trainer.is_global_zero and self.config.fit.resume is None:
+            # The run's own copy: to resume it nothing else is needed.
+            write_plans(datamodule.source, self.folder / PLANS)
+        if model.is_neural:
+            self._train(model, datamodule)
+        else:
+            model.prior.fit(datamodule.learned_from)
+        if self.trainer.is_global_zero:
+            report(self.folder, model, datamodule)
+
+    def _train(self, model: PriorModel, data: PlansData) -> None:
+        model.prior.prepare(data.learned_from, data.window)
+        last = self.folder / LAST
+        try:
+            with few_threads(model.prior, data):
+                self.trainer.fit(model, datamodule=data, ckpt_path=last if last.exists() else None, weights_only=True)
+        except SystemExit as interrupted:
+            # Lightning turns Ctrl-C into this.
+            saved = (
+                f"saved up to step {model.curve[-1]['step']}"
+                if last.exists() and model.curve
+                else "nothing to save yet"
+            )
+            raise KeyboardInterrupt(
+                f"interrupted; {saved}; go on with: python -m train fit --resume {self.folder}"
+            ) from interrupted
+        except (UnpicklingError, EOFError, KeyError) as error:
+            raise ValueError(
+                f"{last}: damaged, or not a checkpoint of this program; remove it to start over"
+            ) from error
+        if self.trainer.is_global_zero:
+            take_best(self.trainer, model)
+
+
+def _with_saved_config(arguments: list[str]) -> list[str]:
+    """The arguments, and before them those that a run to be resumed was started with."""
+    folder = None
+    for number, argument in enumerate(arguments):
+        if argument.startswith("--resume="):
+            folder = argument.partition("=")[2]
+        elif argument == "--resume":
+            folder = arguments[number + 1] if number + 1 < len(arguments) else None
+    if folder is None or "fit" not in arguments:
+        return arguments
+    place = Path(folder)
+    if not (place / CONFIG).exists():
+        raise ValueError(f"{place}: no run to resume ({CONFIG} is missing)")
+    at = arguments.index("fit") + 1
+    saved = ["--config", str(place / CONFIG)]
+    if (place / PLANS).exists():
+        saved += ["--data.file", str(place / PLANS)]
+    return [*arguments[:at], *saved, *arguments[at:]]
