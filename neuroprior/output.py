@@ -5,12 +5,12 @@ import json
 import math
 import os
 import platform
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
@@ -36,20 +36,33 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all.
+    """Write a file so that it is there whole or not at all; see `written_whole`."""
+    with written_whole(path, "wb") as file:
+        file.write(content)
+
+
+@contextmanager
+def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
+    """A file opened for writing beside its place, and moved there when the block ends without an error.
 
     Raises:
-        OSError: it cannot be written; whatever was there before still is.
+        ValueError: the place is a directory.
+        OSError: the file cannot be written.
     """
+    if path.is_dir():
+        raise ValueError(f"{path}: a directory; the name of a file is expected")
     partial = path.with_name(f".{path.name}.partial")
+    text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
     try:
-        partial.write_bytes(content)
+        with open(partial, mode, **text) as file:  # type: ignore[call-overload]
+            yield file
         os.replace(partial, path)
     except OSError as error:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
         # A full disk does not tell which file it was.
         raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def versions() -> dict[str, str]:

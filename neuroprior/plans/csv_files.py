@@ -3,12 +3,12 @@
 import csv
 from pathlib import Path
 
+from neuroprior.output import written_whole
 from neuroprior.plans.columns import Names, number_in
 from neuroprior.plans.csv_plans import plan_rows, read_plan_rows
 from neuroprior.plans.csv_rows import Sheet
 from neuroprior.plans.csv_steps import read_step_rows, step_rows
 from neuroprior.plans.jsonl import check_distinct
-from neuroprior.plans.opening import written_whole
 from neuroprior.plans.plans import Plans, sees_each_step
 
 

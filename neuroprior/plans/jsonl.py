@@ -8,9 +8,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from neuroprior.output import written_whole
 from neuroprior.plans.columns import LARGEST_INTEGER, Column, Gathered, Integers, Names, check_names, renamed
 from neuroprior.plans.json_context import Contexts, shown
-from neuroprior.plans.opening import open_text, written_whole
+from neuroprior.plans.opening import open_text
 from neuroprior.plans.plans import Plans, sees_each_step
 
 HEADER = ("num_actions", "action_names", "context_names", "group_names", "end")

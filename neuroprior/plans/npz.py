@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from neuroprior.output import written_whole
 from neuroprior.plans.columns import Names, renamed
-from neuroprior.plans.opening import check_file, written_whole
+from neuroprior.plans.opening import check_file
 from neuroprior.plans.plans import Plans
 
 NUMBERS = ("actions", "lengths", "context", "group")

@@ -1,10 +1,9 @@
-"""Opening files of plans: what cannot be one is refused in one line; what is written appears whole or not at all."""
+"""Opening files of plans: what cannot be one is refused in one line."""
 
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 
 def check_file(path: Path) -> None:
@@ -40,27 +39,3 @@ def _where_not_utf8(path: Path) -> str:
             except UnicodeDecodeError as error:
                 return f"{path}, line {number}: byte {error.start + 1} of the line is not UTF-8; save the file as UTF-8"
     return f"{path}: not UTF-8; save the file as UTF-8"
-
-
-@contextmanager
-def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
-    """A file opened for writing beside its place, and moved there when the block ends without an error.
-
-    Raises:
-        ValueError: the place is a directory.
-        OSError: the file cannot be written.
-    """
-    if path.is_dir():
-        raise ValueError(f"{path}: a directory; the name of a file is expected")
-    partial = path.with_name(f".{path.name}.partial")
-    text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
-    try:
-        with open(partial, mode, **text) as file:  # type: ignore[call-overload]
-            yield file
-        os.replace(partial, path)
-    except OSError as error:
-        # A full disk does not tell which file it was.
-        raise OSError(error.errno, error.strerror, str(path)) from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
