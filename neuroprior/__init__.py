@@ -1,7 +1,7 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
 
 from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPlanner, collect, oracle
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior, TransformerPrior, UniformPrior, load, save
 from neuroprior.sampling import sample, sample_in_world
 from neuroprior.worlds import GridWorld, Rollout, TabularWorld, World, gridworld
@@ -28,7 +28,9 @@ __all__ = [
     "gridworld",
     "load",
     "oracle",
+    "read_plans",
     "sample",
     "sample_in_world",
     "save",
+    "write_plans",
 ]
