@@ -63,6 +63,7 @@ def _row(one: Score, first: Score) -> dict[str, Any]:
 def _table(rows: list[dict[str, Any]], read: Plans) -> Any:
     table = titled(f"Bits per action on {len(read):,} plans ({int(read.mask().sum()):,} actions)")
     columns(table, ("prior", "sees", "bits", "95 % interval", "more", "95 % interval"), 2)
+    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
     for row in rows:
         more = ("", "")
         if row is not rows[0] and row["more_than_first"] is not None:

@@ -66,11 +66,21 @@ class Source:
         again = torch.nn.functional.one_hot(actions[:, t - self.lag], self.num_actions)
         return REPEAT * again + (1 - REPEAT) * even
 
+    @property
+    def contexts(self) -> int | None:
+        """The number of contexts that a prior for this source sees."""
+        return None if self.context is None else len(self.table)
+
+    def context_at(self, plans: Plans, t: int) -> Tensor | int:
+        """The context of `plans` at action t."""
+        if plans.context is None:
+            return 0
+        return plans.context[:, t] if self.context == "step" else plans.context
+
     def make(self, kind: type[Prior]) -> Prior:
-        contexts = None if self.context is None else len(self.table)
         if kind is MarkovPrior:
-            return MarkovPrior(self.num_actions, self.order, num_contexts=contexts)
-        return kind(self.num_actions, num_contexts=contexts)
+            return MarkovPrior(self.num_actions, self.order, num_contexts=self.contexts)
+        return kind(self.num_actions, num_contexts=self.contexts)
 
 
 def sources(generator: torch.Generator) -> list[Source]:

@@ -50,7 +50,7 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
     )
     write_csv(folder / "metrics.csv", rows)
     if model.curve:
-        learning_curve(folder / "learning_curve.png", name, model.curve, best.model, best.bits_per_action().mean)
+        learning_curve(folder / "learning_curve.png", name, model.curve, best.model, chosen[0])
     console.print(
         f"saved in {folder}; neuroprior.load({str(folder)!r}) gives the prior back", highlight=False, soft_wrap=True
     )
