@@ -1,12 +1,14 @@
 """`python -m eval plans`: saved priors scored on a file of plans."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from eval.tables import columns, titled
-from neuroprior import load
+from neuroprior import Prior, load
 from neuroprior.comparison import Score, score, unit_name
 from neuroprior.output import versions, write_csv, write_json
 from neuroprior.plans import Plans, read_plans
@@ -30,10 +32,10 @@ def plans(
     """
     if not priors:
         raise ValueError("priors: at least one model folder is expected")
-    first = load(priors[0])
-    known = first.num_actions - (first.end is not None)
-    read = read_plans(file, num_actions=num_actions or (None if action_names else known), action_names=action_names)
-    scores = [_score(folder, read) for folder in priors]
+    loaded = {folder: load(folder) for folder in priors}
+    names = action_names or _names(next(iter(loaded.values())))
+    read = _read(file, num_actions, names)
+    scores = [_score(folder, prior, read) for folder, prior in loaded.items()]
     rows = [_row(one, scores[0]) for one in scores]
     Console().print(_table(rows, read))
     folder = Path(out)
@@ -42,12 +44,40 @@ def plans(
     write_json(folder / "results.json", {"rows": rows, "unit": unit_name(read), "versions": versions()})
 
 
-def _score(folder: str, read: Plans) -> Score:
-    prior = load(folder)
+def _names(prior: Prior) -> list[str] | None:
+    """The names of the actions that a prior has learned, without that of its end symbol."""
+    return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
+
+
+def _read(file: str, num_actions: int | None, names: list[str] | None) -> Plans:
+    read = read_plans(file, num_actions=num_actions, action_names=names)
+    return read if read.end is None else read.without_end()
+
+
+def _score(folder: str, prior: Prior, read: Plans) -> Score:
+    known = prior.num_actions - (prior.end is not None)
+    if read.num_actions > known:
+        raise ValueError(f"{folder}: knows {known} actions, the file has {read.num_actions}")
+    if prior.action_names is not None and read.action_names is not None and _names(prior) != list(read.action_names):
+        raise ValueError(f"{folder}: knows other actions than {', '.join(read.action_names)}")
+    seen = _with_contexts_of(prior, replace(read, num_actions=known, action_names=None), folder)
     try:
-        return score(folder, prior, read if prior.end is None else read.with_end())
+        return score(folder, prior, seen if prior.end is None else seen.with_end())
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
+
+
+def _with_contexts_of(prior: Prior, read: Plans, folder: str) -> Plans:
+    """The plans with their contexts numbered as the prior has learned them, by name."""
+    if prior.context_names is None or read.context_names is None or read.context is None:
+        return read
+    unknown = [name for name in read.context_names if name not in prior.context_names]
+    if unknown:
+        raise ValueError(
+            f"{folder}: has not seen the context {unknown[0]!r}; it knows {', '.join(prior.context_names)}"
+        )
+    number = torch.tensor([prior.context_names.index(name) for name in read.context_names])
+    return replace(read, context=number[read.context], context_names=None)
 
 
 def _row(one: Score, first: Score) -> dict[str, Any]:

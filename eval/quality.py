@@ -43,19 +43,20 @@ class Source:
         return self.table.shape[-1]
 
     def draw(self, num_plans: int, generator: torch.Generator) -> tuple[Plans, Tensor]:
-        """Plans, and the log-probability `[N]` (nats) of each under the source."""
+        """Plans, and the log-probability `[N, L]` (nats) of each action under the source."""
         actions = torch.zeros(num_plans, LENGTH, dtype=torch.long)
         size = (num_plans, LENGTH if self.context == "step" else 1)
         context = torch.randint(len(self.table), size, generator=generator).expand(num_plans, LENGTH)
-        history, total = torch.zeros(num_plans, dtype=torch.long), torch.zeros(num_plans, dtype=torch.double)
+        history = torch.zeros(num_plans, dtype=torch.long)
+        taken = torch.zeros(num_plans, LENGTH, dtype=torch.double)
         for t in range(LENGTH):
             probs = self._probs(actions, context[:, t], history, t)
             action = torch.multinomial(probs, 1, generator=generator)
-            total += probs.gather(1, action)[:, 0].log()
+            taken[:, t] = probs.gather(1, action)[:, 0].log()
             actions[:, t] = action[:, 0]
             history = (history * self.num_actions + action[:, 0]) % self.num_actions**self.order
         seen = None if self.context is None else context if self.context == "step" else context[:, 0]
-        return Plans(actions, self.num_actions, context=seen), total
+        return Plans(actions, self.num_actions, context=seen), taken
 
     def _probs(self, actions: Tensor, context: Tensor, history: Tensor, t: int) -> Tensor:
         even = torch.full((len(actions), self.num_actions), 1 / self.num_actions, dtype=torch.double)
@@ -136,9 +137,11 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
     prior.fit(training, **how)
     seconds = time.perf_counter() - began
     with torch.no_grad():
-        taken = prior.log_prob(test.actions, test.context).double()
-    actions, rate = test.actions.numel(), -float(true.sum()) / test.actions.numel() / log(2)
-    excess = float((true - taken).sum()) / actions / log(2)
+        taken = prior.action_log_probs(test).double()
+    # The first actions are drawn evenly; the entropy rate is that of those which depend on what was before.
+    first = max(source.order, source.lag)
+    true, taken = true[:, first:], taken[:, first:]
+    rate, excess = -float(true.mean()) / log(2), float((true - taken).mean()) / log(2)
     free = source.table.numel() // source.num_actions * (source.num_actions - 1)
     return {
         "source": source.name,
@@ -147,7 +150,7 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
         "bits_per_action": rate + excess,
         "excess_percent": 100 * excess / rate,
         # What maximum likelihood of so many free probabilities costs on new plans, for many plans.
-        "expected_percent": 100 * free / (2 * log(2) * training.actions.numel()) / rate
+        "expected_percent": 100 * free / (2 * log(2) * len(training) * (LENGTH - first)) / rate
         if kind is MarkovPrior and not source.lag
         else None,
         "seconds": seconds,
@@ -175,7 +178,7 @@ def _table(rows: list[dict[str, object]], num_plans: int, held_out: int):
             f"{transformer['seconds']:.0f}",
         )
     table.caption = (
-        "entropy: bits per action of the source on the held-out plans. markov: of the source's order; expected: free"
+        "entropy: bits per action of the source, where it depends on the past. markov: of the source's order; expected: free"
         " probabilities / (2 ln 2 x actions), the cost of estimating them. s: seconds of training."
     )
     return table

@@ -1,6 +1,6 @@
 """Priors compared on held-out plans: bits per action with intervals, and the count-based rivals a prior must meet."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import log
 
@@ -9,7 +9,8 @@ from torch import Tensor
 
 from neuroprior.plans import Plans
 from neuroprior.priors import ContextTreePrior, MarkovPrior, Prior, UniformPrior
-from neuroprior.priors.backoff import BACKOFFS
+from neuroprior.priors.backoff import Backoff
+from neuroprior.priors.histories import TooLargeError
 from neuroprior.statistics import Difference, ratio_difference
 
 ORDERS = range(7)
@@ -20,6 +21,16 @@ DEPTH = 10
 
 FEWEST_UNITS = 2
 """Independent units without which there is no interval; below, a finer unit is taken."""
+
+BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
+    ("kneser-ney", 1),
+    ("kneser-ney", 0.5),
+    ("witten-bell", 1),
+    ("witten-bell", 4),
+    ("dirichlet", 1),
+    ("dirichlet", 8),
+]
+"""Back-offs and their smoothing of which each Markov order takes the best."""
 
 BLOCKS = 40
 """Parts into which a single held-out plan is cut, for an interval."""
@@ -46,7 +57,13 @@ class Score:
         return ratio_difference(self.bits, self.actions)
 
     def minus(self, other: "Score") -> Difference:
-        """Bits per action more than `other` took for the same plans, paired by unit."""
+        """Bits per action more than `other` took for the same plans, paired by unit.
+
+        Raises:
+            ValueError: the other was scored on other plans.
+        """
+        if not self.actions.equal(other.actions):
+            raise ValueError(f"{self.model} and {other.model}: not scored on the same plans")
         return ratio_difference(self.bits - other.bits, self.actions)
 
 
@@ -68,7 +85,7 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
     with torch.no_grad():
         bits = -prior.action_log_probs(seen).double().cpu() / log(2)
     mask = plans.mask().cpu()
-    unit = _units(plans, mask)[mask]
+    unit = _units(plans, mask)[mask].unique(return_inverse=True)[1]
     size = int(unit.max()) + 1 if len(unit) else 0
     if size < FEWEST_UNITS:
         raise ValueError(f"plans: at least two held-out actions are needed for a comparison, not {int(mask.sum())}")
@@ -78,10 +95,13 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
 
 
 def unit_name(plans: Plans) -> str:
-    """What the intervals of `score` go over: "groups", "plans" or "parts of the plan"."""
-    if plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS:
+    """What the intervals of `score` go over: "groups", "plans", "plans of one group" or "parts of the plan"."""
+    taken = plans.mask().any(1)
+    if plans.group is not None and len(plans.group[taken].unique()) >= FEWEST_UNITS:
         return "groups"
-    return "plans" if int(plans.mask().any(1).sum()) >= FEWEST_UNITS else "parts of the plan"
+    if plans.group is not None and int(taken.sum()) >= FEWEST_UNITS:
+        return "plans of one group"
+    return "plans" if int(taken.sum()) >= FEWEST_UNITS else "parts of the plan"
 
 
 @dataclass(frozen=True)
@@ -90,65 +110,73 @@ class Rival:
 
     Attributes:
         model: its name, such as "markov-3".
-        how: the back-off or the depth.
-        prior: fitted.
-        validation_bits: bits per action on the validation plans.
+        how: the settings that tell the validation plans best, of those in `BACKOFFS_TRIED`.
+        prior: fitted; None where its tables would be too large.
+        validation_bits: bits per action on the validation plans; infinite without a prior.
     """
 
     model: str
     how: str
-    prior: Prior
+    prior: Prior | None
     validation_bits: float
 
 
-def rivals(training: Plans, validation: Plans, tell: Callable[[str], object] = str) -> Iterator[Rival]:
+def rivals(
+    training: Plans,
+    validation: Plans,
+    num_contexts: int | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Iterator[Rival]:
     """The uniform prior and the count-based ones: Markov chains of every order in `ORDERS`, and a context tree.
 
-    Each Markov order comes with the back-off, and where the plans have a context index with or without it, that tells
-    the validation plans best; so does the context tree. Features cannot be counted and are left aside.
+    Each Markov order comes with the back-off and smoothing, and where the plans have a context index with or without
+    it, that tell the validation plans best; so does the context tree. Features cannot be counted and are left aside.
 
     Args:
         training: what they learn from.
         validation: what they are chosen on.
+        num_contexts: number of context indices, where they may see one.
         tell: called with the name of what is fitted next.
 
     Yields:
         One rival after the other, each fitted when it is asked for.
     """
-    actions = training.num_actions
-    yield _best("uniform", {"": UniformPrior(actions)}, training, validation)
-    seen: list[int | None] = [None]
-    if training.context is not None and not training.context.is_floating_point():
-        largest = max(int(plans.context.max()) for plans in (training, validation) if plans.context is not None)
-        seen.append(max(largest + 1, len(training.context_names or ())))
+    seen: list[int | None] = [None] if num_contexts is None else [None, num_contexts]
+    yield _best("uniform", iter([("", UniformPrior(training.num_actions).fit(training))]), validation)
     for order in ORDERS:
-        tell(f"markov-{order}")
-        made = {
-            backoff + ("" if contexts is None else " "): MarkovPrior(
-                actions, order, backoff=backoff, num_contexts=contexts
-            )
-            for contexts in seen
-            for backoff in BACKOFFS
-        }
-        yield _best(f"markov-{order}", made, training, validation)
-    tell("context tree")
-    trees = {
-        f"depth {DEPTH}" + ("" if contexts is None else " "): ContextTreePrior(actions, DEPTH, num_contexts=contexts)
-        for contexts in seen
-    }
-    yield _best("context tree", trees, training, validation)
+        if tell is not None:
+            tell(f"markov-{order}")
+        yield _best(f"markov-{order}", _chains(training, order, seen), validation)
+    if tell is not None:
+        tell("context tree")
+    trees = (ContextTreePrior(training.num_actions, DEPTH, num_contexts=contexts) for contexts in seen)
+    yield _best("context tree", ((f"depth {DEPTH}", tree.fit(training)) for tree in trees), validation)
 
 
-def _best(model: str, made: Mapping[str, Prior], training: Plans, validation: Plans) -> Rival:
-    """The rival that tells `validation` best, of those that learn from `training`."""
-    best = None
-    for how, unfitted in made.items():
-        prior = unfitted.fit(training)
-        taken = score(model, prior, validation)
-        bits = float(taken.bits.sum() / taken.actions.sum())
-        if best is None or bits < best.validation_bits:
-            best = Rival(model, how.strip(), prior, bits)
-    assert best is not None
+def _chains(training: Plans, order: int, seen: list[int | None]) -> Iterator[tuple[str, Prior]]:
+    """Markov chains of an order with every back-off; what they count is counted once."""
+    for contexts in seen:
+        counted = None
+        for backoff, smoothing in BACKOFFS_TRIED:
+            prior = MarkovPrior(training.num_actions, order, smoothing, num_contexts=contexts, backoff=backoff)
+            counted = prior.count(training) if counted is None else counted
+            prior.training_plans(training)
+            prior.learn(*counted)
+            yield f"{backoff} {smoothing:g}", prior
+
+
+def _best(model: str, made: Iterator[tuple[str, Prior]], validation: Plans) -> Rival:
+    """The rival that tells `validation` best; at most two are held at a time."""
+    best = Rival(model, "too large", None, float("inf"))
+    try:
+        for how, prior in made:
+            taken = score(model, prior, validation)
+            bits = float(taken.bits.sum() / taken.actions.sum())
+            if bits < best.validation_bits:
+                best = Rival(model, how, prior, bits)
+    except TooLargeError:
+        # Those that see a context come last and are the largest: what was found before them stands.
+        pass
     return best
 
 
@@ -159,7 +187,7 @@ def _units(plans: Plans, mask: Tensor) -> Tensor:
         assert plans.group is not None
         unit: Tensor = plans.group.cpu().unique(return_inverse=True)[1]
         return unit[:, None].expand(mask.shape)
-    if what == "plans":
+    if what.startswith("plans"):
         taken = mask.any(1)
         return (taken.cumsum(0) - 1).clamp(min=0)[:, None].expand(mask.shape)
     place = mask.flatten().cumsum(0).view(mask.shape) - 1

@@ -59,6 +59,8 @@ def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
         os.replace(partial, path)
     except OSError as error:
         # A full disk does not tell which file it was.
+        if error.errno is None:
+            raise
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):

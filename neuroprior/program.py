@@ -1,6 +1,8 @@
 """What the programs share: bad input is one line and exit code 2, Ctrl-C one line and 130."""
 
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 
 
@@ -18,8 +20,11 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
     try:
         run([_with_underscores(argument) for argument in given])
     except KeyboardInterrupt as interrupted:
+        # An impatient second Ctrl-C should not spoil the message.
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         return _fail(str(interrupted) or "interrupted; what was not yet written is lost", 130)
-    except (ValueError, OSError, MemoryError, OverflowError) as error:
+    except (ValueError, OSError, MemoryError, OverflowError, ImportError) as error:
         return _fail(f"error: {error}", 2)
     except RuntimeError as error:
         # torch has no exception of its own for memory that it could not get.

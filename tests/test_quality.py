@@ -21,18 +21,18 @@ def test_plans_have_the_probabilities_that_the_source_says(source):
     """Actions that are drawn with probability p, of each of 20 bands of p, come as often as p says."""
     plans, log_prob = source.draw(4000, seeded(1))
     assert plans.actions.shape == (4000, LENGTH)
-    total = torch.zeros(4000, dtype=torch.double)
+    total = torch.zeros(4000, LENGTH, dtype=torch.double)
     history = torch.zeros(4000, dtype=torch.long)
     actions = plans.actions.long()
     for t in range(LENGTH):
         if t < max(source.order, source.lag):
-            total -= math.log(source.num_actions)
+            total[:, t] = -math.log(source.num_actions)
         elif source.lag:
             even = (1 - REPEAT) / source.num_actions
-            total += torch.where(actions[:, t] == actions[:, t - LAG], REPEAT + even, even).log()
+            total[:, t] = torch.where(actions[:, t] == actions[:, t - LAG], REPEAT + even, even).log()
         else:
             probs = source.table[source.context_at(plans, t), history]
-            total += probs.gather(1, actions[:, t, None])[:, 0].log()
+            total[:, t] = probs.gather(1, actions[:, t, None])[:, 0].log()
             if t == LENGTH - 1:
                 likeliest = probs.argmax(1)
                 hits, p = (actions[:, t] == likeliest).double(), probs.amax(1)

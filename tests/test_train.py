@@ -29,12 +29,12 @@ QUICK = [
     "400",
     "--data.world.num_worlds",
     "40",
-    "--data.steps_per_epoch",
+    "--data.check_every",
     "10",
     "--data.batch_size",
     "64",
 ]
-QUICK += ["--trainer.max_epochs", "3", "--trainer.accelerator", "cpu"]
+QUICK += ["--trainer.max_steps", "30", "--trainer.accelerator", "cpu"]
 
 
 def recipe(name: str) -> list[str]:
@@ -145,16 +145,8 @@ def test_two_processes_learn_what_one_does(tmp_path):
         assert one["validation_bits"] == pytest.approx(other["validation_bits"], abs=1e-4)
 
 
-LONG = [
-    "--data.steps_per_epoch",
-    "5",
-    "--trainer.max_epochs",
-    "40",
-    "--trainer.patience",
-    "40",
-    "--model.prior.dropout",
-    "0.1",
-]
+LONG = ["--data.check_every", "5", "--trainer.max_steps", "200", "--trainer.patience", "40"]
+LONG += ["--model.prior.dropout", "0.1"]
 
 
 def test_killed_and_resumed_gives_the_same_prior_bit_for_bit(tmp_path):
@@ -206,7 +198,7 @@ def test_ctrl_c_says_how_to_resume(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["fit"], "prior"),
+        (["fit"], "--config"),
         ([*recipe("gru"), "--data.file", "missing.npz"], "missing.npz"),
         ([*recipe("gru"), "--model.prior.hidden_size", "0"], "hidden_size"),
         ([*recipe("gru"), "--model.prior", "NoPrior"], "NoPrior"),
@@ -279,7 +271,7 @@ def test_a_long_sequence_trains_in_windows(tmp_path):
     actions = torch.arange(6000) // 3 % 4
     write_plans(Plans(actions[None], 4), tmp_path / "plans.npz")
     arguments = ["--data.file", str(tmp_path / "plans.npz"), "--data.window", "16", "--out", str(tmp_path / "run")]
-    assert main([*recipe("gru"), *SMALL["gru"], *QUICK, *arguments, "--trainer.max_epochs", "12"]) == 0
+    assert main([*recipe("gru"), *SMALL["gru"], *QUICK, *arguments, "--trainer.max_steps", "120"]) == 0
     report = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert report["unit"] == "parts of the plan"
     assert report["rows"][-1]["bits_per_action"] < 0.5

@@ -26,7 +26,7 @@ def test_frequent_plans_keep_their_probability(length: int) -> None:
 @pytest.mark.parametrize(("length", "merged"), [(5, True), (6, False)])
 def test_equal_plans_are_merged_where_few_are_distinct(length: int, merged: bool) -> None:
     plans = Plans(torch.randint(4, (9000, length), generator=generator()), 4)
-    rows = PlansModule(plans, plans[:10], batch_size=256, window=128, steps=1 if merged else 36, seed=0)
+    rows = PlansModule(plans, plans[:10], Settings(batch_size=256, max_steps=1 if merged else 36), seed=0)
     assert (rows.training.weight is not None) == merged
     assert (4**length <= MOST_DISTINCT) == merged
     batches = list(rows.train_dataloader())
@@ -36,7 +36,7 @@ def test_equal_plans_are_merged_where_few_are_distinct(length: int, merged: bool
 
 def test_plans_of_other_lengths_are_not_merged() -> None:
     plans = Plans(torch.zeros(100, 3, dtype=torch.long), 2, torch.arange(100) % 3 + 1)
-    rows = PlansModule(plans, plans[:4], batch_size=256, window=128, steps=1, seed=0)
+    rows = PlansModule(plans, plans[:4], Settings(max_steps=1), seed=0)
     (batch,) = rows.train_dataloader()
     assert sorted(batch.weight.sum(1).tolist()) == [1 * 34, 2 * 33, 3 * 33]
 

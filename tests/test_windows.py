@@ -1,10 +1,12 @@
 """Training in windows: what each batch holds, memory carried over, and priors that read on as they were trained."""
 
+import math
+
 import pytest
 import torch
 
 from neuroprior import GRUPrior, Plans, TransformerPrior
-from neuroprior.training import PlansModule, bits
+from neuroprior.training import PlansModule, Settings, bits
 from neuroprior.training.batches import MOST_VALIDATION, Walk, Windows
 from tests.sources import refuses, seeded
 
@@ -20,10 +22,9 @@ def long_plans(num_plans: int = 5, length: int = 37) -> Plans:
 @pytest.mark.parametrize(("window", "batch_size"), [(4, 3), (4, 100), (7, 1), (37, 2), (50, 9)])
 def test_a_pass_reads_every_action_once_and_in_order(window, batch_size):
     plans = long_plans()
-    data = PlansModule(plans, plans, batch_size, window, steps=1, seed=3)
-    windows = data.training
+    windows = PlansModule(plans, plans, Settings(batch_size=batch_size, window=window), seed=3).training
     seen = []
-    for index in Walk(windows, windows.groups * windows.windows, 3, (0, 1)):
+    for index in Walk(windows, windows.steps, 3, (0, 1)):
         batch = windows[index]
         for row in range(len(batch.actions)):
             taken = batch.weight[row] > 0
@@ -54,10 +55,12 @@ def test_processes_share_each_batch(parts):
     windows = Windows(long_plans(7), 4, 3)
     whole = list(Walk(windows, 12, 0, (0, 1)))
     shares = [list(Walk(windows, 12, 0, (n, parts))) for n in range(parts)]
-    for step, (pieces, number, goes_on) in enumerate(whole):
+    for step, (pieces, number, goes_on, _) in enumerate(whole):
         mine = [share[step] for share in shares]
-        assert all(one[1:] == (number, goes_on) and len(one[0]) for one in mine)
-        assert set(torch.cat([one[0] for one in mine]).tolist()) == set(pieces.tolist())
+        assert all((one.number, one.goes_on) == (number, goes_on) for one in mine)
+        assert sorted(torch.cat([one.pieces for one in mine if one.counts]).tolist()) == sorted(pieces.tolist())
+        assert all(float(windows[one].weight.sum()) == 0 for one in mine if not one.counts)
+        assert all(len(one.pieces) for one in mine), "a process without anything to read would keep the others waiting"
 
 
 def test_an_epoch_depends_on_its_number_and_the_seed_alone():
@@ -66,7 +69,7 @@ def test_an_epoch_depends_on_its_number_and_the_seed_alone():
     def epoch(number: int, seed: int = 0):
         walk = Walk(windows, 10, seed, (0, 1))
         walk.set_epoch(number)
-        return [(pieces.tolist(), number, goes_on) for pieces, number, goes_on in walk]
+        return [(step.pieces.tolist(), step.number, step.goes_on) for step in walk]
 
     assert epoch(3) == epoch(3) != epoch(4)
     assert epoch(3) != epoch(3, seed=1)
@@ -77,15 +80,14 @@ def test_an_epoch_depends_on_its_number_and_the_seed_alone():
 def test_windows_with_memory_cost_what_the_whole_costs(prior):
     prior.carry_over(40)
     plans = long_plans()
-    windows = Windows(Plans(plans.actions, 3, lengths=plans.lengths), 5, 100)
-    # as long a piece as the longest plan, so that memory goes all the way
-    windows = Windows(Plans(plans.actions, 3), 5, 5)
+    lengths = torch.tensor([37, 33, 29, 36, 30])
+    windows = Windows(Plans(plans.actions, 3, lengths=lengths), 5, 100, least_windows=8)
+    assert windows.windows == 8, "pieces as long as the longest plan, so that memory goes all the way"
     total, memory = 0.0, None
     for index in Walk(windows, None, None, (0, 1)):
         cost, _, memory = bits(prior, windows[index], memory)
         total += float(cost.detach())
-    whole = -float(prior.log_prob(plans.actions).sum().detach()) / float(torch.log(torch.tensor(2.0)))
-    assert windows.windows == 8
+    whole = -float(prior.log_prob(plans.actions, lengths=lengths).sum().detach()) / math.log(2)
     assert total == pytest.approx(whole, rel=1e-5)
 
 
@@ -124,5 +126,29 @@ def test_a_window_of_its_own_does_not_go_with_long_plans():
 
 
 def test_validation_looks_at_no_more_than_it_must():
-    plans = Plans(torch.zeros(3, MOST_VALIDATION // 2 + 1, dtype=torch.long), 2)
-    assert len(PlansModule(plans, plans, 8, 64, 1, 0).validation.plans) == 1
+    actions = torch.randint(2, (3, MOST_VALIDATION), generator=seeded(0))
+    data = PlansModule(Plans(actions[:, :9], 2), Plans(actions, 2), Settings(), 0)
+    assert len(data.validation.plans) == 1
+    # one long plan does not crowd out the short ones, and those without actions are left aside
+    lengths = torch.cat([torch.tensor([50_000]), torch.full((2000,), 10), torch.zeros(50, dtype=torch.long)])
+    many = Plans(torch.randint(2, (2051, 50_000), generator=seeded(1), dtype=torch.uint8), 2, lengths=lengths)
+    assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 2001
+
+
+@pytest.mark.parametrize(("num_plans", "length"), [(1, 10_000), (20, 1000), (100, 1000), (1, 100_000)])
+def test_memory_is_carried_by_default(num_plans, length):
+    plans = Plans(torch.randint(3, (num_plans, length), generator=seeded(0)), 3)
+    data = PlansModule(plans, plans, Settings(), 0)
+    for windows in (data.training, data.validation):
+        longest = -(-length // 128)
+        assert windows.windows >= min(8, longest)
+        share = sum(step.goes_on for step in Walk(windows, None, None, (0, 1))) / windows.steps
+        assert share >= 0.8
+
+
+def test_few_plans_are_looked_at_often():
+    plans = Plans(torch.randint(3, (200, 20), generator=seeded(0)), 3)
+    data = PlansModule(plans, plans, Settings(), 0)
+    assert (data.steps, data.epochs) == (10, 100)
+    data = PlansModule(plans, plans, Settings(check_every=40, max_steps=100), 0)
+    assert (data.steps, data.epochs) == (34, 3)

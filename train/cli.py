@@ -5,6 +5,8 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
+import torch
+import yaml
 from jsonargparse import ArgumentError
 from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
@@ -23,7 +25,8 @@ from train.report import report
 
 USAGE = """python -m train fit --config train/gru.yaml [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        python -m train fit --resume FOLDER"""
-CONFIG, PLANS, LAST = "run.yaml", "plans.npz", "checkpoints/last.ckpt"
+CONFIG, PLANS = "run.yaml", "plans.npz"
+LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 
 
 def run(arguments: list[str]) -> None:
@@ -45,7 +48,7 @@ def run(arguments: list[str]) -> None:
 
 def make_trainer(
     folder: str = "",
-    max_epochs: int = 20,
+    max_steps: int = 1000,
     patience: int = 4,
     accelerator: str = "auto",
     devices: int | str | list[int] = 1,
@@ -62,8 +65,8 @@ def make_trainer(
 
     Args:
         folder: of the run.
-        max_epochs: an epoch is `data.steps_per_epoch` steps; the validation plans are looked at after each.
-        patience: epochs without better validation bits after which training stops.
+        max_steps: gradient steps at most, about; the learning rate falls to 0 over them.
+        patience: looks without better validation bits after which training stops.
         accelerator: "cpu", "gpu", or "auto".
         devices: number of devices, or their numbers.
         num_nodes: machines.
@@ -75,10 +78,14 @@ def make_trainer(
         enable_progress_bar: show it.
         callbacks: further callbacks of Lightning's.
     """
+    for name, number in (("patience", patience), ("accumulate_grad_batches", accumulate_grad_batches)):
+        if number < 1:
+            raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
+    del max_steps
     own: list[Callback] = checkpoints_and_stopping(Path(folder) / "checkpoints", patience)
     bar: list[Callback] = [RichProgressBar()] if enable_progress_bar and sys.stdout.isatty() else []
     return Trainer(
-        max_epochs=max_epochs,
+        max_epochs=-1,  # set when the data, which divide max_steps into epochs, are there
         accelerator=accelerator,
         devices=devices,
         num_nodes=num_nodes,
@@ -128,32 +135,45 @@ class TrainCLI(LightningCLI):
     def subcommands() -> dict[str, set[str]]:
         return {"fit": {"model", "train_dataloaders", "val_dataloaders", "datamodule", "ckpt_path", "weights_only"}}
 
+    def add_default_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_argument("--seed_everything", type=int, default=0, help="Seed of all that is drawn at random.")
+
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         parser.add_argument("--out", type=str, default="runs/prior", help="Folder of the run; made, must be new.")
-        parser.add_argument("--resume", type=str | None, default=None, help="Folder of a run to go on with.")
-        parser.link_arguments("seed_everything", "data.seed", compute_fn=int)
+        parser.add_argument(
+            "--resume",
+            type=str | None,
+            default=None,
+            help="Folder of a run to go on with; only --trainer options may change.",
+        )
+        parser.link_arguments("seed_everything", "data.seed")
         parser.link_arguments(("out", "resume"), "trainer.folder", compute_fn=lambda out, resume: resume or out)
+        parser.link_arguments("trainer.max_steps", "data.max_steps")
         parser.link_arguments("data", "model.data", apply_on="instantiate")
 
     def before_instantiate_classes(self) -> None:
         fit = self.config.fit
+        if not (fit.resume or fit.out):
+            raise ValueError("out: the name of a folder is expected")
         self.folder = Path(fit.resume or fit.out)
         if rank_zero_only.rank != 0:
             return
         if fit.resume is None:
-            if (self.folder / CONFIG).exists() or (self.folder / "model.safetensors").exists():
+            if any((self.folder / name).exists() for name in (CONFIG, "model.safetensors")):
                 raise ValueError(
                     f"{self.folder}: holds a run already; --resume {self.folder} goes on with it, or give another --out"
                 )
             self.folder.mkdir(parents=True, exist_ok=True)
-            text = self._parser("fit").dump(fit)
-            write_whole(self.folder / CONFIG, text.encode())
+
+    def instantiate_trainer(self, **more: Any) -> Trainer:
+        trainer = super().instantiate_trainer(**more)
+        trainer.fit_loop.max_epochs = self.datamodule.epochs
+        return trainer
 
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
-        if self.trainer.is_global_zero and self.config.fit.resume is None:
-            # The run's own copy: to resume it nothing else is needed.
-            write_plans(datamodule.source, self.folder / PLANS)
+        if self.trainer.is_global_zero:
+            self._keep(datamodule)
         if model.is_neural:
             self._train(model, datamodule)
         else:
@@ -161,45 +181,78 @@ class TrainCLI(LightningCLI):
         if self.trainer.is_global_zero:
             report(self.folder, model, datamodule)
 
+    def _keep(self, data: PlansData) -> None:
+        """Keep what the run needs to be resumed, and nothing else is needed then: its configuration and its plans."""
+        if not (self.folder / PLANS).exists():
+            write_plans(data.source, self.folder / PLANS)
+        config = yaml.safe_load(self._parser("fit").dump(self.config.fit))
+        if (self.folder / CONFIG).exists():
+            # What is resumed with other trainer options goes on with them when it is resumed again.
+            config = yaml.safe_load((self.folder / CONFIG).read_text()) | {"trainer": config["trainer"]}
+        write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
+
     def _train(self, model: PriorModel, data: PlansData) -> None:
         model.prior.prepare(data.learned_from, data.window)
         last = self.folder / LAST
+        if last.exists():
+            for checkpoint in (last, self.folder / BEST):
+                _check(checkpoint, model)
         try:
             with few_threads(model.prior, data):
                 self.trainer.fit(model, datamodule=data, ckpt_path=last if last.exists() else None, weights_only=True)
         except SystemExit as interrupted:
             # Lightning turns Ctrl-C into this.
-            saved = (
-                f"saved up to step {model.curve[-1]['step']}"
-                if last.exists() and model.curve
-                else "nothing to save yet"
-            )
+            if not self.trainer.interrupted or not self.trainer.is_global_zero:
+                raise
+            saved = f"saved up to step {model.curve[-1]['step']}" if model.curve else "nothing to save yet"
             raise KeyboardInterrupt(
                 f"interrupted; {saved}; go on with: python -m train fit --resume {self.folder}"
             ) from interrupted
-        except (UnpicklingError, EOFError, KeyError) as error:
-            raise ValueError(
-                f"{last}: damaged, or not a checkpoint of this program; remove it to start over"
-            ) from error
         if self.trainer.is_global_zero:
             take_best(self.trainer, model)
 
 
+def _check(checkpoint: Path, model: PriorModel) -> None:
+    """Raise ValueError unless a checkpoint is whole and of this model; nothing in it is executed."""
+    try:
+        saved = torch.load(checkpoint, weights_only=True, map_location="cpu")
+        shapes = {name: value.shape for name, value in saved["state_dict"].items()}
+    except (UnpicklingError, EOFError, KeyError, AttributeError, TypeError, RuntimeError, OSError) as error:
+        raise ValueError(
+            f"{checkpoint}: missing, damaged, or no checkpoint of this program; without the folder"
+            f" {checkpoint.parent} the run starts over"
+        ) from error
+    if shapes != {name: value.shape for name, value in model.state_dict().items()}:
+        raise ValueError(f"{checkpoint}: of another model; resume without changing the model")
+
+
 def _with_saved_config(arguments: list[str]) -> list[str]:
     """The arguments, and before them those that a run to be resumed was started with."""
-    folder = None
-    for number, argument in enumerate(arguments):
-        if argument.startswith("--resume="):
-            folder = argument.partition("=")[2]
-        elif argument == "--resume":
-            folder = arguments[number + 1] if number + 1 < len(arguments) else None
-    if folder is None or "fit" not in arguments:
+    folder, others = _resumed(arguments)
+    if folder is None:
+        sources = ("--config", "-c", "--model", "--help", "-h", "--print_config")
+        if arguments[:1] == ["fit"] and not any(argument.startswith(sources) for argument in arguments):
+            raise ValueError("fit: give --config train/gru.yaml, or another recipe, or --resume and a run's folder")
         return arguments
     place = Path(folder)
     if not (place / CONFIG).exists():
         raise ValueError(f"{place}: no run to resume ({CONFIG} is missing)")
-    at = arguments.index("fit") + 1
-    saved = ["--config", str(place / CONFIG)]
+    for other in others:
+        if other.startswith("--") and not other.startswith("--trainer."):
+            raise ValueError(f"{other}: a resumed run keeps its data and model; only --trainer options may change")
+    saved = ["--config", str(place / CONFIG), "--resume", str(place)]
     if (place / PLANS).exists():
         saved += ["--data.file", str(place / PLANS)]
-    return [*arguments[:at], *saved, *arguments[at:]]
+    return ["fit", *saved, *others]
+
+
+def _resumed(arguments: list[str]) -> tuple[str | None, list[str]]:
+    """The folder after `--resume`, or None, and the other arguments of `fit`."""
+    for number, argument in enumerate(arguments):
+        name, equals, value = argument.partition("=")
+        if name == "--resume" and "fit" in arguments[:number]:
+            rest = arguments[number + 1 :]
+            if not equals:
+                value, rest = (rest[0] if rest else ""), rest[1:]
+            return value, [*arguments[:number], *rest][arguments.index("fit") + 1 :]
+    return None, arguments

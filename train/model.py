@@ -31,10 +31,10 @@ class PriorModel(PriorModule):
         assert data is not None
         plans, contexts = data.plans, {}
         if see_context and plans.context is not None:
-            if plans.context.is_floating_point():
+            if data.num_contexts is None:
                 contexts["context_size"] = plans.context.shape[-1]
             else:
-                contexts["num_contexts"] = max(int(plans.context.max()) + 1, len(plans.context_names or ()))
+                contexts["num_contexts"] = data.num_contexts
         try:
             made = prior(plans.num_actions, **contexts)
         except TypeError as error:

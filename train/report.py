@@ -23,9 +23,15 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
     trained = score(name, prior, data.held_out)
     rows, chosen = [], None
     with console.status("fitting count-based priors") as status:
-        for rival in rivals(data.learned_from, data.chosen_on, lambda what: status.update(f"fitting {what}")):
+        contexts = data.num_contexts if prior.takes_context else None
+        tell = lambda what: status.update(f"fitting {what}")  # noqa: E731
+        for rival in rivals(data.learned_from, data.chosen_on, contexts, tell):
+            more = {"how": rival.how, "validation_bits": rival.validation_bits}
+            if rival.prior is None:
+                rows.append(dict.fromkeys(_row(trained, trained), None) | {"model": rival.model} | more)
+                continue
             one = score(rival.model, rival.prior, data.held_out)
-            rows.append(_row(one, trained) | {"how": rival.how, "validation_bits": rival.validation_bits})
+            rows.append(_row(one, trained) | more)
             if chosen is None or rival.validation_bits < chosen[0]:
                 chosen = rival.validation_bits, one
     assert chosen is not None
@@ -86,6 +92,9 @@ def _table(rows: list[dict[str, Any]], chosen: str, data: PlansData) -> Table:
     for row in rows:
         if row is rows[-1]:
             table.add_section()
+        if row["bits_per_action"] is None:
+            table.add_row(row["model"], row["how"])
+            continue
         more = "" if row is rows[-1] else _plus_minus(row, "more_than_trained", "more_high", "+.4f")
         how = ", ".join(part for part in (row["how"], "sees context" * ("context" in row["sees"])) if part)
         name = row["model"] + "*" * (row["model"] == chosen)

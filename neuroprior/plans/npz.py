@@ -76,6 +76,9 @@ def _native(array: NDArray[Any]) -> NDArray[Any]:
     """The same numbers in an order of bytes and a type that torch knows."""
     if array.dtype.kind == "f" and array.dtype.itemsize > 8:
         return array.astype(np.float64)
+    if array.dtype.kind == "u" and array.dtype.itemsize > 1:
+        # what is too large for int64 turns negative, and is refused as such
+        return np.ascontiguousarray(array.astype(np.int64)).reshape(array.shape)
     return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("="))).reshape(array.shape)
 
 

@@ -16,6 +16,10 @@ MAX_TABLE_BYTES = 2**31
 """The tables of a prior may take this much; beyond it `fit` raises."""
 
 
+class TooLargeError(ValueError):
+    """Tables over the limit of `MAX_TABLE_BYTES`."""
+
+
 class Tree(NamedTuple):
     """The histories that occurred, as a state machine.
 
@@ -109,7 +113,7 @@ def count_histories(
         device: where to count.
 
     Raises:
-        ValueError: the tables would be larger than `MAX_TABLE_BYTES`.
+        TooLargeError: the tables would be larger than `MAX_TABLE_BYTES`.
     """
     histories = _Histories(plans.num_actions, depth, num_contexts or 1, device)
     size = max(ACTIONS_AT_ONCE // max(plans.max_length, 1), 1)
@@ -226,7 +230,7 @@ class _Histories:
         rows = nodes if rows is None else rows
         size = 4 * self.num_actions * (nodes + rows)
         if size > MAX_TABLE_BYTES:
-            raise ValueError(
+            raise TooLargeError(
                 f"plans: tables of {max(nodes, rows):,} histories x {self.num_actions} actions, or more, need"
                 f" {size / 1e9:.1f} GB, over the limit of {MAX_TABLE_BYTES / 1e9:.1f} GB;"
                 f" with histories of fewer than {len(self.openings)} actions they would be smaller"

@@ -4,13 +4,17 @@ from abc import abstractmethod
 from typing import Any, Self
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, sees_each_step
 from neuroprior.priors.histories import Counts, Tree, count_histories
 from neuroprior.priors.prior import Prior
 
 _TABLES = ("next_node", "parent", "start_node", "row_code", "log_probs")
+
+
+PART = 256
+"""Actions of a long plan that are walked through one after the other."""
 
 
 class HistoryPrior(Prior):
@@ -54,6 +58,35 @@ class HistoryPrior(Prior):
         node = self.next_node.view(-1)[state.div(contexts, rounding_mode="floor") * self.num_actions + action].long()
         return self._at(node, state % contexts if context is None else context.long())
 
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        num, length = plans.shape
+        node = self._nodes(plans.long())
+        seen = torch.zeros_like(node)
+        if context is not None:
+            seen = context.long() if sees_each_step(context) else context.long()[:, None].expand(num, length)
+        return self.log_probs[self._row(node.flatten(), seen.flatten())].view(num, length, self.num_actions)
+
+    def _nodes(self, actions: Tensor) -> Tensor:
+        """The node before each action of `actions [N, L]`."""
+        num, length = actions.shape
+        if length > 2 * (PART + self._depth):
+            # A node depends on the last `depth` actions alone, so the parts of long plans are walked through side by
+            # side, each from that many actions before it.
+            first = self._nodes(actions[:, :PART])
+            padded = nn.functional.pad(actions[:, PART - self._depth :], (0, -(length - PART) % PART))
+            parts = padded.unfold(1, PART + self._depth, PART).flatten(0, 1)
+            late = self._walk(parts, torch.zeros_like(parts[:, 0]))[:, self._depth :]
+            return torch.cat([first, late.reshape(num, -1)[:, : length - PART]], 1)
+        return self._walk(actions, self.start_node.long().expand(num))
+
+    def _walk(self, actions: Tensor, node: Tensor) -> Tensor:
+        """The node before each action, `[N, L]`, from `node [N]` on."""
+        nodes, follow = torch.empty_like(actions), self.next_node.view(-1)
+        for t in range(actions.shape[1]):
+            nodes[:, t] = node
+            node = follow[node * self.num_actions + actions[:, t]].long()
+        return nodes
+
     def fit(self, plans: Plans | Tensor) -> Self:
         """Count; whatever was learned before is forgotten. Returns self.
 
@@ -63,9 +96,16 @@ class HistoryPrior(Prior):
             ValueError: the plans do not fit this prior, or so many histories occur in them that the tables would need
                 over 2 GB.
         """
-        plans = self.training_plans(plans)
-        self.learn(*count_histories(plans, self._depth, self.num_contexts, self.openings, self.device))
+        self.learn(*self.count(plans))
         return self
+
+    def count(self, plans: Plans | Tensor) -> tuple[Tree, Counts]:
+        """What `fit` counts and `learn` takes over; the same for every prior of this depth that sees the same.
+
+        Raises:
+            ValueError: as `fit`.
+        """
+        return count_histories(self.training_plans(plans), self._depth, self.num_contexts, self.openings, self.device)
 
     @abstractmethod
     def estimate(self, tree: Tree, counts: Counts) -> Tensor:

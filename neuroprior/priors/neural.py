@@ -25,7 +25,7 @@ class NeuralPrior(Prior):
     there, since they still hold the order (`python -m pytest -m slow -k past_the_training_length -s` prints this).
 
     Plans longer than the training window (`Settings.window`) are trained on in consecutive windows with the memory
-    carried over; such a prior has met memories of any age, so it carries its memory on in use as well, without limit.
+    carried over; such a prior has met old memories, so it carries its memory on in use as well, without limit.
 
     The state holds, beside the network's memory, the inputs that the window may still need: `[N, memory + (t + 1) * D]`
     for t actions so far, D = 1 + (1 for a context index, C for features); past the window those inputs alone,
@@ -96,12 +96,16 @@ class NeuralPrior(Prior):
             Logits `[N, T, A]`, and the memory `[N, M']` after the last input.
         """
 
-    def carry_over(self, window: int) -> None:
+    def carry_over(self, window: int | None) -> None:
         """Before a training in windows of so many actions: from now on the memory goes on without limit.
+
+        None: before a training on whole plans.
 
         Raises:
             ValueError: this prior was made to read a window of its own.
         """
+        if window is None:
+            return
         if self._given_window is not None:
             raise ValueError(
                 f"window: this prior reads {self._given_window} actions at a time, but plans of more than {window} are"
@@ -202,9 +206,8 @@ class NeuralPrior(Prior):
         if len(plans) < 2 and int(lengths.sum()) < 2:
             raise ValueError("plans: at least two plans with an action are needed to train a neural prior")
         longest = int(lengths.max())
-        if longest > window:
-            self.carry_over(window)
-        elif self._given_window is None:
+        self.carry_over(window if longest > window else None)
+        if longest <= window and self._given_window is None:
             self.window = longest - 1
         return plans
 

@@ -43,6 +43,7 @@ class Prior(nn.Module, ABC):
             for a prior without context.
         end: the action that ends a plan, as it was in the plans that the prior learned from (see `Plans.with_end`), or
             None. After it `log_prob` and samples have nothing but it.
+        action_names, context_names: names of the actions and contexts, as they were in these plans, or None.
 
     Raises:
         ValueError: an argument is out of range.
@@ -65,6 +66,8 @@ class Prior(nn.Module, ABC):
         self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
         self.end: int | None = None
+        self.action_names: tuple[str, ...] | None = None
+        self.context_names: tuple[str, ...] | None = None
         self.register_buffer("_anchor", torch.zeros(()), persistent=False)
 
     @property
@@ -88,7 +91,8 @@ class Prior(nn.Module, ABC):
     @property
     def learned(self) -> dict[str, Any]:
         """What `fit` found that is neither weights nor an argument (JSON values); saved with the prior."""
-        return {"context_per": self.context_per, "end": self.end}
+        names = {"action_names": self.action_names, "context_names": self.context_names}
+        return {"context_per": self.context_per, "end": self.end} | names
 
     def restore(self, learned: dict[str, Any]) -> None:
         """Take over what `learned` gave when the prior was saved.
@@ -104,6 +108,8 @@ class Prior(nn.Module, ABC):
         if end is not None and (not isinstance(end, int) or not 0 <= end < self.num_actions):
             raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {end!r}")
         self.end = end
+        self.action_names = _names("action_names", learned, self.num_actions)
+        self.context_names = _names("context_names", learned, self.num_contexts or 0)
 
     @abstractmethod
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -254,8 +260,22 @@ class Prior(nn.Module, ABC):
         if plans.num_actions != self.num_actions:
             raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
         self.end = plans.end
+        self.action_names = None if plans.action_names is None else tuple(plans.action_names)
+        self.context_names = None
         if not self.takes_context:
             return replace(plans, context=None, context_names=None)
         self.check_context_of(plans)
         self.context_per = "step" if sees_each_step(plans.context) else "plan"
+        if plans.context_names is not None and len(plans.context_names) <= (self.num_contexts or 0):
+            self.context_names = tuple(plans.context_names)
         return plans
+
+
+def _names(what: str, learned: dict[str, Any], most: int) -> tuple[str, ...] | None:
+    """The names that were saved, at most so many of them."""
+    names = learned[what]
+    if names is None:
+        return None
+    if not isinstance(names, list | tuple) or len(names) > most or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{what}: at most {most} texts are expected")
+    return tuple(names)

@@ -66,7 +66,7 @@ class TransformerPrior(NeuralPrior):
             check_sizes(span=learned["span"])
         self.span = learned["span"]
 
-    def carry_over(self, window: int) -> None:
+    def carry_over(self, window: int | None) -> None:
         super().carry_over(window)
         self.span = window
 

@@ -9,12 +9,16 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from neuroprior.plans import Plans, sees_each_step
+from neuroprior.training.settings import Settings
 
 MOST_DISTINCT = 1024
 """Distinct plans that one training step takes together, each weighted by its number."""
 
 MOST_VALIDATION = 2**18
-"""Actions that are looked at in each validation."""
+"""Actions that are looked at in each validation, about."""
+
+LEAST_WINDOWS = 8
+"""Windows through which memory is carried over in training, where plans are as long; twice as many in validation."""
 
 
 class Batch(NamedTuple):
@@ -35,33 +39,52 @@ class Batch(NamedTuple):
     goes_on: bool
 
 
+class Step(NamedTuple):
+    """What a batch is made of.
+
+    Attributes:
+        pieces: `[N]`, numbers of pieces of plans.
+        number: of the window of each of them.
+        goes_on: whether it goes on with the batch before.
+        counts: False where the actions are read for nothing.
+    """
+
+    pieces: Tensor
+    number: int
+    goes_on: bool
+    counts: bool = True
+
+
 class PlansModule(lightning.LightningDataModule):
     """Plans for training and for validation, in batches.
 
     Where at most `MOST_DISTINCT` plans are distinct, and few enough of them, each step takes them all, each weighted by
     its number: the exact gradient. Otherwise steps take batches of plans.
 
-    An epoch is `steps` steps, and its batches depend on the seed and on its number alone, so that a training that is
-    resumed after an epoch goes on as if it had never stopped. With several processes each takes its part of a batch.
+    An epoch is what lies between two looks at the validation plans. Its batches depend on the seed and on its number
+    alone, so that a training that is resumed after an epoch goes on as if it had never stopped. With several processes
+    each takes its part of a batch.
 
     Args:
         training: plans to learn from.
         validation: plans for early stopping; of more than `MOST_VALIDATION` actions some plans are drawn.
-        batch_size: plans, or pieces of plans, a step.
-        window: actions that a step reads of a plan.
-        steps: steps in an epoch.
+        settings: size of batches and windows, and how often to look.
         seed: draws the order.
+
+    Attributes:
+        epochs: how many there are at most.
+        steps: steps in each.
+
+    Raises:
+        ValueError: no validation plan has an action.
     """
 
-    def __init__(self, training: Plans, validation: Plans, batch_size: int, window: int, steps: int, seed: int) -> None:
+    def __init__(self, training: Plans, validation: Plans, settings: Settings, seed: int) -> None:
         super().__init__()
-        few = max(1, MOST_VALIDATION // max(1, validation.max_length))
-        if len(validation) > few:
-            order = torch.randperm(len(validation), generator=torch.Generator().manual_seed(seed))
-            validation = validation[order[:few].to(validation.actions.device)]
-        self.training = Windows(training, window, batch_size)
-        self.validation = Windows(validation, window, 1024)
-        self.steps, self.seed = steps, seed
+        self.training = Windows(training, settings.window, settings.batch_size, LEAST_WINDOWS)
+        self.validation = Windows(_some(validation, seed), settings.window, 1024, 2 * LEAST_WINDOWS)
+        self.epochs, self.steps = settings.epochs(self.training.steps)
+        self.seed = seed
 
     def train_dataloader(self) -> DataLoader[Batch]:
         return DataLoader(self.training, batch_size=None, sampler=Walk(self.training, self.steps, self.seed, self.part))
@@ -81,13 +104,13 @@ class Windows(Dataset[Batch]):
     Pieces are walked through together, `group_size` at a time; `groups` such walks take all of them.
     """
 
-    def __init__(self, plans: Plans, window: int, batch_size: int) -> None:
+    def __init__(self, plans: Plans, window: int, batch_size: int, least_windows: int = 1) -> None:
         merged = _merge(plans)
         self.plans = plans if merged is None else merged[0]
         self.weight = None if merged is None else merged[1]
         self.window = max(1, min(window, self.plans.max_length))
         lengths = self.plans.mask().sum(1).cpu()
-        self.windows = _piece_size(lengths, self.window, batch_size)
+        self.windows = _piece_size(lengths, self.window, batch_size, least_windows)
         size = self.windows * self.window
         pieces = (lengths + size - 1).div(size, rounding_mode="floor").clamp(min=1)
         self.plan = torch.arange(len(lengths)).repeat_interleave(pieces)
@@ -101,14 +124,19 @@ class Windows(Dataset[Batch]):
         """The number of pieces."""
         return len(self.plan)
 
-    def __getitem__(self, index: tuple[Tensor, int, bool]) -> Batch:
-        """Window number `index[1]` of the pieces `index[0]`; `index[2]` says whether it goes on."""
-        pieces, number, goes_on = index
+    @property
+    def steps(self) -> int:
+        """The number of batches that take every action once."""
+        return self.groups * self.windows
+
+    def __getitem__(self, index: Step) -> Batch:
+        """The batch of a step."""
+        pieces, number, goes_on, counts = index
         plans, device = self.plans, self.plans.actions.device
         plan, first = self.plan[pieces].to(device), (self.first[pieces] + number * self.window).to(device)
         place = first[:, None] + torch.arange(self.window, device=device)
         lengths = plans.max_length if plans.lengths is None else plans.lengths[plan][:, None]
-        weight = (place < lengths).float()
+        weight = (place < lengths).float() * counts
         if self.weight is not None:
             weight = weight * self.weight[plan][:, None]
         place = place.clamp(max=plans.max_length - 1)
@@ -122,7 +150,7 @@ class Windows(Dataset[Batch]):
         return Batch(plans.actions[plan[:, None], place], weight, context, before, goes_on)
 
 
-class Walk(Sampler[tuple[Tensor, int, bool]]):
+class Walk(Sampler[Step]):
     """The order of the batches of one epoch.
 
     Args:
@@ -140,10 +168,10 @@ class Walk(Sampler[tuple[Tensor, int, bool]]):
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return self.steps if self.steps is not None else self.windows.groups * self.windows.windows
+        return self.steps if self.steps is not None else self.windows.steps
 
-    def __iter__(self) -> Iterator[tuple[Tensor, int, bool]]:
-        a_pass = self.windows.groups * self.windows.windows
+    def __iter__(self) -> Iterator[Step]:
+        a_pass = self.windows.steps
         start = 0 if self.steps is None else self.epoch * self.steps
         order, drawn = torch.arange(len(self.windows)), -1
         for step in range(start, start + len(self)):
@@ -156,15 +184,26 @@ class Walk(Sampler[tuple[Tensor, int, bool]]):
             size = self.windows.group_size
             pieces = order[group * size : (group + 1) * size]
             mine = pieces[self.part[0] :: self.part[1]]
-            # A process without a piece reads one of the others' again: all must take part in every step.
-            yield mine if len(mine) else pieces[:1], number, number > 0 and step > start
+            # A process without a piece reads one of the others' for nothing: all must take part in every step.
+            yield Step(mine if len(mine) else pieces[:1], number, number > 0 and step > start, len(mine) > 0)
 
 
-def _piece_size(lengths: Tensor, window: int, batch_size: int) -> int:
+def _some(plans: Plans, seed: int) -> Plans:
+    """Plans drawn at random, with about `MOST_VALIDATION` actions in all; all of them where they have fewer."""
+    lengths = plans.mask().sum(1).cpu()
+    taken = lengths.nonzero()[:, 0]
+    if len(taken) == 0:
+        raise ValueError("plans: no validation plan has an action")
+    order = taken[torch.randperm(len(taken), generator=torch.Generator().manual_seed(seed))]
+    enough = int((lengths[order].cumsum(0) < MOST_VALIDATION).sum()) + 1
+    return plans[order[:enough].sort().values.to(plans.actions.device)]
+
+
+def _piece_size(lengths: Tensor, window: int, batch_size: int, least: int) -> int:
     """Windows a piece: long enough to carry memory far, short enough to fill batches and to leave few windows empty."""
     needed = (lengths + window - 1).div(window, rounding_mode="floor").clamp(min=1)
     total = int(needed.sum())
-    size = min(int(needed.max()), max(1, -(-total // batch_size)))
+    size = min(int(needed.max()), max(least, -(-total // batch_size)))
     while size > 1 and size * int(((needed + size - 1) // size).sum()) > 1.5 * total:
         size = (size + 1) // 2
     return size

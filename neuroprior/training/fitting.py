@@ -6,6 +6,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +46,14 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
     device = next(prior.parameters()).device
     training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
     window = settings.window if hasattr(prior, "read_on") else plans.max_length
-    data = PlansModule(training, validation, settings.batch_size, window, settings.steps_per_epoch, seed)
-    with quiet(), few_threads(prior, data), tempfile.TemporaryDirectory() as folder, torch.random.fork_rng():
+    data = PlansModule(training, validation, replace(settings, window=window), seed)
+    own = [device] if device.type == "cuda" else []
+    with quiet(), few_threads(prior, data), tempfile.TemporaryDirectory() as folder, torch.random.fork_rng(own):
         torch.manual_seed(seed)
         trainer = lightning.Trainer(
             accelerator="gpu" if device.type == "cuda" else device.type,
             devices=[device.index or 0] if device.type == "cuda" else 1,
-            max_epochs=settings.epochs,
+            max_epochs=data.epochs,
             gradient_clip_val=settings.gradient_clip,
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
@@ -95,7 +97,9 @@ def take_best(trainer: lightning.Trainer, module: PriorModule) -> float:
     """
     best = trainer.checkpoint_callback
     assert isinstance(best, ModelCheckpoint)
-    if best.best_model_score is None or not best.best_model_score.isfinite():
+    if best.best_model_score is None:
+        raise ValueError("training ended before the first look at the validation plans; nothing was learned")
+    if not best.best_model_score.isfinite():
         raise ValueError(f"training diverged; a learning_rate below {module.learning_rate} may help")
     checkpoint = torch.load(best.best_model_path, weights_only=True, map_location=module.device)
     module.load_state_dict(checkpoint["state_dict"])

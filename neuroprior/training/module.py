@@ -23,20 +23,26 @@ class PriorModule(lightning.LightningModule):
     Attributes:
         curve: one entry an epoch: step, learning_rate, train_bits and validation_bits (bits per action); saved in
             checkpoints.
+
+    Raises:
+        ValueError: a learning rate or weight decay out of range.
     """
 
     def __init__(
         self, prior: nn.Module, learning_rate: float = 5e-3, weight_decay: float = 0.01, seed: int = 0
     ) -> None:
         super().__init__()
+        if not 0 < learning_rate < float("inf"):
+            raise ValueError(f"learning_rate: a positive number is expected, not {learning_rate}")
+        if not 0 <= weight_decay < float("inf"):
+            raise ValueError(f"weight_decay: must not be negative, not {weight_decay}")
         self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
         self.curve: list[dict[str, float]] = []
         self._memory: Tensor | None = None
-        self._lost = 0.0
 
     def on_train_epoch_start(self) -> None:
         self.prior.train()
-        self._totals = torch.zeros(2, device=self.device)
+        self._totals = torch.zeros(2, device=self.device)  # on the device: a step should not wait for it
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
         # Dropout begins anew in each step, so that a resumed training draws the same.
@@ -52,17 +58,17 @@ class PriorModule(lightning.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.prior.eval()
-        self._memory, self._seen = None, torch.zeros(2, device=self.device, dtype=torch.double)
+        self._memory, self._seen = None, torch.zeros(2, dtype=torch.double)
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
         total, weight, self._memory = bits(self.prior, batch, self._memory)
-        self._seen += torch.stack([total, weight])
+        self._seen += torch.stack([total, weight]).cpu()  # not every device has float64
 
     def on_validation_epoch_end(self) -> None:
         self._memory = None
         seen, totals = self._seen, self._totals
         if self.trainer.world_size > 1:
-            seen, totals = self._over_processes(seen), self._over_processes(totals)
+            seen, totals = self._over_processes(seen.float().to(self.device)), self._over_processes(totals)
         held_out = float(seen[0] / seen[1].clamp(min=1))
         self.log("validation_bits", held_out, prog_bar=True, rank_zero_only=True)
         rate = self.trainer.optimizers[0].param_groups[0]["lr"]

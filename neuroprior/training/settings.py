@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from math import ceil
 
+FEWEST_STEPS, MOST_STEPS = 10, 100
+"""Steps between two looks at the held-out plans, where they are not given."""
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -17,7 +20,8 @@ class Settings:
         weight_decay: of AdamW.
         gradient_clip: the largest norm of a gradient.
         validation: share of plans (of groups, where there are any) held out for early stopping.
-        check_every: steps between two looks at the held-out plans.
+        check_every: steps between two looks at the held-out plans; None: two passes through the plans, but at least
+            `FEWEST_STEPS` and at most `MOST_STEPS`, so that few plans are not learned by heart before the first look.
         patience: looks without improvement after which training stops.
         progress: show a progress bar.
 
@@ -32,12 +36,13 @@ class Settings:
     weight_decay: float = 0.01
     gradient_clip: float = 1.0
     validation: float = 0.1
-    check_every: int = 100
+    check_every: int | None = None
     patience: int = 4
     progress: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("max_steps", "batch_size", "window", "learning_rate", "gradient_clip", "check_every", "patience"):
+        names = ["max_steps", "batch_size", "window", "learning_rate", "gradient_clip", "patience"]
+        for name in names + ["check_every"] * (self.check_every is not None):
             kind = float if name in ("learning_rate", "gradient_clip") else int
             value = getattr(self, name)
             if not isinstance(value, int | kind) or isinstance(value, bool) or not 0 < value < float("inf"):
@@ -47,12 +52,12 @@ class Settings:
         if self.weight_decay < 0:
             raise ValueError(f"weight_decay: must not be negative, not {self.weight_decay}")
 
-    @property
-    def epochs(self) -> int:
-        """Looks at the held-out plans, if training is not stopped early; an epoch is what lies between two."""
-        return ceil(self.max_steps / self.check_every)
+    def epochs(self, steps_a_pass: int) -> tuple[int, int]:
+        """How many looks at the held-out plans, if training is not stopped early, and the steps before each.
 
-    @property
-    def steps_per_epoch(self) -> int:
-        """Steps in each epoch: `check_every`, or a little fewer where that does not divide `max_steps`."""
-        return ceil(self.max_steps / self.epochs)
+        Args:
+            steps_a_pass: steps that take all plans once.
+        """
+        wanted = self.check_every or min(max(2 * steps_a_pass, FEWEST_STEPS), MOST_STEPS)
+        looks = ceil(self.max_steps / wanted)
+        return looks, ceil(self.max_steps / looks)
