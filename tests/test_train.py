@@ -145,7 +145,7 @@ def test_two_processes_learn_what_one_does(tmp_path):
         assert one["validation_bits"] == pytest.approx(other["validation_bits"], abs=1e-4)
 
 
-LONG = ["--data.check_every", "5", "--trainer.max_steps", "200", "--trainer.patience", "40"]
+LONG = ["--data.check_every", "5", "--trainer.max_steps", "200", "--trainer.patience", "200"]
 LONG += ["--model.prior.dropout", "0.1"]
 
 

@@ -1,6 +1,7 @@
 """The command line of `python -m train`, by LightningCLI's conventions, and the order of what a run does."""
 
 import sys
+from math import ceil
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -18,7 +19,7 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from neuroprior.output import write_whole
 from neuroprior.plans import write_plans
 from neuroprior.training import few_threads, quiet
-from neuroprior.training.fitting import WholeCheckpoints, checkpoints_and_stopping, take_best
+from neuroprior.training.fitting import Stopping, WholeCheckpoints, checkpoints_and_stopping, take_best
 from train.data import PlansData
 from train.model import PriorModel
 from train.report import report
@@ -49,7 +50,7 @@ def run(arguments: list[str]) -> None:
 def make_trainer(
     folder: str = "",
     max_steps: int = 1000,
-    patience: int = 4,
+    patience: int = 400,
     accelerator: str = "auto",
     devices: int | str | list[int] = 1,
     num_nodes: int = 1,
@@ -66,7 +67,7 @@ def make_trainer(
     Args:
         folder: of the run.
         max_steps: gradient steps at most, about; the learning rate falls to 0 over them.
-        patience: looks without better validation bits after which training stops.
+        patience: steps without better validation bits after which training stops.
         accelerator: "cpu", "gpu", or "auto".
         devices: number of devices, or their numbers.
         num_nodes: machines.
@@ -81,11 +82,11 @@ def make_trainer(
     for name, number in (("patience", patience), ("accumulate_grad_batches", accumulate_grad_batches)):
         if number < 1:
             raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
-    del max_steps
+    del max_steps  # it and patience are turned into looks when the data are there: see `instantiate_trainer`
     own: list[Callback] = checkpoints_and_stopping(Path(folder) / "checkpoints", patience)
     bar: list[Callback] = [RichProgressBar()] if enable_progress_bar and sys.stdout.isatty() else []
     return Trainer(
-        max_epochs=-1,  # set when the data, which divide max_steps into epochs, are there
+        max_epochs=-1,
         accelerator=accelerator,
         devices=devices,
         num_nodes=num_nodes,
@@ -166,8 +167,12 @@ class TrainCLI(LightningCLI):
             self.folder.mkdir(parents=True, exist_ok=True)
 
     def instantiate_trainer(self, **more: Any) -> Trainer:
+        """The trainer, told how many looks at the validation plans its steps are."""
         trainer = super().instantiate_trainer(**more)
         trainer.fit_loop.max_epochs = self.datamodule.epochs
+        for callback in trainer.callbacks:
+            if isinstance(callback, Stopping):
+                callback.patience = ceil(callback.patience / self.datamodule.steps)
         return trainer
 
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
             gradient_clip_val=settings.gradient_clip,
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
-            callbacks=checkpoints_and_stopping(folder, settings.patience),
+            callbacks=checkpoints_and_stopping(folder, ceil(settings.patience / data.steps)),
             plugins=[WholeCheckpoints()],
             logger=False,
             enable_model_summary=False,
@@ -75,7 +76,7 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
 
 
 def checkpoints_and_stopping(folder: str | Path, patience: int) -> list[lightning.Callback]:
-    """The callbacks of a training: stop when held-out plans are no longer told better; keep the best and the last."""
+    """The callbacks of a training: keep the best and the last, and stop after `patience` looks without improvement."""
     return [
         Stopping("validation_bits", patience=patience, min_delta=1e-4),
         Checkpoints(

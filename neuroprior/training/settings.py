@@ -22,7 +22,7 @@ class Settings:
         validation: share of plans (of groups, where there are any) held out for early stopping.
         check_every: steps between two looks at the held-out plans; None: two passes through the plans, but at least
             `FEWEST_STEPS` and at most `MOST_STEPS`, so that few plans are not learned by heart before the first look.
-        patience: looks without improvement after which training stops.
+        patience: steps without improvement after which training stops.
         progress: show a progress bar.
 
     Raises:
@@ -37,7 +37,7 @@ class Settings:
     gradient_clip: float = 1.0
     validation: float = 0.1
     check_every: int | None = None
-    patience: int = 4
+    patience: int = 400
     progress: bool = True
 
     def __post_init__(self) -> None:
