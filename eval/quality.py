@@ -178,7 +178,7 @@ def _table(rows: list[dict[str, object]], num_plans: int, held_out: int):
             f"{transformer['seconds']:.0f}",
         )
     table.caption = (
-        "entropy: bits per action of the source, where it depends on the past. markov: of the source's order; expected: free"
-        " probabilities / (2 ln 2 x actions), the cost of estimating them. s: seconds of training."
+        "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
+        " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. s: seconds of training."
     )
     return table
