@@ -4,7 +4,7 @@ from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPl
 from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior, TransformerPrior, UniformPrior, load, save
 from neuroprior.sampling import sample, sample_in_world
-from neuroprior.worlds import GridWorld, Rollout, TabularWorld, World, gridworld
+from neuroprior.worlds import GridWorld, Rollout, TabularWorld, World, gridworld, labyrinth
 
 __version__ = "0.1.0"
 
@@ -26,6 +26,7 @@ __all__ = [
     "World",
     "collect",
     "gridworld",
+    "labyrinth",
     "load",
     "oracle",
     "read_plans",

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, load
-from neuroprior.plans import read_plans, write_plans
+from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.training import PriorModule
 from tests.sources import seeded
 from train.__main__ import main
@@ -106,6 +106,7 @@ def files() -> dict[str, tuple[Plans, str]]:
         "context.jsonl": (some_plans(context=steps), "context"),
         "features.npz": (some_plans(context=torch.randn(300, 2, generator=seeded(5))), "context"),
         "rows.csv": (some_plans(group=groups), "actions"),
+        "rows.tsv": (some_plans(action_names=("left", "on", "right")), "actions"),
         "steps.csv": (some_plans(context=steps, group=groups), "context"),
     }
 
@@ -120,6 +121,14 @@ def test_each_kind_of_file(name, tmp_path):
     assert report["unit"] == ("plans" if plans.group is None else "groups")
     assert ("context" in report["rows"][-1]["sees"]) == (sees == "context")
     assert read_plans(tmp_path / "run" / "plans.npz").actions.shape == plans.actions.shape
+
+
+def test_a_minari_dataset(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    write_minari(some_plans(60, context=torch.randint(4, (60, 6), generator=seeded(4))), "mice/train-v0")
+    arguments = ["--data.file", "minari:mice/train-v0", "--out", str(tmp_path / "run"), *QUICK, *SMALL["gru"]]
+    assert main([*recipe("gru"), *arguments]) == 0
+    assert load(tmp_path / "run").num_contexts == 4
 
 
 def test_an_end_symbol(tmp_path):
