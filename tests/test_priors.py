@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, sample, sample_in_world
-from neuroprior.priors import prior as prior_module
 from tests.sources import distribution, every_plan, random_world, refuses, seeded
 
 A, L, C = 3, 7, 4
@@ -93,7 +92,7 @@ def test_log_prob_in_parts(kind, sees, monkeypatch):
     prior, context = make(kind, sees), draw_context(sees, 9, L)
     plans, lengths = torch.randint(A, (9, L), generator=seeded(1)), torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
     whole = prior.log_prob(plans, context, lengths)
-    monkeypatch.setattr(prior_module, "TOKENS_AT_ONCE", 2 * L)
+    monkeypatch.setattr(type(prior), "actions_at_once", 2 * L)
     torch.testing.assert_close(prior.log_prob(plans, context, lengths), whole)
 
 

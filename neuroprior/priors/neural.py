@@ -40,6 +40,8 @@ class NeuralPrior(Prior):
         seed: draws the initial weights; torch's global generator is left alone.
     """
 
+    actions_at_once = 2**18
+
     def __init__(
         self,
         num_actions: int,

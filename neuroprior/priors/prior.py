@@ -12,9 +12,6 @@ from neuroprior.plans import Plans, check_context, sees_each_step
 from neuroprior.sampling import after_end
 from neuroprior.worlds.world import check_range, is_integer
 
-TOKENS_AT_ONCE = 2**21
-"""Actions that `log_prob` scores together; bounds memory."""
-
 
 def check_sizes(**sizes: object) -> None:
     """Raise ValueError, naming the argument, unless all are integers of at least 1."""
@@ -51,6 +48,9 @@ class Prior(nn.Module, ABC):
 
     known: ClassVar[dict[str, type["Prior"]]] = {}
     """Every subclass by name; `load` finds a folder's class here."""
+
+    actions_at_once: ClassVar[int] = 2**21
+    """Actions that `log_prob` scores together; bounds memory."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -195,7 +195,7 @@ class Prior(nn.Module, ABC):
         if plans.actions.numel() == 0:
             return torch.zeros(plans.actions.shape, device=self.device)
         parts = []
-        size = max(TOKENS_AT_ONCE // plans.max_length, 1)
+        size = max(self.actions_at_once // plans.max_length, 1)
         for at in range(0, len(plans), size):
             part = plans[at : at + size]
             actions = part.actions.long()
