@@ -34,7 +34,7 @@ def plans(
         raise ValueError("priors: at least one model folder is expected")
     loaded = {folder: load(folder) for folder in priors}
     names = action_names or _names(next(iter(loaded.values())))
-    read = _read(file, num_actions, names)
+    read = _read(file, num_actions, names, bool(action_names))
     scores = [_score(folder, prior, read) for folder, prior in loaded.items()]
     rows = [_row(one, scores[0]) for one in scores]
     Console().print(_table(rows, read))
@@ -49,7 +49,9 @@ def _names(prior: Prior) -> list[str] | None:
     return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
 
 
-def _read(file: str, num_actions: int | None, names: list[str] | None) -> Plans:
+def _read(file: str, num_actions: int | None, names: list[str] | None, given: bool) -> Plans:
+    # Other files tell their names themselves, and perhaps that of an end symbol, or number fewer actions.
+    names = names if given or Path(file).suffix.lower() in (".csv", ".tsv") else None
     read = read_plans(file, num_actions=num_actions, action_names=names)
     return read if read.end is None else read.without_end()
 
@@ -58,13 +60,24 @@ def _score(folder: str, prior: Prior, read: Plans) -> Score:
     known = prior.num_actions - (prior.end is not None)
     if read.num_actions > known:
         raise ValueError(f"{folder}: knows {known} actions, the file has {read.num_actions}")
-    if prior.action_names is not None and read.action_names is not None and _names(prior) != list(read.action_names):
-        raise ValueError(f"{folder}: knows other actions than {', '.join(read.action_names)}")
+    read = _with_actions_of(prior, read, folder)
     seen = _with_contexts_of(prior, replace(read, num_actions=known, action_names=None), folder)
     try:
         return score(folder, prior, seen if prior.end is None else seen.with_end())
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
+
+
+def _with_actions_of(prior: Prior, read: Plans, folder: str) -> Plans:
+    """The plans with their actions numbered as the prior has learned them, by name."""
+    names = _names(prior)
+    if names is None or read.action_names is None:
+        return read
+    unknown = [name for name in read.action_names if name not in names]
+    if unknown:
+        raise ValueError(f"{folder}: does not know the action {unknown[0]!r}; it knows {', '.join(names)}")
+    number = torch.tensor([names.index(name) for name in read.action_names])
+    return replace(read, actions=number[read.actions.long()], num_actions=len(names), action_names=None)
 
 
 def _with_contexts_of(prior: Prior, read: Plans, folder: str) -> Plans:
@@ -77,7 +90,7 @@ def _with_contexts_of(prior: Prior, read: Plans, folder: str) -> Plans:
             f"{folder}: has not seen the context {unknown[0]!r}; it knows {', '.join(prior.context_names)}"
         )
     number = torch.tensor([prior.context_names.index(name) for name in read.context_names])
-    return replace(read, context=number[read.context], context_names=None)
+    return replace(read, context=number[read.context.long()], context_names=None)
 
 
 def _row(one: Score, first: Score) -> dict[str, Any]:

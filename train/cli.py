@@ -27,6 +27,7 @@ from train.report import report
 USAGE = """python -m train fit --config train/gru.yaml [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        python -m train fit --resume FOLDER"""
 CONFIG, PLANS = "run.yaml", "plans.npz"
+STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 
 
@@ -177,6 +178,7 @@ class TrainCLI(LightningCLI):
 
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
+        self._check_checkpoints(model, datamodule)
         if self.trainer.is_global_zero:
             self._keep(datamodule)
         if model.is_neural:
@@ -186,9 +188,21 @@ class TrainCLI(LightningCLI):
         if self.trainer.is_global_zero:
             report(self.folder, model, datamodule)
 
+    def _check_checkpoints(self, model: PriorModel, data: PlansData) -> None:
+        last = self.folder / LAST
+        if not model.is_neural or not last.exists():
+            return
+        epoch = _check(last, model)["epoch"]
+        _check(self.folder / BEST, model)
+        if epoch >= data.epochs:
+            raise ValueError(
+                f"trainer.max_steps: the run in {self.folder} has made more steps than"
+                f" {self.config.fit.trainer.max_steps} already"
+            )
+
     def _keep(self, data: PlansData) -> None:
         """Keep what the run needs to be resumed, and nothing else is needed then: its configuration and its plans."""
-        if not (self.folder / PLANS).exists():
+        if self.config.fit.resume is None or not (self.folder / PLANS).exists():
             write_plans(data.source, self.folder / PLANS)
         config = yaml.safe_load(self._parser("fit").dump(self.config.fit))
         if (self.folder / CONFIG).exists():
@@ -199,9 +213,6 @@ class TrainCLI(LightningCLI):
     def _train(self, model: PriorModel, data: PlansData) -> None:
         model.prior.prepare(data.learned_from, data.window)
         last = self.folder / LAST
-        if last.exists():
-            for checkpoint in (last, self.folder / BEST):
-                _check(checkpoint, model)
         try:
             with few_threads(model.prior, data):
                 self.trainer.fit(model, datamodule=data, ckpt_path=last if last.exists() else None, weights_only=True)
@@ -217,11 +228,13 @@ class TrainCLI(LightningCLI):
             take_best(self.trainer, model)
 
 
-def _check(checkpoint: Path, model: PriorModel) -> None:
+def _check(checkpoint: Path, model: PriorModel) -> dict[str, Any]:
     """Raise ValueError unless a checkpoint is whole and of this model; nothing in it is executed."""
     try:
-        saved = torch.load(checkpoint, weights_only=True, map_location="cpu")
+        saved: dict[str, Any] = torch.load(checkpoint, weights_only=True, map_location="cpu")
         shapes = {name: value.shape for name, value in saved["state_dict"].items()}
+        for key in STATES if checkpoint.name == Path(LAST).name else ():
+            saved[key]
     except (UnpicklingError, EOFError, KeyError, AttributeError, TypeError, RuntimeError, OSError) as error:
         raise ValueError(
             f"{checkpoint}: missing, damaged, or no checkpoint of this program; without the folder"
@@ -229,6 +242,7 @@ def _check(checkpoint: Path, model: PriorModel) -> None:
         ) from error
     if shapes != {name: value.shape for name, value in model.state_dict().items()}:
         raise ValueError(f"{checkpoint}: of another model; resume without changing the model")
+    return saved
 
 
 def _with_saved_config(arguments: list[str]) -> list[str]:
@@ -243,8 +257,14 @@ def _with_saved_config(arguments: list[str]) -> list[str]:
     if not (place / CONFIG).exists():
         raise ValueError(f"{place}: no run to resume ({CONFIG} is missing)")
     for other in others:
-        if other.startswith("--") and not other.startswith("--trainer."):
+        if other.startswith(("--", "-c")) and not other.startswith("--trainer."):
             raise ValueError(f"{other}: a resumed run keeps its data and model; only --trainer options may change")
+    try:
+        whole = isinstance(yaml.safe_load((place / CONFIG).read_text(encoding="utf-8")), dict)
+    except (yaml.YAMLError, UnicodeDecodeError):
+        whole = False
+    if not whole:
+        raise ValueError(f"{place / CONFIG}: damaged, or not the configuration of a run")
     saved = ["--config", str(place / CONFIG), "--resume", str(place)]
     if (place / PLANS).exists():
         saved += ["--data.file", str(place / PLANS)]

@@ -69,14 +69,15 @@ class HistoryPrior(Prior):
     def _nodes(self, actions: Tensor) -> Tensor:
         """The node before each action of `actions [N, L]`."""
         num, length = actions.shape
-        if length > 2 * (PART + self._depth):
+        part = max(PART, self._depth)  # so that a part reaches back to no more than the one before it
+        if num and length > 2 * (part + self._depth):
             # A node depends on the last `depth` actions alone, so the parts of long plans are walked through side by
             # side, each from that many actions before it.
-            first = self._nodes(actions[:, :PART])
-            padded = nn.functional.pad(actions[:, PART - self._depth :], (0, -(length - PART) % PART))
-            parts = padded.unfold(1, PART + self._depth, PART).flatten(0, 1)
+            first = self._walk(actions[:, :part], self.start_node.long().expand(num))
+            padded = nn.functional.pad(actions[:, part - self._depth :], (0, -(length - part) % part))
+            parts = padded.unfold(1, part + self._depth, part).flatten(0, 1)
             late = self._walk(parts, torch.zeros_like(parts[:, 0]))[:, self._depth :]
-            return torch.cat([first, late.reshape(num, -1)[:, : length - PART]], 1)
+            return torch.cat([first, late.reshape(num, -1)[:, : length - part]], 1)
         return self._walk(actions, self.start_node.long().expand(num))
 
     def _walk(self, actions: Tensor, node: Tensor) -> Tensor:
