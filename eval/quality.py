@@ -162,23 +162,22 @@ def _print(console: Console, row: dict[str, object]) -> None:
 
 
 def _table(rows: list[dict[str, object]], num_plans: int, held_out: int):
-    table = titled(f"Bits more than the source, % ({num_plans:,} plans of {LENGTH} actions, {held_out:,} held out)")
-    columns(table, ("source", "entropy", "markov", "expected", "gru", "s", "transformer", "s"), 1)
+    table = titled(
+        f"Bits more than the source, % ({num_plans:,} plans of {LENGTH} actions, {held_out:,} held out)", gap=1
+    )
+    columns(table, ("source", "entropy", "markov", "expected", "gru", "transformer"), 1)
     for name in dict.fromkeys(row["source"] for row in rows):
-        markov, gru, transformer = (row for row in rows if row["source"] == name)
+        markov, *neural = (row for row in rows if row["source"] == name)
         expected = markov["expected_percent"]
         table.add_row(
             str(name),
             f"{markov['entropy_rate']:.4f}",
             f"{markov['excess_percent']:+.3f}",
             "" if expected is None else f"{expected:+.3f}",
-            f"{gru['excess_percent']:+.2f}",
-            f"{gru['seconds']:.0f}",
-            f"{transformer['excess_percent']:+.2f}",
-            f"{transformer['seconds']:.0f}",
+            *(f"{row['excess_percent']:+.2f} ({row['seconds']:.0f} s)" for row in neural),
         )
     table.caption = (
         "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
-        " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. s: seconds of training."
+        " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. (s): seconds of training."
     )
     return table

@@ -53,7 +53,7 @@ class PlansData(PlansModule):
         end: bool = False,
         validation: float = 0.1,
         held_out: float = 0.1,
-        batch_size: int = 128,
+        batch_size: int = 64,
         window: int = 128,
         check_every: int | None = None,
         max_steps: int = 1000,

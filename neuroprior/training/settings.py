@@ -30,7 +30,7 @@ class Settings:
     """
 
     max_steps: int = 1000
-    batch_size: int = 128
+    batch_size: int = 64
     window: int = 128
     learning_rate: float = 5e-3
     weight_decay: float = 0.01
