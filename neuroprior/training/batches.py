@@ -14,7 +14,7 @@ from neuroprior.training.settings import Settings
 MOST_DISTINCT = 1024
 """Distinct plans that one training step takes together, each weighted by its number."""
 
-MOST_VALIDATION = 2**18
+MOST_VALIDATION = 2**16
 """Actions that are looked at in each validation, about."""
 
 LEAST_WINDOWS = 8
