@@ -112,6 +112,33 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
     return Difference(ratio, ratio - half, ratio + half, float(2 * stats.t.sf(abs(ratio) / error, units - 1)))
 
 
+def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """P-values corrected for the number of tests: Holm's step-down Bonferroni procedure (Holm 1979, section 3).
+
+    The tests may depend on each other in any way: what stays below 0.05 holds for all of them together with a
+    probability of at least 0.95.
+
+    Args:
+        p_values: `[M]`, between 0 and 1; M may be 0.
+
+    Returns:
+        `[M]` float64, in the order given; each at least its own p-value and at most 1.
+
+    Raises:
+        ValueError: another shape, or a value that is no probability.
+    """
+    values = np.asarray(p_values.cpu().numpy() if isinstance(p_values, torch.Tensor) else p_values, dtype=np.float64)
+    if values.ndim != 1:
+        raise ValueError(f"p_values: shape [M] is expected, not {list(values.shape)}")
+    wrong = np.flatnonzero(~((values >= 0) & (values <= 1)))
+    if len(wrong):
+        raise ValueError(f"p_values[{wrong[0]}]: a probability between 0 and 1 is expected, not {values[wrong[0]]}")
+    order = np.argsort(values, kind="stable")
+    corrected = np.empty_like(values)
+    corrected[order] = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1)
+    return corrected
+
+
 def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     if isinstance(values, torch.Tensor):
         values = values.cpu().numpy()
