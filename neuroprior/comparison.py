@@ -81,11 +81,9 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
     Raises:
         ValueError: plans that the prior cannot score, or fewer than two actions.
     """
-    seen = plans if prior.takes_context else replace(plans, context=None, context_names=None)
-    with torch.no_grad():
-        bits = -prior.action_log_probs(seen).double().cpu() / log(2)
+    bits = action_bits(prior, plans)
     mask = plans.mask().cpu()
-    unit = _units(plans, mask)[mask].unique(return_inverse=True)[1]
+    unit = units(plans, mask)[mask].unique(return_inverse=True)[1]
     size = int(unit.max()) + 1 if len(unit) else 0
     if size < FEWEST_UNITS:
         raise ValueError(f"plans: at least two held-out actions are needed for a comparison, not {int(mask.sum())}")
@@ -94,10 +92,28 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
     return Score(model, "actions and context" if prior.takes_context else "actions", totals, counts)
 
 
-def unit_name(plans: Plans) -> str:
-    """What the intervals of `score` go over: "groups", "plans", "plans of one group" or "parts of the plan"."""
-    taken = plans.mask().any(1)
-    if plans.group is not None and len(plans.group[taken].unique()) >= FEWEST_UNITS:
+def action_bits(prior: Prior, plans: Plans) -> Tensor:
+    """What each action costs under `prior`: `[N, L]` bits, float64, on the CPU; 0 beyond a plan's end.
+
+    A prior that sees nothing leaves the context of the plans aside.
+
+    Raises:
+        ValueError: plans that the prior cannot score.
+    """
+    seen = plans if prior.takes_context else replace(plans, context=None, context_names=None)
+    with torch.no_grad():
+        return -prior.action_log_probs(seen).double().cpu() / log(2)
+
+
+def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
+    """What intervals go over: "groups", "plans", "plans of one group" or "parts of the plan".
+
+    Args:
+        plans: the plans.
+        mask: `[N, L]` bool: the actions that count; None: all.
+    """
+    taken = (plans.mask() if mask is None else mask).any(1)
+    if plans.group is not None and len(plans.group.to(taken.device)[taken].unique()) >= FEWEST_UNITS:
         return "groups"
     if plans.group is not None and int(taken.sum()) >= FEWEST_UNITS:
         return "plans of one group"
@@ -180,12 +196,24 @@ def _best(model: str, made: Iterator[tuple[str, Prior]], validation: Plans) -> R
     return best
 
 
-def _units(plans: Plans, mask: Tensor) -> Tensor:
-    """The independent unit of each action, `[N, L]`."""
-    what = unit_name(plans)
+def units(plans: Plans, mask: Tensor) -> Tensor:
+    """The independent unit of each action: what the interval of every statistic of plans goes over.
+
+    The groups; or the plans, where no two groups have actions that count; or `BLOCKS` consecutive parts of the only
+    plan that has any, alike in size but for one action.
+
+    Args:
+        plans: the plans.
+        mask: `[N, L]` bool: the actions that count.
+
+    Returns:
+        `[N, L]` int64, on the device of `mask`: numbers from 0, ascending with the number of the group, of the plan or
+        of the part. They mean nothing outside `mask`, and a group without actions leaves out its number.
+    """
+    what = unit_name(plans, mask)
     if what == "groups":
         assert plans.group is not None
-        unit: Tensor = plans.group.cpu().unique(return_inverse=True)[1]
+        unit: Tensor = plans.group.to(mask.device).unique(return_inverse=True)[1]
         return unit[:, None].expand(mask.shape)
     if what.startswith("plans"):
         taken = mask.any(1)
