@@ -1,0 +1,144 @@
+"""Whether a prior's probabilities are those with which actions are taken: reliability by bins of the forecast."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neuroprior.priors.prior import check_sizes
+from neuroprior.statistics import Interval, ratio_difference, share_interval
+from neuroprior.worlds.world import check_range, is_integer
+
+UNITS = 997
+"""Independent units kept apart: those whose numbers are alike modulo this prime are one."""
+
+AT_ONCE = 2**22
+"""Forecasts looked at together; bounds memory."""
+
+TOLERANCE = 1e-3
+"""How far the probabilities of a place may sum from 1."""
+
+
+@dataclass(frozen=True)
+class Bin:
+    """The forecasts whose probability lies between `low` and `high`.
+
+    Attributes:
+        low, high: the edges; a forecast on an edge belongs to the bin above it, and 1 to the last.
+        forecast: their mean probability.
+        taken: the share of them whose action was taken, with its 95 % interval over units; NaN for the ends where only
+            one unit has any.
+        number: how many there are.
+    """
+
+    low: float
+    high: float
+    forecast: float
+    taken: Interval
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Forecasts against what happened; those of several folds are added by `+`.
+
+    Attributes:
+        sums: `[UNITS, bins, 3]`, float64, on the CPU: of each unit and bin the sum of the forecast probabilities, the
+            number of actions taken, and the number of forecasts.
+    """
+
+    sums: Tensor
+
+    def __add__(self, other: "Reliability") -> "Reliability":
+        """Both together, such as two folds of one cross-validation.
+
+        Raises:
+            ValueError: unlike numbers of bins.
+        """
+        if self.sums.shape != other.sums.shape:
+            raise ValueError(f"bins: {self.sums.shape[1]} and {other.sums.shape[1]} cannot be added")
+        return Reliability(self.sums + other.sums)
+
+    @property
+    def bins(self) -> list[Bin]:
+        """The bins that have forecasts, in ascending order."""
+        forecast, taken, number = self.sums.unbind(-1)
+        edges = torch.linspace(0, 1, self.sums.shape[1] + 1, dtype=torch.double).tolist()
+        found = []
+        for k in self.sums[..., 2].sum(0).nonzero()[:, 0].tolist():
+            has = number[:, k] > 0
+            total = float(number[:, k].sum())
+            share = _share(taken[has, k], number[has, k])
+            found.append(Bin(edges[k], edges[k + 1], float(forecast[:, k].sum()) / total, share, int(total)))
+        return found
+
+    @property
+    def expected_calibration_error(self) -> float:
+        """The mean difference of forecast and share taken in a bin, weighted by number (Naeini et al. 2015)."""
+        forecast, taken, number = self.sums.sum(0).unbind(-1)
+        return float((forecast - taken).abs().sum() / number.sum())
+
+
+def reliability(log_probs: Tensor, actions: Tensor, unit: Tensor, bins: int = 10) -> Reliability:
+    """How often actions were taken that had been forecast with a probability of about 0.05, 0.15, ... 0.95.
+
+    Each place and action counts as one forecast, in `bins` bins of equal width (DeGroot and Fienberg 1983, reliability
+    diagrams). The share of a bin has the interval of a ratio over units (`neuroprior.statistics.ratio_difference`); a
+    share of 0 or 1, which has no spread, has Wilson's, with units for trials.
+
+    Args:
+        log_probs: floating point `[M, A]`, nats: the log-probabilities of all actions at M places, such as
+            `prior(plans.actions).log_softmax(-1)[plans.mask()]`.
+        actions: integers `[M]`: what was taken.
+        unit: integers `[M]`: the independent unit of each place (see `neuroprior.comparison.units`). Those alike modulo
+            `UNITS` are one, so number few units from 0.
+        bins: number of bins.
+
+    Raises:
+        ValueError: no places, a shape or dtype is wrong, or probabilities that do not sum to 1.
+    """
+    check_sizes(bins=bins)
+    if log_probs.dim() != 2 or not log_probs.is_floating_point() or log_probs.numel() == 0:
+        raise ValueError(
+            f"log_probs: floating point, shape [M, A], is expected, not {log_probs.dtype}, {list(log_probs.shape)}"
+        )
+    places, num_actions = log_probs.shape
+    for name, values in (("actions", actions), ("unit", unit)):
+        if values.shape != (places,) or not is_integer(values):
+            raise ValueError(f"{name}: integers of shape [{places}] are expected, not {list(values.shape)}")
+    check_range("actions", actions, num_actions, "actions")
+    sums = torch.zeros(UNITS * bins, 3, dtype=torch.double)
+    size = max(AT_ONCE // num_actions, 1)
+    for at in range(0, places, size):
+        part = slice(at, at + size)
+        probs = log_probs[part].double().exp()
+        _check_probabilities(probs, at)
+        place = (probs * bins).long().clamp(max=bins - 1) + (unit[part].long() % UNITS * bins)[:, None]
+        hit = place.gather(1, actions[part].long()[:, None])[:, 0]
+        flat = place.flatten()
+        counted = [flat.bincount(probs.flatten()), hit.bincount(), flat.bincount()]
+        for column, values in enumerate(counted):
+            sums[: len(values), column] += values.double().cpu()
+    return Reliability(sums.view(UNITS, bins, 3))
+
+
+def _check_probabilities(probs: Tensor, first: int) -> None:
+    """Raise ValueError unless the rows, of which the first has the number `first`, sum to 1."""
+    wrong = ~((probs.sum(1) - 1).abs() <= TOLERANCE)
+    if wrong.any():
+        row = int(wrong.nonzero()[0, 0])
+        raise ValueError(
+            f"log_probs[{first + row}]: the probabilities sum to {float(probs[row].sum()):.4g}, not 1;"
+            " log_softmax makes log-probabilities of logits"
+        )
+
+
+def _share(taken: Tensor, number: Tensor) -> Interval:
+    """The share taken over units `[G]` that all have some."""
+    share = float(taken.sum() / number.sum())
+    if share in (0, 1):
+        return share_interval(round(share * len(taken)), len(taken))
+    if len(taken) < 2:
+        return Interval(share, float("nan"), float("nan"))
+    _, low, high, _ = ratio_difference(taken, number)
+    return Interval(share, max(low, 0.0), min(high, 1.0))
