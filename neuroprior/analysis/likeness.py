@@ -1,0 +1,223 @@
+"""Generated plans against real ones: which of their statistics tell them apart."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from torch import Tensor
+
+from neuroprior.comparison import BLOCKS
+from neuroprior.plans import Plans
+from neuroprior.priors.prior import check_sizes
+from neuroprior.randomness import generator_on
+from neuroprior.statistics import holm
+
+ORDERS = range(1, 5)
+"""Lengths of the n-grams that are compared."""
+
+LONGEST = 50
+"""Steps from which on run lengths and return times are one class."""
+
+MOST_PLANS = 20_000
+"""Plans of each kind that are compared; of more, as many are drawn."""
+
+MOST_ACTIONS = 2**20
+"""Actions of each kind that are compared, likewise."""
+
+MOST_SHOWN = 20
+"""n-grams whose shares are told: the most frequent."""
+
+FEWEST_WAYS = 120
+"""Ways to label the plans without which none of the six corrected p-values can reach 0.05: then plans are cut."""
+
+WORK = 10**9
+"""Additions that the permutations of one statistic may take."""
+
+FEWEST_PERMUTATIONS = 99
+"""Permutations that are made even so."""
+
+AT_ONCE = 2**23
+"""Counts held at once; bounds memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Likeness:
+    """How one statistic of generated plans differs from that of real ones.
+
+    Attributes:
+        statistic: "1-grams" to "4-grams", "run lengths" or "return times".
+        distance: the total variation between the two distributions, 0 (alike) to 1 (nothing in common).
+        chance: the mean distance of two such sets from one source.
+        p_value: of both being from one source.
+        corrected: the same, corrected for the number of statistics (`neuroprior.statistics.holm`).
+        permutations: how many were made.
+        classes: of n-grams the actions of the `MOST_SHOWN` most frequent ones (in the mean of both distributions); else
+            (1,), (2,), ... steps, of which the last, `LONGEST` + 1, stands for all that are longer.
+        real, generated: `[K]`, float64: the share of each of the K classes.
+    """
+
+    statistic: str
+    distance: float
+    chance: float
+    p_value: float
+    corrected: float
+    permutations: int
+    classes: tuple[tuple[int, ...], ...]
+    real: Tensor
+    generated: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Sequences:
+    """Actions of many plans end to end: `actions [M]`, the number of the plan of each `[M]`, ascending; N plans."""
+
+    actions: Tensor
+    plan: Tensor
+    num_plans: int
+
+
+def likeness(
+    real: Plans, generated: Plans, permutations: int = 999, generator: torch.Generator | None = None
+) -> list[Likeness]:
+    """Compare the distributions of n-grams, run lengths and return times in generated and in real plans.
+
+    A run is a stretch of the same action; a return time is the number of steps until the same action comes again, where
+    it does in the same plan. Counts are pooled over plans, the distance is the total variation, and the p-value that
+    of a permutation test: where both are drawn from one source, whole plans may change their labels (Good 2005,
+    Permutation, parametric and bootstrap tests). So the plans of each kind must be independent of each other: plans of
+    few subjects, each with ways of its own, differ from plans of others by more than that. Generate plans as long as
+    the real ones: what comes again within a plan depends on its length.
+
+    Where the plans could be labelled in fewer than `FEWEST_WAYS` ways (nine plans, say, or one among a hundred), all
+    are cut into consecutive pieces of the same length, about `BLOCKS` of the shorter kind, and pieces stand for plans.
+    Then what reaches across pieces must be small, and unlike plans of one kind count as a difference.
+
+    Args:
+        real: executed plans; at most `MOST_PLANS` plans and about `MOST_ACTIONS` actions are drawn from them.
+        generated: plans sampled from a prior, likewise.
+        permutations: at most so many; fewer, but `FEWEST_PERMUTATIONS`, where they would take longer than some seconds.
+        generator: draws the plans and the permutations.
+
+    Returns:
+        One for each statistic that occurs, in the order of `Likeness.statistic`.
+
+    Raises:
+        ValueError: unlike numbers of actions, plans without any action, or no permutations.
+    """
+    check_sizes(permutations=permutations)
+    if real.num_actions != generated.num_actions:
+        raise ValueError(f"real plans have {real.num_actions} actions, generated ones {generated.num_actions}")
+    draw = generator_on(generator, "cpu")
+    kinds = [_flat(name, plans, draw) for name, plans in (("real", real), ("generated", generated))]
+    if comb(sum(kind.num_plans for kind in kinds), kinds[0].num_plans) < FEWEST_WAYS:
+        size = max(min(len(kind.actions) for kind in kinds) // BLOCKS, 1)
+        kinds = [_cut(kind, size) for kind in kinds]
+    first, second = kinds
+    both = _Sequences(
+        torch.cat([first.actions, second.actions]),
+        torch.cat([first.plan, second.plan + first.num_plans]),
+        first.num_plans + second.num_plans,
+    )
+    tested = [
+        _test(name, counts, values, first.num_plans, permutations, draw)
+        for name, counts, values in _statistics(both, real.num_actions)
+    ]
+    corrected = holm([one.p_value for one in tested])
+    return [replace(one, corrected=float(p)) for one, p in zip(tested, corrected, strict=True)]
+
+
+def _flat(name: str, plans: Plans, generator: torch.Generator) -> _Sequences:
+    """The plans that have actions, in random order, as many as are compared."""
+    lengths = plans.mask().sum(1).cpu()
+    taken = lengths.nonzero()[:, 0]
+    if len(taken) == 0:
+        raise ValueError(f"{name}: plans with at least one action are expected")
+    taken = taken[torch.randperm(len(taken), generator=generator)][:MOST_PLANS]
+    taken = taken[lengths[taken].cumsum(0) - lengths[taken] < MOST_ACTIONS]
+    kept = plans[taken.to(plans.actions.device)]
+    mask = kept.mask()
+    plan = torch.arange(len(taken)).repeat_interleave(lengths[taken])
+    return _Sequences(kept.actions[mask].long().cpu()[:MOST_ACTIONS], plan[:MOST_ACTIONS], len(taken))
+
+
+def _cut(sequences: _Sequences, size: int) -> _Sequences:
+    """Each plan cut into pieces of `size` actions; the last of a plan may be shorter."""
+    plan = sequences.plan
+    place = torch.arange(len(plan)) - torch.searchsorted(plan, plan)
+    _, piece = (plan * len(plan) + place // size).unique_consecutive(return_inverse=True)
+    return _Sequences(sequences.actions, piece, int(piece[-1]) + 1)
+
+
+def _statistics(both: _Sequences, num_actions: int) -> Iterator[tuple[str, sparse.csr_matrix, Tensor]]:
+    """Each statistic that occurs: its name, counts `[K, N]` of its classes in the plans, and the classes `[K, n]`."""
+    actions, plan = both.actions, both.plan
+
+    def counts(kind: Tensor, at: Tensor, kinds: int) -> sparse.csr_matrix:
+        where = (kind.numpy(), plan[at].numpy())
+        return sparse.coo_matrix((np.ones(len(at)), where), shape=(kinds, both.num_plans)).tocsr()
+
+    at, gram = torch.arange(len(actions)), torch.zeros_like(actions)
+    for n in ORDERS:
+        whole = at + n - 1 < len(actions)
+        whole &= plan[(at + n - 1).clamp(max=len(actions) - 1)] == plan[at]
+        at, gram = at[whole], gram[whole]
+        if len(at) == 0:
+            break
+        # From the rank of the first n - 1 actions, so that no code grows beyond what an integer holds.
+        distinct, gram = (gram * num_actions + actions[at + n - 1]).unique(return_inverse=True)
+        example = torch.zeros(len(distinct), dtype=torch.long).index_put_((gram,), at)
+        yield f"{n}-grams", counts(gram, at, len(distinct)), actions[example[:, None] + torch.arange(n)]
+    steps = torch.arange(1, LONGEST + 2)[:, None]
+    begins = torch.ones_like(actions, dtype=torch.bool)
+    begins[1:] = (actions[1:] != actions[:-1]) | (plan[1:] != plan[:-1])
+    run = begins.nonzero()[:, 0]
+    length = torch.diff(run, append=torch.tensor([len(actions)]))
+    yield "run lengths", counts(length.clamp(max=LONGEST + 1) - 1, run, len(steps)), steps
+    order = (plan * num_actions + actions).argsort(stable=True)
+    same = (plan[order[1:]] == plan[order[:-1]]) & (actions[order[1:]] == actions[order[:-1]])
+    if same.any():
+        time = (order[1:] - order[:-1])[same]
+        yield "return times", counts(time.clamp(max=LONGEST + 1) - 1, order[1:][same], len(steps)), steps
+
+
+def _test(
+    name: str, counts: sparse.csr_matrix, classes: Tensor, num_real: int, permutations: int, generator: torch.Generator
+) -> Likeness:
+    """The permutation test of one statistic; the first `num_real` plans are real. `corrected` is not known yet."""
+    kinds, num = counts.shape
+    made = min(permutations, max(WORK // (counts.nnz + 4 * kinds), FEWEST_PERMUTATIONS))
+    total = np.asarray(counts.sum(1))
+    observed = np.zeros((num, 1))
+    observed[:num_real] = 1
+    is_real = counts @ observed
+    distance = float(_distances(is_real, total)[0])
+    null = []
+    at_once = max(AT_ONCE // max(kinds, num), 1)
+    for first in range(0, made, at_once):
+        labels = np.zeros((num, min(at_once, made - first)))
+        for column in labels.T:
+            column[torch.randperm(num, generator=generator)[:num_real].numpy()] = 1
+        null.append(_distances(counts @ labels, total))
+    chance = np.concatenate(null)
+    # Ties count, whatever their rounding.
+    p_value = (1 + int((chance >= distance - 1e-9).sum())) / (1 + made)
+    shares = [torch.from_numpy((part / max(part.sum(), 1))[:, 0]) for part in (is_real, total - is_real)]
+    if classes.shape[1] > 1 or name == "1-grams":
+        shown = (shares[0] + shares[1]).argsort(descending=True, stable=True)[:MOST_SHOWN]
+        classes, shares = classes[shown], [share[shown] for share in shares]
+    shown_classes = tuple(tuple(row) for row in classes.tolist())
+    return Likeness(name, distance, float(chance.mean()), p_value, p_value, made, shown_classes, *shares)
+
+
+def _distances(is_real: NDArray[np.float64], total: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The total variation `[P]` of counts `[K, P]` and of what is left to the totals `[K, 1]`."""
+    first = is_real.sum(0)
+    second = np.maximum(total.sum() - first, 1)
+    gaps = is_real * (1 / np.maximum(first, 1) + 1 / second)
+    gaps -= total / second
+    distances: NDArray[np.float64] = np.abs(gaps, out=gaps).sum(0) / 2
+    return distances
