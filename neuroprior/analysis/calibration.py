@@ -107,14 +107,15 @@ def reliability(log_probs: Tensor, actions: Tensor, unit: Tensor, bins: int = 10
         if values.shape != (places,) or not is_integer(values):
             raise ValueError(f"{name}: integers of shape [{places}] are expected, not {list(values.shape)}")
     check_range("actions", actions, num_actions, "actions")
+    actions, unit = actions.to(log_probs.device).long(), unit.to(log_probs.device).long()
     sums = torch.zeros(UNITS * bins, 3, dtype=torch.double)
     size = max(AT_ONCE // num_actions, 1)
     for at in range(0, places, size):
         part = slice(at, at + size)
         probs = log_probs[part].double().exp()
         _check_probabilities(probs, at)
-        place = (probs * bins).long().clamp(max=bins - 1) + (unit[part].long() % UNITS * bins)[:, None]
-        hit = place.gather(1, actions[part].long()[:, None])[:, 0]
+        place = (probs * bins).long().clamp(max=bins - 1) + (unit[part] % UNITS * bins)[:, None]
+        hit = place.gather(1, actions[part][:, None])[:, 0]
         flat = place.flatten()
         counted = [flat.bincount(probs.flatten()), hit.bincount(), flat.bincount()]
         for column, values in enumerate(counted):

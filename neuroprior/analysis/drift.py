@@ -1,25 +1,18 @@
 """Drift: how costs and actions change within plans, from plan to plan of a group, and between groups."""
 
 from dataclasses import dataclass, replace
-from itertools import permutations
 from math import nan
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
+from neuroprior.analysis.ranks import FEWEST_RANKED, mean_correlation, rank_correlation
 from neuroprior.comparison import BLOCKS, FEWEST_UNITS, units
 from neuroprior.plans import Plans
 from neuroprior.priors.prior import check_sizes
 from neuroprior.statistics import Difference, Interval, holm, ratio_difference
-
-FEWEST_PLANS = 3
-"""Plans of a group without which it has no trend."""
-
-EXACT = 7
-"""Plans of a group up to which the p-value of its trend is that of all their orders."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +43,9 @@ class PlanDrift:
         index: int64 `[K]`: which plan of `plans` (or which part).
         group: int64 `[K]`: the group's number; 0 where there are none.
         bits, actions: float64 `[K]`: bits per action, and how many actions count.
-        correlations: of each group with at least `FEWEST_PLANS` plans, its number and Spearman's rank correlation of
-            the plans' order and their bits per action (below 0: plans get easier to predict), with a 95 % interval
-            (Fisher's; -1 to 1 of three plans) and the p-value of 0.
+        correlations: of each group with at least three plans, its number and Spearman's rank correlation of the plans'
+            order and their bits per action (below 0: plans get easier to predict), with a 95 % interval (Fisher's; -1
+            to 1 of three plans) and the p-value of 0.
         trend: their mean over groups, with Student's interval and p-value; that of the only group where there is one;
             None without any.
     """
@@ -161,12 +154,12 @@ def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
     starts = first.sort().indices  # ranks of groups in the order of their first plan
     sizes = inverse.bincount(minlength=len(numbers))[starts].tolist()
     for number, part in zip(numbers[starts].tolist(), costs.split(sizes), strict=True):
-        if len(part) >= FEWEST_PLANS:
-            correlations[number] = _rank_correlation(part.numpy())
+        if len(part) >= FEWEST_RANKED:
+            correlations[number] = rank_correlation(part.numpy())
     means = [one.mean for one in correlations.values()]
     trend = next(iter(correlations.values()), None)
     if len(means) >= FEWEST_UNITS:
-        trend = _mean_correlation(means)
+        trend = mean_correlation(means)
     return PlanDrift(item, index[order], group[order], costs, actions[order], correlations, trend)
 
 
@@ -288,35 +281,3 @@ def _ratio(totals: Tensor, sizes: Tensor) -> Interval:
     if len(sizes) < FEWEST_UNITS:
         return Interval(float(totals.sum() / sizes.sum()), nan, nan)
     return Interval(*ratio_difference(totals, sizes)[:3])
-
-
-def _rank_correlation(values: NDArray[np.float64]) -> Difference:
-    """Spearman's correlation of at least three values with their order, which has no ties; 0 where all are equal."""
-    num = len(values)
-    if (values == values[0]).all():
-        return Difference(0.0, -1.0, 1.0, 1.0)
-    ranks = stats.rankdata(values)
-    ranks = (ranks - ranks.mean()) / np.linalg.norm(ranks - ranks.mean())
-    order = np.arange(num) - (num - 1) / 2
-    order /= np.linalg.norm(order)
-    correlation = round(float(order @ ranks), 12)  # so that a perfect one is 1
-    if num <= EXACT:  # Student's approximation would call three plans in a row certain
-        every = order[np.array(list(permutations(range(num))))] @ ranks
-        p_value = float((np.abs(every) >= abs(correlation) - 1e-9).mean())
-    else:
-        t = correlation * np.sqrt((num - 2) / max(1 - correlation**2, 1e-12))
-        p_value = float(2 * stats.t.sf(abs(t), num - 2))
-    if num <= FEWEST_PLANS or abs(correlation) == 1:
-        return Difference(correlation, -1.0, 1.0, p_value)
-    # 1.06: the variance for ranks (Fieller, Hartley and Pearson 1957).
-    centre, half = np.arctanh(correlation), stats.norm.ppf(0.975) * np.sqrt(1.06 / (num - 3))
-    return Difference(correlation, float(np.tanh(centre - half)), float(np.tanh(centre + half)), p_value)
-
-
-def _mean_correlation(correlations: list[float]) -> Difference:
-    """Student's mean of the correlations of two groups or more, within -1 and 1."""
-    mean, low, high, p_value = ratio_difference(correlations, np.ones(len(correlations)))
-    if len(set(correlations)) == 1 and mean != 0:
-        # Those of few plans are often the same by chance: what then counts is how often all signs are.
-        return Difference(mean, -1.0, 1.0, 2.0 ** (1 - len(correlations)))
-    return Difference(mean, max(low, -1.0), min(high, 1.0), p_value)
