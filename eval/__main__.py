@@ -16,6 +16,7 @@ def _run(arguments: Sequence[str]) -> None:
     from jsonargparse import ArgumentError, ArgumentParser
 
     from eval.bench import bench
+    from eval.mice import LISTS, mice
     from eval.paper import paper
     from eval.plans import plans
     from eval.quality import quality
@@ -23,10 +24,13 @@ def _run(arguments: Sequence[str]) -> None:
     about = "Compare behavioural priors. Dashes and underscores in option names are the same."
     parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False)
     commands = parser.add_subcommands()
-    by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality}
+    by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality, "mice": mice}
     for name, command in by_name.items():
         sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False)
-        sub.add_function_arguments(command, as_group=False, as_positional=True, skip={"priors"})
+        lists = LISTS if command is mice else {}
+        sub.add_function_arguments(command, as_group=False, as_positional=True, skip={"priors", *lists})
+        for option, (default, what) in lists.items():
+            sub.add_argument(f"--{option}", nargs="+", type=int, default=list(default), help=what)
         if command is plans:
             sub.add_argument(
                 "--priors", nargs="+", type=str, required=True, help="model folders; the first is compared with"
