@@ -24,7 +24,8 @@ STYLES = {"": "-", "node": "-", "moves": (0, (4, 2))}
 ENTRANCE = (-8.0, 0.0)
 """Where the corridor from the home cage begins."""
 
-WATER_COLOR = "#00a5cf"
+STAR: dict[str, Any] = {"color": "#00a5cf", "markeredgecolor": "black", "markersize": 15, "zorder": 7}
+START: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "markersize": 8, "zorder": 6}
 
 
 def coordinates(world: TabularWorld) -> Tensor:
@@ -84,11 +85,11 @@ def maze(path: Path, plans: Plans) -> None:
     junction = place[: len(share)].numpy()
     size = 30 + 190 * (number / number.max()).sqrt().numpy()
     turns.scatter(*junction.T, s=size, c=share.numpy(), cmap="PuOr", norm=even, edgecolor="#444444", zorder=4)
-    turns.set_title("which way mice turned on their way in\n(area: how often they walked on inward)")
+    turns.set_title("which way mice turned on their way in\n(the larger, the more moves inward)")
     bar = figure.colorbar(ScalarMappable(even, "PuOr"), ax=turns, shrink=0.75, pad=0.02, ticks=[0, 0.25, 0.5, 0.75, 1])
     bar.set_ticklabels(["always right", "25 % left", "as often", "75 % left", "always left"])
     for axes in (visits, turns):
-        _signs(axes, place, len(share) if axes is turns else 0)
+        _signs(axes, place)
     save(figure, path)
 
 
@@ -107,8 +108,8 @@ def plans_in_maze(path: Path, priors: dict[str, Prior], world: TabularWorld, see
         shift = 0.4 * (torch.rand(number, 1, 2, generator=generator) - 0.5)
         lines = LineCollection(list((place[course] + shift).numpy()), colors=color, linewidths=1.1, alpha=0.4, zorder=3)
         axes.add_collection(lines)
-        _signs(axes, place, 0)
-        axes.plot(*place[int(start)].numpy(), "o", color="white", markeredgecolor="black", markersize=8, zorder=6)
+        axes.plot(*place[start].T.numpy(), "o", label="start", **START)
+        _signs(axes, place)
         reached = int((rollout.rewards.sum(-1) > 0).sum())
         axes.set_title(f"{name}\n{reached} of {number} plans reach the water", fontsize=10)
     figure.tight_layout()
@@ -136,7 +137,7 @@ def _corridors(
     parent = (torch.arange(len(place)) - 1).div(2, rounding_mode="floor")
     ends = torch.stack([place[parent.clamp(min=0)], place], 1).numpy()
     ends[0, 0] = ENTRANCE
-    order = np.arange(len(place))[::-1]  # wide corridors cross at junctions: the outer ones last, on top
+    order = np.arange(len(place))[::-1]  # wide corridors meet at junctions: the inner ones last, on top
     edges = LineCollection(list(ends), colors="#9a9a9a", linewidths=width + 1.6, capstyle="projecting", zorder=1)
     axes.add_collection(edges)
     paint: dict[str, Any] = {"colors": "#efefef"}
@@ -148,21 +149,13 @@ def _corridors(
     axes.spines[:].set_visible(False)
 
 
-def _signs(axes: Axes, place: Tensor, junctions: int) -> None:
-    """The water and the entrance."""
-    x, y = place[WATER].tolist()
-    axes.plot(x, y, "*", color=WATER_COLOR, markeredgecolor="black", markersize=15, zorder=7)
-    axes.annotate("home", ENTRANCE, xytext=(-9.5, 0.75), fontsize=9, va="center")
+def _signs(axes: Axes, place: Tensor) -> None:
+    """The water, the entrance and a legend."""
+    axes.plot(*place[WATER, :, None].numpy(), "*", label="water", **STAR)
     x = ENTRANCE[0]
+    axes.annotate("home", ENTRANCE, xytext=(x - 1.5, 0.75), fontsize=9, va="center")
     axes.annotate("", (x + 0.9, 0), xytext=(x - 0.9, 0), arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=8)
-    axes.legend(
-        [Line2D([], [], marker="*", color=WATER_COLOR, markeredgecolor="black", markersize=12, linestyle="none")],
-        ["water"],
-        loc="lower left",
-        bbox_to_anchor=(0.0, -0.045),
-        frameon=False,
-        handletextpad=0.1,
-    )
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, -0.05), ncols=2, frameon=False, handletextpad=0.1)
 
 
 def reached_against_candidates(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -31,7 +31,7 @@ def mice(
     num_plans: Sequence[int] = LISTS["num_plans"][0],
     lengths: Sequence[int] = LISTS["lengths"][0],
     training_plans: int = 4000,
-    steps: int = 200,
+    steps: int = 300,
     seed: int = 0,
     out: str = "runs/mice-planner",
 ) -> None:
@@ -70,8 +70,12 @@ def mice(
     write_json(folder / "results.json", found | {"versions": versions(), "seed": seed})
     maze_figures.reached_against_candidates(folder / "mice_planner.png", rows)
     maze_figures.maze(folder / "maze.png", plans)
-    shown = (UNIFORM, Key("markov", "mice", "moves"), Key("gru", "mice", "node"))
-    examples = {str(key) if key != UNIFORM else "random legal moves": outcome.priors[key] for key in shown}
+    shown = {
+        "random legal moves": UNIFORM,
+        "the mice's Markov prior, sees its moves": Key("markov", "mice", "moves"),
+        "the mice's GRU, sees the node": Key("gru", "mice", "node"),
+    }
+    examples = {name: outcome.priors[key] for name, key in shown.items()}
     maze_figures.plans_in_maze(folder / "maze_plans.png", examples, world, seed)
     console.print(f"written to {folder}")
 
@@ -207,7 +211,8 @@ def _reached_table(rows: list[dict[str, Any]], study: Study) -> Table:
     for source, kind, sees, some in _by_prior([row for row in rows if row["length"] == length]):
         if (kind, sees) in (("markov", "moves"), ("oracle", "")):
             table.add_section()
-        table.add_row(source, kind, sees, *(_share_text(row) for row in some))
+        everywhere = some * len(study.num_plans) if kind == "oracle" else some
+        table.add_row(source, kind, sees, *(_share_text(row) for row in everywhere))
     table.add_row("model steps", "", "", *(f"{length * number:,}" for number in study.num_plans), style="dim")
     starts = "all 126 nodes" if study.starts == NODES else f"{study.starts} nodes, drawn anew in each"
     table.caption = (
