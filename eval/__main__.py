@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from neuroprior.program import run_program
 
@@ -16,8 +17,10 @@ def _run(arguments: Sequence[str]) -> None:
     from jsonargparse import ArgumentError, ArgumentParser
 
     from eval.bench import bench
-    from eval.mice import LISTS, mice
+    from eval.mice import LISTS as MICE_LISTS
+    from eval.mice import mice
     from eval.paper import paper
+    from eval.plans import LISTS as PLANS_LISTS
     from eval.plans import plans
     from eval.quality import quality
 
@@ -25,16 +28,15 @@ def _run(arguments: Sequence[str]) -> None:
     parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False)
     commands = parser.add_subcommands()
     by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality, "mice": mice}
+    # Lists are given as words, `--priors a b`, which functions cannot say.
+    numbers = {key: {"type": int, "default": [*some], "help": what} for key, (some, what) in MICE_LISTS.items()}
+    lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
     for name, command in by_name.items():
         sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False)
-        lists = LISTS if command is mice else {}
-        sub.add_function_arguments(command, as_group=False, as_positional=True, skip={"priors", *lists})
-        for option, (default, what) in lists.items():
-            sub.add_argument(f"--{option}", nargs="+", type=int, default=list(default), help=what)
-        if command is plans:
-            sub.add_argument(
-                "--priors", nargs="+", type=str, required=True, help="model folders; the first is compared with"
-            )
+        own = lists.get(name, {})
+        sub.add_function_arguments(command, as_group=False, as_positional=True, skip=set(own))
+        for option, how in own.items():
+            sub.add_argument(f"--{option}", nargs="+", **how)
         commands.add_subcommand(name, sub)
     try:
         settings = parser.parse_args(list(arguments))

@@ -1,117 +1,167 @@
-"""`python -m eval plans`: saved priors scored on a file of plans."""
+"""`python -m eval plans`: how much structure a file of plans has, how far back it reaches, and which model tells it."""
 
+import os
+import shlex
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor
 
-from eval.tables import columns, titled
-from neuroprior import Prior, load
-from neuroprior.comparison import Score, score, unit_name
-from neuroprior.output import versions, write_csv, write_json
+from eval import crossval, held_out, saved_priors
+from eval.crossval import ACTIONS, CONTEXT, Design, Study
+from eval.fits import KINDS
+from eval.held_out import Model
+from eval.plan_report import Report, write_report
+from neuroprior import load
+from neuroprior.comparison import BLOCKS, Score, in_parts, unit_name
 from neuroprior.plans import Plans, read_plans
+
+MODELS = ("counts", "gru", "transformer")
+LISTS: dict[str, dict[str, Any]] = {
+    "priors": {"help": "score these model folders only; the first is compared with"},
+    "models": {"default": list(MODELS), "choices": MODELS, "help": "which to fit"},
+    "action_names": {"help": "names of the actions in the order of their numbers, where the file does not tell"},
+}
+"""Options that take several words."""
+
+FOLDS = 5
+"""Where they are not given; fewer where there are fewer groups."""
 
 
 def plans(
     file: str,
-    priors: list[str],
+    priors: list[str] | None = None,
+    test: str | None = None,
+    folds: int | None = None,
+    models: list[str] = list(MODELS),  # noqa: B006
+    skip: int = 0,
+    max_steps: int = 1000,
     num_actions: int | None = None,
     action_names: list[str] | None = None,
+    seed: int = 0,
+    processes: int | None = None,
     out: str = "runs/plans",
 ) -> None:
-    """Score saved priors on a file of plans that they have not learned from.
+    """Report on a file of plans: which models tell them best, how far back they reach, what is typical of them.
 
     Args:
-        file: plans: `.npz`, `.jsonl` or `.csv`.
-        priors: model folders, such as `python -m train` writes; the first is what the others are compared with.
+        file: plans: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
+        priors: score these model folders only, such as `python -m train` writes; the first is compared with.
+        test: learn from the file and score on this one, in place of cross-validation.
+        folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
+        models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer.
+        skip: actions at the beginning of each plan that do not count in scores.
+        max_steps: gradient steps of a neural prior.
         num_actions: number of actions, where the file does not tell.
         action_names: names of the actions in the order of their numbers, where the file does not tell.
-        out: folder for `plans.csv` and `results.json`.
+        seed: draws the folds and everything in training.
+        processes: how many models are fitted at a time; all cores by default.
+        out: folder for `report.html`, `results.json`, tables as CSV, and what an interrupted run goes on from.
     """
-    if not priors:
-        raise ValueError("priors: at least one model folder is expected")
-    loaded = {folder: load(folder) for folder in priors}
-    names = action_names or _names(next(iter(loaded.values())))
-    read = _read(file, num_actions, names, bool(action_names))
-    scores = [_score(folder, prior, read) for folder, prior in loaded.items()]
-    rows = [_row(one, scores[0]) for one in scores]
-    Console().print(_table(rows, read))
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / "plans.csv", rows)
-    write_json(folder / "results.json", {"rows": rows, "unit": unit_name(read), "versions": versions()})
+    if skip < 0 or max_steps < 1:
+        raise ValueError(f"skip and max_steps: at least 0 and 1 are expected, not {skip} and {max_steps}")
+    folder, console = Path(out), Console()
+    if priors is not None:
+        report = _of_saved(file, priors, skip, num_actions, action_names)
+    else:
+        read = _read(file, num_actions, action_names)
+        other = None if test is None else _same_names(read, _read(test, num_actions, action_names), test)
+        design = Design(1 if test is not None else _folds(read, folds), seed, skip, max_steps)
+        report = _of_fitted(folder, read, other, design, [*models, "lags"], processes)
+    command = (
+        "python -m eval " + shlex.join(sys.argv[1:]) if sys.argv[1:2] == ["plans"] else f"python -m eval plans {file}"
+    )
+    write_report(replace(report, command=command, source=test or file), folder, console)
 
 
-def _names(prior: Prior) -> list[str] | None:
-    """The names of the actions that a prior has learned, without that of its end symbol."""
-    return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
+def _read(file: str, num_actions: int | None, action_names: list[str] | None) -> Plans:
+    read = read_plans(file, num_actions=num_actions, action_names=action_names)
+    read = read if read.end is None else read.without_end()
+    return in_parts(read, min(BLOCKS, max(int(read.mask().sum()) // 2, 1))) if len(read) == 1 else read
 
 
-def _read(file: str, num_actions: int | None, names: list[str] | None, given: bool) -> Plans:
-    # Other files tell their names themselves, and perhaps that of an end symbol, or number fewer actions.
-    names = names if given or Path(file).suffix.lower() in (".csv", ".tsv") else None
-    read = read_plans(file, num_actions=num_actions, action_names=names)
-    return read if read.end is None else read.without_end()
+def _folds(read: Plans, folds: int | None) -> int:
+    """How many; by default no more than there are units."""
+    if folds is not None:
+        return folds
+    grouped = read.group is not None and len(read.group.unique()) > 1
+    return min(FOLDS, len(read.group.unique()) if grouped and read.group is not None else len(read))
 
 
-def _score(folder: str, prior: Prior, read: Plans) -> Score:
-    known = prior.num_actions - (prior.end is not None)
-    if read.num_actions > known:
-        raise ValueError(f"{folder}: knows {known} actions, the file has {read.num_actions}")
-    read = _with_actions_of(prior, read, folder)
-    seen = _with_contexts_of(prior, replace(read, num_actions=known, action_names=None), folder)
-    try:
-        return score(folder, prior, seen if prior.end is None else seen.with_end())
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from error
+def _same_names(read: Plans, other: Plans, test: str) -> Plans:
+    """The test plans with actions and contexts numbered as in those that are learned from."""
+    if (read.context is None) != (other.context is None):
+        raise ValueError(f"{test}: {'no' if other.context is None else 'a'} context, unlike the plans to learn from")
+    if read.action_names is not None and other.action_names is not None:
+        number = _numbers("action", read.action_names, other.action_names, test)
+        other = replace(other, actions=number[other.actions.long()], num_actions=read.num_actions, action_names=None)
+    if other.num_actions > read.num_actions:
+        raise ValueError(f"{test}: {other.num_actions} actions, but {read.num_actions} in the plans to learn from")
+    other = replace(other, num_actions=read.num_actions, action_names=read.action_names)
+    if read.context_names is not None and other.context_names is not None and other.context is not None:
+        number = _numbers("context", read.context_names, other.context_names, test)
+        other = replace(other, context=number[other.context.long()], context_names=read.context_names)
+    return other
 
 
-def _with_actions_of(prior: Prior, read: Plans, folder: str) -> Plans:
-    """The plans with their actions numbered as the prior has learned them, by name."""
-    names = _names(prior)
-    if names is None or read.action_names is None:
-        return read
-    unknown = [name for name in read.action_names if name not in names]
-    if unknown:
-        raise ValueError(f"{folder}: does not know the action {unknown[0]!r}; it knows {', '.join(names)}")
-    number = torch.tensor([names.index(name) for name in read.action_names])
-    return replace(read, actions=number[read.actions.long()], num_actions=len(names), action_names=None)
-
-
-def _with_contexts_of(prior: Prior, read: Plans, folder: str) -> Plans:
-    """The plans with their contexts numbered as the prior has learned them, by name."""
-    if prior.context_names is None or read.context_names is None or read.context is None:
-        return read
-    unknown = [name for name in read.context_names if name not in prior.context_names]
-    if unknown:
+def _numbers(what: str, known: Any, names: Any, file: str) -> Tensor:
+    """The number under which each name is known."""
+    known = list(known)
+    if unknown := [name for name in names if name not in known]:
         raise ValueError(
-            f"{folder}: has not seen the context {unknown[0]!r}; it knows {', '.join(prior.context_names)}"
+            f"{file}: the {what} {unknown[0]!r} is not in the plans to learn from; they have {', '.join(known)}"
         )
-    number = torch.tensor([prior.context_names.index(name) for name in read.context_names])
-    return replace(read, context=number[read.context.long()], context_names=None)
+    return torch.tensor([known.index(name) for name in names])
 
 
-def _row(one: Score, first: Score) -> dict[str, Any]:
-    taken = one.bits_per_action()
-    row = {"model": one.model, "sees": one.sees, "bits_per_action": taken.mean, "low": taken.low, "high": taken.high}
-    if len(one.bits) != len(first.bits) or not one.actions.equal(first.actions):
-        # one tells the ends of plans too, the other does not
-        return row | {"more_than_first": None, "more_low": None, "more_high": None}
-    gap = one.minus(first)
-    return row | {"more_than_first": gap.mean, "more_low": gap.low, "more_high": gap.high}
+def _of_fitted(
+    folder: Path, read: Plans, test: Plans | None, design: Design, kinds: list[str], processes: int | None
+) -> Report:
+    """Fit all models and score them on held-out plans."""
+    study = Study.prepare(folder, read, test, design)
+    sees = [ACTIONS] + [CONTEXT] * (read.context is not None)
+    todo = crossval.jobs(design, [kind for kind in KINDS if kind in kinds], sees)
+    bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*bar, TimeRemainingColumn(), transient=True) as progress:
+        task = progress.add_task("fitting models", total=len(todo))
+        crossval.run(study, todo, processes or os.cpu_count() or 1, lambda job: progress.advance(task))
+    models = held_out.models_of(study, todo)
+    scored, mask = study.scored, study.mask()
+    scores = held_out.scores_of(models, scored, mask)
+    rows = held_out.score_rows(scores, models)
+    reference = min(scores, key=lambda one: one.bits_per_action().mean)
+    settings = {"folds": design.folds, "seed": design.seed, "skip": design.skip, "max_steps": design.max_steps}
+    return Report(
+        read if test is None else scored,
+        scored,
+        mask,
+        models,
+        scores,
+        rows,
+        f"{reference.model} ({reference.sees})",
+        held_out.step_rows(study, todo),
+        settings,
+    )
 
 
-def _table(rows: list[dict[str, Any]], read: Plans) -> Any:
-    table = titled(f"Bits per action on {len(read):,} plans ({int(read.mask().sum()):,} actions)")
-    columns(table, ("prior", "sees", "bits", "95 % interval", "more", "95 % interval"), 2)
-    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
-    for row in rows:
-        more = ("", "")
-        if row is not rows[0] and row["more_than_first"] is not None:
-            more = (f"{row['more_than_first']:+.4f}", f"{row['more_low']:+.4f} to {row['more_high']:+.4f}")
-        sees = "context" if "context" in row["sees"] else "actions"
-        table.add_row(row["model"], sees, f"{row['bits_per_action']:.4f}", f"{row['low']:.4f}-{row['high']:.4f}", *more)
-    table.caption = f"95 % intervals over {unit_name(read)}; more: bits more than the first takes, paired."
-    return table
+def _of_saved(
+    file: str, folders: list[str], skip: int, num_actions: int | None, action_names: list[str] | None
+) -> Report:
+    """Score saved priors alone."""
+    if not folders:
+        raise ValueError("priors: at least one model folder is expected")
+    loaded = {folder: load(folder) for folder in folders}
+    read = saved_priors.read_for(file, loaded, num_actions, action_names)
+    found = [saved_priors.score_saved(folder, prior, read, skip) for folder, prior in loaded.items()]
+    models: list[Model] = [model for model, _ in found]
+    scores: list[Score] = [score for _, score in found]
+    rows = [held_out.score_row(one, scores[0]) | {"how": model.how} for model, one in found]
+    mask = read.mask()
+    mask[:, :skip] = False
+    settings = {"priors": ", ".join(folders), "skip": skip, "unit": unit_name(read, mask)}
+    return Report(read, read, mask, models, scores, rows, folders[0], [], settings)

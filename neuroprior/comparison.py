@@ -7,7 +7,7 @@ from math import log
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, sees_each_step
 from neuroprior.priors import ContextTreePrior, MarkovPrior, Prior, UniformPrior
 from neuroprior.priors.backoff import Backoff
 from neuroprior.priors.histories import TooLargeError
@@ -81,15 +81,30 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
     Raises:
         ValueError: plans that the prior cannot score, or fewer than two actions.
     """
-    bits = action_bits(prior, plans)
-    mask = plans.mask().cpu()
+    sees = "actions and context" if prior.takes_context else "actions"
+    return score_bits(model, sees, action_bits(prior, plans), plans)
+
+
+def score_bits(model: str, sees: str, bits: Tensor, plans: Plans, mask: Tensor | None = None) -> Score:
+    """The score of a model whose bits are known.
+
+    Args:
+        model: its name.
+        sees: "actions", or "actions and context".
+        bits: `[N, L]`, what each action cost.
+        plans: held-out plans, of which the units come.
+        mask: `[N, L]` bool: the actions that count; None: all.
+
+    Raises:
+        ValueError: fewer than two actions count.
+    """
+    mask = (plans.mask() if mask is None else mask).cpu()
     unit = units(plans, mask)[mask].unique(return_inverse=True)[1]
     size = int(unit.max()) + 1 if len(unit) else 0
     if size < FEWEST_UNITS:
         raise ValueError(f"plans: at least two held-out actions are needed for a comparison, not {int(mask.sum())}")
-    totals = torch.zeros(size, dtype=torch.double).index_add_(0, unit, bits[mask])
-    counts = unit.bincount(minlength=size).double()
-    return Score(model, "actions and context" if prior.takes_context else "actions", totals, counts)
+    totals = torch.zeros(size, dtype=torch.double).index_add_(0, unit, bits[mask].double())
+    return Score(model, sees, totals, unit.bincount(minlength=size).double())
 
 
 def action_bits(prior: Prior, plans: Plans) -> Tensor:
@@ -103,6 +118,59 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
     seen = plans if prior.takes_context else replace(plans, context=None, context_names=None)
     with torch.no_grad():
         return -prior.action_log_probs(seen).double().cpu() / log(2)
+
+
+def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:
+    """Cross-validation over independent units: each action is held out once.
+
+    Groups stay together where there are two or more; else plans are drawn. Single plans are not cut: see `in_parts`.
+
+    Args:
+        plans: N of them.
+        number: of folds, at least 2 and at most the number of groups (of plans, where there are no two groups).
+        seed: draws which unit is in which fold.
+
+    Returns:
+        For each fold the numbers of the plans to learn from and of those held out, int64, each in order.
+
+    Raises:
+        ValueError: fewer than two folds, or fewer units than folds.
+    """
+    grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
+    unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
+    unit = torch.arange(len(plans)) if unit is None else unit
+    count = int(unit.max()) + 1 if len(unit) else 0
+    if not 2 <= number <= count:
+        kind = "groups" if grouped else "plans"
+        raise ValueError(f"folds: between 2 and the number of {kind}, {count}, are expected, not {number}")
+    drawn = torch.randperm(count, generator=torch.Generator().manual_seed(seed)) % number
+    return [((drawn[unit] != fold).nonzero()[:, 0], (drawn[unit] == fold).nonzero()[:, 0]) for fold in range(number)]
+
+
+def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
+    """A single plan cut into `number` consecutive plans of about the same length, for cross-validation in time.
+
+    Raises:
+        ValueError: not a single plan, or fewer actions than parts.
+    """
+    length = int(plans.mask().sum())
+    if len(plans) != 1 or length < number:
+        raise ValueError(f"plans: a single one of at least {number} actions is expected, not {len(plans)} of {length}")
+    size = -(-length // number)
+    parts = -(-length // size)
+    place = torch.arange(parts * size, device=plans.actions.device).view(parts, size)
+    context = plans.context
+    if context is not None:
+        each = sees_each_step(context)
+        context = context[0][place.clamp(max=length - 1)] if each else context.expand(parts, *context.shape[1:])
+    return replace(
+        plans,
+        actions=plans.actions[0][place.clamp(max=length - 1)],
+        lengths=(length - place[:, 0]).clamp(max=size),
+        context=context,
+        group=None,
+        group_names=None,
+    )
 
 
 def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
@@ -142,6 +210,7 @@ def rivals(
     validation: Plans,
     num_contexts: int | None = None,
     tell: Callable[[str], None] | None = None,
+    always_see: bool = False,
 ) -> Iterator[Rival]:
     """The uniform prior and the count-based ones: Markov chains of every order in `ORDERS`, and a context tree.
 
@@ -153,12 +222,14 @@ def rivals(
         validation: what they are chosen on.
         num_contexts: number of context indices, where they may see one.
         tell: called with the name of what is fitted next.
+        always_see: all see the context, whether or not it helps; the uniform prior, which cannot, is left out.
 
     Yields:
         One rival after the other, each fitted when it is asked for.
     """
-    seen: list[int | None] = [None] if num_contexts is None else [None, num_contexts]
-    yield _best("uniform", iter([("", UniformPrior(training.num_actions).fit(training))]), validation)
+    seen: list[int | None] = [None] if num_contexts is None else [num_contexts] if always_see else [None, num_contexts]
+    if not (always_see and num_contexts is not None):
+        yield _best("uniform", iter([("", UniformPrior(training.num_actions).fit(training))]), validation)
     for order in ORDERS:
         if tell is not None:
             tell(f"markov-{order}")

@@ -75,9 +75,9 @@ def test_scores_are_those_of_the_library(suffix, tmp_path, capsys):
     for folder, row in zip(folders, rows, strict=True):
         assert row["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
         assert row["low"] < row["bits_per_action"] < row["high"] or row["bits_per_action"] == row["low"]
-    assert rows[0]["more_than_first"] == 0
+    assert rows[0]["more"] == 0
     gap = score("b", load(folders[1]), new).minus(score("a", load(folders[0]), new))
-    assert (rows[1]["more_than_first"], rows[1]["more_low"], rows[1]["more_high"]) == pytest.approx(gap[:3])
+    assert (rows[1]["more"], rows[1]["more_low"], rows[1]["more_high"]) == pytest.approx(gap[:3])
     assert f"{rows[0]['bits_per_action']:.4f}" in capsys.readouterr().out
 
 
@@ -144,7 +144,7 @@ def test_ends(suffix, named, closed, tmp_path):
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folders[0]), new.with_end()), abs=1e-6)
     assert rows[1]["bits_per_action"] == pytest.approx(cost(load(folders[1]), new), abs=1e-6)
     # per action with and without ends: nothing to subtract
-    assert rows[1]["more_than_first"] is rows[1]["more_low"] is rows[1]["more_high"] is None
+    assert rows[1]["more"] is rows[1]["more_low"] is rows[1]["more_high"] is None
     again = evaluate(tmp_path / f"new.{suffix}", folders[::-1], tmp_path / "again")
     assert [row["bits_per_action"] for row in again] == [row["bits_per_action"] for row in rows[::-1]]
 

@@ -1,16 +1,13 @@
 """The `data` section of a recipe: plans from a file, or collected in a world, split in three."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
 import torch
 
 from neuroprior import Planner, Plans, World, collect
-from neuroprior.plans import read_minari, read_plans
+from neuroprior.plans import read_plans
 from neuroprior.training import PlansModule, Settings
-
-MINARI = "minari:"
 
 PARTS, LEAST_ACTIONS = 3, 2
 """Parts that plans are split in, and actions without which a part tells nothing."""
@@ -66,7 +63,7 @@ class PlansData(PlansModule):
             raise ValueError(f"data: validation and held_out leave nothing to learn from: {validation} + {held_out}")
         settings = Settings(max_steps, batch_size, window, check_every=check_every)
         if file is not None:
-            self.source = _read(file, num_actions, action_names)
+            self.source = read_plans(file, num_actions=num_actions, action_names=action_names)
         elif world is not None and planner is not None:
             generator = torch.Generator().manual_seed(seed)
             self.source = collect(planner, world, num_plans, context=context, generator=generator)
@@ -118,9 +115,3 @@ def _num_contexts(plans: Plans) -> int | None:
 def _check_indices(what: str, number: int) -> None:
     if number > MOST_INDICES:
         raise ValueError(f"data: {what} indices go up to {number - 1}; number them from 0, or write them as names")
-
-
-def _read(file: str, num_actions: int | None, action_names: Sequence[str] | None) -> Plans:
-    if file.startswith(MINARI):
-        return read_minari(file.removeprefix(MINARI))
-    return read_plans(file, num_actions=num_actions, action_names=action_names)

@@ -7,8 +7,12 @@ from pathlib import Path
 from neuroprior.plans.columns import check_names
 from neuroprior.plans.csv_files import read_csv, write_csv
 from neuroprior.plans.jsonl import read_jsonl, write_jsonl
+from neuroprior.plans.minari_datasets import read_minari
 from neuroprior.plans.npz import read_npz, write_npz
 from neuroprior.plans.plans import Plans
+
+MINARI = "minari:"
+"""Before the name of a Minari dataset, where a file may be given."""
 
 READERS = {".csv": read_csv, ".tsv": read_csv, ".jsonl": read_jsonl, ".npz": read_npz}
 
@@ -16,7 +20,7 @@ READERS = {".csv": read_csv, ".tsv": read_csv, ".jsonl": read_jsonl, ".npz": rea
 def read_plans(
     path: str | os.PathLike[str], *, num_actions: int | None = None, action_names: Sequence[str] | None = None
 ) -> Plans:
-    """Plans of a file, by its suffix.
+    """Plans of a file, by its suffix, or of a Minari dataset: `minari:` and its name, see `read_minari`.
 
     - `.npz`: arrays named as the attributes of `Plans`; of them `actions [N, L]` is needed. Nothing is unpickled.
     - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and perhaps `context` and
@@ -32,7 +36,7 @@ def read_plans(
     Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if one is no number.
 
     Args:
-        path: the file.
+        path: the file or dataset.
         num_actions: A, for what CSV and other files do not tell: the largest action + 1, or the number of names.
         action_names: A names in the order of their numbers; without them the names are sorted.
 
@@ -43,6 +47,8 @@ def read_plans(
         FileNotFoundError: there is no such file.
         ValueError: an argument or the file is wrong; the message names the file and the line or the array.
     """
+    if isinstance(path, str) and path.startswith(MINARI):
+        return read_minari(path.removeprefix(MINARI))
     place = Path(path)
     names = check_names(num_actions, action_names)
     return READERS[_suffix(place)](place, num_actions, names)

@@ -1,6 +1,7 @@
 """The interface of a prior: a distribution over action sequences that is also a small state machine."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
 
@@ -189,22 +190,38 @@ class Prior(nn.Module, ABC):
         Raises:
             ValueError: other actions or another context than this prior's.
         """
+        if plans.actions.numel() == 0:
+            self._check_scored(plans)
+            return torch.zeros(plans.actions.shape, device=self.device)
+        parts = []
+        for part, log_probs in self.forecasts(plans):
+            taken = log_probs.gather(-1, part.actions.long()[..., None])[..., 0]
+            parts.append(taken.masked_fill(~part.mask(), 0))
+        return torch.cat(parts)
+
+    def forecasts(self, plans: Plans) -> Iterator[tuple[Plans, Tensor]]:
+        """What the prior expects before each action, given those before it, some plans at a time.
+
+        Yields:
+            Some of the plans, in order, and the log-probabilities `[n, L, A]` (nats) of every action at each of their
+            steps; beyond a plan's end they mean nothing.
+
+        Raises:
+            ValueError: other actions or another context than this prior's.
+        """
+        self._check_scored(plans)
+        size = max(self.actions_at_once // max(plans.max_length, 1), 1)
+        for at in range(0, len(plans), size):
+            part = plans[at : at + size]
+            logits = self(part.actions, part.context)
+            if self.end is not None:
+                logits = torch.cat([logits[:, :1], after_end(logits[:, 1:], part.actions[:, :-1].long(), self.end)], 1)
+            yield part, torch.log_softmax(logits, -1)
+
+    def _check_scored(self, plans: Plans) -> None:
         if plans.num_actions != self.num_actions:
             raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
         self.check_context_of(plans)
-        if plans.actions.numel() == 0:
-            return torch.zeros(plans.actions.shape, device=self.device)
-        parts = []
-        size = max(self.actions_at_once // plans.max_length, 1)
-        for at in range(0, len(plans), size):
-            part = plans[at : at + size]
-            actions = part.actions.long()
-            logits = self(part.actions, part.context)
-            if self.end is not None:
-                logits = torch.cat([logits[:, :1], after_end(logits[:, 1:], actions[:, :-1], self.end)], 1)
-            taken = torch.log_softmax(logits, -1).gather(-1, actions[..., None])[..., 0]
-            parts.append(taken.masked_fill(~part.mask(), 0))
-        return torch.cat(parts)
 
     def sample(
         self,

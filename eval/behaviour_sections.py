@@ -1,0 +1,283 @@
+"""The sections of a report on plans about the behaviour itself: transitions, sequences, likeness of samples, drift."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from eval import matrix_figures, plan_figures
+from eval import plan_statistics as statistics
+from eval.crossval import ACTIONS, CONTEXT
+from eval.held_out import Model, leading
+from eval.page import FigureBox, Section, Table, svg
+from neuroprior.analysis import action_drift, by_group, by_plan, by_position
+from neuroprior.comparison import unit_name
+
+if TYPE_CHECKING:
+    from eval.plan_report import Report
+
+Rows = dict[str, Sequence[dict[str, Any]]]
+
+DRAWN = 12
+"""Sequences drawn, real and generated."""
+
+MOST_LISTED = 12
+"""Actions and groups in tables."""
+
+
+def transition_section(report: "Report") -> tuple[Section, Rows] | None:
+    """What follows what, overall and in each group."""
+    if int(report.plans.mask().sum(1).max()) < 2:
+        return None
+    rows, test = statistics.transition_rows(report.plans)
+    names = statistics.action_names(report.plans)
+    figures = [
+        FigureBox(
+            svg(matrix_figures.transition_figure(test["probs"], names)),
+            "The probability of each action (column) after each action (row).",
+            "Transition matrix.",
+        )
+    ]
+    text = ["How often each action follows each other one, within plans."]
+    if len(test["groups"]) > 1:
+        how = {
+            "permutation": f"a permutation test over whole plans, {test['permutations']} permutations",
+            "chi-square": "a chi-square test, which takes an action to depend on the one before it alone",
+            "none": "too few to test",
+        }[test["test"]]
+        differ = "differ" if test["p_value"] < statistics.SIGNIFICANT else "cannot be told apart"
+        verdict = "" if test["test"] == "none" else f": the groups {differ} (p = {test['p_value']:.2g})"
+        text.append(
+            f"{len(test['groups'])} groups{verdict}, by {how}. Marked cells differ at p < 0.05, corrected for all."
+        )
+        figures.append(
+            FigureBox(
+                svg(
+                    matrix_figures.group_transition_figure(
+                        test["group_probs"], test["probs"], names, test["groups"], test["significant"]
+                    )
+                ),
+                "Each group's transition probabilities less those of all.",
+                "Differences of the groups' transitions.",
+            )
+        )
+    return Section("What follows what", text, [], figures), {"transitions": rows}
+
+
+def motif_section(report: "Report") -> tuple[Section, Rows] | None:
+    """Sequences that stand out."""
+    rows = statistics.motif_rows(report.plans)
+    if not rows:
+        return None
+    tables, figures = [], []
+    for repeats in dict.fromkeys(row["repeats"] for row in rows):
+        own = [row for row in rows if row["repeats"] == repeats]
+        merged = ", repeats of an action merged" * (repeats == "merged")
+        cells = [
+            [
+                r["sequence"],
+                f"{r['count']:,}",
+                f"{r['expected']:,.1f}",
+                f"{r['ratio']:.2f}",
+                f"{r['low']:.2f} to {r['high']:.2f}",
+                _p(r["corrected"]),
+            ]
+            for r in own
+        ]
+        caption = f"Against a chain of order n - 2{merged}. p: Fisher's exact test, corrected for all sequences (Holm)."
+        tables.append(Table(("sequence", "count", "expected", "ratio", "95 % interval", "p"), cells, caption))
+        figures.append(
+            FigureBox(
+                svg(plan_figures.motif_figure(own)),
+                f"How many times as often as expected{merged}.",
+                "Over-represented sequences: " + "; ".join(row["sequence"] for row in own[:5]),
+            )
+        )
+    text = [
+        "Sequences of three to six actions that occur more (or less) often than their parts explain: than a chain says"
+        " that knows how often the sequence without its first, and without its last action occurs.",
+    ]
+    return Section("Sequences that stand out", text, tables, figures), {"motifs": rows}
+
+
+def likeness_section(report: "Report") -> tuple[Section, Rows] | None:
+    """Sequences sampled from the models beside real ones."""
+    rows: list[dict[str, Any]] = []
+    shown: tuple[Model, list[Any]] | None = None
+    cost = {id(m): s.bits_per_action().mean for m, s in zip(report.models, report.scores, strict=True)}
+    kept = [model for sees in (CONTEXT, ACTIONS) for model in leading(report.models, report.scores, sees)]
+    for model in sorted(kept, key=lambda model: cost[id(model)]):
+        own, found = statistics.likeness_rows(statistics.first_fold(report.scored, report.settings), model)
+        rows += own
+        if found and shown is None:
+            shown = model, found
+    if shown is None:
+        return None
+    model, found = shown
+    statistic = [one.statistic for one in found]
+    cells = [
+        [row["model"], "+ context" if "context" in row["sees"] else "actions"]
+        + [
+            f"{r['distance']:.3f}{'*' * (r['corrected'] < statistics.SIGNIFICANT)}"
+            for r in rows
+            if (r["model"], r["sees"]) == (row["model"], row["sees"])
+        ]
+        for row in rows
+        if row["statistic"] == statistic[0]
+    ]
+    alike = ["alike", "", *(f"{one.chance:.3f}" for one in found)]
+    table = Table(
+        ("model", "sees", *(name.replace(" ", "\n") for name in statistic)),
+        [*cells, alike],
+        "Total variation between the distributions in generated and in held-out real plans (0: the same). *: told apart"
+        " at p < 0.05, permutation test over plans, corrected. alike: what two such sets of one source differ by.",
+        "ll" + "r" * len(statistic),
+    )
+    return (
+        Section(
+            "Generated sequences beside real ones",
+            _likeness_text(model),
+            [table],
+            _likeness_figures(report, model, found),
+        ),
+        {"likeness": rows},
+    )
+
+
+def _likeness_text(model: Model) -> list[str]:
+    return [
+        "From each model of the first fold a plan was sampled for each held-out plan, as long as that. A good model of"
+        " behaviour is one whose plans cannot be told from real ones, by sequences of actions (n-grams), by how long an"
+        " action is repeated, and by how long it takes to come back.",
+        f"The figures show the best model, {model.label}.",
+    ]
+
+
+def _likeness_figures(report: "Report", model: Model, found: Sequence[Any]) -> list[FigureBox]:
+    real = statistics.first_fold(report.scored, report.settings)[:DRAWN]
+    generated = model.load("generated")
+    assert generated is not None
+    beyond = ~real.mask()
+    strips = [torch.as_tensor(a).long().masked_fill(beyond, -1) for a in (real.actions, generated[: len(real)])]
+    lengths = {
+        one.statistic: (one.real.tolist(), one.generated.tolist())
+        for one in found
+        if len(one.classes[0]) == 1 and "gram" not in one.statistic
+    }
+    boxes = [
+        FigureBox(
+            svg(matrix_figures.raster_figure(*strips, statistics.action_names(report.plans))),
+            f"Held-out plans, and plans sampled from {model.label}.",
+            "Real and generated sequences as strips of colour.",
+        )
+    ]
+    if lengths:
+        boxes.append(
+            FigureBox(
+                svg(plan_figures.distribution_figure({f"{name}, actions": pair for name, pair in lengths.items()})),
+                "Shares of run lengths and return times; the last class holds all that are longer.",
+                "Run lengths and return times, real and generated.",
+            )
+        )
+    return boxes
+
+
+def drift_section(report: "Report") -> tuple[Section, Rows] | None:
+    """Whether plans get easier or harder to predict, within and between them."""
+    cost = [one.bits_per_action().mean for one in report.scores]
+    whole = [k for k, model in enumerate(report.models) if model.bits().shape == report.scored.actions.shape]
+    if not whole:
+        return None
+    model = report.models[min(whole, key=lambda k: cost[k])]
+    drifts = report.scored, model.bits(), report.mask
+    within, plans, groups = by_position(*drifts), by_plan(*drifts), by_group(*drifts)
+    names = statistics.group_names(report.scored, torch.tensor(list(groups.groups)))
+    named = dict(zip(groups.groups, names, strict=True))
+    rows = [
+        {"what": "place", "name": f"part {n} of {len(within.parts)}", "bits": i.mean, "low": i.low, "high": i.high}
+        for n, i in enumerate(within.parts, 1)
+    ] + [
+        {"what": "group", "name": named[g], "bits": i.mean, "low": i.low, "high": i.high}
+        for g, i in groups.groups.items()
+    ]
+    figure = plan_figures.drift_figure(
+        [(i.mean, i.low, i.high) for i in within.parts],
+        _in_groups(plans, named),
+        [(named[g], i.mean, i.low, i.high) for g, i in groups.groups.items()],
+    )
+    unit = unit_name(report.scored, report.mask)
+    text = [
+        f"Bits per held-out action of {model.label}: where behaviour changes, plans get harder (or easier) to predict.",
+        _trends(within, plans, groups),
+    ]
+    box = FigureBox(svg(figure), f"95 % intervals over {unit}.", "Bits per action by place, plan and group.")
+    changes, table = _action_changes(report)
+    return Section("Drift", text, table, [box]), {"drift": rows, "action_drift": changes}
+
+
+def _in_groups(plans: Any, named: dict[int, str]) -> list[tuple[str, int, float]]:
+    """Each plan's group, its place in the group, and its bits per action."""
+    seen: dict[int, int] = {}
+    points = []
+    for group, bits in zip(plans.group.tolist(), plans.bits.tolist(), strict=True):
+        seen[group] = seen.get(group, 0) + 1
+        points.append((named.get(group, ""), seen[group], bits))
+    return points
+
+
+def _trends(within: Any, plans: Any, groups: Any) -> str:
+    """The tests in words."""
+    said = []
+    if within.trend is not None:
+        trend = within.trend
+        said.append(
+            f"Over the length of a plan it changes by {trend.mean:+.3f} bits"
+            f" ({trend.low:+.3f} to {trend.high:+.3f}, p = {trend.p_value:.2g})."
+        )
+    if plans.trend is not None:
+        said.append(
+            f"From one of the {plans.item} to the next in the file the rank correlation is {plans.trend.mean:+.2f}"
+            f" ({plans.trend.low:+.2f} to {plans.trend.high:+.2f}, p = {plans.trend.p_value:.2g})."
+        )
+    if groups.p_value is not None:
+        said.append(f"Groups: p = {groups.p_value:.2g} that all are alike (Kruskal and Wallis's test).")
+    return " ".join(said) or "There is too little to test."
+
+
+def _action_changes(report: "Report") -> tuple[list[dict[str, Any]], list[Table]]:
+    """How the share of each action changes from the first to the second half of the plans."""
+    names = statistics.action_names(report.plans)
+    try:
+        found = action_drift(report.plans)
+    except ValueError:
+        return [], []  # too few plans with two halves
+    rows = [
+        {
+            "action": names[one.action],
+            "first_half": one.first,
+            "second_half": one.second,
+            "change": one.change.mean,
+            "low": one.change.low,
+            "high": one.change.high,
+            "p_value": one.change.p_value,
+            "corrected": one.corrected,
+        }
+        for one in found
+    ]
+    most = sorted(rows, key=lambda row: (row["corrected"], -abs(row["change"])))[:MOST_LISTED]
+    cells = [
+        [
+            row["action"],
+            f"{100 * row['first_half']:.2f}",
+            f"{100 * row['second_half']:.2f}",
+            f"{100 * row['change']:+.2f} ± {100 * (row['high'] - row['change']):.2f}",
+            _p(row["corrected"]),
+        ]
+        for row in most
+    ]
+    caption = "Share of all actions, %, in the first and in the second half of the plans. p: corrected (Holm)."
+    return rows, [Table(("action", "first", "second", "change", "p"), cells, caption)]
+
+
+def _p(value: float) -> str:
+    return f"{value:.1g}" if value else "<1e-300"

@@ -1,0 +1,212 @@
+"""Cross-validation: every model fitted in every fold, in several processes; each result is kept in a file."""
+
+import hashlib
+import json
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from eval import fits
+from neuroprior import __version__
+from neuroprior.comparison import folds, units
+from neuroprior.output import write_json, written_whole
+from neuroprior.plans import Plans, read_plans, write_plans
+
+Array = np.ndarray[Any, Any]
+
+ACTIONS, CONTEXT = "actions", "actions and context"
+"""What a model sees."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """All that decides the results of a cross-validation, beside the plans.
+
+    Attributes:
+        folds: how many; 1: learn from one file and score on another.
+        seed: draws the folds, and everything in training.
+        skip: actions at the beginning of each plan that are left out of the score.
+        max_steps: gradient steps of neural priors.
+        reach: the most past actions whose information is measured.
+        version: of the library.
+    """
+
+    folds: int
+    seed: int = 0
+    skip: int = 0
+    max_steps: int = 1000
+    reach: int = 16
+    version: str = __version__
+
+
+@dataclass(frozen=True)
+class Job:
+    """What one process does at a time.
+
+    Attributes:
+        fold: number of the fold.
+        kind: one of `fits.KINDS`.
+        sees: `ACTIONS` or `CONTEXT`.
+    """
+
+    fold: int
+    kind: str
+    sees: str
+
+    @property
+    def name(self) -> str:
+        """Of its file."""
+        return f"fold{self.fold}-{self.kind}{'-context' * (self.sees == CONTEXT)}.npz"
+
+
+@dataclass(frozen=True)
+class Study:
+    """Plans to learn from and plans to score, in a folder that the processes share.
+
+    Attributes:
+        folder: where the plans are, and where results are kept.
+        design: what is done with them.
+    """
+
+    folder: Path
+    design: Design
+
+    @classmethod
+    def prepare(cls, out: Path, plans: Plans, test: Plans | None, design: Design) -> "Study":
+        """Write the plans, unless a study of the very same plans and design is there already."""
+        partial = out / "folds"
+        partial.mkdir(parents=True, exist_ok=True)
+        names = ["plans.npz"] + ["test.npz"] * (test is not None)
+        digest = hashlib.sha256(json.dumps(asdict(design), sort_keys=True).encode())
+        for name, some in zip(names, (plans, test), strict=False):
+            assert some is not None
+            write_plans(some, partial / name)
+            digest.update((partial / name).read_bytes())
+        folder = partial / digest.hexdigest()[:12]
+        folder.mkdir(exist_ok=True)
+        for name in names:
+            (partial / name).replace(folder / name)
+        write_json(folder / "design.json", asdict(design))
+        return cls(folder, design)
+
+    @property
+    def plans(self) -> Plans:
+        """Those that are learned from."""
+        return _read(self.folder / "plans.npz")
+
+    @property
+    def scored(self) -> Plans:
+        """Those that are scored: all of them in turn, or those of the test file."""
+        test = self.folder / "test.npz"
+        return _read(test) if test.exists() else self.plans
+
+    def mask(self) -> Tensor:
+        """`[N, L]` bool: the actions that count in the score."""
+        mask = self.scored.mask()
+        mask[:, : self.design.skip] = False
+        return mask
+
+    def split(self, fold: int) -> tuple[Plans, Tensor]:
+        """The plans to learn from in a fold, and the numbers of those that are scored."""
+        if self.design.folds == 1:
+            return self.plans, torch.arange(len(self.scored))
+        learned, held_out = folds(self.plans, self.design.folds, self.design.seed)[fold]
+        return self.plans[learned], held_out
+
+    def models(self, job: Job) -> dict[str, str]:
+        """The models that a finished job fitted, and their settings."""
+        with np.load(self.folder / job.name, allow_pickle=False) as file:
+            return {key.rsplit("/", 1)[0]: str(file[key]) for key in file.files if key.endswith("/how")}
+
+    def array(self, job: Job, model: str, what: str) -> Array | None:
+        """What a finished job kept of a model, see `fits.Outcome`; None for nothing."""
+        with np.load(self.folder / job.name, allow_pickle=False) as file:
+            return file[f"{model}/{what}"] if f"{model}/{what}" in file.files else None
+
+    def finished(self, job: Job) -> bool:
+        """Whether its results are there."""
+        return (self.folder / job.name).exists()
+
+
+def jobs(design: Design, kinds: Iterable[str], sees: Iterable[str]) -> list[Job]:
+    """What there is to do: the slowest first, so that no process is left alone with one at the end."""
+    kinds, sees = list(kinds), list(sees)
+    return [
+        Job(fold, kind, seen)
+        for kind in fits.KINDS
+        if kind in kinds
+        for fold in range(1 if kind in fits.ONCE else design.folds)
+        for seen in reversed(sees)
+    ]
+
+
+def run(study: Study, todo: list[Job], processes: int, done: Callable[[Job], None]) -> None:
+    """Do the jobs that have no result yet, each in one thread.
+
+    Args:
+        study: on what.
+        todo: the jobs.
+        processes: at the same time.
+        done: called after each job; of those that are finished already at once.
+
+    Raises:
+        ValueError: plans that a model cannot learn from.
+        MemoryError: a process was killed, as happens where memory runs out.
+    """
+    missing = [job for job in todo if not study.finished(job)]
+    for job in todo:
+        if job not in missing:
+            done(job)
+    if processes == 1 or len(missing) < 2:
+        for job in missing:
+            do(study, job)
+            done(job)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(missing)), context, _in_process) as pool:
+        try:
+            running = {pool.submit(do, study, job): job for job in missing}
+            for future in as_completed(running):
+                future.result()
+                done(running[future])
+        except BrokenProcessPool as error:
+            raise MemoryError("a process was killed, probably for want of memory; try --processes 1") from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def do(study: Study, job: Job) -> None:
+    """Fit what a job names and keep how it scores."""
+    learned, index = study.split(job.fold)
+    scored = study.scored[index]
+    mask = study.mask()
+    unit = units(study.scored, mask)[index]
+    if job.sees == ACTIONS:
+        learned, scored = (replace(plans, context=None, context_names=None) for plans in (learned, scored))
+    found = fits.outcomes(job.kind, learned, scored, mask[index], unit, study.design, job.fold)
+    with written_whole(study.folder / job.name, "wb") as file:
+        np.savez(file, **fits.packed(found))
+
+
+def _in_process() -> None:
+    # Ctrl-C is for the main process, which ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+
+
+@lru_cache(maxsize=2)
+def _read(path: Path) -> Plans:
+    return read_plans(path)

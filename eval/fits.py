@@ -1,0 +1,217 @@
+"""What `python -m eval plans` fits, and what it keeps of each fit: scores, calibration, information by lag, samples."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior
+from neuroprior.analysis import Reliability, bits_by_position, pieces, reliability
+from neuroprior.comparison import FEWEST_UNITS, Score, rivals
+from neuroprior.plans import sees_each_step
+from neuroprior.priors.histories import TooLargeError
+from neuroprior.sampling import sample, sample_in_world
+
+if TYPE_CHECKING:
+    from eval.crossval import Design
+
+KINDS = ("transformer", "gru", "lags", "counts")
+"""What one job fits; the slowest first."""
+
+ONCE = ("lags",)
+"""What is fitted in the first fold alone."""
+
+COUNTED = "markov"
+"""The count-based model of the information by lag; the other is the GRU."""
+
+VALIDATION = 0.1
+"""Share of what is learned from on which the settings of count-based models are chosen."""
+
+MOST_PIECES, PIECES_A_STEP = 20_000, 512
+MOST_GENERATED = 1000
+"""Bounds of what is cut into pieces, read in a step, and sampled."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is kept of a fitted model.
+
+    Attributes:
+        how: its settings.
+        arrays: by name. `bits [n, L]`, float32: what each held-out action cost. `calibration`: the sums of a
+            `Reliability`. `generated [g, L]`: plans sampled from it. Or, of information by lag, `bits` and `actions`
+            `[J, U]`: what actions cost with 0, 1, ... J - 1 past ones known, by unit.
+    """
+
+    how: str
+    arrays: dict[str, np.ndarray[Any, Any]]
+
+
+def outcomes(
+    kind: str, learned: Plans, scored: Plans, mask: Tensor, unit: Tensor, design: "Design", fold: int
+) -> dict[str, Outcome]:
+    """Fit the models of a kind and score them.
+
+    Args:
+        kind: one of `KINDS`.
+        learned: plans to learn from.
+        scored: held-out plans, n of them.
+        mask: `[n, L]` bool: their actions that count.
+        unit: `[n, L]`: the independent unit of each, numbered over all folds.
+        design: of the study.
+        fold: its number.
+
+    Raises:
+        ValueError: plans that cannot be learned from.
+    """
+    seed = design.seed * 1000 + fold
+    if kind == "lags":
+        return _by_lag(learned, scored, design, seed)
+    found = {}
+    world = None if fold else _world(learned, scored)
+    for name, how, prior in _fitted(kind, learned, scored, design, seed):
+        arrays = scored_by(prior, scored, mask, unit)
+        if fold == 0:
+            generated = _generated(prior, scored, world, seed)
+            arrays |= {} if generated is None else {"generated": generated.numpy()}
+        found[name] = Outcome(how, arrays)
+    return found
+
+
+def packed(found: dict[str, Outcome]) -> dict[str, np.ndarray[Any, Any]]:
+    """Outcomes as arrays for one file."""
+    arrays = {f"{name}/{key}": array for name, one in found.items() for key, array in one.arrays.items()}
+    return arrays | {f"{name}/how": np.array(one.how) for name, one in found.items()}
+
+
+def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: int) -> Iterator[tuple[str, str, Prior]]:
+    sizes = _sizes(learned, scored)
+    learned = _loose(learned)
+    if kind == "counts":
+        if "context_size" in sizes:
+            return  # features cannot be counted
+        training, validation = learned.split(VALIDATION, torch.Generator().manual_seed(seed))
+        for rival in rivals(training, validation, sizes.get("num_contexts"), always_see=True):
+            if rival.prior is not None:
+                # Chosen on the validation plans; then these are learned from as well.
+                yield rival.model, rival.how, rival.prior.fit(learned)  # type: ignore[operator]
+        return
+    prior = {"gru": GRUPrior, "transformer": TransformerPrior}[kind](learned.num_actions, seed=seed, **sizes)
+    generator = torch.Generator().manual_seed(seed)
+    yield kind, "default recipe", prior.fit(learned, generator, max_steps=design.max_steps, progress=False)
+
+
+def _sizes(*some: Plans) -> dict[str, int]:
+    """The arguments that let a prior see the context of these plans."""
+    contexts = [plans.context for plans in some if plans.context is not None]
+    if not contexts:
+        return {}
+    if contexts[0].is_floating_point():
+        return {"context_size": contexts[0].shape[-1]}
+    most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
+    return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
+
+
+def _loose(plans: Plans) -> Plans:
+    """Plans without their groups where these are too few to be split."""
+    few = plans.group is None or len(plans.group.unique()) < FEWEST_UNITS
+    return replace(plans, group=None, group_names=None) if few else plans
+
+
+def scored_by(prior: Prior, scored: Plans, mask: Tensor, unit: Tensor) -> dict[str, np.ndarray[Any, Any]]:
+    """The bits of each action, and the calibration over units of the fold."""
+    bits = torch.zeros(scored.actions.shape)
+    total: Reliability | None = None
+    at = 0
+    with torch.no_grad():
+        for part, log_probs in prior.forecasts(scored):
+            rows = slice(at, at + len(part))
+            at += len(part)
+            taken = log_probs.gather(-1, part.actions.long()[..., None])[..., 0]
+            bits[rows] = -taken.masked_fill(~part.mask(), 0) / np.log(2)
+            counts = mask[rows]
+            if counts.any():
+                one = reliability(log_probs[counts], part.actions[counts].long(), unit[rows][counts])
+                total = one if total is None else total + one
+    return {"bits": bits.numpy()} | ({} if total is None else {"calibration": total.sums.numpy()})
+
+
+def _by_lag(learned: Plans, scored: Plans, design: "Design", seed: int) -> dict[str, Outcome]:
+    """What the actions of short pieces cost, of which nothing older is known."""
+    reach = _reach(learned, scored, design.reach)
+    if reach is None:
+        return {}
+    sizes = _sizes(learned, scored)
+    generator = torch.Generator().manual_seed(seed)
+    held_out = pieces(scored, reach + 1, MOST_PIECES, generator)
+    short = pieces(learned, reach + 1, MOST_PIECES * 5, generator)
+    neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
+    neural.fit(_loose(short), generator, max_steps=design.max_steps, batch_size=PIECES_A_STEP, progress=False)
+    found = {} if "context_size" in sizes else {COUNTED: _chains(learned, held_out, reach, sizes.get("num_contexts"))}
+    found["gru"] = bits_by_position(neural, held_out)
+    return {
+        name: Outcome("", {what: np.stack([getattr(s, what) for s in scores]) for what in ("bits", "actions")})
+        for name, scores in found.items()
+    }
+
+
+def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | None) -> list[Score]:
+    """What the j-th action of pieces costs a chain of order j, for each j.
+
+    Each order is a prior of its own: in one of a high order the shorter histories only serve to lean on.
+    """
+    scores = []
+    for order in range(reach + 1):
+        chain = MarkovPrior(learned.num_actions, order, initial="lower", num_contexts=num_contexts)
+        try:
+            chain.fit(learned)
+        except TooLargeError:
+            break
+        scores.append(bits_by_position(chain, held_out)[order])
+    return scores
+
+
+def _reach(learned: Plans, scored: Plans, most: int) -> int | None:
+    """Past actions that are known at most: so many that half of the plans of either part are longer."""
+    lengths = [plans.mask().sum(1) for plans in (learned, scored)]
+    reach = min(most, *(int(length.double().median()) - 1 for length in lengths))
+    return reach if reach >= 1 else None
+
+
+def _world(*some: Plans) -> TabularWorld | None:
+    """How the context a step follows from the one before and the action there, where these alone decide it."""
+    if not all(sees_each_step(plans.context) and not plans.context.is_floating_point() for plans in some):  # type: ignore[union-attr]
+        return None
+    size, actions = _sizes(*some)["num_contexts"], some[0].num_actions
+    codes, following = [], []
+    for plans in some:
+        assert plans.context is not None
+        goes_on = plans.mask()[:, 1:]
+        codes.append((plans.context.long() * actions + plans.actions.long())[:, :-1][goes_on])
+        following.append(plans.context[:, 1:][goes_on].long())
+    code, after = torch.cat(codes), torch.cat(following)
+    table = torch.arange(size).repeat_interleave(actions)
+    table[code] = after
+    if not bool((table[code] == after).all()) or len(code) == 0:
+        return None
+    legal = torch.zeros(size * actions, dtype=torch.bool)
+    legal[code] = True
+    legal = legal.view(size, actions)
+    legal[~legal.any(1)] = True
+    return TabularWorld(table.view(size, actions), torch.zeros(1, size), legal)
+
+
+def _generated(prior: Prior, scored: Plans, world: TabularWorld | None, seed: int) -> Tensor | None:
+    """A plan sampled for each of the first held-out plans, as long, in its place; None where that cannot be told."""
+    like, generator = scored[:MOST_GENERATED], torch.Generator().manual_seed(seed)
+    if not prior.takes_context:
+        return sample(prior, len(like), like.max_length, generator=generator)
+    assert like.context is not None
+    if not sees_each_step(like.context):
+        return sample(prior, len(like), like.max_length, like.context, generator=generator)
+    if world is None or like.max_length == 0:
+        return None
+    return sample_in_world(prior, world, like.context[:, 0].long(), 1, like.max_length, generator=generator)[0][:, 0]
