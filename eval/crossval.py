@@ -18,9 +18,10 @@ from torch import Tensor
 
 from eval import fits
 from neuroprior import __version__
-from neuroprior.comparison import folds, units
+from neuroprior.comparison import units
 from neuroprior.output import write_json, written_whole
 from neuroprior.plans import Plans, read_plans, write_plans
+from neuroprior.plans.folds import folds
 
 Array = np.ndarray[Any, Any]
 

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior
 from neuroprior.analysis import Reliability, bits_by_position, pieces, reliability
-from neuroprior.comparison import FEWEST_UNITS, Score, rivals
+from neuroprior.comparison import Score, rivals
 from neuroprior.plans import sees_each_step
+from neuroprior.plans.folds import FEWEST_UNITS
 from neuroprior.priors.histories import TooLargeError
 from neuroprior.sampling import sample, sample_in_world
 

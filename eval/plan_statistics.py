@@ -16,8 +16,8 @@ from neuroprior.analysis import (
     order_selection,
     transitions,
 )
-from neuroprior.comparison import folds
 from neuroprior.plans import Plans, sees_each_step
+from neuroprior.plans.folds import folds
 
 MOST_ORDER = 6
 MOST_LAG = 20

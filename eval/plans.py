@@ -18,8 +18,9 @@ from eval.fits import KINDS
 from eval.held_out import Model
 from eval.plan_report import Report, write_report
 from neuroprior import load
-from neuroprior.comparison import BLOCKS, Score, in_parts, unit_name
+from neuroprior.comparison import Score, unit_name
 from neuroprior.plans import Plans, read_plans
+from neuroprior.plans.folds import BLOCKS, in_parts
 
 MODELS = ("counts", "gru", "transformer")
 LISTS: dict[str, dict[str, Any]] = {

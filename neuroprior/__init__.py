@@ -2,7 +2,18 @@
 
 from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPlanner, collect, oracle
 from neuroprior.plans import Plans, read_plans, write_plans
-from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior, TransformerPrior, UniformPrior, load, save
+from neuroprior.priors import (
+    ContextTreePrior,
+    GRUPrior,
+    MarkovPrior,
+    MixturePrior,
+    Prior,
+    StackedPrior,
+    TransformerPrior,
+    UniformPrior,
+    load,
+    save,
+)
 from neuroprior.sampling import sample, sample_in_world
 from neuroprior.worlds import GridWorld, Rollout, TabularWorld, World, gridworld, labyrinth
 
@@ -15,11 +26,13 @@ __all__ = [
     "GRUPrior",
     "GridWorld",
     "MarkovPrior",
+    "MixturePrior",
     "Planner",
     "Plans",
     "Prior",
     "Rollout",
     "SamplingPlanner",
+    "StackedPrior",
     "TabularWorld",
     "TransformerPrior",
     "UniformPrior",

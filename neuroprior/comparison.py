@@ -7,7 +7,8 @@ from math import log
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans, sees_each_step
+from neuroprior.plans import Plans
+from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.priors import ContextTreePrior, MarkovPrior, Prior, UniformPrior
 from neuroprior.priors.backoff import Backoff
 from neuroprior.priors.histories import TooLargeError
@@ -19,9 +20,6 @@ ORDERS = range(7)
 DEPTH = 10
 """Depth of the context trees that a prior is compared with."""
 
-FEWEST_UNITS = 2
-"""Independent units without which there is no interval; below, a finer unit is taken."""
-
 BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
     ("kneser-ney", 1),
     ("kneser-ney", 0.5),
@@ -31,9 +29,6 @@ BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
     ("dirichlet", 8),
 ]
 """Back-offs and their smoothing of which each Markov order takes the best."""
-
-BLOCKS = 40
-"""Parts into which a single held-out plan is cut, for an interval."""
 
 
 @dataclass(frozen=True)
@@ -118,59 +113,6 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
     seen = plans if prior.takes_context else replace(plans, context=None, context_names=None)
     with torch.no_grad():
         return -prior.action_log_probs(seen).double().cpu() / log(2)
-
-
-def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:
-    """Cross-validation over independent units: each action is held out once.
-
-    Groups stay together where there are two or more; else plans are drawn. Single plans are not cut: see `in_parts`.
-
-    Args:
-        plans: N of them.
-        number: of folds, at least 2 and at most the number of groups (of plans, where there are no two groups).
-        seed: draws which unit is in which fold.
-
-    Returns:
-        For each fold the numbers of the plans to learn from and of those held out, int64, each in order.
-
-    Raises:
-        ValueError: fewer than two folds, or fewer units than folds.
-    """
-    grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
-    unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
-    unit = torch.arange(len(plans)) if unit is None else unit
-    count = int(unit.max()) + 1 if len(unit) else 0
-    if not 2 <= number <= count:
-        kind = "groups" if grouped else "plans"
-        raise ValueError(f"folds: between 2 and the number of {kind}, {count}, are expected, not {number}")
-    drawn = torch.randperm(count, generator=torch.Generator().manual_seed(seed)) % number
-    return [((drawn[unit] != fold).nonzero()[:, 0], (drawn[unit] == fold).nonzero()[:, 0]) for fold in range(number)]
-
-
-def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
-    """A single plan cut into `number` consecutive plans of about the same length, for cross-validation in time.
-
-    Raises:
-        ValueError: not a single plan, or fewer actions than parts.
-    """
-    length = int(plans.mask().sum())
-    if len(plans) != 1 or length < number:
-        raise ValueError(f"plans: a single one of at least {number} actions is expected, not {len(plans)} of {length}")
-    size = -(-length // number)
-    parts = -(-length // size)
-    place = torch.arange(parts * size, device=plans.actions.device).view(parts, size)
-    context = plans.context
-    if context is not None:
-        each = sees_each_step(context)
-        context = context[0][place.clamp(max=length - 1)] if each else context.expand(parts, *context.shape[1:])
-    return replace(
-        plans,
-        actions=plans.actions[0][place.clamp(max=length - 1)],
-        lengths=(length - place[:, 0]).clamp(max=size),
-        context=context,
-        group=None,
-        group_names=None,
-    )
 
 
 def unit_name(plans: Plans, mask: Tensor | None = None) -> str:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, UniformPrior
-from neuroprior.comparison import BACKOFFS_TRIED, BLOCKS, DEPTH, ORDERS, rivals, score, unit_name
+from neuroprior.comparison import BACKOFFS_TRIED, DEPTH, ORDERS, rivals, score, unit_name
+from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors import histories
 from neuroprior.statistics import mean_interval, paired_difference, ratio_difference
 from tests.sources import FALSE_ALARM, refuses, seeded

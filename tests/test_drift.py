@@ -10,7 +10,7 @@ from scipy import stats
 
 from neuroprior import Plans
 from neuroprior.analysis.drift import action_drift, by_group, by_plan, by_position
-from neuroprior.comparison import BLOCKS
+from neuroprior.plans.folds import BLOCKS
 from neuroprior.statistics import holm, mean_interval, paired_difference, ratio_difference
 from tests.sources import FALSE_ALARM, refuses, seeded
 

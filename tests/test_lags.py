@@ -10,7 +10,8 @@ from scipy import stats
 from neuroprior import MarkovPrior, Plans, UniformPrior
 from neuroprior.analysis import lags
 from neuroprior.analysis.lags import bits_by_position, mutual_information, pieces
-from neuroprior.comparison import BLOCKS, score
+from neuroprior.comparison import score
+from neuroprior.plans.folds import BLOCKS
 from tests.sources import FALSE_ALARM, TablePrior, distribution, every_plan, refuses, seeded
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 from neuroprior import Plans
 from neuroprior.analysis import motifs, words
 from neuroprior.analysis.hypergeometric import two_sided
-from neuroprior.comparison import BLOCKS
+from neuroprior.plans.folds import BLOCKS
 from tests.chains import markov_plans, markov_probs, null_sets
 from tests.sources import FALSE_ALARM, refuses, seeded
 

@@ -9,8 +9,9 @@ from scipy import stats
 from torch import Tensor
 
 from neuroprior.analysis.ranks import FEWEST_RANKED, mean_correlation, rank_correlation
-from neuroprior.comparison import BLOCKS, FEWEST_UNITS, units
+from neuroprior.comparison import units
 from neuroprior.plans import Plans
+from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.priors.prior import check_sizes
 from neuroprior.statistics import Difference, Interval, holm, ratio_difference
 

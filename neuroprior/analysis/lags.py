@@ -7,8 +7,9 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from neuroprior.comparison import BLOCKS, Score, action_bits, unit_name, units
+from neuroprior.comparison import Score, action_bits, unit_name, units
 from neuroprior.plans import Plans, sees_each_step
+from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors import Prior
 from neuroprior.priors.prior import check_sizes
 from neuroprior.randomness import generator_on

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from torch import Tensor
 
-from neuroprior.comparison import BLOCKS
 from neuroprior.plans import Plans
+from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors.prior import check_sizes
 from neuroprior.randomness import generator_on
 from neuroprior.statistics import holm

@@ -14,8 +14,9 @@ from torch import Tensor
 from neuroprior.analysis.hypergeometric import two_sided
 from neuroprior.analysis.windows import Line
 from neuroprior.analysis.words import Windows, Words, candidates, middles
-from neuroprior.comparison import BLOCKS, FEWEST_UNITS, units
+from neuroprior.comparison import units
 from neuroprior.plans import Plans
+from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 
 POISSON_ZERO = -log(0.025)
 """The mean up to which no event at all is in the 95 % interval of a Poisson count."""

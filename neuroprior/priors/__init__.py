@@ -4,7 +4,9 @@ from neuroprior.priors.context_tree import ContextTreePrior, Leaf
 from neuroprior.priors.folders import load, save
 from neuroprior.priors.gru import GRUPrior
 from neuroprior.priors.markov import MarkovPrior
+from neuroprior.priors.mixture import MixturePrior
 from neuroprior.priors.prior import Prior
+from neuroprior.priors.stacked import StackedPrior
 from neuroprior.priors.transformer import TransformerPrior
 from neuroprior.priors.uniform import UniformPrior
 
@@ -13,7 +15,9 @@ __all__ = [
     "GRUPrior",
     "Leaf",
     "MarkovPrior",
+    "MixturePrior",
     "Prior",
+    "StackedPrior",
     "TransformerPrior",
     "UniformPrior",
     "load",

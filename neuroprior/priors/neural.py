@@ -10,6 +10,9 @@ from neuroprior.plans import Plans, sees_each_step
 from neuroprior.priors.prior import Prior, check_sizes
 from neuroprior.randomness import draw_seed, generator_on
 
+CONTEXT_SPREAD = 0.03
+"""Standard deviation of the first weights of contexts. With 1, as of other vectors, few plans are learned by heart."""
+
 LAG_WIDTH = 16
 """Numbers that stand for each of the last actions."""
 
@@ -251,6 +254,13 @@ class NeuralPrior(Prior):
         """The size of the memory in a state of `state_size` numbers."""
 
 
+def context_embedding(num_contexts: int, width: int) -> nn.Embedding:
+    """Vectors of contexts that begin nearly alike: what tells them apart is learned, where plans show it."""
+    made = nn.Embedding(num_contexts, width)
+    nn.init.normal_(made.weight, std=CONTEXT_SPREAD)
+    return made
+
+
 class Embedding(nn.Module):
     """Inputs `[N, T, D]` (action before, context) to vectors `[N, T, width]`.
 
@@ -267,7 +277,7 @@ class Embedding(nn.Module):
         self.action = nn.Embedding(num_actions + 1, width)
         self.past = nn.Embedding(num_actions + 2, LAG_WIDTH, padding_idx=self.nothing) if lags > 1 else None
         self.mix = nn.Conv1d(LAG_WIDTH, width, lags, bias=False) if lags > 1 else None
-        self.index = None if num_contexts is None else nn.Embedding(num_contexts, width)
+        self.index = None if num_contexts is None else context_embedding(num_contexts, width)
         self.features = None if context_size is None else nn.Linear(context_size, width)
 
     def forward(self, inputs: Tensor, recent: Tensor | None) -> tuple[Tensor, Tensor]:
