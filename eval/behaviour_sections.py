@@ -67,6 +67,8 @@ def transition_section(report: "Report") -> tuple[Section, Rows] | None:
 def motif_section(report: "Report") -> tuple[Section, Rows] | None:
     """Sequences that stand out."""
     rows = statistics.motif_rows(report.plans)
+    # Where any is significant, the others say nothing.
+    rows = [row for row in rows if row["corrected"] < statistics.SIGNIFICANT] or rows
     if not rows:
         return None
     tables, figures = [], []

@@ -27,6 +27,7 @@ WIDTH = 7.5
 """Width of a figure, inches: that of a column of text."""
 
 KINDS = {
+    "stacked": "#d64550",
     "mixture": "#d64550",
     "ensemble": "#d64550",
     "uniform": "#7d838c",

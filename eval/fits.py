@@ -1,14 +1,16 @@
 """What `python -m eval plans` fits, and what it keeps of each fit: scores, calibration, information by lag, samples."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior
+from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, StackedPrior, TabularWorld, TransformerPrior
 from neuroprior.analysis import Reliability, bits_by_position, pieces, reliability
 from neuroprior.comparison import Score, rivals
 from neuroprior.plans import sees_each_step
@@ -19,8 +21,24 @@ from neuroprior.sampling import sample, sample_in_world
 if TYPE_CHECKING:
     from eval.crossval import Design
 
-KINDS = ("transformer", "gru", "lags", "counts")
+KINDS = ("gru-large", "stacked", "transformer", "gru", "lags", "counts")
 """What one job fits; the slowest first."""
+
+NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+    "gru": (GRUPrior, {}),
+    "transformer": (TransformerPrior, {}),
+    # It hardly learns by heart, so few plans will do to stop it early.
+    "stacked": (StackedPrior, {"learning_rate": 4e-3, "validation": 0.05}),
+    # For long sequences of few subjects: without lags, which such plans let it learn by heart.
+    "gru-large": (
+        partial(GRUPrior, hidden_size=256, lags=1, dropout=0.5),
+        {"learning_rate": 4e-3, "validation": 0.05},
+    ),
+}
+"""How neural priors are made and trained; the first two by default recipes."""
+
+PATIENCE = 0.25
+"""Steps without improvement after which training stops, as a share of all."""
 
 ONCE = ("lags",)
 """What is fitted in the first fold alone."""
@@ -100,9 +118,12 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
                 # Chosen on the validation plans; then these are learned from as well.
                 yield rival.model, rival.how, rival.prior.fit(learned)  # type: ignore[operator]
         return
-    prior = {"gru": GRUPrior, "transformer": TransformerPrior}[kind](learned.num_actions, seed=seed, **sizes)
-    generator = torch.Generator().manual_seed(seed)
-    yield kind, "default recipe", prior.fit(learned, generator, max_steps=design.max_steps, progress=False)
+    if kind == "stacked" and "context_size" in sizes:
+        return  # its experts count
+    make, settings = NEURAL[kind]
+    how = {"max_steps": design.max_steps, "patience": ceil(PATIENCE * design.max_steps), "progress": False} | settings
+    prior = make(learned.num_actions, seed=seed, **sizes)
+    yield kind, "", prior.fit(learned, torch.Generator().manual_seed(seed), **how)
 
 
 def _sizes(*some: Plans) -> dict[str, int]:
@@ -150,7 +171,9 @@ def _by_lag(learned: Plans, scored: Plans, design: "Design", seed: int) -> dict[
     held_out = pieces(scored, reach + 1, MOST_PIECES, generator)
     short = pieces(learned, reach + 1, MOST_PIECES * 5, generator)
     neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
-    neural.fit(_loose(short), generator, max_steps=design.max_steps, batch_size=PIECES_A_STEP, progress=False)
+    patience = ceil(PATIENCE * design.max_steps)
+    size = PIECES_A_STEP
+    neural.fit(_loose(short), generator, max_steps=design.max_steps, patience=patience, batch_size=size, progress=False)
     found = {} if "context_size" in sizes else {COUNTED: _chains(learned, held_out, reach, sizes.get("num_contexts"))}
     found["gru"] = bits_by_position(neural, held_out)
     return {

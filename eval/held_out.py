@@ -11,7 +11,7 @@ from torch import Tensor
 from eval.crossval import ACTIONS, CONTEXT, Array, Job, Study
 from eval.fits import COUNTED
 from neuroprior.analysis import Reliability
-from neuroprior.comparison import Score, score_bits
+from neuroprior.comparison import ORDERS, Score, score_bits
 from neuroprior.plans import Plans
 
 
@@ -64,7 +64,8 @@ def models_of(study: Study, jobs: Sequence[Job]) -> list[Model]:
             if all(name in models for models in how):
                 settings = ", ".join(dict.fromkeys(models[name] for models in how if models[name]))
                 found.append(Model(name, sees, settings, _loader(study, some, name)))
-    place = ["uniform", *(f"markov-{order}" for order in range(20)), "context tree", "gru", "transformer"]
+    chains = [f"markov-{order}" for order in ORDERS]
+    place = ["uniform", *chains, "context tree", "gru", "transformer", "gru-large", "stacked"]
     return sorted(found, key=lambda model: (model.sees == CONTEXT, place.index(model.name)))
 
 

@@ -115,7 +115,7 @@ def lag_figure(
     sizes = [abs(row[1]) for rows in information.values() for row in rows if row[1]]
     largest = max(sizes, default=0.0)
     small = np.abs(chance) if floor else [min(sizes, default=1.0)]
-    linear = 10 ** np.round(np.log10(np.nanmax([largest / 1000, *small, 1e-9])))
+    linear = 10 ** np.round(np.log10(np.nanmax([largest / 100, *small, 1e-9])))
     if largest > 30 * linear:
         axes.set_yscale("symlog", linthresh=linear, linscale=0.6)
         axes.yaxis.set_major_formatter(DIGITS)

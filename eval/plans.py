@@ -22,10 +22,10 @@ from neuroprior.comparison import Score, unit_name
 from neuroprior.plans import Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, in_parts
 
-MODELS = ("counts", "gru", "transformer")
+MODELS = ("counts", "gru", "transformer", "stacked", "gru-large")
 LISTS: dict[str, dict[str, Any]] = {
     "priors": {"help": "score these model folders only; the first is compared with"},
-    "models": {"default": list(MODELS), "choices": MODELS, "help": "which to fit"},
+    "models": {"default": list(MODELS[:4]), "choices": MODELS, "help": "which to fit"},
     "action_names": {"help": "names of the actions in the order of their numbers, where the file does not tell"},
 }
 """Options that take several words."""
@@ -39,7 +39,7 @@ def plans(
     priors: list[str] | None = None,
     test: str | None = None,
     folds: int | None = None,
-    models: list[str] = list(MODELS),  # noqa: B006
+    models: list[str] = list(MODELS[:4]),  # noqa: B006
     skip: int = 0,
     max_steps: int = 1000,
     num_actions: int | None = None,
@@ -55,7 +55,8 @@ def plans(
         priors: score these model folders only, such as `python -m train` writes; the first is compared with.
         test: learn from the file and score on this one, in place of cross-validation.
         folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
-        models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer.
+        models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
+            weighs the forecasts of counts), gru-large (256 wide, with dropout; slow, and left out by default).
         skip: actions at the beginning of each plan that do not count in scores.
         max_steps: gradient steps of a neural prior.
         num_actions: number of actions, where the file does not tell.
