@@ -28,11 +28,11 @@ NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "gru": (GRUPrior, {}),
     "transformer": (TransformerPrior, {}),
     # It hardly learns by heart, so few plans will do to stop it early.
-    "stacked": (StackedPrior, {"learning_rate": 4e-3, "validation": 0.05}),
+    "stacked": (StackedPrior, {"learning_rate": 4e-3, "validation": 0.02}),
     # For long sequences of few subjects: without lags, which such plans let it learn by heart.
     "gru-large": (
         partial(GRUPrior, hidden_size=256, lags=1, dropout=0.5),
-        {"learning_rate": 4e-3, "validation": 0.05},
+        {"learning_rate": 4e-3, "validation": 0.02},
     ),
 }
 """How neural priors are made and trained; the first two by default recipes."""

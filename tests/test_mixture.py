@@ -1,6 +1,7 @@
 """Mixtures: Bayes' rule against enumeration, fixed share against its recursion, learned weights, packed states."""
 
 import math
+from functools import cache
 
 import pytest
 import torch
@@ -66,20 +67,21 @@ def test_weights_follow_the_recursion_of_fixed_share(share):
     assert float(mixture.log_prob(plan)) == pytest.approx(total, abs=1e-5)
 
 
-def conformance():
+@cache
+def conformance() -> list[MixturePrior]:
     plans, seen = some_plans(), some_plans(contexts=4)
     small = {"max_steps": 5, "progress": False}
-    yield weighted(MixturePrior(A, experts()), [0.1, 0.4, 0.3, 0.2], 0.1)
-    made = [MarkovPrior(A, 1, num_contexts=4), ContextTreePrior(A, 2), GRUPrior(A, 8, num_contexts=4)]
-    yield MixturePrior(A, made).fit(seen, seeded(0), **small)
-    yield MixturePrior(A, [TransformerPrior(A, 16, window=2), GRUPrior(A, 8, window=1)])
+    made = [weighted(MixturePrior(A, experts()), [0.1, 0.4, 0.3, 0.2], 0.1)]
+    some = [MarkovPrior(A, 1, num_contexts=4), ContextTreePrior(A, 2), GRUPrior(A, 8, num_contexts=4)]
+    made.append(MixturePrior(A, some).fit(seen, seeded(0), **small))
+    made.append(MixturePrior(A, [TransformerPrior(A, 16, window=2), GRUPrior(A, 8, window=1)]))
     nested = MixturePrior(A, [StackedPrior(A, 8, orders=(1,), depth=2), UniformPrior(A)])
-    yield MixturePrior(A, [nested, MarkovPrior(A, 1)]).fit(plans, seeded(0), **small)
+    return [*made, MixturePrior(A, [nested, MarkovPrior(A, 1)]).fit(plans, seeded(0), **small)]
 
 
 @pytest.mark.parametrize("number", range(4), ids=["no context", "contexts", "windows", "nested"])
 def test_it_is_a_prior(number):
-    check_prior(list(conformance())[number], 3, 2000)
+    check_prior(conformance()[number], 3, 2000)
 
 
 def test_weights_are_learned():
