@@ -90,7 +90,7 @@ def outcomes(
     if kind == "lags":
         return _by_lag(learned, scored, design, seed)
     found = {}
-    world = None if fold else _world(learned, scored)
+    world = None if fold else _world(learned, _sizes(learned, scored).get("num_contexts", 0))
     for name, how, prior in _fitted(kind, learned, scored, design, seed):
         arrays = scored_by(prior, scored, mask, unit)
         if fold == 0:
@@ -205,27 +205,23 @@ def _reach(learned: Plans, scored: Plans, most: int) -> int | None:
     return reach if reach >= 1 else None
 
 
-def _world(*some: Plans) -> TabularWorld | None:
+def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:
     """How the context a step follows from the one before and the action there, where these alone decide it."""
-    if not all(sees_each_step(plans.context) and not plans.context.is_floating_point() for plans in some):  # type: ignore[union-attr]
+    context, actions = learned.context, learned.num_actions
+    if context is None or context.is_floating_point() or not sees_each_step(context):
         return None
-    size, actions = _sizes(*some)["num_contexts"], some[0].num_actions
-    codes, following = [], []
-    for plans in some:
-        assert plans.context is not None
-        goes_on = plans.mask()[:, 1:]
-        codes.append((plans.context.long() * actions + plans.actions.long())[:, :-1][goes_on])
-        following.append(plans.context[:, 1:][goes_on].long())
-    code, after = torch.cat(codes), torch.cat(following)
-    table = torch.arange(size).repeat_interleave(actions)
+    goes_on = learned.mask()[:, 1:]
+    code = (context.long() * actions + learned.actions.long())[:, :-1][goes_on]
+    after = context[:, 1:][goes_on].long()
+    table = torch.arange(num_contexts).repeat_interleave(actions)
     table[code] = after
     if not bool((table[code] == after).all()) or len(code) == 0:
         return None
-    legal = torch.zeros(size * actions, dtype=torch.bool)
+    legal = torch.zeros(num_contexts * actions, dtype=torch.bool)
     legal[code] = True
-    legal = legal.view(size, actions)
+    legal = legal.view(num_contexts, actions)
     legal[~legal.any(1)] = True
-    return TabularWorld(table.view(size, actions), torch.zeros(1, size), legal)
+    return TabularWorld(table.view(num_contexts, actions), torch.zeros(1, num_contexts), legal)
 
 
 def _generated(prior: Prior, scored: Plans, world: TabularWorld | None, seed: int) -> Tensor | None:

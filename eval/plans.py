@@ -78,7 +78,7 @@ def plans(
     command = (
         "python -m eval " + shlex.join(sys.argv[1:]) if sys.argv[1:2] == ["plans"] else f"python -m eval plans {file}"
     )
-    write_report(replace(report, command=command, source=test or file), folder, console)
+    write_report(replace(report, command=command, source=file), folder, console)
 
 
 def _read(file: str, num_actions: int | None, action_names: list[str] | None) -> Plans:
@@ -137,9 +137,15 @@ def _of_fitted(
     scores = held_out.scores_of(models, scored, mask)
     rows = held_out.score_rows(scores, models)
     reference = min(scores, key=lambda one: one.bits_per_action().mean)
-    settings = {"folds": design.folds, "seed": design.seed, "skip": design.skip, "max_steps": design.max_steps}
+    settings = {
+        "models": ", ".join(kinds),
+        "folds": design.folds,
+        "seed": design.seed,
+        "skip": design.skip,
+        "max_steps": design.max_steps,
+    }
     return Report(
-        read if test is None else scored,
+        read,
         scored,
         mask,
         models,
