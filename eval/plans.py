@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +78,8 @@ def plans(
     command = (
         "python -m eval " + shlex.join(sys.argv[1:]) if sys.argv[1:2] == ["plans"] else f"python -m eval plans {file}"
     )
-    write_report(replace(report, command=command, source=file), folder, console)
+    settings = report.settings | ({} if test is None else {"test": test})
+    write_report(replace(report, command=command, source=file, settings=settings), folder, console)
 
 
 def _read(file: str, num_actions: int | None, action_names: list[str] | None) -> Plans:
@@ -137,13 +138,7 @@ def _of_fitted(
     scores = held_out.scores_of(models, scored, mask)
     rows = held_out.score_rows(scores, models)
     reference = min(scores, key=lambda one: one.bits_per_action().mean)
-    settings = {
-        "models": ", ".join(kinds),
-        "folds": design.folds,
-        "seed": design.seed,
-        "skip": design.skip,
-        "max_steps": design.max_steps,
-    }
+    settings = {"models": ", ".join(kinds)} | asdict(design)
     return Report(
         read,
         scored,
