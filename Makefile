@@ -12,8 +12,9 @@ mice: .venv/programs
 	$(BIN)/python -m eval plans eval/data/labyrinth/plans.jsonl --skip 1 --max-steps 400 --out runs/mice
 	$(BIN)/python -m eval mice --out runs/mice-planner
 
+# One thread a process: two processes of two threads each wait for one another.
 test: check
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
 
 check: .venv/dev
 	$(BIN)/ruff check .

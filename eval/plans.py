@@ -132,7 +132,11 @@ def _of_fitted(
     bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*bar, TimeRemainingColumn(), transient=True) as progress:
         task = progress.add_task("fitting models", total=len(todo))
-        crossval.run(study, todo, processes or os.cpu_count() or 1, lambda job: progress.advance(task))
+        try:
+            crossval.run(study, todo, processes or os.cpu_count() or 1, lambda job: progress.advance(task))
+        except KeyboardInterrupt as interrupted:
+            kept = f"interrupted; fits that were finished are kept in {study.folder}, and the same command goes on"
+            raise KeyboardInterrupt(kept) from interrupted
     models = held_out.models_of(study, todo)
     scored, mask = study.scored, study.mask()
     scores = held_out.scores_of(models, scored, mask)
