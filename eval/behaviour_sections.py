@@ -188,7 +188,7 @@ def drift_section(report: "Report") -> tuple[Section, Rows] | None:
     """Whether plans get easier or harder to predict, within and between them."""
     cost = [one.bits_per_action().mean for one in report.scores]
     whole = [k for k, model in enumerate(report.models) if model.bits().shape == report.scored.actions.shape]
-    if not whole:
+    if not whole or int(report.mask.sum(1).max()) < 2:
         return None
     model = report.models[min(whole, key=lambda k: cost[k])]
     drifts = report.scored, model.bits(), report.mask

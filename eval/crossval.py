@@ -3,10 +3,13 @@
 import hashlib
 import json
 import multiprocessing
+import os
 import signal
-from collections.abc import Callable, Iterable
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -176,7 +179,8 @@ def run(study: Study, todo: list[Job], processes: int, done: Callable[[Job], Non
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(processes, len(missing)), context, _in_process) as pool:
         try:
-            running = {pool.submit(do, study, job): job for job in missing}
+            with _no_interrupt():
+                running = {pool.submit(do, study, job): job for job in missing}
             for future in as_completed(running):
                 future.result()
                 done(running[future])
@@ -190,22 +194,49 @@ def run(study: Study, todo: list[Job], processes: int, done: Callable[[Job], Non
 
 
 def do(study: Study, job: Job) -> None:
-    """Fit what a job names and keep how it scores."""
+    """Fit what a job names and keep how it scores; in one thread, as the number of threads changes the last digits."""
     learned, index = study.split(job.fold)
     scored = study.scored[index]
     mask = study.mask()
     unit = units(study.scored, mask)[index]
     if job.sees == ACTIONS:
         learned, scored = (replace(plans, context=None, context_names=None) for plans in (learned, scored))
-    found = fits.outcomes(job.kind, learned, scored, mask[index], unit, study.design, job.fold)
+    with _one_thread():
+        found = fits.outcomes(job.kind, learned, scored, mask[index], unit, study.design, job.fold)
     with written_whole(study.folder / job.name, "wb") as file:
         np.savez(file, **fits.packed(found))
 
 
-def _in_process() -> None:
-    # Ctrl-C is for the main process, which ends the others.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Ctrl-C is held back, and never reaches processes that are started here: the main one ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _in_process() -> None:
+    # Where the main process is killed, nobody else would end this one.
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 @lru_cache(maxsize=2)

@@ -112,7 +112,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
     if kind == "counts":
         if "context_size" in sizes:
             return  # features cannot be counted
-        training, validation = learned.split(VALIDATION, torch.Generator().manual_seed(seed))
+        training, validation = _split(learned, seed)
         for rival in rivals(training, validation, sizes.get("num_contexts"), always_see=True):
             if rival.prior is not None:
                 # Chosen on the validation plans; then these are learned from as well.
@@ -124,6 +124,14 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
     how = {"max_steps": design.max_steps, "patience": ceil(PATIENCE * design.max_steps), "progress": False} | settings
     prior = make(learned.num_actions, seed=seed, **sizes)
     yield kind, "", prior.fit(learned, torch.Generator().manual_seed(seed), **how)
+
+
+def _split(learned: Plans, seed: int) -> tuple[Plans, Plans]:
+    """Plans to count and plans to choose settings on, the latter of two actions or more where that can be."""
+    training, validation = learned.split(VALIDATION, torch.Generator().manual_seed(seed))
+    if int(validation.mask().sum()) < FEWEST_UNITS:
+        training, validation = learned.split(0.5, torch.Generator().manual_seed(seed))
+    return training, validation
 
 
 def _sizes(*some: Plans) -> dict[str, int]:
@@ -200,8 +208,10 @@ def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | Non
 
 def _reach(learned: Plans, scored: Plans, most: int) -> int | None:
     """Past actions that are known at most: so many that half of the plans of either part are longer."""
-    lengths = [plans.mask().sum(1) for plans in (learned, scored)]
-    reach = min(most, *(int(length.double().median()) - 1 for length in lengths))
+    reach = most
+    for plans in (learned, scored):
+        # A single plan must be longer than a piece: a comparison needs two pieces.
+        reach = min(reach, int(plans.mask().sum(1).double().median()) - 1 - (len(plans) == 1))
     return reach if reach >= 1 else None
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.text import Text
 from torch import Tensor
 
@@ -87,7 +88,7 @@ def write_report(report: Report, folder: Path, console: Console) -> None:
                 console.print(printed(section.title, table))
             parts.append(Part(section, files))
     lead = sections.lead(report)
-    console.print(lead, highlight=False)
+    console.print(lead, highlight=False, markup=False)
     files = {name: rows for part in parts for name, rows in part.files.items() if rows}
     for name, rows in files.items():
         write_csv(folder / f"{name}.csv", rows)
@@ -105,7 +106,7 @@ def write_report(report: Report, folder: Path, console: Console) -> None:
     settings |= report.settings | {f"version: {name}": number for name, number in versions().items()}
     title = f"Plans in {Path(report.source).name}"
     write_page(folder / "report.html", Page(title, lead, report.command, settings, [part.section for part in parts]))
-    console.print(f"report: {folder / 'report.html'}", highlight=False, soft_wrap=True)
+    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
 
 
 def printed(title: str, table: Table) -> Any:
@@ -117,5 +118,5 @@ def printed(title: str, table: Table) -> Any:
         made.columns[0].no_wrap, made.columns[0].overflow = False, "fold"
     for row in table.rows:
         made.add_row(*map(Text, row))  # names are no markup
-    made.caption = table.caption
+    made.caption = escape(table.caption)
     return made

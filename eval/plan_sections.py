@@ -75,6 +75,8 @@ def score_section(report: "Report") -> tuple[Section, Rows]:
 def lag_section(report: "Report") -> tuple[Section, Rows] | None:
     """How far back structure reaches."""
     rows = [*statistics.information_rows(report.plans, report.settings["skip"]), *report.steps]
+    if not rows:
+        return None
     curves: dict[str, list[tuple[int, float, float, float]]] = {}
     for row in rows:
         name = f"{row['model']}, sees context" if "context" in row["sees"] else row["model"]
@@ -106,7 +108,7 @@ def _told(row: tuple[int, float, float, float] | None) -> str:
 
 def order_section(report: "Report") -> tuple[Section, Rows] | None:
     """Which order."""
-    if int(report.plans.mask().sum(1).max()) < 2:
+    if int(report.plans.mask().sum(1).max()) < 2 or report.plans.num_actions < 2:
         return None
     rows = statistics.order_rows(report.plans, statistics.num_contexts([report.plans]))
     held_out: dict[str, dict[int, dict[str, Any]]] = {}

@@ -29,6 +29,11 @@ MANY_REPEATS = 0.2
 """Share of actions that repeat the last one beyond which over-represented sequences are also sought without them."""
 
 
+def _shuffles() -> torch.Generator:
+    """What permutation tests draw from: the same file gives the same report."""
+    return torch.Generator().manual_seed(0)
+
+
 def action_names(plans: Plans) -> list[str]:
     """Names of the actions; their numbers where they have none."""
     return list(plans.action_names or map(str, range(plans.num_actions)))
@@ -40,11 +45,13 @@ def group_names(plans: Plans, groups: Tensor) -> list[str]:
 
 
 def information_rows(plans: Plans, skip: int) -> list[dict[str, Any]]:
-    """The mutual information of actions k steps apart."""
+    """The mutual information of actions k steps apart; none where there are no two pairs of them."""
+    if int(plans.mask()[:, max(skip, 1) :].sum()) < 2:
+        return []
     return [
         {"what": "mutual information", "model": "counts", "sees": "actions"}
         | {key: value for key, value in asdict(one).items() if key != "pairs"}
-        for one in mutual_information(plans, MOST_LAG, skip)
+        for one in mutual_information(plans, MOST_LAG, skip, _shuffles())
     ]
 
 
@@ -63,7 +70,7 @@ def order_rows(plans: Plans, num_contexts: int | None) -> list[dict[str, Any]]:
 
 def transition_rows(plans: Plans) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Each transition, overall and in each group; and the test of whether groups differ, with the matrices."""
-    found = transitions(plans)
+    found = transitions(plans, generator=_shuffles())
     names, groups = action_names(plans), group_names(plans, found.groups) if plans.group is not None else []
     probs, each = found.probs(), found.group_probs()
     rows = [
@@ -113,7 +120,7 @@ def likeness_rows(real: Plans, model: Model) -> tuple[list[dict[str, Any]], list
     like = real[: len(generated)]
     sampled = Plans(torch.from_numpy(generated), real.num_actions, like.lengths)
     plain = Plans(like.actions, real.num_actions, like.lengths)
-    found = likeness(plain, sampled)
+    found = likeness(plain, sampled, generator=_shuffles())
     rows = [
         {
             "model": model.name,

@@ -20,7 +20,7 @@ from eval.plan_report import Report, write_report
 from neuroprior import load
 from neuroprior.comparison import Score, unit_name
 from neuroprior.plans import Plans, read_plans
-from neuroprior.plans.folds import BLOCKS, in_parts
+from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 
 MODELS = ("counts", "gru", "transformer", "stacked", "gru-large")
 LISTS: dict[str, dict[str, Any]] = {
@@ -65,16 +65,21 @@ def plans(
         processes: how many models are fitted at a time; all cores by default.
         out: folder for `report.html`, `results.json`, tables as CSV, and what an interrupted run goes on from.
     """
-    if skip < 0 or max_steps < 1:
-        raise ValueError(f"skip and max_steps: at least 0 and 1 are expected, not {skip} and {max_steps}")
+    _check(skip, max_steps, seed, processes)
     folder, console = Path(out), Console()
     if priors is not None:
         report = _of_saved(file, priors, skip, num_actions, action_names)
     else:
-        read = _read(file, num_actions, action_names)
-        other = None if test is None else _same_names(read, _read(test, num_actions, action_names), test)
-        design = Design(1 if test is not None else _folds(read, folds), seed, skip, max_steps)
+        read, empty = _read(file, num_actions, action_names)
+        other = None
+        if test is not None:
+            other, empty = _read(test, num_actions, action_names)
+            other = _same_names(read, other, test)
+        read, other = _renumbered(read, other)
+        design = Design(1 if test is not None else _folds(file, read, folds), seed, skip, max_steps)
         report = _of_fitted(folder, read, other, design, [*models, "lags"], processes)
+        if empty:
+            report = replace(report, settings=report.settings | {"plans without actions, left out": empty})
     command = (
         "python -m eval " + shlex.join(sys.argv[1:]) if sys.argv[1:2] == ["plans"] else f"python -m eval plans {file}"
     )
@@ -82,24 +87,57 @@ def plans(
     write_report(replace(report, command=command, source=file, settings=settings), folder, console)
 
 
-def _read(file: str, num_actions: int | None, action_names: list[str] | None) -> Plans:
+def _check(skip: int, max_steps: int, seed: int, processes: int | None) -> None:
+    """Raise ValueError, naming the option, unless these numbers can be."""
+    if skip < 0 or max_steps < 1:
+        raise ValueError(f"skip and max_steps: at least 0 and 1 are expected, not {skip} and {max_steps}")
+    if not 0 <= seed < 2**50:
+        raise ValueError(f"seed: an integer from 0 to 2**50 - 1 is expected, not {seed}")
+    if processes is not None and processes < 1:
+        raise ValueError(f"processes: at least 1 is expected, not {processes}")
+
+
+def _read(file: str, num_actions: int | None, action_names: list[str] | None) -> tuple[Plans, int]:
+    """The plans that have actions, and how many have none: these neither teach nor test anything."""
     read = read_plans(file, num_actions=num_actions, action_names=action_names)
     read = read if read.end is None else read.without_end()
-    return in_parts(read, min(BLOCKS, max(int(read.mask().sum()) // 2, 1))) if len(read) == 1 else read
+    some = read.mask().any(1)
+    if not bool(some.any()):
+        raise ValueError(f"{file}: no plan has an action")
+    kept = read[some]
+    parts = min(BLOCKS, max(int(kept.mask().sum()) // 2, 1))
+    return in_parts(kept, parts) if len(kept) == 1 else kept, int((~some).sum())
 
 
-def _folds(read: Plans, folds: int | None) -> int:
+def _folds(file: str, read: Plans, folds: int | None) -> int:
     """How many; by default no more than there are units."""
-    if folds is not None:
-        return folds
     grouped = read.group is not None and len(read.group.unique()) > 1
-    return min(FOLDS, len(read.group.unique()) if grouped and read.group is not None else len(read))
+    units = len(read.group.unique()) if grouped and read.group is not None else len(read)
+    if units < 2:
+        raise ValueError(f"{file}: at least two plans, or a single long one, are needed for cross-validation")
+    number = min(FOLDS, units) if folds is None else folds
+    if number < 2:  # which a `Design` takes for a test file
+        raise ValueError(f"folds: at least 2 are expected, not {number}")
+    return number
+
+
+def _renumbered(read: Plans, test: Plans | None) -> tuple[Plans, Plans | None]:
+    """The plans with the contexts that occur numbered from 0, where they have no names: no model grows with a gap."""
+    contexts = [some.context for some in (read, test) if some is not None and some.context is not None]
+    named = read.context_names is not None or (test is not None and test.context_names is not None)
+    if not contexts or named or contexts[0].is_floating_point():
+        return read, test
+    seen = torch.cat([context.flatten().long() for context in contexts]).unique()
+    if int(seen[0]) < 0:
+        raise ValueError(f"context: numbers from 0 are expected, not {int(seen[0])}")
+    new = [torch.searchsorted(seen, context.long().contiguous()) for context in contexts]
+    return replace(read, context=new[0]), None if test is None else replace(test, context=new[-1])
 
 
 def _same_names(read: Plans, other: Plans, test: str) -> Plans:
     """The test plans with actions and contexts numbered as in those that are learned from."""
-    if (read.context is None) != (other.context is None):
-        raise ValueError(f"{test}: {'no' if other.context is None else 'a'} context, unlike the plans to learn from")
+    if _sees(read) != _sees(other):
+        raise ValueError(f"{test}: {_sees(other)}, but {_sees(read)} in the plans to learn from")
     if read.action_names is not None and other.action_names is not None:
         number = _numbers("action", read.action_names, other.action_names, test)
         other = replace(other, actions=number[other.actions.long()], num_actions=read.num_actions, action_names=None)
@@ -110,6 +148,13 @@ def _same_names(read: Plans, other: Plans, test: str) -> Plans:
         number = _numbers("context", read.context_names, other.context_names, test)
         other = replace(other, context=number[other.context.long()], context_names=read.context_names)
     return other
+
+
+def _sees(plans: Plans) -> str:
+    """What kind of context plans have."""
+    if plans.context is None:
+        return "no context"
+    return f"{plans.context.shape[-1]} features" if plans.context.is_floating_point() else "context indices"
 
 
 def _numbers(what: str, known: Any, names: Any, file: str) -> Tensor:
@@ -128,6 +173,8 @@ def _of_fitted(
     """Fit all models and score them on held-out plans."""
     study = Study.prepare(folder, read, test, design)
     sees = [ACTIONS] + [CONTEXT] * (read.context is not None)
+    if (counted := int(study.mask().sum())) < FEWEST_UNITS:
+        raise ValueError(f"skip: {counted} actions are left to score after the first {design.skip} of each plan")
     todo = crossval.jobs(design, [kind for kind in KINDS if kind in kinds], sees)
     bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*bar, TimeRemainingColumn(), transient=True) as progress:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, UniformPrior
-from neuroprior.comparison import BACKOFFS_TRIED, DEPTH, ORDERS, rivals, score, unit_name
+from neuroprior.comparison import BACKOFFS_TRIED, DEPTH, ORDERS, action_bits, rivals, score, score_bits, unit_name
 from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors import histories
 from neuroprior.statistics import mean_interval, paired_difference, ratio_difference
@@ -184,6 +184,32 @@ def test_no_plans_are_refused():
         score("it", UniformPrior(3), Plans(torch.zeros(0, 4).long(), 3))
 
 
+@pytest.mark.parametrize("group", [None, torch.arange(12) // 3 * 5])
+def test_score_of_bits_with_a_mask(group):
+    """Only what counts is summed, by unit; a unit of which nothing counts is none."""
+    plans = held_out(group=group)
+    cost = torch.rand(12, 7, generator=seeded(4))
+    mask = plans.mask()
+    mask[:, :2] = False
+    found = score_bits("it", "actions", cost, plans, mask)
+    unit = torch.arange(12) if group is None else group
+    of = [unit == number for number in unit.unique()]
+    want = [(float(cost[rows][mask[rows]].double().sum()), int(mask[rows].sum())) for rows in of]
+    want = [(total, number) for total, number in want if number]
+    assert found.bits.tolist() == pytest.approx([total for total, _ in want])
+    assert found.actions.tolist() == [number for _, number in want]
+    whole = score_bits("it", "actions", cost, plans)
+    assert float(whole.actions.sum()) == 40
+    assert float(whole.bits.sum()) == pytest.approx(float(cost[plans.mask()].sum()))
+    prior = MarkovPrior(3, 1).fit(plans)
+    again = score_bits("it", "actions", action_bits(prior, plans), plans)
+    torch.testing.assert_close(again.bits, score("it", prior, plans).bits)
+    mask[:, :] = False
+    mask[0, 3] = True
+    with refuses("two held-out actions", "not 1"):
+        score_bits("it", "actions", cost, plans, mask)
+
+
 def test_minus_is_paired():
     plans = held_out()
     markov, uniform = (score(p.__class__.__name__, p, plans) for p in (MarkovPrior(3, 1).fit(plans), UniformPrior(3)))
@@ -269,6 +295,24 @@ def test_contexts_that_only_held_out_plans_have():
             assert 0 < rival.validation_bits < 5
             new = replace(validation, context=torch.full((50,), 3))
             assert score(rival.model, rival.prior, new).bits_per_action().mean < 5
+
+
+def test_rivals_that_always_see():
+    """Also where the context tells nothing; the uniform prior, which cannot see, is left out."""
+    both = sources(False), sources(False, 50, 7)
+    training, validation = (replace(plans, context=torch.arange(len(plans)) % 20) for plans in both)
+    found = list(rivals(training, validation, 20, always_see=True))
+    assert [rival.model for rival in found] == [*(f"markov-{k}" for k in ORDERS), "context tree"]
+    blind = {rival.model: rival for rival in rivals(training, validation)}
+    for rival in found:
+        assert rival.prior.num_contexts == 20
+        if rival.model in ("markov-1", "markov-2"):
+            assert rival.validation_bits > blind[rival.model].validation_bits
+    chosen = {rival.model: rival.validation_bits for rival in rivals(training, validation, 20)}
+    assert all(chosen[r.model] == min(r.validation_bits, blind[r.model].validation_bits) for r in found)
+    # Where there is none to see, nothing changes.
+    same = {rival.model: rival.validation_bits for rival in rivals(training, validation, always_see=True)}
+    assert same == {model: rival.validation_bits for model, rival in blind.items()}
 
 
 def test_rivals_that_are_too_large(monkeypatch):

@@ -96,6 +96,51 @@ def test_log_prob_in_parts(kind, sees, monkeypatch):
     torch.testing.assert_close(prior.log_prob(plans, context, lengths), whole)
 
 
+@pytest.mark.parametrize("end", [False, True])
+@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None])
+@torch.no_grad()
+def test_forecasts(kind, sees, end, monkeypatch):
+    """What is forecast of every action, some plans at a time, is what `log_prob` takes of the one that came."""
+    prior = make(kind, sees)
+    lengths = torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
+    actions = torch.randint(A, (9, L), generator=seeded(1))
+    if end:  # action 2 closes plans, and the prior has learned so
+        actions = torch.where(torch.arange(L) == lengths[:, None] - 1, 2, actions.clamp(max=1))
+        prior.end = 2
+    plans = Plans(actions, A, lengths, context=draw_context(sees, 9, L), end=2 if end else None)
+    (whole,) = list(prior.forecasts(plans))
+    assert whole[0].actions.equal(plans.actions)
+    assert whole[1].shape == (9, L, A)
+    within = whole[1][plans.mask()]
+    torch.testing.assert_close(within.exp().sum(-1), torch.ones(len(within)))
+    taken = whole[1].gather(-1, plans.actions.long()[..., None])[..., 0].masked_fill(~plans.mask(), 0)
+    torch.testing.assert_close(taken, prior.action_log_probs(plans))
+    torch.testing.assert_close(taken.sum(1), prior.log_prob(plans.actions, plans.context, lengths))
+    if not end:
+        torch.testing.assert_close(whole[1], prior(plans.actions, plans.context).log_softmax(-1))
+    else:  # after the end nothing but it
+        steps = plans.actions[:, :-1] == 2
+        assert int(steps.sum()) == 6
+        assert (whole[1][:, 1:][steps][:, 2] == 0).all()
+        assert whole[1][:, 1:][steps][:, :2].isneginf().all()
+    monkeypatch.setattr(type(prior), "actions_at_once", 2 * L + 1)
+    parts = list(prior.forecasts(plans))
+    assert [len(part) for part, _ in parts] == [2, 2, 2, 2, 1]
+    assert torch.cat([part.actions for part, _ in parts]).equal(plans.actions)
+    torch.testing.assert_close(torch.cat([log_probs for _, log_probs in parts]), whole[1])
+    monkeypatch.setattr(type(prior), "actions_at_once", 1)  # never fewer than a plan
+    assert [len(part) for part, _ in prior.forecasts(plans)] == [1] * 9
+
+
+def test_forecasts_of_other_plans_are_refused():
+    prior = make("markov", "index a plan")
+    with refuses("4 actions", "3"):
+        next(iter(prior.forecasts(Plans(torch.zeros(2, 2).long(), 4, context=torch.zeros(2).long()))))
+    with refuses("context"):
+        next(iter(prior.forecasts(Plans(torch.zeros(2, 2).long(), A))))
+    assert list(prior.forecasts(Plans(torch.zeros(0, 2).long(), A, context=torch.zeros(0).long()))) == []
+
+
 @pytest.mark.parametrize(("kind", "sees", "window"), [case for case in ALL if case[2] in (None, 1, 3)])
 @torch.no_grad()
 def test_states_are_reordered_by_indexing(kind, sees, window):

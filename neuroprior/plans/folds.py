@@ -45,8 +45,10 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
     """A single plan cut into `number` consecutive plans of about the same length, for cross-validation in time.
 
     Raises:
-        ValueError: not a single plan, or fewer actions than parts.
+        ValueError: not a single plan, fewer actions than parts, or no parts.
     """
+    if number < 1:
+        raise ValueError(f"number: at least 1 is expected, not {number}")
     length = int(plans.mask().sum())
     if len(plans) != 1 or length < number:
         raise ValueError(f"plans: a single one of at least {number} actions is expected, not {len(plans)} of {length}")
