@@ -21,6 +21,13 @@ Rows = dict[str, Sequence[dict[str, Any]]]
 DRAWN = 12
 """Sequences drawn, real and generated."""
 
+MOTIFS = (
+    "Sequences of three to six actions that occur more (or less) often than their parts explain: than a chain says that"
+    " knows how often the sequence without its first, and without its last action occurs. All plans are taken to be of"
+    " one chain: where groups differ, sequences of some of them stand out, too. One that stands out makes others do so"
+    " that share its beginning."
+)
+
 MOST_LISTED = 12
 """Actions and groups in tables."""
 
@@ -40,21 +47,20 @@ def transition_section(report: "Report") -> tuple[Section, Rows] | None:
     ]
     text = ["How often each action follows each other one, within plans."]
     if len(test["groups"]) > 1:
-        how = {
-            "permutation": f"a permutation test over whole plans, {test['permutations']} permutations",
-            "chi-square": "a chi-square test, which takes an action to depend on the one before it alone",
-            "none": "too few to test",
-        }[test["test"]]
+        tested = test["test"] == "permutation"
         differ = "differ" if test["p_value"] < statistics.SIGNIFICANT else "cannot be told apart"
-        verdict = "" if test["test"] == "none" else f": the groups {differ} (p = {test['p_value']:.2g})"
         text.append(
-            f"{len(test['groups'])} groups{verdict}, by {how}. Marked cells differ at p < 0.05, corrected for all."
+            f"{len(test['groups'])} groups: they {differ} (p = {test['p_value']:.2g}, permutation test over plans,"
+            f" {test['permutations']} permutations). Marked cells differ at p < 0.05, corrected for all."
+            if tested
+            else f"{len(test['groups'])} groups, with too few plans in each to test whether they differ."
         )
+        significant = test["significant"] & tested
         figures.append(
             FigureBox(
                 svg(
                     matrix_figures.group_transition_figure(
-                        test["group_probs"], test["probs"], names, test["groups"], test["significant"]
+                        test["group_probs"], test["probs"], names, test["groups"], significant
                     )
                 ),
                 "Each group's transition probabilities less those of all.",
@@ -67,10 +73,7 @@ def transition_section(report: "Report") -> tuple[Section, Rows] | None:
 def motif_section(report: "Report") -> tuple[Section, Rows] | None:
     """Sequences that stand out."""
     rows = statistics.motif_rows(report.plans)
-    # Where any is significant, the others say nothing.
-    rows = [row for row in rows if row["corrected"] < statistics.SIGNIFICANT] or rows
-    if not rows:
-        return None
+    rows = [row for row in rows if row["corrected"] < statistics.SIGNIFICANT]
     tables, figures = [], []
     for repeats in dict.fromkeys(row["repeats"] for row in rows):
         own = [row for row in rows if row["repeats"] == repeats]
@@ -95,10 +98,7 @@ def motif_section(report: "Report") -> tuple[Section, Rows] | None:
                 "Over-represented sequences: " + "; ".join(row["sequence"] for row in own[:5]),
             )
         )
-    text = [
-        "Sequences of three to six actions that occur more (or less) often than their parts explain: than a chain says"
-        " that knows how often the sequence without its first, and without its last action occurs.",
-    ]
+    text = [MOTIFS] + ([] if rows else ["None stands out (p < 0.05, corrected for all sequences)."])
     return Section("Sequences that stand out", text, tables, figures), {"motifs": rows}
 
 
@@ -108,41 +108,40 @@ def likeness_section(report: "Report") -> tuple[Section, Rows] | None:
     shown: tuple[Model, list[Any]] | None = None
     cost = {id(m): s.bits_per_action().mean for m, s in zip(report.models, report.scores, strict=True)}
     kept = [model for sees in (CONTEXT, ACTIONS) for model in leading(report.models, report.scores, sees)]
+    tested = unit_name(report.scored) != "groups"
     for model in sorted(kept, key=lambda model: cost[id(model)]):
-        own, found = statistics.likeness_rows(statistics.first_fold(report.scored, report.settings), model)
+        own, found = statistics.likeness_rows(statistics.first_fold(report.scored, report.settings), model, tested)
         rows += own
         if found and shown is None:
             shown = model, found
     if shown is None:
         return None
-    model, found = shown
-    statistic = [one.statistic for one in found]
-    cells = [
-        [row["model"], "+ context" if "context" in row["sees"] else "actions"]
-        + [
-            f"{r['distance']:.3f}{'*' * (r['corrected'] < statistics.SIGNIFICANT)}"
-            for r in rows
-            if (r["model"], r["sees"]) == (row["model"], row["sees"])
-        ]
-        for row in rows
-        if row["statistic"] == statistic[0]
-    ]
-    alike = ["alike", "", *(f"{one.chance:.3f}" for one in found)]
-    table = Table(
-        ("model", "sees", *(name.replace(" ", "\n") for name in statistic)),
-        [*cells, alike],
-        "Total variation between the distributions in generated and in held-out real plans (0: the same). *: told apart"
-        " at p < 0.05, permutation test over plans, corrected. alike: what two such sets of one source differ by.",
-        "ll" + "r" * len(statistic),
-    )
+    tables, figures = [_likeness_table(rows, shown[1], tested)], _likeness_figures(report, *shown)
     return (
-        Section(
-            "Generated sequences beside real ones",
-            _likeness_text(model),
-            [table],
-            _likeness_figures(report, model, found),
-        ),
+        Section("Generated sequences beside real ones", _likeness_text(shown[0]), tables, figures),
         {"likeness": rows},
+    )
+
+
+def _likeness_table(rows: list[dict[str, Any]], found: Sequence[Any], tested: bool) -> Table:
+    """A row a model, a column a statistic; and what two sets of one source differ by."""
+    statistic = [one.statistic for one in found]
+    cells: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        own = cells.setdefault((row["model"], row["sees"]), [])
+        own.append(f"{row['distance']:.3f}{'*' * (tested and row['corrected'] < statistics.SIGNIFICANT)}")
+    named = [[name, "+ context" if "context" in sees else "actions", *own] for (name, sees), own in cells.items()]
+    test = (
+        "*: told apart at p < 0.05, permutation test over plans, corrected."
+        if tested
+        else "Not tested: plans of one group are not independent."
+    )
+    return Table(
+        ("model", "sees", *(name.replace(" ", "\n") for name in statistic)),
+        [*named, ["alike", "", *(f"{one.chance:.3f}" for one in found)]],
+        f"Total variation between the distributions in generated and in held-out real plans (0: the same). {test}"
+        " alike: what two such sets of one source differ by, were all plans independent.",
+        "ll" + "r" * len(statistic),
     )
 
 
@@ -210,9 +209,18 @@ def drift_section(report: "Report") -> tuple[Section, Rows] | None:
     unit = unit_name(report.scored, report.mask)
     text = [
         f"Bits per held-out action of {model.label}: where behaviour changes, plans get harder (or easier) to predict.",
+        *(
+            ["The only plan was cut into consecutive parts, which stand for plans."]
+            if report.settings.get("cut")
+            else []
+        ),
         _trends(within, plans, groups),
     ]
-    box = FigureBox(svg(figure), f"95 % intervals over {unit}.", "Bits per action by place, plan and group.")
+    box = FigureBox(
+        svg(figure),
+        f"95 % intervals over {unit}; of groups, over the plans of each.",
+        "Bits per action by place, plan and group.",
+    )
     changes, table = _action_changes(report)
     return Section("Drift", text, table, [box]), {"drift": rows, "action_drift": changes}
 

@@ -42,6 +42,7 @@ class Design:
         skip: actions at the beginning of each plan that are left out of the score.
         max_steps: gradient steps of neural priors.
         reach: the most past actions whose information is measured.
+        cut: whether the plans are consecutive parts of a single one.
         version: of the library.
     """
 
@@ -50,6 +51,7 @@ class Design:
     skip: int = 0
     max_steps: int = 1000
     reach: int = 16
+    cut: bool = False
     version: str = __version__
 
 
@@ -91,15 +93,16 @@ class Study:
         partial = out / "folds"
         partial.mkdir(parents=True, exist_ok=True)
         names = ["plans.npz"] + ["test.npz"] * (test is not None)
-        digest = hashlib.sha256(json.dumps(asdict(design), sort_keys=True).encode())
+        # With the recipes: after a change of these, fits that were finished before do not count.
+        digest = hashlib.sha256((json.dumps(asdict(design), sort_keys=True) + fits.recipes()).encode())
         for name, some in zip(names, (plans, test), strict=False):
             assert some is not None
-            write_plans(some, partial / name)
-            digest.update((partial / name).read_bytes())
+            write_plans(some, partial / f"{os.getpid()}-{name}")
+            digest.update((partial / f"{os.getpid()}-{name}").read_bytes())
         folder = partial / digest.hexdigest()[:12]
         folder.mkdir(exist_ok=True)
         for name in names:
-            (partial / name).replace(folder / name)
+            (partial / f"{os.getpid()}-{name}").replace(folder / name)
         write_json(folder / "design.json", asdict(design))
         return cls(folder, design)
 
@@ -116,9 +119,7 @@ class Study:
 
     def mask(self) -> Tensor:
         """`[N, L]` bool: the actions that count in the score."""
-        mask = self.scored.mask()
-        mask[:, : self.design.skip] = False
-        return mask
+        return counted(self.scored, self.design.skip, self.design.cut)
 
     def split(self, fold: int) -> tuple[Plans, Tensor]:
         """The plans to learn from in a fold, and the numbers of those that are scored."""
@@ -140,6 +141,16 @@ class Study:
     def finished(self, job: Job) -> bool:
         """Whether its results are there."""
         return (self.folder / job.name).exists()
+
+
+def counted(plans: Plans, skip: int, cut: bool) -> Tensor:
+    """`[N, L]` bool: all actions but the first `skip` of each plan; of parts of a single plan, but its first."""
+    mask = plans.mask()
+    if cut:
+        place = mask.flatten().cumsum(0).view(mask.shape)
+        return mask & (place > skip)
+    mask[:, :skip] = False
+    return mask
 
 
 def jobs(design: Design, kinds: Iterable[str], sees: Iterable[str]) -> list[Job]:
@@ -204,7 +215,7 @@ def do(study: Study, job: Job) -> None:
     with _one_thread():
         found = fits.outcomes(job.kind, learned, scored, mask[index], unit, study.design, job.fold)
     with written_whole(study.folder / job.name, "wb") as file:
-        np.savez(file, **fits.packed(found))
+        np.savez_compressed(file, **fits.packed(found))
 
 
 @contextmanager

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, StackedPrior, TabularWorld, TransformerPrior
-from neuroprior.analysis import Reliability, bits_by_position, pieces, reliability
-from neuroprior.comparison import Score, rivals
+from neuroprior.analysis import Reliability, pieces, reliability
+from neuroprior.comparison import Score, action_bits, rivals, score_bits
 from neuroprior.plans import sees_each_step
 from neuroprior.plans.folds import FEWEST_UNITS
 from neuroprior.priors.histories import TooLargeError
@@ -54,6 +54,11 @@ MOST_GENERATED = 1000
 """Bounds of what is cut into pieces, read in a step, and sampled."""
 
 
+def recipes() -> str:
+    """All that decides a fit beside the plans and the design; after a change of it, old fits do not count."""
+    return repr((NEURAL, PATIENCE, VALIDATION, MOST_PIECES, PIECES_A_STEP, torch.__version__))
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What is kept of a fitted model.
@@ -62,7 +67,7 @@ class Outcome:
         how: its settings.
         arrays: by name. `bits [n, L]`, float32: what each held-out action cost. `calibration`: the sums of a
             `Reliability`. `generated [g, L]`: plans sampled from it. Or, of information by lag, `bits` and `actions`
-            `[J, U]`: what actions cost with 0, 1, ... J - 1 past ones known, by unit.
+            `[J, U]`: what the same actions cost with 0, 1, ... J - 1 past ones known, by unit.
     """
 
     how: str
@@ -170,20 +175,25 @@ def scored_by(prior: Prior, scored: Plans, mask: Tensor, unit: Tensor) -> dict[s
 
 
 def _by_lag(learned: Plans, scored: Plans, design: "Design", seed: int) -> dict[str, Outcome]:
-    """What the actions of short pieces cost, of which nothing older is known."""
+    """What the last actions of short pieces cost, with 0, 1, 2 and more of the actions before them known."""
     reach = _reach(learned, scored, design.reach)
-    if reach is None:
+    if reach < 1:
         return {}
     sizes = _sizes(learned, scored)
     generator = torch.Generator().manual_seed(seed)
-    held_out = pieces(scored, reach + 1, MOST_PIECES, generator)
+    late = _after(scored, 0 if design.cut else design.skip - reach)
+    if int(late.mask().sum(1).max()) <= reach:
+        return {}
+    held_out = pieces(late, reach + 1, MOST_PIECES, generator)
     short = pieces(learned, reach + 1, MOST_PIECES * 5, generator)
+    if held_out.group is None or len(held_out.group.unique()) < FEWEST_UNITS:
+        return {}
     neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
-    patience = ceil(PATIENCE * design.max_steps)
-    size = PIECES_A_STEP
+    patience, size = ceil(PATIENCE * design.max_steps), PIECES_A_STEP
     neural.fit(_loose(short), generator, max_steps=design.max_steps, patience=patience, batch_size=size, progress=False)
-    found = {} if "context_size" in sizes else {COUNTED: _chains(learned, held_out, reach, sizes.get("num_contexts"))}
-    found["gru"] = bits_by_position(neural, held_out)
+    found = {"gru": [_of_last(neural, held_out, known) for known in range(reach + 1)]}
+    if "context_size" not in sizes:
+        found[COUNTED] = _chains(learned, held_out, reach, sizes.get("num_contexts"))
     return {
         name: Outcome("", {what: np.stack([getattr(s, what) for s in scores]) for what in ("bits", "actions")})
         for name, scores in found.items()
@@ -191,7 +201,7 @@ def _by_lag(learned: Plans, scored: Plans, design: "Design", seed: int) -> dict[
 
 
 def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | None) -> list[Score]:
-    """What the j-th action of pieces costs a chain of order j, for each j.
+    """What the last action of pieces costs a chain of order j, for each j.
 
     Each order is a prior of its own: in one of a high order the shorter histories only serve to lean on.
     """
@@ -202,17 +212,35 @@ def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | Non
             chain.fit(learned)
         except TooLargeError:
             break
-        scores.append(bits_by_position(chain, held_out)[order])
+        scores.append(_of_last(chain, held_out, order))
     return scores
 
 
-def _reach(learned: Plans, scored: Plans, most: int) -> int | None:
-    """Past actions that are known at most: so many that half of the plans of either part are longer."""
-    reach = most
-    for plans in (learned, scored):
-        # A single plan must be longer than a piece: a comparison needs two pieces.
-        reach = min(reach, int(plans.mask().sum(1).double().median()) - 1 - (len(plans) == 1))
-    return reach if reach >= 1 else None
+def _of_last(prior: Prior, held_out: Plans, known: int) -> Score:
+    """What the last action of each piece costs, with so many before it known: the same actions whatever is known."""
+    bits = action_bits(prior, _ending(held_out, known + 1))
+    return score_bits("", "", bits[:, -1:], _ending(held_out, 1))
+
+
+def _ending(plans: Plans, length: int) -> Plans:
+    """The last actions of plans of the same length."""
+    first = plans.max_length - length
+    context = plans.context[:, first:] if sees_each_step(plans.context) and plans.context is not None else plans.context
+    return replace(plans, actions=plans.actions[:, first:], lengths=None, context=context)
+
+
+def _after(plans: Plans, skip: int) -> Plans:
+    """The plans without their first `skip` actions."""
+    skip = min(max(skip, 0), max(plans.max_length - 1, 0))
+    lengths = (plans.mask().sum(1) - skip).clamp(min=0)
+    context = plans.context[:, skip:] if sees_each_step(plans.context) and plans.context is not None else plans.context
+    return replace(plans, actions=plans.actions[:, skip:], lengths=lengths, context=context)
+
+
+def _reach(learned: Plans, scored: Plans, most: int) -> int:
+    """Past actions that are known at most: half of what the median plan has, so that pieces stand anywhere in plans."""
+    halves = (int(plans.mask().sum(1).double().median()) // 2 for plans in (learned, scored))
+    return min(most, *halves)
 
 
 def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:

@@ -125,7 +125,7 @@ def leading(models: Sequence[Model], scores: Sequence[Score], sees: str) -> list
     """The models of figures, of those that see this: the best chain, and all that are no chains."""
     cost = {id(model): one.bits_per_action().mean for model, one in zip(models, scores, strict=True)}
     same = [model for model in models if model.sees == sees]
-    chains = [model for model in same if model.name.startswith("markov-")]
+    chains = [model for model in same if model.name.removeprefix("markov-").isdecimal()]
     chosen = [min(chains, key=lambda model: cost[id(model)])] if chains else []
     return chosen + [model for model in same if model not in chains and model.name != "uniform"]
 
@@ -151,6 +151,7 @@ def step_rows(study: Study, jobs: Sequence[Job]) -> list[dict[str, Any]]:
                         "low": gain.low,
                         "high": gain.high,
                         "chance": None,
+                        "units": len(scores[lag].actions),
                     }
                 )
     return sorted(rows, key=lambda row: row["sees"] != ACTIONS)

@@ -1,5 +1,6 @@
 """The sections of a report on plans: what each shows, its tables, figures and words."""
 
+import re
 from collections.abc import Sequence
 from math import log2
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,12 @@ if TYPE_CHECKING:
 
 Rows = dict[str, Sequence[dict[str, Any]]]
 
+ENOUGH_UNITS, LEAST = 5, 1e-9
+"""Units below which no gain is starred, and bits that are none."""
+
+CHAIN = re.compile(r"markov-\d+")
+"""Names of Markov chains among fitted models."""
+
 LISTED = (1, 2, 3, 4, 6, 8, 12, 16, 20)
 """Lags in the table."""
 
@@ -29,8 +36,8 @@ def lead(report: "Report") -> str:
         f"The best model, {_named(best)}, takes {_bits(best)} bits per action"
         f" (perplexity {best['perplexity']:.2f}); even odds would take {log2(plans.num_actions):.3f}.",
     ]
-    counted = [row for row in rows if row["model"].startswith(("markov", "context tree"))]
-    if counted and counted[0] is not best:
+    counted = [row for row in rows if CHAIN.fullmatch(row["model"]) or row["model"] == "context tree"]
+    if counted and counted[0] is not best and best["more"] == 0:
         row = counted[0]
         gap = f"{row['more']:.4f} bits more ({row['more_low']:.4f} to {row['more_high']:.4f})"
         told = f"takes {gap}" if row["more_low"] > 0 else f"cannot be told from it ({gap})"
@@ -60,9 +67,10 @@ def score_section(report: "Report") -> tuple[Section, Rows]:
     )
     text = [
         "What each model pays for actions that it has not learned from: the fewer bits, the more of the structure it"
-        " holds. Perplexity is the number of equally likely actions that would cost as much.",
+        " holds; a nat is 1.44 bits. Perplexity (perpl.) is how many equally likely actions would cost as much.",
         "Order, back-off and smoothing of count-based models were chosen within the plans learned from. A difference"
-        " whose interval holds 0 cannot be told from chance.",
+        " whose interval holds 0 cannot be told from chance. The reference is the best of all models on the same plans,"
+        " which favours it a little; differences are not corrected for the number of models.",
     ]
     figure = FigureBox(
         svg(plan_figures.score_figure(report.rows)),
@@ -78,32 +86,39 @@ def lag_section(report: "Report") -> tuple[Section, Rows] | None:
     if not rows:
         return None
     curves: dict[str, list[tuple[int, float, float, float]]] = {}
+    starred: dict[str, set[int]] = {}
     for row in rows:
         name = f"{row['model']}, sees context" if "context" in row["sees"] else row["model"]
         label = "mutual information" if row["what"] == "mutual information" else f"gain, {name}"
+        few = row["units"] is not None and row["units"] < ENOUGH_UNITS
+        starred.setdefault(label, set()).update([] if few or row["low"] < LEAST else [row["lag"]])
         curves.setdefault(label, []).append((row["lag"], row["bits"], row["low"], row["high"]))
     floor = [(row["lag"], row["chance"]) for row in rows if row["chance"] is not None]
     by_lag = {label: {row[0]: row for row in curve} for label, curve in curves.items()}
     lags = [lag for lag in LISTED if any(lag in own for own in by_lag.values())]
-    cells = [[str(lag), *(_told(own.get(lag)) for own in by_lag.values())] for lag in lags]
+    cells = [[str(lag), *(_told(own.get(lag), lag in starred[label]) for label, own in by_lag.items())] for lag in lags]
     headings = ["lag", *(label.replace(", ", "\n").replace("sees context", "+ context") for label in by_lag)]
-    unit = unit_name(report.scored)
-    table = Table(headings, cells, f"Bits. *: above 0, by the 95 % interval of that lag over {unit}.")
+    first = statistics.first_fold(report.scored, report.settings)
+    over = f"{unit_name(report.plans)} (gain: {unit_name(first)} of the first fold, if there are {ENOUGH_UNITS})"
+    table = Table(headings, cells, f"Bits. *: above 0, by the 95 % interval of that lag over {over}.")
     text = [
         "Mutual information: what an action tells of the one k steps later, whatever lies between. Gain: what the"
-        " action k steps back tells beyond all nearer ones, in held-out plans: a model that knows k actions against one"
-        " that knows k - 1 (a Markov chain of that order with back-off; a GRU that has learned from pieces of plans).",
+        " action k steps back tells beyond all nearer ones, in held-out plans of the first fold: a model that knows k"
+        " actions against one that knows k - 1, on the same actions (a Markov chain of that order with back-off; a GRU"
+        " that has learned from pieces of plans).",
         "Where the gain of the chain ends before that of the GRU, longer histories matter but occur too seldom to be"
         " counted; below 0 more is lost by splitting the counts than an older action tells.",
     ]
     figure = FigureBox(
-        svg(plan_figures.lag_figure(curves, floor)), "Bits that the action k steps back gives.", "Information by lag."
+        svg(plan_figures.lag_figure(curves, floor)),
+        "Bits that the action k steps back gives. Expected by chance: below it is 95 % of what is none.",
+        "Information by lag.",
     )
     return Section("How far back the structure reaches", text, [table], [figure]), {"lags": rows}
 
 
-def _told(row: tuple[int, float, float, float] | None) -> str:
-    return "" if row is None else f"{row[1]:.4f}{'*' if row[2] > 0 else ' '}"
+def _told(row: tuple[int, float, float, float] | None, star: bool) -> str:
+    return "" if row is None else f"{row[1]:.4f}{'*' if star else ' '}"
 
 
 def order_section(report: "Report") -> tuple[Section, Rows] | None:
@@ -113,7 +128,7 @@ def order_section(report: "Report") -> tuple[Section, Rows] | None:
     rows = statistics.order_rows(report.plans, statistics.num_contexts([report.plans]))
     held_out: dict[str, dict[int, dict[str, Any]]] = {}
     for row in report.rows:
-        if row["model"].startswith("markov-"):
+        if CHAIN.fullmatch(row["model"]):
             held_out.setdefault(row["sees"], {})[int(row["model"].removeprefix("markov-"))] = row
     criteria = {
         f"{name.upper()}{', context' * ('context' in sees)}": [
@@ -166,8 +181,8 @@ def _best_orders(rows: Sequence[dict[str, Any]], held_out: dict[str, dict[int, d
             + ", ".join(f"{name} choose{'s' * (name != 'held-out plans')} order {k}" for name, k in chosen.items())
         )
     why = (
-        "The criteria count a parameter for each action after each history that occurred; the held-out score has"
-        " back-off, so a high order costs it little."
+        "The criteria judge plans that were learned from, and count a parameter for each action after each history"
+        " that occurred; held-out chains lean on shorter histories where a history is rare."
     )
     return ". ".join([*said, why])
 

@@ -51,14 +51,16 @@ def information_rows(plans: Plans, skip: int) -> list[dict[str, Any]]:
     return [
         {"what": "mutual information", "model": "counts", "sees": "actions"}
         | {key: value for key, value in asdict(one).items() if key != "pairs"}
+        | {"units": None}
         for one in mutual_information(plans, MOST_LAG, skip, _shuffles())
     ]
 
 
 def order_rows(plans: Plans, num_contexts: int | None) -> list[dict[str, Any]]:
     """Information criteria of Markov chains; in bits per action half of each stands on the scale of the others."""
-    longest = int(plans.mask().sum(1).max())
-    most = min(MOST_ORDER, longest - 1)
+    # All orders are fitted on the same actions: those with as many before them as the highest order takes.
+    usual = int(plans.mask().sum(1).double().median())
+    most = min(MOST_ORDER, max(usual // 2, 1), int(plans.mask().sum(1).max()) - 1)
     rows = []
     for contexts in [None] if num_contexts is None else [None, num_contexts]:
         for fit in order_selection(plans, most, contexts):
@@ -80,7 +82,7 @@ def transition_rows(plans: Plans) -> tuple[list[dict[str, Any]], dict[str, Any]]
             "to": names[b],
             "count": int(counts[a, b]),
             "probability": float(matrix[a, b]),
-            "p_value": None if p_values is None else float(p_values[a, b]),
+            "p_value": None if p_values is None or found.test != "permutation" else float(p_values[a, b]),
         }
         for group, counts, matrix, p_values in [
             ("all", found.counts, probs, None),
@@ -112,8 +114,12 @@ def motif_rows(plans: Plans) -> list[dict[str, Any]]:
     return rows
 
 
-def likeness_rows(real: Plans, model: Model) -> tuple[list[dict[str, Any]], list[Any]]:
-    """Sequences sampled from a model against the real ones in whose place they stand."""
+def likeness_rows(real: Plans, model: Model, tested: bool) -> tuple[list[dict[str, Any]], list[Any]]:
+    """Sequences sampled from a model against the real ones in whose place they stand.
+
+    Where the plans come in groups they are not `tested`: plans of one subject are more alike than those of a model of
+    all subjects, however good, and the first fold holds too few groups to shuffle these.
+    """
     generated = model.load("generated")
     if generated is None:
         return [], []
@@ -128,8 +134,8 @@ def likeness_rows(real: Plans, model: Model) -> tuple[list[dict[str, Any]], list
             "statistic": one.statistic,
             "distance": one.distance,
             "chance": one.chance,
-            "p_value": one.p_value,
-            "corrected": one.corrected,
+            "p_value": one.p_value if tested else None,
+            "corrected": one.corrected if tested else None,
         }
         for one in found
     ]

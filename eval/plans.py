@@ -30,6 +30,9 @@ LISTS: dict[str, dict[str, Any]] = {
 }
 """Options that take several words."""
 
+MOST_ACTIONS = 10_000
+"""Kinds of actions beyond which they are thought to be names that look like numbers."""
+
 FOLDS = 5
 """Where they are not given; fewer where there are fewer groups."""
 
@@ -68,16 +71,25 @@ def plans(
     _check(skip, max_steps, seed, processes)
     folder, console = Path(out), Console()
     if priors is not None:
+        if test is not None or folds is not None:
+            raise ValueError("priors: saved priors are scored on the file as they are; leave --test and --folds out")
         report = _of_saved(file, priors, skip, num_actions, action_names)
     else:
         read, empty = _read(file, num_actions, action_names)
+        if test is not None and Path(test).resolve() == Path(file).resolve():
+            raise ValueError("test: the very plans that are learned from; give others, or leave --test out")
+        if test is not None and folds is not None:
+            raise ValueError("folds: with --test nothing is left out of the file; leave --folds out")
         other = None
         if test is not None:
             other, empty = _read(test, num_actions, action_names)
             other = _same_names(read, other, test)
         read, other = _renumbered(read, other)
-        design = Design(1 if test is not None else _folds(file, read, folds), seed, skip, max_steps)
-        report = _of_fitted(folder, read, other, design, [*models, "lags"], processes)
+        whole = read
+        scored, cut = _in_parts(read if other is None else other)
+        read, other = (scored, None) if other is None else (_in_parts(read)[0], scored)
+        design = Design(1 if test is not None else _folds(file, read, folds), seed, skip, max_steps, cut=cut)
+        report = replace(_of_fitted(folder, read, other, design, [*models, "lags"], processes), plans=whole)
         if empty:
             report = replace(report, settings=report.settings | {"plans without actions, left out": empty})
     command = (
@@ -101,12 +113,21 @@ def _read(file: str, num_actions: int | None, action_names: list[str] | None) ->
     """The plans that have actions, and how many have none: these neither teach nor test anything."""
     read = read_plans(file, num_actions=num_actions, action_names=action_names)
     read = read if read.end is None else read.without_end()
+    if read.num_actions > MOST_ACTIONS:
+        raise ValueError(
+            f"{file}: action numbers go up to {read.num_actions - 1}; number the actions from 0, or write names"
+        )
     some = read.mask().any(1)
     if not bool(some.any()):
         raise ValueError(f"{file}: no plan has an action")
-    kept = read[some]
-    parts = min(BLOCKS, max(int(kept.mask().sum()) // 2, 1))
-    return in_parts(kept, parts) if len(kept) == 1 else kept, int((~some).sum())
+    return read[some], int((~some).sum())
+
+
+def _in_parts(read: Plans) -> tuple[Plans, bool]:
+    """The plans, a single one cut into consecutive parts; and whether it was."""
+    if len(read) > 1:
+        return read, False
+    return in_parts(read, min(BLOCKS, max(int(read.mask().sum()) // 2, 1))), True
 
 
 def _folds(file: str, read: Plans, folds: int | None) -> int:

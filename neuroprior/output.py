@@ -51,7 +51,7 @@ def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
     """
     if path.is_dir():
         raise ValueError(f"{path}: a directory; the name of a file is expected")
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")  # another process may write the same file
     text = {} if "b" in mode else {"encoding": "utf-8", "newline": ""}
     try:
         with open(partial, mode, **text) as file:  # type: ignore[call-overload]

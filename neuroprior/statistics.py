@@ -79,7 +79,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
         raise ValueError(f"paired_difference: {len(a)} and {len(b)} values are no pairs")
     mean, low, high = mean_interval(a - b, level)
     if np.ptp(a - b) == 0:
-        return Difference(mean, low, high, 1.0 if mean == 0 else 0.0)
+        return Difference(mean, low, high, 1.0 if mean == 0 else 2.0 ** (1 - len(a)))
     return Difference(mean, low, high, float(stats.ttest_rel(a, b).pvalue))
 
 
@@ -108,7 +108,8 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
     error = float(np.sqrt(units / (units - 1) * ((above - ratio * below) ** 2).sum()) / below.sum())
     half = float(stats.t.ppf((1 + level) / 2, units - 1)) * error
     if error == 0:
-        return Difference(ratio, ratio, ratio, 1.0 if ratio == 0 else 0.0)
+        # No spread at all: by a sign test, since few units may agree by chance.
+        return Difference(ratio, ratio, ratio, 1.0 if ratio == 0 else 2.0 ** (1 - units))
     return Difference(ratio, ratio - half, ratio + half, float(2 * stats.t.sf(abs(ratio) / error, units - 1)))
 
 

@@ -39,7 +39,7 @@ def test_a_ratio_by_hand():
 
 
 def test_a_ratio_without_spread():
-    assert ratio_difference([2, 4], [1, 2]) == (2, 2, 2, 0)
+    assert ratio_difference([2, 4], [1, 2]) == (2, 2, 2, 0.5)
     assert ratio_difference([0, 0], [1, 2]) == (0, 0, 0, 1)
     # A unit of size 0 is one more, and shifts nothing.
     assert ratio_difference([2, 4, 0], [1, 2, 0]).mean == 2

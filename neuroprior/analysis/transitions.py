@@ -82,7 +82,8 @@ def transitions(plans: Plans, permutations: int = 999, generator: torch.Generato
     small. It is held against the largest of all cells in each shuffle (Westfall and Young 1993: single-step maxT).
 
     With too few plans for that the chi-square distribution takes its place, under which an action depends on nothing
-    but the one before (Anderson and Goodman 1957), and cells are corrected by Holm's procedure.
+    but the one before (Anderson and Goodman 1957), and cells are corrected by Holm's procedure. That holds for many
+    actions a group only: with few, or where the order is higher, it finds differences that are none.
 
     Args:
         plans: with a `group`; without, nothing is tested. An end symbol is an action like others.

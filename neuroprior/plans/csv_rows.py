@@ -15,6 +15,7 @@ from neuroprior.plans.opening import open_text
 BLOCK = 2**10
 """Rows that are in memory as texts at a time; a few times faster than blocks that no cache holds."""
 DELIMITERS = (",", ";", "\t")
+_OTHER_WORDS = re.compile(r"session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code")
 _WORDS = re.compile(r"plan|action(_1)?|context_1")
 Row = list[str]
 T = TypeVar("T")
@@ -49,6 +50,11 @@ class Sheet:
             if twice is not None:
                 raise ValueError(f"{path}, line 1: the column {twice!r} is there twice")
             self.header = {name: i for i, name in enumerate(names)}
+        elif other := next((name for name in names if _OTHER_WORDS.fullmatch(name)), None):
+            raise ValueError(
+                f"{path}, line 1: looks like a header ({other!r}) without a column 'action' (or 'action_1', ...); name"
+                " the column that holds the actions so, and 'plan' the one that tells sequences apart"
+            )
 
     def blocks(self) -> Iterator[tuple[Integers, list[Row]]]:
         """The rows below the header, all of `width` cells, in blocks, with the line on which each ends."""

@@ -1,12 +1,14 @@
 """The mixture of priors: experts that are weighed by how well they have told the plan so far."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from neuroprior.plans import Plans
+from neuroprior.plans.folds import FEWEST_UNITS
 from neuroprior.priors.neural import NeuralPrior
 from neuroprior.priors.packing import pack, unpack
 from neuroprior.priors.prior import Prior
@@ -115,14 +117,22 @@ class MixturePrior(Prior):
         """
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
+        if plans.group is not None and len(plans.group.unique()) < FEWEST_UNITS:
+            plans = replace(plans, group=None, group_names=None)
         learned, held_out = plans.split(VALIDATION, generator)
         for expert in self._experts():
             _fit(expert, learned, generator, settings)
         self.learn_weights(held_out)
-        for expert in self._experts():
-            if not isinstance(expert, NeuralPrior | StackedPrior):
-                expert.fit(plans)
+        self._count(plans)
         return self
+
+    def _count(self, plans: Plans) -> None:
+        """Fit the count-based experts anew, those of mixtures among the experts as well."""
+        for expert in self._experts():
+            if isinstance(expert, MixturePrior):
+                expert._count(plans)
+            elif not isinstance(expert, NeuralPrior | StackedPrior):
+                expert.fit(plans)
 
     @torch.no_grad()
     def learn_weights(self, plans: Plans) -> None:

@@ -24,6 +24,9 @@ LEAST = -6.0
 LONG_AGO = 500.0
 """Steps from which on it is no matter how long ago an action was taken."""
 
+MOST_NUMBERS = 2**24
+"""Of the table of when each action was last taken in each context, held at a time."""
+
 PARTS = 8
 """Parts of the plans: experts forecast each of them after learning from the others."""
 
@@ -189,16 +192,24 @@ class StackedPrior(Prior):
         """The same for whole plans, `[N, L, D]`, of forecasts `[N, L, E, A]`."""
         parts = [forecasts.clamp(min=LEAST).flatten(2)]
         if context is not None and self.num_contexts is not None:
-            code = context.long() * self.num_actions + plans.long()
-            here = context.long()[..., None] * self.num_actions + torch.arange(self.num_actions, device=code.device)
-            size = self.num_contexts * self.num_actions
-            last = torch.full((len(plans), size), -LONG_AGO, device=code.device)
-            ago = torch.empty(*plans.shape, self.num_actions, device=code.device)
-            for t in range(plans.shape[1]):
-                ago[:, t] = t - last.gather(1, here[:, t])
-                last.scatter_(1, code[:, t, None], float(t))
-            parts = [context[..., None].float(), *parts, _log(ago.clamp_(max=LONG_AGO))]
+            size = max(MOST_NUMBERS // (self.num_contexts * self.num_actions), 1)
+            ago = [
+                self._ago(some.long(), seen.long())
+                for some, seen in zip(plans.split(size), context.split(size), strict=True)
+            ]
+            parts = [context[..., None].float(), *parts, _log(torch.cat(ago))]
         return torch.cat(parts, 2)
+
+    def _ago(self, plans: Tensor, context: Tensor) -> Tensor:
+        """`[N, L, A]`: how long ago each action was last taken in the context of each step `[N, L]`."""
+        here = context[..., None] * self.num_actions + torch.arange(self.num_actions, device=plans.device)
+        code = context * self.num_actions + plans
+        last = torch.full((len(plans), (self.num_contexts or 0) * self.num_actions), -LONG_AGO, device=plans.device)
+        ago = torch.empty(*plans.shape, self.num_actions, device=plans.device)
+        for t in range(plans.shape[1]):
+            ago[:, t] = t - last.gather(1, here[:, t])
+            last.scatter_(1, code[:, t, None], float(t))
+        return ago.clamp_(max=LONG_AGO)
 
     def _packed(self, memory: Tensor, states: tuple[Tensor, ...], ago: Tensor, context: Tensor | None) -> Tensor:
         """The state: the network's memory, each expert's state, how long ago, and the context."""
