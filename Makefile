@@ -1,15 +1,17 @@
-# make paper: the paper's simulations. make mice: mice in a labyrinth. make test: everything that is checked before a change lands.
+# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands.
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHONPATH :=
 
-.PHONY: paper mice test check bench clean
+.PHONY: paper mice mice-planner test check bench clean
 
 paper: .venv/programs
 	$(BIN)/python -m eval paper
 
 mice: .venv/programs
 	$(BIN)/python -m eval plans eval/data/labyrinth/plans.jsonl --skip 1 --max-steps 400 --out runs/mice
+
+mice-planner: .venv/programs
 	$(BIN)/python -m eval mice --out runs/mice-planner
 
 # One thread a process: two processes of two threads each wait for one another.

@@ -27,7 +27,7 @@ KINDS = ("gru-large", "stacked", "transformer", "gru", "lags", "counts")
 NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "gru": (GRUPrior, {}),
     "transformer": (TransformerPrior, {}),
-    # It hardly learns by heart, so few plans will do to stop it early.
+    # These hardly learn by heart: few plans are held out to find the best moment, and they train to the end.
     "stacked": (StackedPrior, {"learning_rate": 4e-3, "validation": 0.02}),
     # For long sequences of few subjects: without lags, which such plans let it learn by heart.
     "gru-large": (
@@ -56,7 +56,7 @@ MOST_GENERATED = 1000
 
 def recipes() -> str:
     """All that decides a fit beside the plans and the design; after a change of it, old fits do not count."""
-    return repr((NEURAL, PATIENCE, VALIDATION, MOST_PIECES, PIECES_A_STEP, torch.__version__))
+    return repr((NEURAL, PATIENCE, "to the end", VALIDATION, MOST_PIECES, PIECES_A_STEP, torch.__version__))
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,8 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
     if kind == "stacked" and "context_size" in sizes:
         return  # its experts count
     make, settings = NEURAL[kind]
-    how = {"max_steps": design.max_steps, "patience": ceil(PATIENCE * design.max_steps), "progress": False} | settings
+    patience = design.max_steps if "validation" in settings else ceil(PATIENCE * design.max_steps)
+    how = {"max_steps": design.max_steps, "patience": patience, "progress": False} | settings
     prior = make(learned.num_actions, seed=seed, **sizes)
     yield kind, "", prior.fit(learned, torch.Generator().manual_seed(seed), **how)
 

@@ -26,6 +26,11 @@ MODELS = ("counts", "gru", "transformer", "stacked", "gru-large")
 LISTS: dict[str, dict[str, Any]] = {
     "priors": {"help": "score these model folders only; the first is compared with"},
     "models": {"default": list(MODELS[:4]), "choices": MODELS, "help": "which to fit"},
+    "sees": {
+        "default": ["actions", "context"],
+        "choices": ["actions", "context"],
+        "help": "what models see: past actions alone, or the context too, where the file has one",
+    },
     "action_names": {"help": "names of the actions in the order of their numbers, where the file does not tell"},
 }
 """Options that take several words."""
@@ -43,6 +48,7 @@ def plans(
     test: str | None = None,
     folds: int | None = None,
     models: list[str] = list(MODELS[:4]),  # noqa: B006
+    sees: list[str] = ["actions", "context"],  # noqa: B006
     skip: int = 0,
     max_steps: int = 1000,
     num_actions: int | None = None,
@@ -60,6 +66,7 @@ def plans(
         folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
         models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
             weighs the forecasts of counts), gru-large (256 wide, with dropout; slow, and left out by default).
+        sees: what models see: past actions alone, the context as well where the file has one, or each in turn.
         skip: actions at the beginning of each plan that do not count in scores.
         max_steps: gradient steps of a neural prior.
         num_actions: number of actions, where the file does not tell.
@@ -89,7 +96,7 @@ def plans(
         scored, cut = _in_parts(read if other is None else other)
         read, other = (scored, None) if other is None else (_in_parts(read)[0], scored)
         design = Design(1 if test is not None else _folds(file, read, folds), seed, skip, max_steps, cut=cut)
-        report = replace(_of_fitted(folder, read, other, design, [*models, "lags"], processes), plans=whole)
+        report = replace(_of_fitted(folder, read, other, design, [*models, "lags"], sees, processes), plans=whole)
         if empty:
             report = replace(report, settings=report.settings | {"plans without actions, left out": empty})
     command = (
@@ -189,14 +196,22 @@ def _numbers(what: str, known: Any, names: Any, file: str) -> Tensor:
 
 
 def _of_fitted(
-    folder: Path, read: Plans, test: Plans | None, design: Design, kinds: list[str], processes: int | None
+    folder: Path,
+    read: Plans,
+    test: Plans | None,
+    design: Design,
+    kinds: list[str],
+    sees: list[str],
+    processes: int | None,
 ) -> Report:
     """Fit all models and score them on held-out plans."""
     study = Study.prepare(folder, read, test, design)
-    sees = [ACTIONS] + [CONTEXT] * (read.context is not None)
+    seen = [ACTIONS] * ("actions" in sees) + [CONTEXT] * ("context" in sees and read.context is not None)
+    if not seen:
+        raise ValueError("sees: the file has no context; leave --sees context out")
     if (counted := int(study.mask().sum())) < FEWEST_UNITS:
         raise ValueError(f"skip: {counted} actions are left to score after the first {design.skip} of each plan")
-    todo = crossval.jobs(design, [kind for kind in KINDS if kind in kinds], sees)
+    todo = crossval.jobs(design, [kind for kind in KINDS if kind in kinds], seen)
     bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*bar, TimeRemainingColumn(), transient=True) as progress:
         task = progress.add_task("fitting models", total=len(todo))
