@@ -41,6 +41,7 @@ class Design:
         seed: draws the folds, and everything in training.
         skip: actions at the beginning of each plan that are left out of the score.
         max_steps: gradient steps of neural priors.
+        patience: share of them without improvement after which training stops.
         reach: the most past actions whose information is measured.
         cut: whether the plans are consecutive parts of a single one.
         version: of the library.
@@ -50,6 +51,7 @@ class Design:
     seed: int = 0
     skip: int = 0
     max_steps: int = 1000
+    patience: float = 0.25
     reach: int = 16
     cut: bool = False
     version: str = __version__

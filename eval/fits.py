@@ -27,7 +27,7 @@ KINDS = ("gru-large", "stacked", "transformer", "gru", "lags", "counts")
 NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "gru": (GRUPrior, {}),
     "transformer": (TransformerPrior, {}),
-    # These hardly learn by heart: few plans are held out to find the best moment, and they train to the end.
+    # It hardly learns by heart: few plans will do to find the best moment.
     "stacked": (StackedPrior, {"learning_rate": 4e-3, "validation": 0.02}),
     # For long sequences of few subjects: without lags, which such plans let it learn by heart.
     "gru-large": (
@@ -36,9 +36,6 @@ NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
 }
 """How neural priors are made and trained; the first two by default recipes."""
-
-PATIENCE = 0.25
-"""Steps without improvement after which training stops, as a share of all."""
 
 ONCE = ("lags",)
 """What is fitted in the first fold alone."""
@@ -56,7 +53,7 @@ MOST_GENERATED = 1000
 
 def recipes() -> str:
     """All that decides a fit beside the plans and the design; after a change of it, old fits do not count."""
-    return repr((NEURAL, PATIENCE, "to the end", VALIDATION, MOST_PIECES, PIECES_A_STEP, torch.__version__))
+    return repr((NEURAL, VALIDATION, MOST_PIECES, PIECES_A_STEP, torch.__version__))
 
 
 @dataclass(frozen=True)
@@ -126,10 +123,15 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
     if kind == "stacked" and "context_size" in sizes:
         return  # its experts count
     make, settings = NEURAL[kind]
-    patience = design.max_steps if "validation" in settings else ceil(PATIENCE * design.max_steps)
-    how = {"max_steps": design.max_steps, "patience": patience, "progress": False} | settings
+    how = _training(design) | settings
     prior = make(learned.num_actions, seed=seed, **sizes)
     yield kind, "", prior.fit(learned, torch.Generator().manual_seed(seed), **how)
+
+
+def _training(design: "Design") -> dict[str, Any]:
+    """How neural priors are trained."""
+    patience = max(ceil(design.patience * design.max_steps), 1)
+    return {"max_steps": design.max_steps, "patience": patience, "progress": False}
 
 
 def _split(learned: Plans, seed: int) -> tuple[Plans, Plans]:
@@ -190,8 +192,7 @@ def _by_lag(learned: Plans, scored: Plans, design: "Design", seed: int) -> dict[
     if held_out.group is None or len(held_out.group.unique()) < FEWEST_UNITS:
         return {}
     neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
-    patience, size = ceil(PATIENCE * design.max_steps), PIECES_A_STEP
-    neural.fit(_loose(short), generator, max_steps=design.max_steps, patience=patience, batch_size=size, progress=False)
+    neural.fit(_loose(short), generator, batch_size=PIECES_A_STEP, **_training(design))
     found = {"gru": [_of_last(neural, held_out, known) for known in range(reach + 1)]}
     if "context_size" not in sizes:
         found[COUNTED] = _chains(learned, held_out, reach, sizes.get("num_contexts"))

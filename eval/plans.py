@@ -51,6 +51,7 @@ def plans(
     sees: list[str] = ["actions", "context"],  # noqa: B006
     skip: int = 0,
     max_steps: int = 1000,
+    patience: float = 0.25,
     num_actions: int | None = None,
     action_names: list[str] | None = None,
     seed: int = 0,
@@ -69,13 +70,14 @@ def plans(
         sees: what models see: past actions alone, the context as well where the file has one, or each in turn.
         skip: actions at the beginning of each plan that do not count in scores.
         max_steps: gradient steps of a neural prior.
+        patience: share of these steps without improvement after which training stops; 1 trains to the end.
         num_actions: number of actions, where the file does not tell.
         action_names: names of the actions in the order of their numbers, where the file does not tell.
         seed: draws the folds and everything in training.
         processes: how many models are fitted at a time; all cores by default.
         out: folder for `report.html`, `results.json`, tables as CSV, and what an interrupted run goes on from.
     """
-    _check(skip, max_steps, seed, processes)
+    _check(skip, max_steps, patience, seed, processes)
     folder, console = Path(out), Console()
     if priors is not None:
         if test is not None or folds is not None:
@@ -95,7 +97,7 @@ def plans(
         whole = read
         scored, cut = _in_parts(read if other is None else other)
         read, other = (scored, None) if other is None else (_in_parts(read)[0], scored)
-        design = Design(1 if test is not None else _folds(file, read, folds), seed, skip, max_steps, cut=cut)
+        design = Design(1 if test is not None else _folds(file, read, folds), seed, skip, max_steps, patience, cut=cut)
         report = replace(_of_fitted(folder, read, other, design, [*models, "lags"], sees, processes), plans=whole)
         if empty:
             report = replace(report, settings=report.settings | {"plans without actions, left out": empty})
@@ -106,10 +108,12 @@ def plans(
     write_report(replace(report, command=command, source=file, settings=settings), folder, console)
 
 
-def _check(skip: int, max_steps: int, seed: int, processes: int | None) -> None:
+def _check(skip: int, max_steps: int, patience: float, seed: int, processes: int | None) -> None:
     """Raise ValueError, naming the option, unless these numbers can be."""
     if skip < 0 or max_steps < 1:
         raise ValueError(f"skip and max_steps: at least 0 and 1 are expected, not {skip} and {max_steps}")
+    if not 0 < patience <= 1:
+        raise ValueError(f"patience: a share of the steps, above 0 and at most 1, is expected, not {patience}")
     if not 0 <= seed < 2**50:
         raise ValueError(f"seed: an integer from 0 to 2**50 - 1 is expected, not {seed}")
     if processes is not None and processes < 1:
