@@ -109,8 +109,9 @@ def likeness_section(report: "Report") -> tuple[Section, Rows] | None:
     cost = {id(m): s.bits_per_action().mean for m, s in zip(report.models, report.scores, strict=True)}
     kept = [model for sees in (CONTEXT, ACTIONS) for model in leading(report.models, report.scores, sees)]
     tested = unit_name(report.scored) != "groups"
+    real = statistics.first_fold(report.scored, report.settings)
     for model in sorted(kept, key=lambda model: cost[id(model)]):
-        own, found = statistics.likeness_rows(statistics.first_fold(report.scored, report.settings), model, tested)
+        own, found = statistics.likeness_rows(real, model, tested)
         rows += own
         if found and shown is None:
             shown = model, found
@@ -185,12 +186,17 @@ def _likeness_figures(report: "Report", model: Model, found: Sequence[Any]) -> l
 
 def drift_section(report: "Report") -> tuple[Section, Rows] | None:
     """Whether plans get easier or harder to predict, within and between them."""
-    cost = [one.bits_per_action().mean for one in report.scores]
-    whole = [k for k, model in enumerate(report.models) if model.bits().shape == report.scored.actions.shape]
-    if not whole or int(report.mask.sum(1).max()) < 2:
+    if int(report.mask.sum(1).max()) < 2:
         return None
-    model = report.models[min(whole, key=lambda k: cost[k])]
-    drifts = report.scored, model.bits(), report.mask
+    cost = [one.bits_per_action().mean for one in report.scores]
+    # The best whose bits are those of the plans' own actions; one that tells ends, too, has more of them.
+    for place in sorted(range(len(cost)), key=lambda k: cost[k]):
+        model, bits = report.models[place], report.models[place].bits()
+        if bits.shape == report.scored.actions.shape:
+            break
+    else:
+        return None
+    drifts = report.scored, bits, report.mask
     within, plans, groups = by_position(*drifts), by_plan(*drifts), by_group(*drifts)
     names = statistics.group_names(report.scored, torch.tensor(list(groups.groups)))
     named = dict(zip(groups.groups, names, strict=True))

@@ -25,6 +25,7 @@ from neuroprior.comparison import units
 from neuroprior.output import write_json, written_whole
 from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.plans.folds import folds
+from neuroprior.threads import one_thread
 
 Array = np.ndarray[Any, Any]
 
@@ -145,7 +146,7 @@ class Study:
         return (self.folder / job.name).exists()
 
 
-def counted(plans: Plans, skip: int, cut: bool) -> Tensor:
+def counted(plans: Plans, skip: int, cut: bool = False) -> Tensor:
     """`[N, L]` bool: all actions but the first `skip` of each plan; of parts of a single plan, but its first."""
     mask = plans.mask()
     if cut:
@@ -214,20 +215,10 @@ def do(study: Study, job: Job) -> None:
     unit = units(study.scored, mask)[index]
     if job.sees == ACTIONS:
         learned, scored = (replace(plans, context=None, context_names=None) for plans in (learned, scored))
-    with _one_thread():
+    with one_thread():
         found = fits.outcomes(job.kind, learned, scored, mask[index], unit, study.design, job.fold)
     with written_whole(study.folder / job.name, "wb") as file:
         np.savez_compressed(file, **fits.packed(found))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @contextmanager

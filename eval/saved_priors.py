@@ -1,12 +1,14 @@
 """Saved priors, scored on a file of plans: actions and contexts are told apart by their names."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from eval import fits
-from eval.crossval import ACTIONS, CONTEXT
+from eval.crossval import ACTIONS, CONTEXT, counted
 from eval.held_out import Model
 from neuroprior import Prior
 from neuroprior.comparison import Score, score_bits, units
@@ -39,8 +41,7 @@ def score_saved(folder: str, prior: Prior, read: Plans, skip: int) -> tuple[Mode
     if not prior.takes_context:
         seen = replace(seen, context=None, context_names=None)
     seen = seen if prior.end is None else seen.with_end()
-    mask = seen.mask()
-    mask[:, :skip] = False
+    mask = counted(seen, skip)
     sees = CONTEXT if prior.takes_context else ACTIONS
     try:
         arrays = fits.scored_by(prior, seen, mask, units(seen, mask))
@@ -48,6 +49,17 @@ def score_saved(folder: str, prior: Prior, read: Plans, skip: int) -> tuple[Mode
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from error
     return Model(folder, sees, type(prior).__name__, arrays.get), score
+
+
+def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:
+    """The number under which each of the names is known.
+
+    Raises:
+        ValueError: a name is not known; it stands between `before` and `after`, and those that are follow.
+    """
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(known)}")
+    return torch.tensor([known.index(name) for name in names])
 
 
 def _names(prior: Prior) -> list[str] | None:
@@ -67,10 +79,7 @@ def _with_actions_of(prior: Prior, read: Plans, folder: str) -> Plans:
     names = _names(prior)
     if names is None or read.action_names is None:
         return read
-    unknown = [name for name in read.action_names if name not in names]
-    if unknown:
-        raise ValueError(f"{folder}: does not know the action {unknown[0]!r}; it knows {', '.join(names)}")
-    number = torch.tensor([names.index(name) for name in read.action_names])
+    number = numbers(names, read.action_names, f"{folder}: does not know the action", "; it knows")
     return replace(read, actions=number[read.actions.long()], num_actions=len(names), action_names=None)
 
 
@@ -78,10 +87,5 @@ def _with_contexts_of(prior: Prior, read: Plans, folder: str) -> Plans:
     """The plans with their contexts numbered as the prior has learned them, by name."""
     if prior.context_names is None or read.context_names is None or read.context is None:
         return read
-    unknown = [name for name in read.context_names if name not in prior.context_names]
-    if unknown:
-        raise ValueError(
-            f"{folder}: has not seen the context {unknown[0]!r}; it knows {', '.join(prior.context_names)}"
-        )
-    number = torch.tensor([prior.context_names.index(name) for name in read.context_names])
+    number = numbers(prior.context_names, read.context_names, f"{folder}: has not seen the context", "; it knows")
     return replace(read, context=number[read.context.long()], context_names=None)

@@ -14,6 +14,12 @@ BLOCKS = 40
 """Parts into which a single plan is cut."""
 
 
+def divisible(plans: Plans) -> Plans:
+    """Plans as they can be split: of fewer than two groups, without them, so that each stands alone."""
+    few = plans.group is None or len(plans.group.unique()) < FEWEST_UNITS
+    return replace(plans, group=None, group_names=None) if few else plans
+
+
 def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:
     """Cross-validation over independent units: each action is held out once.
 

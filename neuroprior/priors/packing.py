@@ -1,5 +1,7 @@
 """Several state tensors in one: a prior made of others keeps their states side by side."""
 
+from math import prod
+
 import torch
 from torch import Tensor
 
@@ -42,7 +44,7 @@ def unpack(packed: Tensor, number: int) -> list[Tensor]:
     at, parts = HEADER * number, []
     for kind, *sizes in zip(heads[::3], heads[1::3], heads[2::3], strict=True):
         shape = [size for size in sizes if size] or ([] if kind else [0])
-        size = int(torch.tensor(shape).prod()) if shape else 1
+        size = prod(shape)
         body = packed[:, at : at + size * (1 + kind)]
         at += size * (1 + kind)
         if kind:

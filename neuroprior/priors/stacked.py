@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroprior.plans import Plans, sees_each_step
-from neuroprior.plans.folds import FEWEST_UNITS, folds, in_parts
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
 from neuroprior.priors.context_tree import ContextTreePrior
 from neuroprior.priors.history_prior import HistoryPrior
 from neuroprior.priors.markov import MarkovPrior
@@ -89,7 +89,7 @@ class StackedPrior(Prior):
         return super().config | own | {"orders": list(self.orders), "depth": self.depth}
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        forecasts, states = zip(*(e.start(batch_size, _for(e, context)) for e in self._experts()), strict=True)
+        forecasts, states = zip(*(e.start(batch_size, seen_by(e, context)) for e in self._experts()), strict=True)
         ago = torch.full((batch_size, (self.num_contexts or 0) * self.num_actions), LONG_AGO, device=self.device)
         logits, memory = self.mixer.start(batch_size, self._features(torch.stack(forecasts, 1), ago, context))
         return logits, self._packed(memory, states, ago, context)
@@ -103,7 +103,7 @@ class StackedPrior(Prior):
             ago = ago.add(1).clamp_(max=LONG_AGO)
             ago = ago.scatter(1, (last * self.num_actions + action.long())[:, None], 1.0)
             context = last if context is None else context.long()
-        found = [e.step(action, s, _for(e, context)) for e, s in zip(self._experts(), before, strict=True)]
+        found = [e.step(action, s, seen_by(e, context)) for e, s in zip(self._experts(), before, strict=True)]
         forecasts, states = zip(*found, strict=True)
         logits, memory = self.mixer.step(action, memory, self._features(torch.stack(forecasts, 1), ago, context))
         return logits, self._packed(memory, states, ago, context)
@@ -113,7 +113,7 @@ class StackedPrior(Prior):
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
         seen = self._each_step(plans, context)
         with torch.no_grad():
-            forecasts = torch.stack([e(plans, _for(e, seen)) for e in self._experts()], 2)
+            forecasts = torch.stack([e(plans, seen_by(e, seen)) for e in self._experts()], 2)
         logits: Tensor = self.mixer(plans, self._all_features(forecasts, plans, seen))
         return logits
 
@@ -137,9 +137,9 @@ class StackedPrior(Prior):
             learned = in_parts(learned, min(PARTS, int(learned.mask().sum())))
         if len(learned) < FEWEST_UNITS:
             raise ValueError("plans: at least two plans with an action are needed to train a stacked prior")
-        if learned.group is not None and len(learned.group.unique()) < FEWEST_UNITS:
-            learned = replace(learned, group=None, group_names=None)
-        features = self._all_features(self._forecasts(learned, generator), learned.actions, self._context_of(learned))
+        learned = divisible(learned)
+        seen = self._each_step(learned.actions, learned.context)
+        features = self._all_features(self._forecasts(learned, generator), learned.actions, seen)
         stacked = replace(learned, context=features, context_names=None)
         self.mixer.fit(stacked, generator, **settings)
         self.mixer.window = None  # its memory is carried on
@@ -161,16 +161,13 @@ class StackedPrior(Prior):
                 part = plans[left_out]
                 for number, expert in enumerate(self._experts()):
                     expert.fit(plans[learned])
-                    out[left_out, :, number] = expert(part.actions, _for(expert, part.context))
+                    out[left_out, :, number] = expert(part.actions, seen_by(expert, part.context))
         return out
 
     def _experts(self) -> Iterator[HistoryPrior]:
         for expert in self.experts:
             assert isinstance(expert, HistoryPrior)
             yield expert
-
-    def _context_of(self, plans: Plans) -> Tensor | None:
-        return self._each_step(plans.actions, plans.context)
 
     def _each_step(self, plans: Tensor, context: Tensor | None) -> Tensor | None:
         """The context before each action, `[N, L]`."""
@@ -180,25 +177,28 @@ class StackedPrior(Prior):
 
     def _features(self, forecasts: Tensor, ago: Tensor, context: Tensor | None) -> Tensor:
         """What the network sees, `[N, D]`, of forecasts `[N, E, A]`."""
-        parts = [forecasts.clamp(min=LEAST).flatten(1)]
-        if self.num_contexts is not None:
-            if context is None:
-                raise ValueError("context: this prior sees a context, and none was given")
-            here = context.long()[:, None] * self.num_actions + torch.arange(self.num_actions, device=ago.device)
-            parts = [context[:, None].float(), *parts, _log(ago.gather(1, here))]
-        return torch.cat(parts, 1)
+        if self.num_contexts is None:
+            return self._joined(forecasts, None, None)
+        if context is None:
+            raise ValueError("context: this prior sees a context, and none was given")
+        here = context.long()[:, None] * self.num_actions + torch.arange(self.num_actions, device=ago.device)
+        return self._joined(forecasts, ago.gather(1, here), context)
 
     def _all_features(self, forecasts: Tensor, plans: Tensor, context: Tensor | None) -> Tensor:
         """The same for whole plans, `[N, L, D]`, of forecasts `[N, L, E, A]`."""
-        parts = [forecasts.clamp(min=LEAST).flatten(2)]
-        if context is not None and self.num_contexts is not None:
-            size = max(MOST_NUMBERS // (self.num_contexts * self.num_actions), 1)
-            ago = [
-                self._ago(some.long(), seen.long())
-                for some, seen in zip(plans.split(size), context.split(size), strict=True)
-            ]
-            parts = [context[..., None].float(), *parts, _log(torch.cat(ago))]
-        return torch.cat(parts, 2)
+        if context is None or self.num_contexts is None:
+            return self._joined(forecasts, None, None)
+        size = max(MOST_NUMBERS // (self.num_contexts * self.num_actions), 1)
+        parts = zip(plans.split(size), context.split(size), strict=True)
+        ago = torch.cat([self._ago(some.long(), seen.long()) for some, seen in parts])
+        return self._joined(forecasts, ago, context)
+
+    def _joined(self, forecasts: Tensor, ago: Tensor | None, context: Tensor | None) -> Tensor:
+        """`[..., D]`: the context, the forecasts `[..., E, A]`, and how long ago each action was taken `[..., A]`."""
+        parts = [forecasts.clamp(min=LEAST).flatten(-2)]
+        if ago is not None and context is not None:
+            parts = [context[..., None].float(), *parts, _log(ago)]
+        return torch.cat(parts, -1)
 
     def _ago(self, plans: Tensor, context: Tensor) -> Tensor:
         """`[N, L, A]`: how long ago each action was last taken in the context of each step `[N, L]`."""
@@ -273,7 +273,7 @@ class Mixer(NeuralPrior):
         return self.hidden_size
 
 
-def _for(expert: Prior, context: Tensor | None) -> Tensor | None:
+def seen_by(expert: Prior, context: Tensor | None) -> Tensor | None:
     """The context, for an expert that sees it."""
     return context if expert.takes_context else None
 

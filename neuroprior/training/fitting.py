@@ -19,6 +19,7 @@ from torch import nn
 
 from neuroprior.output import write_whole
 from neuroprior.plans import Plans
+from neuroprior.threads import one_thread
 from neuroprior.training.batches import PlansModule
 from neuroprior.training.module import PriorModule
 from neuroprior.training.settings import Settings
@@ -144,13 +145,8 @@ def few_threads(prior: nn.Module, data: PlansModule) -> Iterator[None]:
     """One thread for small steps: there, more gain little, and on a busy machine they wait for one another."""
     tokens = data.training.group_size * data.training.window
     operations = 6 * tokens * sum(weight.numel() for weight in prior.parameters())
-    threads = torch.get_num_threads()
-    if operations < SMALL_STEP:
-        torch.set_num_threads(1)
-    try:
+    with one_thread(operations < SMALL_STEP):
         yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @contextmanager
