@@ -5,7 +5,8 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from neuroprior.plans import action_dtype, sees_each_step
+from neuroprior.draws import Draw, after_end, shuffled_rows, worth_splitting
+from neuroprior.plans import sees_each_step
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import Rollout, World, is_integer, join_states
 
@@ -72,7 +73,7 @@ def sample(
     if context is not None and sees_each_step(context) and context.shape[1] < length:
         raise ValueError(f"context: {length} steps are to be sampled, but it has only {context.shape[1]}")
     prior.check_context_of(context, num_plans, length)
-    draw = _Draw(prior.num_actions, temperature, generator_on(generator, prior.device), prior.end)
+    draw = Draw(prior.num_actions, temperature, generator_on(generator, prior.device), prior.end)
     if context is None:
         roots = torch.full((min(num_plans, 1),), num_plans, device=prior.device)
         return _grow(prior, roots, None, length, draw, method, batch_size)
@@ -100,6 +101,9 @@ def sample_in_world(
 ) -> tuple[Tensor, Rollout]:
     """Sample plans and try them in the same pass: the prior sees each state before it acts there.
 
+    Plans from a start that begin alike share their beginning's evaluation and steps (see `sample`), unless the world
+    says that chance has a part in it.
+
     The context of a prior that has one is `world.observe` of the start, and again of each further state unless the
     prior has learned from a context a plan. Actions that do not exist in a state (`world.legal`) are never sampled.
 
@@ -126,40 +130,52 @@ def sample_in_world(
     if prior.num_actions != world.num_actions:
         raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
     generator = generator_on(generator, prior.device)
-    draw = _Draw(prior.num_actions, temperature, generator)
-    batch = state.shape[0]
-    now = state.repeat_interleave(num_plans, 0)
-    seen = world.observe(now) if prior.context_per is not None else None
+    draw = Draw(prior.num_actions, temperature, generator)
+    batch = len(state)
+    seen = world.observe(state) if prior.context_per is not None else None
     if seen is not None and sees_each_step(seen):
         raise ValueError(f"observe: indices [N] or features [N, C] are expected, not {seen.dtype} {list(seen.shape)}")
-    prior.check_context_of(seen, len(now))
-    logits, memory = prior.start(len(now), seen)
-    actions, states = [torch.zeros(len(now), 0, dtype=draw.dtype, device=state.device)], []
-    rewards = [torch.zeros(len(now), 0, device=state.device)]
+    prior.check_context_of(seen, batch)
+    logits, memory = prior.start(batch, seen)
+    now, root = state, torch.arange(batch, device=state.device)
+    counts = torch.full((batch,), num_plans, device=state.device)
+    tried: list[list[Tensor]] = [[], [], []]  # of each step: actions, rewards, states
+    alone = False
     for t in range(length):
         if not world.all_legal:
             logits = logits.masked_fill(~world.legal(now), -torch.inf)
-        action = draw.actions(logits)
+        if not alone and (world.stochastic or 2 * logits.numel() > batch * num_plans):
+            alone, row = True, shuffled_rows(counts, root, generator)
+            logits, memory, now, tried = logits[row], memory[row], now[row], _rows(tried, row)
+        if alone:
+            action = draw.actions(logits)
+        else:
+            children = draw.split(counts, logits)
+            row, action = children.nonzero(as_tuple=True)
+            counts, root = children[row, action], root[row]
+            memory, now, tried = memory[row], now[row], _rows(tried, row)
         now, reward = world.step(now, action, generator)
-        actions.append(action[:, None].to(draw.dtype))
-        rewards.append(reward[:, None])
-        if keep_states:
-            states.append(now)
+        for column, what in zip(tried, (action.to(draw.dtype), reward, now), strict=True):
+            column.append(what)
+        if not keep_states:
+            tried[2].clear()
         if t + 1 < length:
             logits, memory = prior.step(action, memory, world.observe(now) if prior.context_per == "step" else None)
-    shape = (batch, num_plans, *state.shape[1:])
-    course = join_states(states, state, shape) if keep_states else None
-    gained = torch.cat(rewards, 1).view(batch, num_plans, length)
-    return torch.cat(actions, 1).view(batch, num_plans, length), Rollout(now.view(shape), gained, course)
+    if not alone:
+        row = shuffled_rows(counts, root, generator)
+        now, tried = now[row], _rows(tried, row)
+    course = join_states(tried[2], state, (batch, num_plans, *state.shape[1:])) if keep_states else None
+    # no step at all leaves nothing to stack
+    none = (torch.zeros(len(now), 0, dtype=draw.dtype), torch.zeros(len(now), 0))
+    plans, gained = (
+        torch.stack(steps, 1) if steps else empty.to(now.device) for steps, empty in zip(tried, none, strict=False)
+    )
+    shape = (batch, num_plans, length)
+    return plans.view(shape), Rollout(now.view(*shape[:2], *state.shape[1:]), gained.view(shape), course)
 
 
-def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:
-    """`logits [..., A]`, but nothing else than the end symbol where the action `before [...]` was that symbol."""
-    if end is None:
-        return logits
-    ended = torch.full_like(logits[..., :1], -torch.inf).repeat_interleave(logits.shape[-1], -1)
-    ended[..., end] = 0
-    return torch.where((before == end)[..., None], ended, logits)
+def _rows(columns: list[list[Tensor]], row: Tensor) -> list[list[Tensor]]:
+    return [[step[row] for step in column] for column in columns]
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
@@ -172,50 +188,12 @@ def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> 
         raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
 
 
-class _Draw:
-    """Draws actions from logits."""
-
-    def __init__(
-        self, num_actions: int, temperature: float, generator: torch.Generator, end: int | None = None
-    ) -> None:
-        self.num_actions, self.temperature, self.generator, self.end = num_actions, temperature, generator, end
-        self.dtype = action_dtype(num_actions)
-
-    def actions(self, logits: Tensor) -> Tensor:
-        """One action a row of `logits [N, A]`: int64 `[N]`. Actions of probability 0 are never drawn."""
-        cumulative = self._probs(logits).cumsum(-1)
-        total = cumulative[:, -1:]
-        uniform = torch.rand(len(logits), 1, generator=self.generator, device=logits.device, dtype=cumulative.dtype)
-        action = (cumulative <= uniform * total).sum(-1)
-        # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
-        return torch.minimum(action, (cumulative < total).sum(-1))
-
-    def _probs(self, logits: Tensor) -> Tensor:
-        # The largest is taken off first, so that no temperature makes it infinite.
-        return torch.softmax((logits - logits.amax(-1, keepdim=True)) / self.temperature, -1)
-
-    def split(self, counts: Tensor, logits: Tensor) -> Tensor:
-        """Split `counts [M]` multinomially by the rows of `logits [M, A]`: `[M, A]`, a binomial draw an action."""
-        probs = self._probs(logits.double())
-        # The share of an action among those not yet dealt out: exact 0 and 1 are kept by summing from the end.
-        rest = probs.flip(-1).cumsum(-1).flip(-1)
-        share = torch.where(rest > 0, probs / rest, 0).clamp_(0, 1)
-        share[:, -1] = 1
-        left = counts.double()
-        parts = []
-        for action in range(self.num_actions):
-            part = torch.binomial(left, share[:, action].contiguous(), generator=self.generator)
-            parts.append(part)
-            left = left - part
-        return torch.stack(parts, -1).long()
-
-
 def _grow(
     prior: Steppable,
     counts: Tensor,
     context: Tensor | None,
     length: int,
-    draw: _Draw,
+    draw: Draw,
     method: str,
     batch_size: int,
 ) -> Tensor:
@@ -228,7 +206,8 @@ def _grow(
     logits, state = prior.start(len(counts), context[:, 0] if context is not None and per_step else context)
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
     root = torch.arange(len(counts), device=counts.device)
-    while prefix.shape[1] < length and _worth_splitting(method, len(counts) * draw.num_actions, total):
+    known = {"tree": True, "ancestral": False}
+    while prefix.shape[1] < length and known.get(method, worth_splitting(len(counts) * draw.num_actions, total)):
         children = draw.split(counts, logits)
         parent, action = children.nonzero(as_tuple=True)
         counts = children[parent, action]
@@ -239,7 +218,7 @@ def _grow(
             logits = after_end(logits, action, draw.end)
         else:
             logits, state = logits[parent], state[parent]
-    row = _shuffled_rows(counts, root, draw.generator)
+    row = shuffled_rows(counts, root, draw.generator)
     depth = prefix.shape[1]
     plans[:, :depth] = prefix[row]
     if depth == length:
@@ -255,19 +234,3 @@ def _grow(
                 now, memory = prior.step(action, memory, seen)
                 now = after_end(now, action, draw.end)
     return plans
-
-
-def _worth_splitting(method: str, children: int, total: int) -> bool:
-    """A split costs one evaluation a child; drawing plan by plan costs one a plan and needs no shuffling."""
-    return method == "tree" or (method == "auto" and 8 * children <= total)
-
-
-def _shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> Tensor:
-    """The prefix of each plan: prefix m `counts[m]` times; root by root, in random order within a root."""
-    row = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-    if len(counts) == 1 or len(counts) == len(row) == int(root[-1]) + 1:
-        return row
-    row = row[torch.randperm(len(row), generator=generator, device=row.device)]
-    if int(root[-1]) == 0:
-        return row
-    return row[root[row].argsort(stable=True)]

@@ -5,7 +5,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, World, sample, sample_in_world
+from neuroprior import (
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    TabularWorld,
+    TransformerPrior,
+    UniformPrior,
+    World,
+    sample,
+    sample_in_world,
+)
 from tests.sources import (
     FALSE_ALARM,
     TablePrior,
@@ -241,6 +251,34 @@ def test_in_world(per, legal):
         probs = in_world_distribution(prior, world, int(starts[i]), 3, temperature=0.8)
         assert (probs == 0).any() == legal
         assert fits(plans[i], probs, A)
+        assert fits(plans[i, :10_000], probs, A)  # in random order, though they grew on one tree
+
+
+class CountingSteps(TabularWorld):
+    """Counts the steps that are taken in it."""
+
+    taken = 0
+
+    def step(self, state, action, generator=None):
+        self.taken += len(state)
+        return super().step(state, action, generator)
+
+
+@pytest.mark.parametrize("chance", [False, True])
+@pytest.mark.parametrize(("num_plans", "steps"), [(20_000, 2 * (3 + 9 + 27)), (17, 2 * (3 + 17 + 17))])
+def test_in_world_plans_that_begin_alike_are_tried_once(chance, num_plans, steps):
+    """With few plans only the first step is shared; where chance decides, none is."""
+    known = random_world(3)
+    world = CountingSteps(known.next_state, known.reward)
+    world.stochastic = chance
+    states = torch.tensor([4, 9])
+    plans, rollout = sample_in_world(
+        UniformPrior(A), world, states, num_plans, 3, generator=seeded(0), keep_states=True
+    )
+    assert world.taken == (2 * num_plans * 3 if chance else steps)
+    want = known.rollout(states, plans, keep_states=True)
+    for found, wanted in zip(rollout, want, strict=True):
+        assert torch.equal(found, wanted)
 
 
 def test_in_world_same_seed_and_sizes():

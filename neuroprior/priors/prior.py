@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from neuroprior import sampling
+from neuroprior.draws import after_end
 from neuroprior.plans import Plans, check_context, sees_each_step
-from neuroprior.sampling import after_end
 from neuroprior.worlds.world import check_range, is_integer
 
 

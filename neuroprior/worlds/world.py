@@ -30,10 +30,12 @@ class World(ABC):
     Attributes:
         num_actions: the number of actions, A.
         all_legal: True where every action exists in every state, so that nobody need ask `legal`.
+        stochastic: True where chance decides what comes of an action, so that one try of a plan says little of it.
     """
 
     num_actions: int
     all_legal: bool = True
+    stochastic: bool = False
 
     @abstractmethod
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:

@@ -1,0 +1,69 @@
+"""Drawing actions: from logits one by one, or a number of plans split over the actions that go on from a prefix."""
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import action_dtype
+
+
+def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:
+    """`logits [..., A]`, but nothing else than the end symbol where the action `before [...]` was that symbol."""
+    if end is None:
+        return logits
+    ended = torch.full_like(logits[..., :1], -torch.inf).repeat_interleave(logits.shape[-1], -1)
+    ended[..., end] = 0
+    return torch.where((before == end)[..., None], ended, logits)
+
+
+class Draw:
+    """Draws actions from logits."""
+
+    def __init__(
+        self, num_actions: int, temperature: float, generator: torch.Generator, end: int | None = None
+    ) -> None:
+        self.num_actions, self.temperature, self.generator, self.end = num_actions, temperature, generator, end
+        self.dtype = action_dtype(num_actions)
+
+    def actions(self, logits: Tensor) -> Tensor:
+        """One action a row of `logits [N, A]`: int64 `[N]`. Actions of probability 0 are never drawn."""
+        cumulative = self._probs(logits).cumsum(-1)
+        total = cumulative[:, -1:]
+        uniform = torch.rand(len(logits), 1, generator=self.generator, device=logits.device, dtype=cumulative.dtype)
+        action = (cumulative <= uniform * total).sum(-1)
+        # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
+        return torch.minimum(action, (cumulative < total).sum(-1))
+
+    def _probs(self, logits: Tensor) -> Tensor:
+        # The largest is taken off first, so that no temperature makes it infinite.
+        return torch.softmax((logits - logits.amax(-1, keepdim=True)) / self.temperature, -1)
+
+    def split(self, counts: Tensor, logits: Tensor) -> Tensor:
+        """Split `counts [M]` multinomially by the rows of `logits [M, A]`: `[M, A]`, a binomial draw an action."""
+        probs = self._probs(logits.double())
+        # The share of an action among those not yet dealt out: exact 0 and 1 are kept by summing from the end.
+        rest = probs.flip(-1).cumsum(-1).flip(-1)
+        share = torch.where(rest > 0, probs / rest, 0).clamp_(0, 1)
+        share[:, -1] = 1
+        left = counts.double()
+        parts = []
+        for action in range(self.num_actions):
+            part = torch.binomial(left, share[:, action].contiguous(), generator=self.generator)
+            parts.append(part)
+            left = left - part
+        return torch.stack(parts, -1).long()
+
+
+def worth_splitting(children: int, total: int) -> bool:
+    """A split costs one evaluation a child; drawing plan by plan costs one a plan and needs no shuffling."""
+    return 8 * children <= total
+
+
+def shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> Tensor:
+    """The prefix of each plan: prefix m `counts[m]` times; root by root, in random order within a root."""
+    row = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+    if len(row) == 0 or len(counts) == int(root[-1]) + 1:
+        return row  # one prefix a root
+    row = row[torch.randperm(len(row), generator=generator, device=row.device)]
+    if int(root[-1]) == 0:
+        return row
+    return row[root[row].argsort(stable=True)]
