@@ -10,18 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, StackedPrior, TabularWorld, TransformerPrior
+from neuroprior import GRUPrior, MarkovPrior, MixturePrior, Plans, Prior, StackedPrior, TabularWorld, TransformerPrior
 from neuroprior.analysis import Reliability, pieces, reliability
 from neuroprior.comparison import Score, action_bits, rivals, score_bits
 from neuroprior.plans import sees_each_step
-from neuroprior.plans.folds import FEWEST_UNITS
+from neuroprior.plans.folds import FEWEST_UNITS, divisible
 from neuroprior.priors.histories import TooLargeError
 from neuroprior.sampling import sample, sample_in_world
 
 if TYPE_CHECKING:
     from eval.crossval import Design
 
-KINDS = ("gru-large", "stacked", "transformer", "gru", "lags", "counts")
+KINDS = ("mixture", "gru-large", "stacked", "transformer", "gru", "lags", "counts")
 """What one job fits; the slowest first."""
 
 NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
@@ -36,6 +36,9 @@ NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
 }
 """How neural priors are made and trained; the first two by default recipes."""
+
+MIXED = ("stacked", "gru-large")
+"""The experts of the mixture, each by its own recipe but for the training, which is that of the first."""
 
 ONCE = ("lags",)
 """What is fitted in the first fold alone."""
@@ -53,7 +56,7 @@ MOST_GENERATED = 1000
 
 def recipes() -> str:
     """All that decides a fit beside the plans and the design; after a change of it, old fits do not count."""
-    return repr((NEURAL, VALIDATION, MOST_PIECES, PIECES_A_STEP, torch.__version__))
+    return repr((NEURAL, MIXED, VALIDATION, MOST_PIECES, PIECES_A_STEP, torch.__version__))
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def packed(found: dict[str, Outcome]) -> dict[str, np.ndarray[Any, Any]]:
 
 def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: int) -> Iterator[tuple[str, str, Prior]]:
     sizes = _sizes(learned, scored)
-    learned = _loose(learned)
+    learned = divisible(learned)
     if kind == "counts":
         if "context_size" in sizes:
             return  # features cannot be counted
@@ -120,12 +123,18 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
                 # Chosen on the validation plans; then these are learned from as well.
                 yield rival.model, rival.how, rival.prior.fit(learned)  # type: ignore[operator]
         return
-    if kind == "stacked" and "context_size" in sizes:
-        return  # its experts count
-    make, settings = NEURAL[kind]
-    how = _training(design) | settings
-    prior = make(learned.num_actions, seed=seed, **sizes)
+    if kind in ("stacked", "mixture") and "context_size" in sizes:
+        return  # their experts count
+    how = _training(design) | NEURAL[MIXED[0] if kind == "mixture" else kind][1]
+    prior = _made(kind, learned.num_actions, seed=seed, **sizes)
     yield kind, "", prior.fit(learned, torch.Generator().manual_seed(seed), **how)
+
+
+def _made(kind: str, num_actions: int, **how: Any) -> Any:
+    """A neural prior, or a mixture of them, before training."""
+    if kind == "mixture":
+        return MixturePrior(num_actions, [_made(expert, num_actions, **how) for expert in MIXED])
+    return NEURAL[kind][0](num_actions, **how)
 
 
 def _training(design: "Design") -> dict[str, Any]:
@@ -151,12 +160,6 @@ def _sizes(*some: Plans) -> dict[str, int]:
         return {"context_size": contexts[0].shape[-1]}
     most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
     return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
-
-
-def _loose(plans: Plans) -> Plans:
-    """Plans without their groups where these are too few to be split."""
-    few = plans.group is None or len(plans.group.unique()) < FEWEST_UNITS
-    return replace(plans, group=None, group_names=None) if few else plans
 
 
 def scored_by(prior: Prior, scored: Plans, mask: Tensor, unit: Tensor) -> dict[str, np.ndarray[Any, Any]]:
@@ -192,7 +195,7 @@ def _by_lag(learned: Plans, scored: Plans, design: "Design", seed: int) -> dict[
     if held_out.group is None or len(held_out.group.unique()) < FEWEST_UNITS:
         return {}
     neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
-    neural.fit(_loose(short), generator, batch_size=PIECES_A_STEP, **_training(design))
+    neural.fit(divisible(short), generator, batch_size=PIECES_A_STEP, **_training(design))
     found = {"gru": [_of_last(neural, held_out, known) for known in range(reach + 1)]}
     if "context_size" not in sizes:
         found[COUNTED] = _chains(learned, held_out, reach, sizes.get("num_contexts"))

@@ -65,7 +65,7 @@ def models_of(study: Study, jobs: Sequence[Job]) -> list[Model]:
                 settings = ", ".join(dict.fromkeys(models[name] for models in how if models[name]))
                 found.append(Model(name, sees, settings, _loader(study, some, name)))
     chains = [f"markov-{order}" for order in ORDERS]
-    place = ["uniform", *chains, "context tree", "gru", "transformer", "gru-large", "stacked"]
+    place = ["uniform", *chains, "context tree", "gru", "transformer", "gru-large", "stacked", "mixture"]
     return sorted(found, key=lambda model: (model.sees == CONTEXT, place.index(model.name)))
 
 

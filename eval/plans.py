@@ -10,19 +10,19 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from torch import Tensor
 
 from eval import crossval, held_out, saved_priors
 from eval.crossval import ACTIONS, CONTEXT, Design, Study
 from eval.fits import KINDS
 from eval.held_out import Model
 from eval.plan_report import Report, write_report
+from eval.saved_priors import numbers
 from neuroprior import load
 from neuroprior.comparison import Score, unit_name
 from neuroprior.plans import Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 
-MODELS = ("counts", "gru", "transformer", "stacked", "gru-large")
+MODELS = ("counts", "gru", "transformer", "stacked", "gru-large", "mixture")
 LISTS: dict[str, dict[str, Any]] = {
     "priors": {"help": "score these model folders only; the first is compared with"},
     "models": {"default": list(MODELS[:4]), "choices": MODELS, "help": "which to fit"},
@@ -170,14 +170,15 @@ def _same_names(read: Plans, other: Plans, test: str) -> Plans:
     """The test plans with actions and contexts numbered as in those that are learned from."""
     if _sees(read) != _sees(other):
         raise ValueError(f"{test}: {_sees(other)}, but {_sees(read)} in the plans to learn from")
+    elsewhere = " is not in the plans to learn from; they have"
     if read.action_names is not None and other.action_names is not None:
-        number = _numbers("action", read.action_names, other.action_names, test)
+        number = numbers(read.action_names, other.action_names, f"{test}: the action", elsewhere)
         other = replace(other, actions=number[other.actions.long()], num_actions=read.num_actions, action_names=None)
     if other.num_actions > read.num_actions:
         raise ValueError(f"{test}: {other.num_actions} actions, but {read.num_actions} in the plans to learn from")
     other = replace(other, num_actions=read.num_actions, action_names=read.action_names)
     if read.context_names is not None and other.context_names is not None and other.context is not None:
-        number = _numbers("context", read.context_names, other.context_names, test)
+        number = numbers(read.context_names, other.context_names, f"{test}: the context", elsewhere)
         other = replace(other, context=number[other.context.long()], context_names=read.context_names)
     return other
 
@@ -187,16 +188,6 @@ def _sees(plans: Plans) -> str:
     if plans.context is None:
         return "no context"
     return f"{plans.context.shape[-1]} features" if plans.context.is_floating_point() else "context indices"
-
-
-def _numbers(what: str, known: Any, names: Any, file: str) -> Tensor:
-    """The number under which each name is known."""
-    known = list(known)
-    if unknown := [name for name in names if name not in known]:
-        raise ValueError(
-            f"{file}: the {what} {unknown[0]!r} is not in the plans to learn from; they have {', '.join(known)}"
-        )
-    return torch.tensor([known.index(name) for name in names])
 
 
 def _of_fitted(
@@ -255,7 +246,6 @@ def _of_saved(
     models: list[Model] = [model for model, _ in found]
     scores: list[Score] = [score for _, score in found]
     rows = [held_out.score_row(one, scores[0]) | {"how": model.how} for model, one in found]
-    mask = read.mask()
-    mask[:, :skip] = False
+    mask = crossval.counted(read, skip)
     settings = {"priors": ", ".join(folders), "skip": skip, "unit": unit_name(read, mask)}
     return Report(read, read, mask, models, scores, rows, folders[0], [], settings)

@@ -1,25 +1,24 @@
 """The mixture of priors: experts that are weighed by how well they have told the plan so far."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import FEWEST_UNITS
+from neuroprior.plans.folds import divisible
 from neuroprior.priors.neural import NeuralPrior
 from neuroprior.priors.packing import pack, unpack
 from neuroprior.priors.prior import Prior
-from neuroprior.priors.stacked import StackedPrior
+from neuroprior.priors.stacked import StackedPrior, seen_by
 from neuroprior.randomness import generator_on
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Of which `fit` takes the best."""
 
 VALIDATION = 0.1
-"""Share of the plans on which the weights are learned."""
+"""Share of the plans on which the weights are learned, unless the settings have another."""
 
 STEPS = 50
 """Of expectation maximisation, in which weights are learned."""
@@ -83,7 +82,7 @@ class MixturePrior(Prior):
             expert.restore(own)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        found = [e.start(batch_size, _for(e, context)) for e in self._experts()]
+        found = [e.start(batch_size, seen_by(e, context)) for e in self._experts()]
         weights = self.first.expand(batch_size, -1)
         return self._mixed(weights, found)
 
@@ -92,13 +91,13 @@ class MixturePrior(Prior):
             return torch.zeros(0, self.num_actions, device=self.device), state
         weights, forecasts, *states = unpack(state, 2 + len(self.experts))
         taken = forecasts.gather(2, action.long()[:, None, None].expand(-1, forecasts.shape[1], 1))[..., 0]
-        found = [e.step(action, s, _for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
+        found = [e.step(action, s, seen_by(e, context)) for e, s in zip(self._experts(), states, strict=True)]
         return self._mixed(self._after(weights, taken), found)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
-        forecasts = torch.stack([e(plans, _for(e, context)).log_softmax(-1) for e in self._experts()], 2)
+        forecasts = torch.stack([e(plans, seen_by(e, context)).log_softmax(-1) for e in self._experts()], 2)
         weights = self._weights(forecasts, plans)
         return (weights[..., None] + forecasts).logsumexp(2)
 
@@ -110,16 +109,16 @@ class MixturePrior(Prior):
         Args:
             plans: what to learn from.
             generator: draws the held-out plans, and is passed on to neural experts.
-            settings: passed on to neural experts, see `neuroprior.training.Settings`.
+            settings: passed on to neural experts, see `neuroprior.training.Settings`; `validation` is also the share of
+                the plans on which the weights are learned.
 
         Raises:
             ValueError: plans that the experts cannot learn from, or too few of them.
         """
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
-        if plans.group is not None and len(plans.group.unique()) < FEWEST_UNITS:
-            plans = replace(plans, group=None, group_names=None)
-        learned, held_out = plans.split(VALIDATION, generator)
+        plans = divisible(plans)
+        learned, held_out = plans.split(settings.get("validation", VALIDATION), generator)
         for expert in self._experts():
             _fit(expert, learned, generator, settings)
         self.learn_weights(held_out)
@@ -138,7 +137,9 @@ class MixturePrior(Prior):
     def learn_weights(self, plans: Plans) -> None:
         """Learn the first weights, and which of `SHARES` is best, from plans that the experts have not learned from."""
         mask = plans.mask()
-        forecasts = torch.stack([e(plans.actions, _for(e, plans.context)).log_softmax(-1) for e in self._experts()], 2)
+        forecasts = torch.stack(
+            [e(plans.actions, seen_by(e, plans.context)).log_softmax(-1) for e in self._experts()], 2
+        )
         index = plans.actions.long()[:, :, None, None].expand(-1, -1, forecasts.shape[2], 1)
         taken = forecasts.gather(3, index)[..., 0]
         best = (float("-inf"), self.first, self.share)
@@ -188,8 +189,3 @@ def _fit(expert: Prior, plans: Plans, generator: torch.Generator, settings: dict
         expert.fit(plans, generator, **settings)
     else:
         expert.fit(plans)
-
-
-def _for(expert: Prior, context: Tensor | None) -> Tensor | None:
-    """The context, for an expert that sees it."""
-    return context if expert.takes_context else None
