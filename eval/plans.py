@@ -66,7 +66,8 @@ def plans(
         test: learn from the file and score on this one, in place of cross-validation.
         folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
         models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
-            weighs the forecasts of counts), gru-large (256 wide, with dropout; slow, and left out by default).
+            weighs the forecasts of counts), gru-large (256 wide, with dropout), mixture (of stacked and gru-large);
+            the last two are slow, and left out by default.
         sees: what models see: past actions alone, the context as well where the file has one, or each in turn.
         skip: actions at the beginning of each plan that do not count in scores.
         max_steps: gradient steps of a neural prior.

@@ -74,6 +74,15 @@ def test_the_entropy_rate_is_reached(second_order):
     }
 
 
+def test_a_mixture_is_as_good_as_its_experts(second_order, tmp_path):
+    """Its stacked expert knows the chain by counts, the large GRU has hardly learned in 20 steps."""
+    plans = markov_plans(second_order[1], 400, 30, 1)
+    own = bits(report(plans, tmp_path, "--skip", "2", "--folds", "2", "--models", "mixture", "--max-steps", "20"))
+    known = bits(second_order[0])
+    assert list(own) == ["mixture"]
+    assert own["mixture"] < known["markov-2"] + 0.01
+
+
 def test_two_actions_back_and_no_further(second_order):
     results, _ = second_order
     gains = {row["lag"]: row for row in results["lags"] if (row["what"], row["model"]) == ("gain", "markov")}
