@@ -19,7 +19,7 @@ from neuroprior.statistics import Interval, mean_interval, paired_difference
 
 DATA = Path(__file__).parent / "data" / "labyrinth" / "plans.jsonl"
 NODES, LONGEST = 126, 500
-LISTS = {"num_plans": ((2, 8, 32, 128), "numbers of candidate plans"), "lengths": ((8, 12, 16), "moves in a plan")}
+LISTS = {"num_plans": ((16, 64, 256, 1024), "numbers of candidate plans"), "lengths": ((8, 12, 16), "moves in a plan")}
 """Options that take several numbers: their defaults, and what they are."""
 
 PER_SIGHT = (("markov_order", "d"), ("bits", ".3f"))
