@@ -71,7 +71,7 @@ def q_learning(
     _require(0 <= initial_scale < math.inf, "initial_scale", "a finite number, at least 0,", initial_scale)
     _require(0 <= epsilon <= 1, "epsilon", "a share between 0 and 1", epsilon)
     generator = generator_on(generator, world.device)
-    device, size = world.device, (num_agents, *world.next_state.shape)
+    device, size = world.device, (num_agents, world.num_states, world.num_actions)
     values = torch.rand(size, generator=generator, device=device, dtype=torch.float64) * initial_scale
     values[:, goal] = 1 / discount
     values.masked_fill_(~world.legal(torch.arange(world.num_states, device=device)), -torch.inf)
@@ -80,7 +80,7 @@ def q_learning(
     for step in range(steps):
         here = values[agent, cell]
         action = _choose(here, epsilon, generator)
-        after = world.next_state[cell, action]
+        after, _ = world.step(cell, action, generator)
         # The goal is worth 1 / discount, so that the target is 1 there, the reward, without a case of its own.
         values[agent, cell, action] = here[agent, action].lerp(discount * values[agent, after].amax(1), step_size)
         cell = torch.where(after == goal, _other_cells(goal, world.num_states, num_agents, generator), after)
@@ -122,7 +122,8 @@ def value_iteration(
         sweeps: stop after so many synchronous sweeps from values of 0: with a goal, cells farther from it than that
             are then still worth 0. None goes on to the end.
         tolerance: the end, without a goal, is where no value changes by more than this; values are then within
-            tolerance * discount / (1 - discount) of the true ones. With a goal it is where nothing changes at all.
+            tolerance * discount / (1 - discount) of the true ones. With a goal it is where nothing changes at all, but
+            in a world with chance the same as without a goal.
 
     Returns:
         `[W, S]` float64; with a goal `[1, S]`.
@@ -135,14 +136,14 @@ def value_iteration(
     _require(0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
     if goal is not None:
         _require(discount > 0, "discount", "with a goal, a number above 0", discount)
-        goal, tolerance = _check_goal(world, goal), 0.0
+        goal, tolerance = _check_goal(world, goal), tolerance if world.stochastic else 0.0
     rewards = _action_rewards(world, goal is not None)
     values = rewards.new_zeros(rewards.shape[0], world.num_states)
     if goal is not None:
         values[:, goal] = 1 / discount
     most = math.inf
     for _ in itertools.count() if sweeps is None else range(sweeps):
-        before, values = values, (rewards + discount * values[:, world.next_state]).amax(-1)
+        before, values = values, (rewards + discount * world.mean_after(values)).amax(-1)
         if goal is not None:
             values[:, goal] = 1 / discount
         # Each sweep shrinks the largest change by the discount at least, which rounding must not hide forever.
@@ -154,8 +155,8 @@ def value_iteration(
 
 def _action_rewards(world: TabularWorld, none: bool) -> Tensor:
     """The reward of each action in each cell, `[W, S, A]` float64, or 0 `[1, S, A]`; -inf where it is not legal."""
-    rewards = world.reward.new_zeros(1, world.num_states) if none else world.reward
-    rewards = (rewards[:, world.next_state] if rewards.dim() == 2 else rewards).double()
+    shape = 1, world.num_states, world.num_actions
+    rewards = (world.reward.new_zeros(shape) if none else world.mean_reward()).double()
     legal = world.legal(torch.arange(world.num_states, device=world.device))
     for where in (rewards.isinf() & legal).nonzero().tolist()[:1]:
         raise ValueError(f"world: the reward of [map, cell, action] {where} is infinite; values need finite ones")
@@ -177,10 +178,11 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
         `[B]` bool.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: an argument is out of range, or the world has chance.
     """
     world.check_state(state)
     goal = _check_goal(world, goal)
+    _require(not world.stochastic, "world", "one without chance", "one in which no plan is sure of where it leads")
     _require(length >= 0, "length", "a number of steps that is not negative", length)
     cells = torch.arange(world.num_states, device=world.device)
     ends, legal = cells == goal, world.legal(cells)

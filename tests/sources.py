@@ -95,6 +95,23 @@ def random_world(
     return TabularWorld(table, reward, exists)
 
 
+def chance_world(
+    seed: int, rewards: str = "WSAK", states: int = 5, actions: int = 3, outcomes: int = 4, maps: int = 2
+) -> TabularWorld:
+    """A random table with chance; the outcomes of an action are different cells, about a third of which cannot occur.
+
+    `rewards`: "S", "SA", "SAK", or one of these after a "W".
+    """
+    generator = seeded(seed)
+    size = {"W": maps, "S": states, "A": actions, "K": outcomes}
+    reward = torch.rand([size[letter] for letter in rewards], generator=generator)
+    table = torch.rand(states, actions, states, generator=generator).argsort(-1)[..., :outcomes]
+    probability = torch.rand(table.shape, generator=generator, dtype=torch.float64)
+    probability[torch.rand(table.shape, generator=generator) < 0.33] = 0
+    probability[..., 1] += 0.1
+    return TabularWorld(table, reward, probability=probability / probability.sum(-1, keepdim=True))
+
+
 class TablePrior(Prior):
     """A prior written down: `logits[t]` of shape `[contexts, A**t, A]` are those of action t after each prefix.
 

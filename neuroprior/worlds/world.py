@@ -59,6 +59,9 @@ class World(ABC):
     ) -> Rollout:
         """Try P plans from each of B starts. Shapes, dtypes and ranges are checked once, here, not at every step.
 
+        In a world with chance this default draws for each plan by itself. A world may let all plans of a start meet
+        the same chance instead (common random numbers, as `TabularWorld` does); starts are always independent.
+
         Args:
             state: `[B, ...]`.
             plans: integers `[B, P, L]` between 0 and A - 1.
