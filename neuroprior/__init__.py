@@ -1,6 +1,6 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
 
-from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPlanner, collect, oracle
+from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPlanner, collect, expected_score, oracle
 from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.priors import (
     ContextTreePrior,
@@ -38,6 +38,7 @@ __all__ = [
     "UniformPrior",
     "World",
     "collect",
+    "expected_score",
     "gridworld",
     "labyrinth",
     "load",

@@ -112,6 +112,22 @@ def chance_world(
     return TabularWorld(table, reward, probability=probability / probability.sum(-1, keepdim=True))
 
 
+def courses(world: TabularWorld, state: int, plan: list[int]) -> list[tuple[float, tuple[int, ...], tuple[float, ...]]]:
+    """All that may come of `plan` from `state`: (probability, states after each step, rewards), by recursion."""
+    if not plan:
+        return [(1.0, (), ())]
+    cell, number = state % world.num_states, state // world.num_states
+    found = []
+    for k, to in enumerate(world.next_state[cell, plan[0]].tolist()):
+        p = float(world.probability[cell, plan[0], k])
+        if p > 0:
+            where = {2: (number, to), 3: (number, cell, plan[0]), 4: (number, cell, plan[0], k)}[world.reward.dim()]
+            after, reward = number * world.num_states + to, float(world.reward[where])
+            for q, states, rewards in courses(world, after, plan[1:]):
+                found.append((p * q, (after, *states), (reward, *rewards)))
+    return found
+
+
 class TablePrior(Prior):
     """A prior written down: `logits[t]` of shape `[contexts, A**t, A]` are those of action t after each prefix.
 

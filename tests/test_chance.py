@@ -9,25 +9,9 @@ from neuroprior import TabularWorld
 from neuroprior.testing import check_world
 from neuroprior.values import can_reach, q_learning, value_iteration
 from neuroprior.worlds.chance import Chance
-from tests.sources import FALSE_ALARM, chance_world, p_value, random_world, refuses, seeded
+from tests.sources import FALSE_ALARM, chance_world, courses, p_value, random_world, refuses, seeded
 
 KINDS = ("S", "SA", "SAK", "WS", "WSA", "WSAK")
-
-
-def courses(world, state, plan):
-    """All that may come of `plan` from `state`: (probability, states after each step, rewards), by recursion."""
-    if not plan:
-        return [(1.0, (), ())]
-    cell, number = state % world.num_states, state // world.num_states
-    found = []
-    for k, to in enumerate(world.next_state[cell, plan[0]].tolist()):
-        p = float(world.probability[cell, plan[0], k])
-        if p > 0:
-            where = {2: (number, to), 3: (number, cell, plan[0]), 4: (number, cell, plan[0], k)}[world.reward.dim()]
-            after, reward = number * world.num_states + to, float(world.reward[where])
-            for q, states, rewards in courses(world, after, plan[1:]):
-                found.append((p * q, (after, *states), (reward, *rewards)))
-    return found
 
 
 @pytest.mark.parametrize("outcomes", [1, 2, 3, 4, 5, 8, 11])

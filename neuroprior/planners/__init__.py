@@ -2,8 +2,9 @@
 
 from neuroprior.planners.collect import collect
 from neuroprior.planners.exhaustive import ExhaustivePlanner
+from neuroprior.planners.expected import expected_score
 from neuroprior.planners.oracle import oracle
 from neuroprior.planners.planner import Decision, Planner
 from neuroprior.planners.sampling import SamplingPlanner
 
-__all__ = ["Decision", "ExhaustivePlanner", "Planner", "SamplingPlanner", "collect", "oracle"]
+__all__ = ["Decision", "ExhaustivePlanner", "Planner", "SamplingPlanner", "collect", "expected_score", "oracle"]

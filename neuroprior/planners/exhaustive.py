@@ -6,8 +6,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
-from neuroprior.plans import action_dtype
+from neuroprior.planners.chance import check_rollouts, mean_scores
+from neuroprior.planners.planner import Decision, Planner, decide, in_chunks, random_best
+from neuroprior.plans import action_dtype, all_plans
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import World
 
@@ -17,11 +18,13 @@ MOST_PLANS = 2**24
 class ExhaustivePlanner(Planner):
     """Tries every plan of `depth` actions: Hyvärinen's deterministic planner.
 
-    Plans that share a prefix share its steps, so a decision takes A + A**2 + ... + A**depth of them.
+    Plans that share a prefix share its steps, so a decision takes A + A**2 + ... + A**depth of them. In a world with
+    chance each plan is tried by itself, which takes num_rollouts * depth * A**depth.
 
     Args:
         depth: number of actions in a plan, at least 1; A**depth may be at most 2**24.
         objective, discount, value, any_prefix: see `Planner`.
+        num_rollouts: see `SamplingPlanner`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -35,11 +38,13 @@ class ExhaustivePlanner(Planner):
         discount: float = 1.0,
         value: Callable[[Tensor], Tensor] | None = None,
         any_prefix: bool = False,
+        num_rollouts: int = 1,
     ) -> None:
         super().__init__(objective, discount, value, any_prefix)
         if depth < 1:
             raise ValueError(f"depth: at least 1 is expected, not {depth}")
-        self.depth = depth
+        check_rollouts(num_rollouts)
+        self.depth, self.num_rollouts = depth, num_rollouts
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         actions = world.num_actions
@@ -49,7 +54,12 @@ class ExhaustivePlanner(Planner):
         generator = generator_on(generator, state.device)
         steps = sum(actions**depth for depth in range(1, self.depth + 1))
 
+        if world.stochastic:
+            steps = self.num_rollouts * self.depth * actions**self.depth
+
         def some(state: Tensor) -> Decision:
+            if world.stochastic:
+                return self._plan_with_chance(world, state, generator, steps)
             return self._plan(world, state, generator, steps)
 
         return in_chunks(some, state, steps)
@@ -85,3 +95,15 @@ class ExhaustivePlanner(Planner):
             steps,
             length if self.any_prefix else None,
         )
+
+    def _plan_with_chance(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
+        actions = world.num_actions
+        plans = all_plans(actions, self.depth).to(state.device, action_dtype(actions))
+        ending = None
+        if self.any_prefix:
+            # Of the plans that share a prefix, the one that goes on with zeros stands for it.
+            rest = actions ** torch.arange(self.depth - 1, -1, -1, device=state.device)
+            ending = torch.arange(len(plans), device=state.device)[:, None] % rest == 0
+        plans = plans.expand(len(state), -1, -1)
+        score, ends = mean_scores(self, world, state, plans, self.num_rollouts, generator)
+        return decide(plans, score, ends, steps, generator, ending)

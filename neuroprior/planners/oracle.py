@@ -22,6 +22,9 @@ def oracle(
 ) -> Tensor:
     """The exact highest score of all legal plans of `length` actions: finite-horizon dynamic programming.
 
+    In a world with chance it is the highest mean score of all closed-loop policies, which choose each action knowing
+    where the earlier ones led: an upper bound of what any plan, whose actions are fixed in advance, has on average.
+
     Args:
         world: a table.
         state: starts `[B]`.
@@ -39,14 +42,14 @@ def oracle(
     check_objective(objective, discount)
     world.check_state(state)
     maps, states, actions = world.num_maps, world.num_states, world.num_actions
-    reward = world.reward if world.reward.dim() == 3 else world.reward[:, world.next_state]
+    reward = world.mean_reward()
     every = torch.arange(maps * states, device=world.device)
     best = torch.zeros(maps, states, device=world.device, dtype=reward.dtype)
     if value is not None:
         best = value_of(value, every).view(maps, states).to(reward.dtype)
     prefix = torch.full_like(best, -torch.inf)
     for left in range(length):
-        after = best[:, world.next_state]
+        after = world.mean_after(best)
         if objective == "return":
             after = reward + discount * after
         elif left == 0:

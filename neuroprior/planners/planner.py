@@ -18,8 +18,10 @@ class Decision(NamedTuple):
 
     Attributes:
         plan: `[B, L]`: the best plan that it found; 0 beyond `lengths`.
-        score: `[B]`: what its objective gives for that plan.
-        final_state: `[B, ...]`: where the plan ends (its executed part, where there are `lengths`).
+        score: `[B]`: what its objective gives for that plan; in a world with chance the mean over the planner's own
+            rollouts, which flatters the winner (`expected_score` does not).
+        final_state: `[B, ...]`: where the plan ends (its executed part, where there are `lengths`); in a world with
+            chance, in the first of the planner's rollouts.
         model_steps: single simulator steps that it took for each start.
         lengths: `[B]`: how many actions of each plan are to be executed; None: all.
     """
@@ -129,6 +131,37 @@ def random_best(score: Tensor, generator: torch.Generator, legal: Tensor | None 
         best = best & legal
     draws = torch.rand(score.shape, generator=generator, device=score.device)
     return torch.where(best, draws, -1.0).argmax(1)
+
+
+def decide(
+    plans: Tensor,
+    score: Tensor,
+    ends: Tensor,
+    model_steps: int,
+    generator: torch.Generator,
+    allowed: Tensor | None = None,
+) -> Decision:
+    """The best of some candidates, or of their prefixes.
+
+    Args:
+        plans: `[B, P, L]`.
+        score: `[B, P]`, or `[B, P, L]` where any prefix may win.
+        ends: where they end, or their prefixes: as `score`, and the state's own dimensions.
+        model_steps: what that took for each start.
+        generator: breaks ties.
+        allowed: `[P, L]` bool: the prefixes that may win; None: all.
+    """
+    row = torch.arange(len(plans), device=plans.device)
+    if score.dim() == 2:
+        best = random_best(score, generator)
+        return Decision(plans[row, best], score[row, best], ends[row, best], model_steps)
+    length = plans.shape[2]
+    score = score.flatten(1)
+    chosen = random_best(score, generator, None if allowed is None else allowed.flatten().expand(score.shape))
+    best, last = chosen.div(length, rounding_mode="floor"), chosen % length
+    beyond = torch.arange(length, device=plans.device) > last[:, None]
+    plan = plans[row, best].masked_fill(beyond, 0)
+    return Decision(plan, score[row, chosen], ends[row, best, last], model_steps, last + 1)
 
 
 def in_chunks(plan_some: Callable[[Tensor], Decision], state: Tensor, steps_per_start: int) -> Decision:

@@ -6,7 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
+from neuroprior.planners.chance import check_rollouts, mean_scores
+from neuroprior.planners.planner import Decision, Planner, decide, in_chunks
 from neuroprior.priors.prior import Prior
 from neuroprior.randomness import generator_on
 from neuroprior.sampling import sample_in_world
@@ -19,12 +20,17 @@ class SamplingPlanner(Planner):
     A prior without context proposes plans blindly, and they are tried as a whole. A prior that sees the world, and any
     prior in a world where not every action exists everywhere, is stepped together with the world.
 
+    In a world with chance a plan is a sequence of actions that is executed whatever comes of them. A prior that sees
+    the world proposes each plan along one course of events; all plans are then scored by new rollouts.
+
     Args:
         prior: what proposes; `UniformPrior(A)` makes the random planner.
         length: number of actions in a plan, at least 1.
         num_plans: number of candidate plans for each start, at least 1.
         objective, discount, value, any_prefix: see `Planner`.
         temperature: of sampling.
+        num_rollouts: a plan's score is its mean over so many rollouts, all plans of a start meeting the same chance
+            where the world can (see `World.rollout`). Without chance (`World.stochastic`) one is all that is taken.
 
     Raises:
         ValueError: an argument is out of range. `plan` raises it for a prior that samples an end symbol, too.
@@ -41,12 +47,15 @@ class SamplingPlanner(Planner):
         value: Callable[[Tensor], Tensor] | None = None,
         any_prefix: bool = False,
         temperature: float = 1.0,
+        num_rollouts: int = 1,
     ) -> None:
         super().__init__(objective, discount, value, any_prefix)
         if length < 1 or num_plans < 1:
             raise ValueError(f"length and num_plans must be at least 1, not {length} and {num_plans}")
         if not 0 < temperature < float("inf"):
             raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+        check_rollouts(num_rollouts)
+        self.num_rollouts = num_rollouts
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
@@ -62,38 +71,51 @@ class SamplingPlanner(Planner):
         def some(state: Tensor) -> Decision:
             return self._plan(world, state, generator)
 
-        return in_chunks(some, state, self.num_plans * self.length)
+        return in_chunks(some, state, self._steps(world))
+
+    def _steps(self, world: World) -> int:
+        """Simulator steps for each start."""
+        times = 1
+        if world.stochastic:
+            times = self.num_rollouts + (1 if self.prior.takes_context else 0)
+        return times * self.num_plans * self.length
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
-        plans, rollout = self.candidates(world, state, generator)
-        row = torch.arange(len(state), device=state.device)
-        steps = self.num_plans * self.length
-        if rollout.states is None:
-            score = self.score(rollout.rewards, rollout.final_state)
-            best = random_best(score, generator)
-            return Decision(plans[row, best], score[row, best], rollout.final_state[row, best], steps)
-        score = self.prefix_scores(rollout.rewards, rollout.states).flatten(1)
-        chosen = random_best(score, generator)
-        best, last = chosen.div(self.length, rounding_mode="floor"), chosen % self.length
-        beyond = torch.arange(self.length, device=state.device) > last[:, None]
-        plan = plans[row, best].masked_fill(beyond, 0)
-        return Decision(plan, score[row, chosen], rollout.states[row, best, last], steps, last + 1)
+        if world.stochastic:
+            sees = self.prior.takes_context
+            plans = self._along(world, state, generator)[0] if sees else self._blind(len(state), generator)
+            score, ends = mean_scores(self, world, state, plans, self.num_rollouts, generator)
+        else:
+            plans, rollout = self.candidates(world, state, generator)
+            if rollout.states is None:
+                score, ends = self.score(rollout.rewards, rollout.final_state), rollout.final_state
+            else:
+                score, ends = self.prefix_scores(rollout.rewards, rollout.states), rollout.states
+        return decide(plans, score, ends, self._steps(world), generator)
 
     def candidates(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Rollout]:
-        """The candidate plans `[B, P, L]` for starts `[B, ...]`, and what comes of them."""
+        """The candidate plans `[B, P, L]` for starts `[B, ...]`, and what came of them."""
         if self.prior.takes_context or not world.all_legal:
-            return sample_in_world(
-                self.prior,
-                world,
-                state,
-                self.num_plans,
-                self.length,
-                temperature=self.temperature,
-                generator=generator,
-                keep_states=self.any_prefix,
-            )
-        batch = len(state)
+            return self._along(world, state, generator)
+        plans = self._blind(len(state), generator)
+        return plans, world.rollout(state, plans, generator, self.any_prefix)
+
+    def _along(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Rollout]:
+        """Plans that are drawn along with the world."""
+        return sample_in_world(
+            self.prior,
+            world,
+            state,
+            self.num_plans,
+            self.length,
+            temperature=self.temperature,
+            generator=generator,
+            keep_states=self.any_prefix,
+        )
+
+    def _blind(self, batch: int, generator: torch.Generator) -> Tensor:
+        """Plans that are drawn without a look at the world."""
         plans = self.prior.sample(
             batch * self.num_plans, self.length, temperature=self.temperature, generator=generator
-        ).view(batch, self.num_plans, self.length)
-        return plans, world.rollout(state, plans, generator, self.any_prefix)
+        )
+        return plans.view(batch, self.num_plans, self.length)

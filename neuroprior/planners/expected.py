@@ -1,0 +1,120 @@
+"""The exact mean score of plans in a table with chance, by carrying the distribution over its cells forward."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neuroprior.planners.planner import check_objective, value_of
+from neuroprior.worlds.tabular import TabularWorld
+from neuroprior.worlds.world import check_plans, check_range
+
+NUMBERS_AT_ONCE = 2**22
+"""Outcomes (plans x cells x outcomes of an action) that are looked at together; bounds memory."""
+
+
+@torch.no_grad()
+def expected_score(
+    world: TabularWorld,
+    state: Tensor,
+    plans: Tensor,
+    *,
+    objective: Literal["terminal", "return"] = "terminal",
+    discount: float = 1.0,
+    value: Callable[[Tensor], Tensor] | None = None,
+    lengths: Tensor | None = None,
+) -> Tensor:
+    """The exact mean score of plans whose actions are executed whatever comes of them (open loop).
+
+    A planner's own score of the plan that it chose is the best of many noisy means, and so too high (the winner's
+    curse); this is what the plan is worth. Without chance it is the plan's score.
+
+    Args:
+        world: a table.
+        state: starts `[B]`.
+        plans: integers `[B, P, L]`; for one plan a start, `plans[:, None]`.
+        objective, discount, value: what is scored; see `Planner`.
+        lengths: integers `[B, P]`, 1 to L: how many actions of each plan are executed; None: all.
+
+    Returns:
+        `[B, P]` floating point. Takes `B * P * L * S * K` operations.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    check_objective(objective, discount)
+    world.check_state(state)
+    check_plans(plans, len(state), world.num_actions)
+    batch, num_plans, length = plans.shape
+    if length < 1:
+        raise ValueError("plans: at least one action is expected, not 0")
+    if lengths is None:
+        lengths = torch.full((batch, num_plans), length, device=state.device)
+    _check_lengths(lengths, plans.shape)
+    worth = torch.zeros(world.num_maps * world.num_states, device=world.device)
+    if value is not None:
+        worth = value_of(value, torch.arange(len(worth), device=world.device))
+    table = _Table(world, worth)
+    outcomes = 1 if world.probability is None else world.probability.shape[2]
+    size = max(NUMBERS_AT_ONCE // (world.num_states * outcomes), 1)
+    rows = zip(
+        state.repeat_interleave(num_plans).split(size),
+        plans.reshape(-1, length).split(size),
+        lengths.reshape(-1).split(size),
+        strict=True,
+    )
+    scores = [table.scores(*some, objective == "terminal", discount) for some in rows]
+    return torch.cat(scores).view(batch, num_plans).to(world.reward.dtype)
+
+
+class _Table:
+    """A world's transitions and mean rewards, action by action: `[A, S * K]` and `[W * A, S]`."""
+
+    def __init__(self, world: TabularWorld, worth: Tensor) -> None:
+        self.world = world
+        shape = world.num_actions, -1
+        self.next_state = world.next_state.transpose(0, 1).reshape(shape)
+        self.probability = None if world.probability is None else world.probability.transpose(0, 1).reshape(shape)
+        self.reward = world.mean_reward().double().transpose(1, 2).reshape(-1, world.num_states)
+        self.worth = worth.double().view(-1, world.num_states)
+
+    def scores(self, state: Tensor, plans: Tensor, lengths: Tensor, terminal: bool, discount: float) -> Tensor:
+        """The mean scores `[N]` of `plans [N, L]` from `state [N]`, of which `lengths [N]` actions are executed."""
+        world = self.world
+        reward_map = world.reward_map(state)
+        # How likely each cell is, N x S.
+        share = torch.zeros(len(state), world.num_states, device=state.device, dtype=torch.float64)
+        share.scatter_(1, world.cell(state)[:, None], 1.0)
+        score = torch.zeros(len(state), device=state.device, dtype=torch.float64)
+        for t in range(plans.shape[1]):
+            action, executed = plans[:, t].long(), t < lengths
+            reward = _mean(share, self.reward.index_select(0, reward_map * world.num_actions + action))
+            counts = lengths == t + 1 if terminal else executed
+            score = torch.where(counts, score + discount**t * reward, score)
+            share = torch.where(executed[:, None], self._after(share, action), share)
+        weight = 1.0 if terminal else discount ** lengths.double()
+        return score + weight * _mean(share, self.worth.index_select(0, reward_map))
+
+    def _after(self, share: Tensor, action: Tensor) -> Tensor:
+        """How likely each cell is after one more `action [N]`."""
+        to = self.next_state.index_select(0, action)
+        outcomes = to.shape[1] // share.shape[1]
+        weight = share.repeat_interleave(outcomes, 1)
+        if self.probability is not None:
+            weight = weight * self.probability.index_select(0, action)
+        return torch.zeros_like(share).scatter_add_(1, to, weight)
+
+
+def _mean(share: Tensor, values: Tensor) -> Tensor:
+    """The mean `[N]` of `values [N, S]`; a cell that cannot be has no part in it, infinite or not."""
+    return (share * values).masked_fill(share == 0, 0).sum(1)
+
+
+def _check_lengths(lengths: Tensor, shape: torch.Size) -> None:
+    if lengths.shape != shape[:2]:
+        raise ValueError(f"lengths: shape [B, P] = {list(shape[:2])} is expected, not {list(lengths.shape)}")
+    check_range("lengths", lengths, shape[2] + 1, "lengths")
+    if (lengths < 1).any():
+        where = (lengths < 1).nonzero()[0].tolist()
+        raise ValueError(f"lengths{where}: at least one action is executed, not 0")
