@@ -3,16 +3,16 @@
 import tempfile
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from neuroprior.chi_square import alike, chi_square
 from neuroprior.plans import all_plans, sees_each_step
 from neuroprior.priors import Prior, load, save
 from neuroprior.sampling import sample
-from neuroprior.worlds import World
+from neuroprior.worlds import TabularWorld, World
 from neuroprior.worlds.world import is_integer
 
 FALSE_ALARM = 1e-6
@@ -58,8 +58,10 @@ def check_world(world: World, num_states: int = 50, length: int = 6, seed: int =
     """Raise AssertionError, with a message that says how, unless `world` does what a world must.
 
     `reset`, `step`, `observe` and `legal` return what the interface says; `step` leaves its arguments alone and treats
-    each state of a batch by itself; the same seed gives the same course; `rollout` equals stepping (compared in worlds
-    without chance) and refuses plans of a wrong shape, dtype or range.
+    each state of a batch by itself; the same seed gives the same course; `rollout` equals stepping and refuses plans of
+    a wrong shape, dtype or range. A world with chance says so (`stochastic`), and its rollouts have the distribution of
+    its steps (chi-square tests, together with a false alarm of 1e-6); those of a table let all plans of a start meet
+    the same chance.
 
     Args:
         world: the world to check.
@@ -89,6 +91,9 @@ def check_world(world: World, num_states: int = 50, length: int = 6, seed: int =
     if not chance:
         _require(_same(rollout.final_state, by_steps), "rollout ends in other states than stepping")
         _require(_same(rollout.rewards, rewards), "rollout gives other rewards than stepping")
+    else:
+        _require(world.stochastic, "step: chance was seen, but the world's `stochastic` is False")
+        _check_chance(world, state, plans[:, 0], seed)
     none = world.rollout(state, plans[:, :, :0])
     _require(none.final_state[:, 0].equal(state), "rollout of plans of length 0 must end where it starts")
     for wrong, what in (
@@ -199,24 +204,6 @@ def _check_samples(
     _require(p > FALSE_ALARM, f"{method} samples do not fit log_prob: chi-square p = {p:.2g}, {num_plans} plans")
 
 
-def chi_square(counts: Tensor, expected: Tensor) -> float:
-    """The p-value of Pearson's test of `counts [K]` against `expected [K]`; the rarest cells are taken together."""
-    order = expected.argsort()
-    counts, expected = counts[order].double(), expected[order].double()
-    # Cells below 5 expected counts go together, as the test's approximation needs.
-    pooled = int((expected < 5).sum())
-    while 0 < pooled < len(expected) and float(expected[:pooled].sum()) < 5:
-        pooled += 1
-    groups = [slice(0, pooled), *(slice(a, b) for a, b in pairwise(range(pooled, len(expected) + 1)))]
-    if pooled == 0:
-        groups = groups[1:]
-    seen, wanted = (torch.stack([v[g].sum() for g in groups]) for v in (counts, expected))
-    if len(groups) < 2:
-        return 1.0
-    statistic = ((seen - wanted) ** 2 / wanted).sum()
-    return float(torch.special.gammaincc(torch.tensor((len(groups) - 1) / 2).double(), statistic / 2))
-
-
 def _check_seeds(prior: Prior, kind: str | None, length: int, generator: torch.Generator) -> None:
     """The same seed gives the same plans; torch's global generator is not used."""
     context = _random_context(prior, kind, 64, length, generator)
@@ -296,3 +283,26 @@ def _step_through(world: World, state: Tensor, plans: Tensor, seed: int) -> tupl
         finals.append(now)
         rewards.append(torch.stack(row, -1))
     return torch.stack(finals, 1), torch.stack(rewards, 1), chance
+
+
+def _check_chance(world: World, state: Tensor, plans: Tensor, seed: int, times: int = 200) -> None:
+    """Rollouts in a world with chance against steps, `times` from each start `[N, ...]` by its plan `[N, L]`."""
+    generator = torch.Generator().manual_seed(seed)
+    group = torch.arange(len(state)).repeat_interleave(times)
+    now, plans = state.repeat_interleave(times, 0), plans.repeat_interleave(times, 0)
+    rollout = world.rollout(now, plans[:, None], generator)
+    again = world.rollout(now, plans[:, None], torch.Generator().manual_seed(seed))
+    _require(_same(rollout.final_state, again.final_state), "rollout: the same seed gave other states")
+    rewards = []
+    for t in range(plans.shape[1]):
+        now, reward = world.step(now, plans[:, t], generator)
+        rewards.append(reward)
+    seen = torch.cat([rollout.final_state.reshape(len(now), -1).double(), rollout.rewards[:, 0].double()], 1)
+    due = torch.cat([now.reshape(len(now), -1).double(), torch.stack(rewards, 1).double()], 1)
+    for column in range(seen.shape[1]):
+        p = alike(seen[:, column].cpu(), due[:, column].cpu(), group)
+        what = "rewards" if column >= seen.shape[1] - plans.shape[1] else "final states"
+        _require(p > FALSE_ALARM / seen.shape[1], f"{what} of rollout do not fit those of steps: p = {p:.2g}")
+    if isinstance(world, TabularWorld):
+        twice = world.rollout(state, plans[::times, None].expand(-1, 2, -1), generator)
+        _require(twice.rewards[:, 0].equal(twice.rewards[:, 1]), "rollout: the same plan twice met different chance")

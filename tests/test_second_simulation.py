@@ -8,7 +8,8 @@ import torch
 from eval.second_simulation import Task, ceiling, empty_world, objective, pursue, random_starts
 from eval.value_quality import families
 from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, oracle
-from neuroprior.testing import FALSE_ALARM, chi_square
+from neuroprior.chi_square import chi_square
+from neuroprior.testing import FALSE_ALARM
 from neuroprior.values import can_reach, value_iteration
 
 

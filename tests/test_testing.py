@@ -19,8 +19,10 @@ from neuroprior import (
     World,
     gridworld,
 )
-from neuroprior.testing import check_prior, check_world, chi_square
+from neuroprior.chi_square import alike, chi_square
+from neuroprior.testing import check_prior, check_world
 from neuroprior.worlds import Rollout
+from tests.sources import chance_world
 
 
 def random_plans(num_actions: int, context: Tensor | None = None, length: int = 5) -> Plans:
@@ -78,8 +80,14 @@ def legal_world() -> TabularWorld:
 
 @pytest.mark.parametrize(
     "world",
-    [gridworld(5, 4, "wall", num_worlds=3), gridworld(20, 20, "torus"), gridworld(1, 1), legal_world()],
-    ids=["walls", "torus", "one cell", "legal"],
+    [
+        gridworld(5, 4, "wall", num_worlds=3),
+        gridworld(20, 20, "torus"),
+        gridworld(1, 1),
+        legal_world(),
+        chance_world(0),
+    ],
+    ids=["walls", "torus", "one cell", "legal", "chance"],
 )
 def test_every_world_conforms(world: World) -> None:
     check_world(world)
@@ -182,6 +190,8 @@ class Line(World):
 class Noisy(Line):
     """With chance, which is allowed."""
 
+    stochastic = True
+
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         after, reward = super().step(state, action)
         return after + torch.randn(after.shape, generator=generator), reward
@@ -217,6 +227,46 @@ class Unchecked(Line):
         return Rollout(final, -places.abs())
 
 
+class Unannounced(Noisy):
+    stochastic = False
+
+
+class Calm(Noisy):
+    """Chance in its rollouts is less than in its steps."""
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        final, rewards, states = super().rollout(state, plans, generator, keep_states)
+        return Rollout(final, 0.9 * rewards, states)
+
+
+class Lucky(TabularWorld):
+    """Each plan meets its own chance."""
+
+    def __init__(self) -> None:
+        world = chance_world(0)
+        super().__init__(world.next_state, world.reward, probability=world.probability)
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        return World.rollout(self, state, plans, generator, keep_states)
+
+
+class Biased(Lucky):
+    """In its rollouts an action that fails is tried again, one time in two."""
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        worse, better = (TabularWorld.rollout(self, state, plans, generator, keep_states) for _ in range(2))
+        again = torch.rand(len(state), generator=generator) < 0.5
+        pick = again[:, None] & (better.rewards[..., -1:] > worse.rewards[..., -1:]).any(-1)
+        final = torch.where(pick, better.final_state, worse.final_state)
+        return Rollout(final, torch.where(pick[..., None], better.rewards, worse.rewards))
+
+
 class Stuck(Line):
     all_legal = False
 
@@ -242,6 +292,10 @@ def test_worlds_of_ones_own_conform(world: type[World]) -> None:
         (MixedBatch, "depends on its batch"),
         (Careless, "rollout ends in other states"),
         (Unchecked, "must raise ValueError"),
+        (Unannounced, "`stochastic` is False"),
+        (Calm, "rewards of rollout do not fit"),
+        (Lucky, "different chance"),
+        (Biased, "do not fit those of steps"),
         (Stuck, "without any legal action"),
         (Unsaid, "all_legal is True"),
     ],
@@ -260,3 +314,34 @@ def test_chi_square_is_scipys() -> None:
     # Two cells below five are taken together: 3 + 4 expected.
     pooled = stats.chisquare([5.0, 60.0, 42.0], [7.0, 60.0, 40.0]).pvalue
     assert chi_square(torch.tensor([1.0, 4, 60, 42]), torch.tensor([3.0, 4, 60, 40])) == pytest.approx(pooled)
+
+
+def test_alike_is_scipys_test_of_each_group() -> None:
+    from scipy import stats
+
+    generator = torch.Generator().manual_seed(0)
+    group = torch.arange(3).repeat_interleave(1000)
+    weights = torch.tensor([[5.0, 3, 2], [1, 1, 8], [0, 1, 0]])  # each number's middle rank is in a bin of its own
+    first, second = (weights[group].multinomial(1, generator=generator)[:, 0] for _ in range(2))
+    statistic = 0.0
+    for g in range(2):
+        table = torch.stack([part[group == g].bincount(minlength=3) for part in (first, second)])
+        statistic += stats.chi2_contingency(table, correction=False).statistic
+    assert alike(first, second, group) == pytest.approx(stats.chi2.sf(statistic, 4))
+    assert alike(first, torch.where(group == 2, 0, second), group) < 1e-50
+    assert alike(first[group == 2], first[group == 2], group[group == 2] - 2) == 1.0
+
+
+@pytest.mark.parametrize("continuous", [True, False])
+def test_alike_raises_false_alarms_as_often_as_it_says(continuous: bool) -> None:
+    from scipy import stats
+
+    generator = torch.Generator().manual_seed(1)
+    group = torch.arange(5).repeat_interleave(100)
+    p = []
+    for _ in range(300):
+        draws = torch.rand(2, 500, generator=generator)
+        draws = draws if continuous else (draws**3 * 6).floor()
+        p.append(alike(draws[0], draws[1], group))
+    assert stats.kstest(p, "uniform", alternative="greater").pvalue > 1e-6  # small p-values are no more frequent
+    assert sum(p) / 300 < 0.62  # and it is not blind
