@@ -15,7 +15,17 @@ from neuroprior.priors import (
     save,
 )
 from neuroprior.sampling import sample, sample_in_world
-from neuroprior.worlds import GridWorld, Rollout, TabularWorld, World, gridworld, labyrinth
+from neuroprior.worlds import (
+    GridWorld,
+    Rollout,
+    TabularWorld,
+    World,
+    egocentric,
+    four_rooms,
+    gridworld,
+    labyrinth,
+    maze,
+)
 
 __version__ = "0.1.0"
 
@@ -38,10 +48,13 @@ __all__ = [
     "UniformPrior",
     "World",
     "collect",
+    "egocentric",
     "expected_score",
+    "four_rooms",
     "gridworld",
     "labyrinth",
     "load",
+    "maze",
     "oracle",
     "read_plans",
     "sample",

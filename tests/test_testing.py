@@ -17,7 +17,10 @@ from neuroprior import (
     TransformerPrior,
     UniformPrior,
     World,
+    egocentric,
+    four_rooms,
     gridworld,
+    maze,
 )
 from neuroprior.chi_square import alike, chi_square
 from neuroprior.testing import check_prior, check_world
@@ -86,8 +89,11 @@ def legal_world() -> TabularWorld:
         gridworld(1, 1),
         legal_world(),
         chance_world(0),
+        maze(7, 9, num_layouts=3, num_worlds=2),
+        four_rooms(egocentric=True, view=2, reward="goal"),
+        egocentric(gridworld(5, 5, "torus")),
     ],
-    ids=["walls", "torus", "one cell", "legal", "chance"],
+    ids=["walls", "torus", "one cell", "legal", "chance", "maze", "four rooms", "egocentric"],
 )
 def test_every_world_conforms(world: World) -> None:
     check_world(world)

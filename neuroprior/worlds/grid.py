@@ -1,40 +1,119 @@
-"""Grid worlds: cells in a rectangle, four moves, independent random rewards."""
+"""Grid worlds: squares in rectangles, with walls or without; four moves, or turning and going forward."""
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from neuroprior.randomness import generator_on
 from neuroprior.worlds.tabular import TabularWorld
+from neuroprior.worlds.views import check_view, view_table
 
 MOVES = ("up", "right", "down", "left")
 """The four moves in the order of their numbers; the reversal of move a is (a + 2) % 4."""
+
+TURNS = ("left", "right", "forward")
+"""The three actions of an agent with a heading (0 up, 1 right, 2 down, 3 left), in the order of their numbers."""
 
 _ROW_COLUMN = torch.tensor([[-1, 0], [0, 1], [1, 0], [0, -1]])
 
 
 class GridWorld(TabularWorld):
-    """A `TabularWorld` whose cells are the squares of a rectangle, row by row from the top left; see `gridworld`.
+    """A `TabularWorld` whose cells are the squares of M rectangles; see `gridworld`, `maze` and `four_rooms`.
+
+    A cell is `layout * height * width + row * width + column`; where the agent has a heading (`egocentric`), it is four
+    times that plus the heading. A move into a wall, or off a grid that is no torus, stays where it is; wall squares are
+    cells that nobody enters.
 
     Args:
         height, width, edges: see `gridworld`.
-        reward: floating point `[W, S]`: the rewards of arriving in each cell, for W reward maps.
+        reward: floating point `[W, M * H * W]`: the rewards of arriving in each square, for W reward maps. With a
+            heading a step that turns arrives too, in the square where the agent is.
+        walls: bool `[M, H, W]`: which squares are walls; None: one layout without any.
+        egocentric: the actions are turning left, turning right and going forward, instead of the four moves.
+        view: the agent sees which squares up to so many rows and columns away are free, instead of which cell it is in.
 
     Attributes:
-        height, width: its size in cells.
+        height, width: size of a layout in squares.
         edges: "wall" or "torus".
+        walls: bool `[M, H, W]`.
+        num_layouts: M.
+        egocentric, view: as given.
+
+    Raises:
+        ValueError: a shape, dtype or value is wrong.
     """
 
-    def __init__(self, height: int, width: int, edges: Literal["wall", "torus"], reward: Tensor) -> None:
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        edges: Literal["wall", "torus"],
+        reward: Tensor,
+        *,
+        walls: Tensor | None = None,
+        egocentric: bool = False,
+        view: int | None = None,
+    ) -> None:
+        check_view(view)
+        if walls is None:
+            walls = torch.zeros(1, height, width, dtype=torch.bool, device=reward.device)
+        _check_walls(walls, height, width)
         self.height, self.width, self.edges = height, width, edges
+        self.walls, self.num_layouts, self.egocentric, self.view = walls, len(walls), egocentric, view
+        table = _moves(walls, edges)
+        if egocentric:
+            table, reward = _turns_and_moves(table), reward.repeat_interleave(4, -1)
         # One map cannot be mistaken for rewards of actions, as four maps of four cells could be.
-        super().__init__(_moves(height, width, edges), reward[:1], action_names=MOVES)
+        super().__init__(table, reward[:1], action_names=TURNS if egocentric else MOVES)
         self._set_maps(reward)
+        self._seen = None if view is None else view_table(walls, edges, view, egocentric)
+        # The cells in which planning may start; None where that is all of them.
+        self._free = (
+            (~walls.view(-1)).repeat_interleave(4 if egocentric else 1).nonzero()[:, 0] if walls.any() else None
+        )
+
+    def to(self, device: torch.device | str) -> "GridWorld":
+        """Move the tables to `device`; returns self."""
+        super().to(device)
+        self.walls = self.walls.to(device)
+        self._seen = None if self._seen is None else self._seen.to(device)
+        self._free = None if self._free is None else self._free.to(device)
+        return self
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        """States `[batch_size]`, uniform over the squares that are no walls, headings and reward maps."""
+        if self._free is None:
+            return super().reset(batch_size, generator)
+        generator, free = generator_on(generator, self.device), len(self._free)
+        draw = torch.randint(self.num_maps * free, (batch_size,), generator=generator, device=self.device)
+        return self._free[draw % free] + draw.div(free, rounding_mode="floor") * self.num_states
+
+    def observe(self, state: Tensor) -> Tensor:
+        """The cell of each state; with a `view` what is seen there, see `local_view`."""
+        if self._seen is None:
+            return super().observe(state)
+        return self._seen.index_select(0, self.cell(state)).float()
+
+    def square(self, state: Tensor) -> Tensor:
+        """The square of each state among all layouts' squares, `layout * height * width + row * width + column`."""
+        return self.cell(state).div(4, rounding_mode="floor") if self.egocentric else self.cell(state)
+
+    def layout(self, state: Tensor) -> Tensor:
+        """The layout of each state, between 0 and M - 1."""
+        return self.square(state).div(self.height * self.width, rounding_mode="floor")
 
     def coordinates(self, state: Tensor) -> Tensor:
-        """Row and column of each state: `[..., 2]`."""
-        cell = self.cell(state)
-        return torch.stack([cell.div(self.width, rounding_mode="floor"), cell % self.width], -1)
+        """Row and column of each state in its layout: `[..., 2]`."""
+        square = self.square(state) % (self.height * self.width)
+        return torch.stack([square.div(self.width, rounding_mode="floor"), square % self.width], -1)
+
+    def heading(self, state: Tensor) -> Tensor:
+        """The heading of each state: 0 up, 1 right, 2 down, 3 left; ValueError where agents have none."""
+        if not self.egocentric:
+            raise ValueError("heading: only in an egocentric grid has the agent one; see egocentric()")
+        return self.cell(state) % 4
 
 
 def gridworld(
@@ -71,10 +150,71 @@ def gridworld(
     return GridWorld(height, width, edges, uniform.pow(reward_power))
 
 
-def _moves(height: int, width: int, edges: str) -> Tensor:
-    """The transition table `[height * width, 4]`."""
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    to = torch.stack([rows, columns], -1).view(-1, 1, 2) + _ROW_COLUMN
-    size = torch.tensor([height, width])
+def egocentric(world: GridWorld) -> GridWorld:
+    """The same grid for an agent with a heading, whose actions are turning left, turning right and going forward.
+
+    A turn stays in the square and is rewarded as an arrival there. What the agent sees with a `view` turns with it.
+
+    Raises:
+        ValueError: the agents of `world` have headings already.
+    """
+    if world.egocentric:
+        raise ValueError("egocentric: the world is egocentric already")
+    return GridWorld(
+        world.height, world.width, world.edges, world.reward, walls=world.walls, egocentric=True, view=world.view
+    )
+
+
+def local_view(world: GridWorld, radius: int = 2) -> Callable[[Tensor], Tensor]:
+    """What an agent sees around itself, as features for a prior: which squares near it are free.
+
+    Args:
+        world: a grid.
+        radius: how many rows and columns away it sees, through walls too.
+
+    Returns:
+        A function from states `[N]` to float32 `[N, C]`, C = (2 * radius + 1) ** 2 - 1: 1 for a free square, 0 for a
+        wall or what is beyond the edge; row by row from the top left, without the agent's own square. In an egocentric
+        grid the first row is the farthest before the agent. `GridWorld(view=radius)` observes the same.
+
+    Raises:
+        ValueError: the radius is not at least 1.
+    """
+    check_view(radius)
+    table = view_table(world.walls, world.edges, radius, world.egocentric)
+    return lambda state: table.index_select(0, world.cell(state)).float()
+
+
+def _moves(walls: Tensor, edges: str) -> Tensor:
+    """The transition table `[M * H * W, 4]`."""
+    layouts, height, width = walls.shape
+    device = walls.device
+    rows, columns = torch.meshgrid(
+        torch.arange(height, device=device), torch.arange(width, device=device), indexing="ij"
+    )
+    to = torch.stack([rows, columns], -1).view(-1, 1, 2) + _ROW_COLUMN.to(device)
+    size = torch.tensor([height, width], device=device)
     to = to % size if edges == "torus" else to.clamp(min=torch.zeros_like(size), max=size - 1)
-    return to[..., 0] * width + to[..., 1]
+    square = torch.arange(height * width, device=device)[:, None]
+    to = to[..., 0] * width + to[..., 1]
+    blocked = walls.view(layouts, -1)
+    after = torch.where(blocked[:, to] | blocked[:, :, None], square, to)
+    return (after + torch.arange(layouts, device=device)[:, None, None] * height * width).view(-1, 4)
+
+
+def _turns_and_moves(moves: Tensor) -> Tensor:
+    """The transition table `[4 * S, 3]` of (square, heading), from that of the four moves, `[S, 4]`."""
+    square, heading = torch.arange(len(moves), device=moves.device)[:, None], torch.arange(4, device=moves.device)
+    turns = [4 * square + (heading + turn) % 4 for turn in (-1, 1)]
+    return torch.stack([*turns, 4 * moves + heading], -1).view(-1, 3)
+
+
+def _check_walls(walls: Tensor, height: int, width: int) -> None:
+    if walls.dtype != torch.bool or walls.dim() != 3 or walls.shape[1:] != (height, width) or len(walls) == 0:
+        raise ValueError(
+            f"walls: bool of shape [M, {height}, {width}] is expected,"
+            f" not {str(walls.dtype).removeprefix('torch.')} of shape {list(walls.shape)}"
+        )
+    full = walls.flatten(1).all(1).nonzero()
+    if len(full):
+        raise ValueError(f"walls[{int(full[0])}]: this layout has no free square; every one needs some")
