@@ -4,6 +4,8 @@ import itertools
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from neuroprior import TabularWorld
 from neuroprior.testing import check_world
@@ -34,10 +36,13 @@ def test_draws_are_quantiles(outcomes):
 
 
 def test_rounding_cannot_draw_past_the_last_outcome():
-    """Ten times 0.1 need not sum to 1 in floating point; the last one, of probability 0, must not be drawn."""
-    probability = torch.tensor([0.1] * 10 + [0.0]).view(1, 1, 11)
-    chance = Chance(probability, torch.device("cpu"))
-    assert chance.draw(torch.tensor([0]), torch.tensor([1 - 2**-24])).tolist() == [9]
+    """n times 1 / n need not sum to 1 in floating point; the last one, of probability 0, must not be drawn."""
+    for n in (3, 10, 49, 1000):
+        probability = torch.tensor([1 / n] * n + [0.0] * 3).view(1, 1, n + 3)
+        chance = Chance(probability, torch.device("cpu"))
+        assert chance.draw(torch.tensor([0]), torch.tensor([1 - 2**-24])).tolist() == [n - 1]
+    chance = Chance(torch.tensor([[[0.5, 0.5 - 9e-7, 0.0]]], dtype=torch.float64), torch.device("cpu"))
+    assert chance.draw(torch.tensor([0]), torch.tensor([1 - 2**-24])).tolist() == [1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -155,7 +160,10 @@ def test_values_are_those_of_the_mean():
     # v = 0.9 (0.75 v + 0.25 / 0.9)
     want = 0.25 / (1 - 0.9 * 0.75)
     assert float(value_iteration(lazy, goal=1)[0, 0]) == pytest.approx(want, abs=1e-6)
-    learned = q_learning(lazy, 1, num_agents=400, steps=400, step_size=0.1, generator=seeded(0))
+    learned, again = (
+        q_learning(lazy, 1, num_agents=400, steps=400, step_size=0.1, generator=seeded(0)) for _ in range(2)
+    )
+    assert torch.equal(learned, again)
     assert float(learned[:, 0, 0].mean()) == pytest.approx(want, abs=0.05)
 
 
@@ -190,6 +198,16 @@ def changed(*where_value):
 def test_refuses(change, words):
     with refuses(*words):
         TabularWorld(**({"next_state": TABLE, "reward": torch.rand(3), "probability": EVEN} | change))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    where=st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(0, 1)),
+    bad=st.floats(allow_nan=True, allow_infinity=True, width=32).filter(lambda p: not abs(p - 0.5) <= 1e-6),
+)
+def test_a_bad_probability_is_named(where, bad):
+    with refuses("probability", str(list(where))[:5]):
+        TabularWorld(TABLE, torch.rand(3), probability=changed(*where, bad))
 
 
 def test_a_cube_of_rewards_is_ambiguous():

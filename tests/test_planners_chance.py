@@ -143,14 +143,19 @@ def test_all_plans_meet_the_same_chance_whatever_is_tried_together(prefix, rollo
         lambda **rest: SamplingPlanner(MarkovPrior(3, num_contexts=5), 3, 9, **rest),
     ],
 )
-def test_a_decision_is_what_the_first_rollout_says(make, prefix):
+def test_a_decision_is_what_the_first_rollout_says(make, prefix, monkeypatch):
     """With one rollout and rewards on arrival the score is the reward where the plan, or its executed part, ends."""
     world = chance_world(6, "WS")
     planner = make(any_prefix=prefix)
     decision = planner.plan(world, torch.arange(10).repeat(20), seeded(0))
     assert torch.equal(decision.score, world.reward.view(-1)[decision.final_state])
     assert (decision.lengths is not None) == prefix
+    tried, rollout = [], world.rollout
+    monkeypatch.setattr(world, "rollout", lambda *rest: tried.append(rollout(*rest)) or tried[-1])
     many = make(any_prefix=prefix, num_rollouts=50).plan(world, torch.arange(10).repeat(20), seeded(0))
+    ((final, _, states),) = tried
+    first = (final if states is None else states)[::50].flatten(1)
+    assert (first == many.final_state[:, None]).any(1).all()
     times = 51 if isinstance(planner, SamplingPlanner) and planner.prior.takes_context else 50
     assert many.model_steps == times * 3 * (27 if isinstance(planner, ExhaustivePlanner) else 9)
     if many.lengths is not None:

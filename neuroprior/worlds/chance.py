@@ -25,9 +25,9 @@ class Chance:
         probability = probability.to(device).double()
         self.probability = probability / probability.sum(-1, keepdim=True)
         self.num_outcomes = probability.shape[-1]
-        upper = self.probability.cumsum(-1)
-        # The last outcome of any probability ends at exactly 1, so that no number below 1 is past it.
-        upper = (upper / upper[..., -1:]).float()
+        # Summed in float64 and then rounded, the last outcome of any probability ends at exactly 1, which no number
+        # drawn is past.
+        upper = self.probability.cumsum(-1).float()
         # Searching halves a power of two; what fills it up is never reached.
         width = 1 << (self.num_outcomes - 1).bit_length()
         self._steps = [width >> n for n in range(1, width.bit_length())]
