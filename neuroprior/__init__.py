@@ -15,17 +15,7 @@ from neuroprior.priors import (
     save,
 )
 from neuroprior.sampling import sample, sample_in_world
-from neuroprior.worlds import (
-    GridWorld,
-    Rollout,
-    TabularWorld,
-    World,
-    egocentric,
-    four_rooms,
-    gridworld,
-    labyrinth,
-    maze,
-)
+from neuroprior.worlds import GridWorld, PocketCube, Rollout, TabularWorld, World, cube, gridworld, labyrinth
 
 __version__ = "0.1.0"
 
@@ -39,6 +29,7 @@ __all__ = [
     "MixturePrior",
     "Planner",
     "Plans",
+    "PocketCube",
     "Prior",
     "Rollout",
     "SamplingPlanner",
@@ -48,9 +39,7 @@ __all__ = [
     "UniformPrior",
     "World",
     "collect",
-    "egocentric",
-    "expected_score",
-    "four_rooms",
+    "cube",
     "gridworld",
     "labyrinth",
     "load",
