@@ -15,13 +15,26 @@ from neuroprior.priors import (
     save,
 )
 from neuroprior.sampling import sample, sample_in_world
-from neuroprior.worlds import GridWorld, PocketCube, Rollout, TabularWorld, World, cube, gridworld, labyrinth
+from neuroprior.worlds import (
+    EpisodicWorld,
+    GridWorld,
+    PocketCube,
+    Rollout,
+    SteppedWorld,
+    TabularWorld,
+    World,
+    cube,
+    from_gymnasium,
+    gridworld,
+    labyrinth,
+)
 
 __version__ = "0.1.0"
 
 __all__ = [
     "ContextTreePrior",
     "Decision",
+    "EpisodicWorld",
     "ExhaustivePlanner",
     "GRUPrior",
     "GridWorld",
@@ -34,12 +47,14 @@ __all__ = [
     "Rollout",
     "SamplingPlanner",
     "StackedPrior",
+    "SteppedWorld",
     "TabularWorld",
     "TransformerPrior",
     "UniformPrior",
     "World",
     "collect",
     "cube",
+    "from_gymnasium",
     "gridworld",
     "labyrinth",
     "load",

@@ -1,10 +1,25 @@
 """Worlds: batched simulators in which planners try plans."""
 
 from neuroprior.worlds.cube import PocketCube, cube
+from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.grid import GridWorld, gridworld
+from neuroprior.worlds.gymnasium_stepping import SteppedWorld
+from neuroprior.worlds.gymnasium_worlds import from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
-__all__ = ["GridWorld", "PocketCube", "Rollout", "TabularWorld", "World", "cube", "gridworld", "labyrinth"]
+__all__ = [
+    "EpisodicWorld",
+    "GridWorld",
+    "PocketCube",
+    "Rollout",
+    "SteppedWorld",
+    "TabularWorld",
+    "World",
+    "cube",
+    "from_gymnasium",
+    "gridworld",
+    "labyrinth",
+]

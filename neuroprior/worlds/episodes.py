@@ -1,0 +1,80 @@
+"""Tables of environments in which episodes begin somewhere and may end: start states, absorbing ends, layouts."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from neuroprior.randomness import generator_on
+from neuroprior.worlds.tabular import TabularWorld
+
+
+class EpisodicWorld(TabularWorld):
+    """A `TabularWorld` with start states and absorbing ends, and any number of disjoint layouts side by side.
+
+    Args:
+        next_state, reward, action_names, probability: see `TabularWorld`.
+        starts: floating point `[S]`: the probability that an episode starts there.
+        ended: `[S]` bool: where the episode is over: every action stays there, without reward.
+        layouts: integers `[S]`: the layout that each state belongs to; None: there is one.
+        features: floating point `[S, C]`: what `observe` returns; None: the number of the state.
+
+    Attributes:
+        starts, ended, features: the same.
+        num_layouts: number of layouts.
+    """
+
+    def __init__(
+        self,
+        next_state: Tensor,
+        reward: Tensor,
+        action_names: Sequence[str] | None,
+        starts: Tensor,
+        ended: Tensor,
+        *,
+        probability: Tensor | None = None,
+        layouts: Tensor | None = None,
+        features: Tensor | None = None,
+    ) -> None:
+        super().__init__(next_state, reward, None, action_names, probability=probability)
+        self.starts, self.ended, self.features = starts, ended, features
+        self._layouts = torch.zeros_like(ended, dtype=torch.long) if layouts is None else layouts.long()
+        self.num_layouts = int(self._layouts.max()) + 1
+
+    def to(self, device: torch.device | str) -> "EpisodicWorld":
+        super().to(device)
+        self.starts, self.ended, self._layouts = (t.to(device) for t in (self.starts, self.ended, self._layouts))
+        self.features = None if self.features is None else self.features.to(device)
+        return self
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        """States `[batch_size]`, drawn as episodes start."""
+        generator = generator_on(generator, self.device)
+        where = self.starts.nonzero()[:, 0]
+        upper = self.starts[where].double().cumsum(0)
+        uniform = torch.rand(batch_size, generator=generator, device=self.device, dtype=torch.float64)
+        drawn = torch.searchsorted(upper, uniform * upper[-1], right=True)
+        return where[drawn.clamp(max=len(where) - 1)]
+
+    def layout(self, state: Tensor) -> Tensor:
+        """The layout of each state: int64 of the shape of `state`."""
+        return self._layouts[self.cell(state)]
+
+    def observe(self, state: Tensor) -> Tensor:
+        """The features `[N, C]` of each state, or its number `[N]` where there are none."""
+        return super().observe(state) if self.features is None else self.features[self.cell(state)]
+
+    def start_anywhere(self) -> "EpisodicWorld":
+        """Let episodes start, with equal probability, in any state that can be reached and is no end; returns self."""
+        reached = self.starts > 0
+        possible = None if self.probability is None else self.probability > 0
+        while True:
+            after = self.next_state[reached]
+            after = after.flatten() if possible is None else after[possible[reached]]
+            grown = reached.index_fill(0, after, True)
+            if grown.equal(reached):
+                break
+            reached = grown
+        anywhere = (reached & ~self.ended).double()
+        self.starts = anywhere / anywhere.sum()
+        return self

@@ -1,0 +1,281 @@
+"""Snapshots of Gymnasium environments: copies that are checked, states told apart, step counters set back."""
+
+import copy
+import hashlib
+import itertools
+import pickle
+import random
+from collections.abc import Callable
+from enum import Enum
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from neuroprior.worlds.gymnasium_opening import TRUNCATED, Episode, Seen, import_gymnasium, layers
+
+WALKS, WALK_LENGTH = 8, 40
+IGNORED = frozenset({"env", "spec", "_np_random_seed", "lastaction"})
+"""Attributes that are no part of a state: what is wrapped is looked at by itself, `lastaction` is for pictures alone."""
+
+
+class Copier(NamedTuple):
+    """A way to copy an environment: what `save` returns can be restored any number of times."""
+
+    save: Callable[[Any], Any]
+    restore: Callable[[Any], Any]
+
+
+COPIERS = (Copier(pickle.dumps, pickle.loads), Copier(copy.deepcopy, copy.deepcopy))
+
+
+def walks(num_actions: int) -> list[list[int]]:
+    """A few sequences of random actions, the same each time."""
+    drawn = np.random.default_rng(0).integers(num_actions, size=(WALKS, WALK_LENGTH))
+    return [[int(action) for action in walk] for walk in drawn]
+
+
+def follow(episode: Episode, actions: list[int]) -> list[Seen]:
+    """What is seen on the way, up to the end of the episode."""
+    course: list[Seen] = []
+    for action in actions:
+        course.append(episode.step(action))
+        if course[-1].end:
+            break
+    return course
+
+
+def first_difference(first: list[Seen], second: list[Seen]) -> str | None:
+    """What differs between two courses, in words; None where nothing does."""
+    for t, (one, other) in enumerate(zip(first, second, strict=False), start=1):
+        if not np.array_equal(one.features, other.features, equal_nan=True):
+            return f"the observation after {t} actions"
+        if one.reward != other.reward:
+            return f"the reward of action {t} ({one.reward:g} and {other.reward:g})"
+        if one.end != other.end:
+            return f"the end of the episode after {t} actions"
+    return None if len(first) == len(second) else f"the length of the episode ({len(first)} and {len(second)})"
+
+
+def unlike_itself(episode: Episode, seed: int) -> str | None:
+    """What differs between two courses of the same actions from the same seed; None where nothing does."""
+    for actions in walks(episode.num_actions):
+        seen = episode.reset(seed)
+        first = follow(episode, actions)
+        again = episode.reset(seed)
+        if not np.array_equal(seen, again, equal_nan=True):
+            return "the first observation"
+        difference = first_difference(first, follow(episode, actions))
+        if difference is not None:
+            return difference
+    return None
+
+
+def exact_copier(episode: Episode, seed: int) -> Copier | None:
+    """The first way of copying after which copy and original go on alike, each by itself; None where there is none."""
+    return next((copier for copier in COPIERS if _copies_exactly(episode, seed, copier)), None)
+
+
+def _copies_exactly(episode: Episode, seed: int, copier: Copier) -> bool:
+    original = episode.env
+    try:
+        for number, actions in enumerate(walks(episode.num_actions)):
+            before, after = actions[: 4 * number], actions[4 * number :]
+            episode.reset(seed)
+            course = follow(episode, before)
+            if course and course[-1].end:
+                continue
+            saved = copier.save(original)
+            courses = []
+            for env in (copier.restore(saved), original, copier.restore(saved)):
+                episode.env = env
+                courses.append(follow(episode, after))
+            episode.env = original
+            if first_difference(courses[0], courses[1]) or first_difference(courses[2], courses[1]):
+                return False
+    except Exception:  # an environment may fail to be copied in any way of its own
+        return False
+    finally:
+        episode.env = original
+    return True
+
+
+class Counters:
+    """The attributes of an environment that only count its steps; they are set back, so that they tell nothing apart.
+
+    An attribute counts steps if on random walks it grows with each, by what does not depend on the actions, and if
+    observations and ends are the same where it is set back after each step.
+
+    Args:
+        episode: an environment that copies exactly.
+        seed: starts the walks.
+
+    Attributes:
+        names: pairs of a layer (0 is the outermost wrapper) and an attribute's name.
+    """
+
+    def __init__(self, episode: Episode, seed: int) -> None:
+        self._values: list[Any] = []
+        self.names = _growing(episode, seed)
+        if self.names and not self._idle(episode, seed):
+            self.names = []
+
+    def remember(self, env: Any) -> None:
+        """Take the values of an environment that was just reset as those to set back to."""
+        found = layers(env)
+        self._values = [vars(found[layer])[name] for layer, name in self.names]
+
+    def set_back(self, env: Any) -> None:
+        """Set the counters of `env` to what they were after its reset."""
+        found = layers(env)
+        for (layer, name), value in zip(self.names, self._values, strict=True):
+            setattr(found[layer], name, value)
+
+    def _idle(self, episode: Episode, seed: int) -> bool:
+        """Whether observations and ends stay the same where the counters are set back."""
+        for actions in walks(episode.num_actions):
+            episode.reset(seed)
+            counted = [seen._replace(reward=0.0) for seen in follow(episode, actions)]
+            if counted[-1].end == TRUNCATED:  # a limit of time, as far as can be told, which need not count
+                counted.pop()
+            episode.reset(seed)
+            self.remember(episode.env)
+            uncounted = []
+            for action in actions[: len(counted)]:
+                uncounted.append(episode.step(action)._replace(reward=0.0))
+                self.set_back(episode.env)
+            if first_difference(counted, uncounted) is not None:
+                return False
+        return True
+
+
+def _growing(episode: Episode, seed: int) -> list[tuple[int, str]]:
+    """The numbers among the attributes that grow with each step, the same way on every walk."""
+    courses: list[list[dict[tuple[int, str], Any]]] = []
+    for actions in walks(episode.num_actions):
+        episode.reset(seed)
+        course = [_numbers(episode.env)]
+        for action in actions:
+            seen = episode.step(action)
+            course.append(_numbers(episode.env))
+            if seen.end:
+                break
+        courses.append(course)
+    longest = max(courses, key=len)
+    if len(longest) < 3:
+        return []
+
+    def counts(key: tuple[int, str]) -> bool:
+        if any(key not in numbers for numbers in longest):
+            return False
+        clock = [numbers[key] for numbers in longest]
+        grows = all(later > earlier for earlier, later in itertools.pairwise(clock))
+        return grows and all(
+            key in numbers and numbers[key] == clock[t] for course in courses for t, numbers in enumerate(course)
+        )
+
+    return [key for key in longest[0] if counts(key)]
+
+
+def _numbers(env: Any) -> dict[tuple[int, str], Any]:
+    """The attributes that are single numbers, by layer and name."""
+    return {
+        (number, name): value
+        for number, layer in enumerate(layers(env))
+        for name, value in vars(layer).items()
+        if isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and name not in IGNORED
+    }
+
+
+def reseed(env: Any, seed: int) -> None:
+    """Put other random generators in the place of those that the environment and its wrappers hold."""
+    for layer in layers(env):
+        for name, value in list(vars(layer).items()):
+            if isinstance(value, np.random.Generator):
+                setattr(layer, name, np.random.default_rng(seed))
+            elif isinstance(value, np.random.RandomState):
+                setattr(layer, name, np.random.RandomState(seed))
+            elif isinstance(value, random.Random):
+                setattr(layer, name, random.Random(seed))
+
+
+def digest(env: Any) -> bytes:
+    """16 bytes that tell states apart: all attributes of an environment and its wrappers, but for random generators.
+
+    Raises:
+        ValueError: an attribute cannot be read.
+    """
+    parts: list[str] = []
+    writer = _Writer(parts)
+    for layer in layers(env):
+        writer.attributes(layer)
+    return hashlib.blake2b("\n".join(parts).encode("utf-8", "surrogatepass"), digest_size=16).digest()
+
+
+class _Writer:
+    """Writes values as text that depends on nothing but what they are: not on addresses, dtypes or insertion order."""
+
+    def __init__(self, parts: list[str]) -> None:
+        self.parts, self._seen = parts, dict[int, int]()
+        self._kept: list[Any] = []  # so that no address is used twice
+        self._space = import_gymnasium().Space
+
+    def attributes(self, thing: Any) -> None:
+        """Those of an object, by name."""
+        names = dict(vars(thing)) if hasattr(thing, "__dict__") else {}
+        for kind in type(thing).__mro__:
+            slots = getattr(kind, "__slots__", ())
+            names |= {s: getattr(thing, s) for s in ([slots] if isinstance(slots, str) else slots) if hasattr(thing, s)}
+        for name in sorted(names):
+            if name not in IGNORED:
+                self.parts.append(name)
+                self.value(names[name])
+
+    def value(self, value: Any) -> None:
+        """Any value, however deep."""
+        if value is None or isinstance(value, (int, float, str, bytes, complex)):
+            self.parts.append(repr(value.value if isinstance(value, Enum) else value))
+        elif isinstance(value, np.generic):
+            self.parts.append(repr(value.item()))
+        elif isinstance(value, (FunctionType, BuiltinFunctionType, MethodType, ModuleType, type)):
+            self.parts.append(getattr(value, "__qualname__", value.__name__))
+        elif isinstance(value, (np.random.Generator, np.random.RandomState, random.Random, self._space)):
+            self.parts.append(type(value).__name__)
+        elif isinstance(value, np.ndarray) and value.size > 64 and value.dtype != object:
+            self.parts.append(f"{value.dtype}{value.shape}{value.tobytes().hex()}")
+        elif isinstance(value, np.ndarray):
+            self.value(value.tolist())
+        elif id(value) in self._seen:
+            self.parts.append(f"@{self._seen[id(value)]}")
+        else:
+            if not isinstance(value, tuple):  # nobody can tell a tuple from its equal
+                self._seen[id(value)] = len(self._seen)
+                self._kept.append(value)
+            self._compound(value)
+
+    def _compound(self, value: Any) -> None:
+        if isinstance(value, (list, tuple)):
+            self.parts.append(f"[{len(value)}")
+            for inner in value:
+                self.value(inner)
+        elif isinstance(value, (set, frozenset)):
+            self.parts.append("{" + ",".join(sorted(repr(inner) for inner in value)))
+        elif isinstance(value, dict):
+            self.parts.append("{" + str(len(value)))
+            for key in sorted(value, key=repr):
+                self.parts.append(repr(key))
+                self.value(value[key])
+        elif hasattr(value, "__dict__") or hasattr(type(value), "__slots__"):
+            self.parts.append(type(value).__qualname__)
+            self.attributes(value)
+        else:
+            self._opaque(value)
+
+    def _opaque(self, value: Any) -> None:
+        try:
+            self.parts.append(pickle.dumps(value).hex())
+        except Exception as error:
+            raise ValueError(
+                f"the environment holds a {type(value).__name__} by which states cannot be told apart;"
+                ' use method="step"'
+            ) from error
