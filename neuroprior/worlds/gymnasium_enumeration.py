@@ -73,7 +73,8 @@ class _Search:
         """All states that can be reached from `seed`."""
         self.episode.env = self._env
         seen = self.episode.reset(seed)
-        self.counters.remember(self.episode.env)
+        self.counters.remember(self._env)
+        self.episode.env = self.copier.restore(self.copier.save(self._env))  # like all others, a copy
         self.starts.append(self._number(layout, Seen(seen, 0.0, GOES_ON)))
         for state in iter(lambda: len(self.next_state), None):
             if state == len(self.layouts):

@@ -138,7 +138,7 @@ class Episode:
             parts = [self._features(inner, observation[key]) for key, inner in space.spaces.items()]
         elif isinstance(space, spaces.Tuple):
             parts = [self._features(inner, part) for inner, part in zip(space.spaces, observation, strict=True)]
-        elif _is_flat(space):
+        elif _is_flat(space) and not isinstance(space, spaces.Text):
             parts = [np.asarray(spaces.flatten(space, observation), dtype=np.float32).ravel()]
         else:
             parts = []

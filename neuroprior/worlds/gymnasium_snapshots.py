@@ -5,12 +5,13 @@ import hashlib
 import itertools
 import pickle
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from neuroprior.worlds.gymnasium_opening import TRUNCATED, Episode, Seen, import_gymnasium, layers
 
@@ -245,6 +246,8 @@ class _Writer:
             self.parts.append(f"{value.dtype}{value.shape}{value.tobytes().hex()}")
         elif isinstance(value, np.ndarray):
             self.value(value.tolist())
+        elif isinstance(value, Tensor):
+            self.value(value.detach().cpu().numpy())
         elif id(value) in self._seen:
             self.parts.append(f"@{self._seen[id(value)]}")
         else:
@@ -254,28 +257,39 @@ class _Writer:
             self._compound(value)
 
     def _compound(self, value: Any) -> None:
-        if isinstance(value, (list, tuple)):
-            self.parts.append(f"[{len(value)}")
+        kind = type(value)
+        self.parts.append("list" if kind is tuple else kind.__qualname__)
+        if kind in (list, tuple):
+            self.parts.append(str(len(value)))
             for inner in value:
                 self.value(inner)
-        elif isinstance(value, (set, frozenset)):
-            self.parts.append("{" + ",".join(sorted(repr(inner) for inner in value)))
-        elif isinstance(value, dict):
-            self.parts.append("{" + str(len(value)))
+        elif kind in (set, frozenset):
+            self.parts.append(",".join(sorted(repr(inner) for inner in value)))
+        elif kind is dict:
+            self.parts.append(str(len(value)))
             for key in sorted(value, key=repr):
                 self.parts.append(repr(key))
                 self.value(value[key])
-        elif hasattr(value, "__dict__") or hasattr(type(value), "__slots__"):
-            self.parts.append(type(value).__qualname__)
+        elif _is_plain(value):
             self.attributes(value)
         else:
-            self._opaque(value)
+            self._reduced(value)
 
-    def _opaque(self, value: Any) -> None:
+    def _reduced(self, value: Any) -> None:
+        """What pickle would write of a value that has more to it than attributes."""
         try:
-            self.parts.append(pickle.dumps(value).hex())
+            reduced = value.__reduce_ex__(4)
         except Exception as error:
             raise ValueError(
-                f"the environment holds a {type(value).__name__} by which states cannot be told apart;"
-                ' use method="step"'
+                f'env: it holds a {type(value).__name__}, by which its states cannot be told apart; use method="step"'
             ) from error
+        for part in reduced:
+            self.value(list(part) if isinstance(part, Iterator) else part)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value is its attributes, in `__dict__` or `__slots__`, and nothing else."""
+    kind = type(value)
+    if any(getattr(kind, name) is not getattr(object, name) for name in ("__reduce__", "__reduce_ex__")):
+        return False
+    return hasattr(value, "__dict__") or any("__slots__" in vars(base) for base in kind.__mro__)
