@@ -89,6 +89,27 @@ class Slippery(Corridor):
         return super().step(11 - action if slips else action)
 
 
+class Dice:
+    def __init__(self, generator, draw):
+        self.generator, self.draw = generator, draw
+
+
+class Deep(Corridor):
+    """Slips by one of several kinds of generators, which it holds in an object of its own."""
+
+    def __init__(self, make, draw):
+        super().__init__()
+        self.make, self.draw = make, draw
+
+    def reset(self, *, seed=None, options=None):
+        self.dice = Dice(self.make(seed), self.draw)
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        slips = self.dice.draw(self.dice.generator) < 0.4
+        return super().step(11 - action if slips else action)
+
+
 class Unseeded(Corridor):
     """Slips by the global generator: nothing repeats itself."""
 

@@ -1,6 +1,7 @@
 """Enumerated environments against what is known of their states, against themselves, and what is refused."""
 
 import copy
+import random
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +14,7 @@ import torch
 from neuroprior import ExhaustivePlanner, from_gymnasium, oracle
 from neuroprior.testing import check_world
 from tests import environments
-from tests.sources import refuses
+from tests.sources import refuses, seeded
 
 
 def minigrid_key(env, ended):
@@ -72,6 +73,16 @@ class Slotted:
         self.number = number
 
 
+class Private:
+    __slots__ = ("__number",)
+
+    def __init__(self, number):
+        self.__number = number
+
+    def number(self):
+        return self.__number
+
+
 class NamedList(list):
     pass
 
@@ -89,6 +100,7 @@ WAYS_TO_KEEP = {
     "tensor": (torch.tensor, int),
     "object": (Box, lambda kept: kept.number),
     "slots": (Slotted, lambda kept: kept.number),
+    "private slots": (Private, lambda kept: kept.number()),
     "deep": (lambda n: {"a": [(Box(n),)]}, lambda kept: kept["a"][0][0].number),
     "set": (lambda n: {n}, min),
     "deque": (lambda n: deque([n]), lambda kept: kept[0]),
@@ -204,6 +216,22 @@ def test_larger_minigrids(name, least):
 def test_what_cannot_be_enumerated_is_refused(env, words):
     with refuses(*words):
         from_gymnasium(env())
+
+
+@pytest.mark.parametrize(
+    ("make", "draw"),
+    [
+        (np.random.default_rng, lambda dice: dice.random()),
+        (np.random.RandomState, lambda dice: dice.rand()),
+        (random.Random, lambda dice: dice.random()),
+        (seeded, lambda dice: float(torch.rand((), generator=dice))),
+    ],
+    ids=["generator", "random state", "random", "torch"],
+)
+def test_chance_deep_inside_is_noticed(make, draw):
+    # Each of eight transitions is repeated, and differs with probability 0.48; the seeds are fixed.
+    with refuses("led to two different states"):
+        from_gymnasium(environments.Deep(make, draw))
 
 
 def test_too_many_states():

@@ -14,13 +14,12 @@ from neuroprior.worlds.gymnasium_opening import GOES_ON, TRUNCATED, Episode, See
 from neuroprior.worlds.gymnasium_snapshots import (
     Copier,
     Counters,
-    digest,
     exact_copier,
     first_difference,
-    reseed,
     unlike_itself,
     walks,
 )
+from neuroprior.worlds.gymnasium_states import digest, reseed
 
 CHECKED_FIRST, CHECKED_EVERY = 100, 10
 
@@ -91,17 +90,16 @@ class _Search:
         """The row of one state."""
         row, rewards = [], []
         for action in range(self.episode.num_actions):
-            after, reward = self._try(layout, saved, action)
-            row.append(after)
-            rewards.append(reward)
-            if (state < CHECKED_FIRST or state % CHECKED_EVERY == 0) and self._try(layout, saved, action, state) != (
-                after,
-                reward,
-            ):
-                raise ValueError(
-                    f'env: action {action} led to two different states from the same one; use method="step"'
-                    " where chance may be fixed by the seed"
-                )
+            found = self._try(layout, saved, action)
+            if state < CHECKED_FIRST or state % CHECKED_EVERY == 0:
+                again = self._try(layout, saved, action, other_seed=state * self.episode.num_actions + action)
+                if again != found:
+                    raise ValueError(
+                        f"env: action {action} led to two different states from the same one;"
+                        ' use method="step" where chance may be fixed by the seed'
+                    )
+            row.append(found[0])
+            rewards.append(found[1])
         self.next_state.append(row)
         self.rewards.append(rewards)
 

@@ -1,23 +1,17 @@
-"""Snapshots of Gymnasium environments: copies that are checked, states told apart, step counters set back."""
+"""Snapshots of Gymnasium environments: copies that are checked, and step counters that are set back."""
 
 import copy
-import hashlib
 import itertools
 import pickle
-import random
-from collections.abc import Callable, Iterator
-from enum import Enum
-from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from torch import Tensor
 
-from neuroprior.worlds.gymnasium_opening import TRUNCATED, Episode, Seen, import_gymnasium, layers
+from neuroprior.worlds.gymnasium_opening import TRUNCATED, Episode, Seen, layers
+from neuroprior.worlds.gymnasium_states import IGNORED
 
 WALKS, WALK_LENGTH = 8, 40
-IGNORED = frozenset({"env", "spec", "_np_random_seed", "lastaction"})
-"""Attributes that are no part of a state: what is wrapped is looked at by itself, `lastaction` is for pictures alone."""
 
 
 class Copier(NamedTuple):
@@ -186,110 +180,3 @@ def _numbers(env: Any) -> dict[tuple[int, str], Any]:
         for name, value in vars(layer).items()
         if isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and name not in IGNORED
     }
-
-
-def reseed(env: Any, seed: int) -> None:
-    """Put other random generators in the place of those that the environment and its wrappers hold."""
-    for layer in layers(env):
-        for name, value in list(vars(layer).items()):
-            if isinstance(value, np.random.Generator):
-                setattr(layer, name, np.random.default_rng(seed))
-            elif isinstance(value, np.random.RandomState):
-                setattr(layer, name, np.random.RandomState(seed))
-            elif isinstance(value, random.Random):
-                setattr(layer, name, random.Random(seed))
-
-
-def digest(env: Any) -> bytes:
-    """16 bytes that tell states apart: all attributes of an environment and its wrappers, but for random generators.
-
-    Raises:
-        ValueError: an attribute cannot be read.
-    """
-    parts: list[str] = []
-    writer = _Writer(parts)
-    for layer in layers(env):
-        writer.attributes(layer)
-    return hashlib.blake2b("\n".join(parts).encode("utf-8", "surrogatepass"), digest_size=16).digest()
-
-
-class _Writer:
-    """Writes values as text that depends on nothing but what they are: not on addresses, dtypes or insertion order."""
-
-    def __init__(self, parts: list[str]) -> None:
-        self.parts, self._seen = parts, dict[int, int]()
-        self._kept: list[Any] = []  # so that no address is used twice
-        self._space = import_gymnasium().Space
-
-    def attributes(self, thing: Any) -> None:
-        """Those of an object, by name."""
-        names = dict(vars(thing)) if hasattr(thing, "__dict__") else {}
-        for kind in type(thing).__mro__:
-            slots = getattr(kind, "__slots__", ())
-            names |= {s: getattr(thing, s) for s in ([slots] if isinstance(slots, str) else slots) if hasattr(thing, s)}
-        for name in sorted(names):
-            if name not in IGNORED:
-                self.parts.append(name)
-                self.value(names[name])
-
-    def value(self, value: Any) -> None:
-        """Any value, however deep."""
-        if value is None or isinstance(value, (int, float, str, bytes, complex)):
-            self.parts.append(repr(value.value if isinstance(value, Enum) else value))
-        elif isinstance(value, np.generic):
-            self.parts.append(repr(value.item()))
-        elif isinstance(value, (FunctionType, BuiltinFunctionType, MethodType, ModuleType, type)):
-            self.parts.append(getattr(value, "__qualname__", value.__name__))
-        elif isinstance(value, (np.random.Generator, np.random.RandomState, random.Random, self._space)):
-            self.parts.append(type(value).__name__)
-        elif isinstance(value, np.ndarray) and value.size > 64 and value.dtype != object:
-            self.parts.append(f"{value.dtype}{value.shape}{value.tobytes().hex()}")
-        elif isinstance(value, np.ndarray):
-            self.value(value.tolist())
-        elif isinstance(value, Tensor):
-            self.value(value.detach().cpu().numpy())
-        elif id(value) in self._seen:
-            self.parts.append(f"@{self._seen[id(value)]}")
-        else:
-            if not isinstance(value, tuple):  # nobody can tell a tuple from its equal
-                self._seen[id(value)] = len(self._seen)
-                self._kept.append(value)
-            self._compound(value)
-
-    def _compound(self, value: Any) -> None:
-        kind = type(value)
-        self.parts.append("list" if kind is tuple else kind.__qualname__)
-        if kind in (list, tuple):
-            self.parts.append(str(len(value)))
-            for inner in value:
-                self.value(inner)
-        elif kind in (set, frozenset):
-            self.parts.append(",".join(sorted(repr(inner) for inner in value)))
-        elif kind is dict:
-            self.parts.append(str(len(value)))
-            for key in sorted(value, key=repr):
-                self.parts.append(repr(key))
-                self.value(value[key])
-        elif _is_plain(value):
-            self.attributes(value)
-        else:
-            self._reduced(value)
-
-    def _reduced(self, value: Any) -> None:
-        """What pickle would write of a value that has more to it than attributes."""
-        try:
-            reduced = value.__reduce_ex__(4)
-        except Exception as error:
-            raise ValueError(
-                f'env: it holds a {type(value).__name__}, by which its states cannot be told apart; use method="step"'
-            ) from error
-        for part in reduced:
-            self.value(list(part) if isinstance(part, Iterator) else part)
-
-
-def _is_plain(value: Any) -> bool:
-    """Whether a value is its attributes, in `__dict__` or `__slots__`, and nothing else."""
-    kind = type(value)
-    if any(getattr(kind, name) is not getattr(object, name) for name in ("__reduce__", "__reduce_ex__")):
-        return False
-    return hasattr(value, "__dict__") or any("__slots__" in vars(base) for base in kind.__mro__)

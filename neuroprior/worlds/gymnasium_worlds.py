@@ -1,7 +1,7 @@
 """`from_gymnasium`: Gymnasium environments as worlds."""
 
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -11,11 +11,14 @@ from neuroprior.worlds.gymnasium_stepping import SteppedWorld
 from neuroprior.worlds.gymnasium_tables import has_table, read_table
 from neuroprior.worlds.world import World
 
+if TYPE_CHECKING:
+    import gymnasium
+
 METHODS = ("auto", "table", "enumerate", "step")
 
 
 def from_gymnasium(
-    env: Any,
+    env: "str | gymnasium.Env[Any, Any]",
     *,
     method: Literal["auto", "table", "enumerate", "step"] = "auto",
     max_states: int = 100_000,
