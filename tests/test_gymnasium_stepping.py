@@ -100,8 +100,39 @@ def test_replayed_and_copied_environments_go_the_same_way(env):
     check_world(world)
 
 
-def test_stepped_worlds_conform():
-    check_world(from_gymnasium("CartPole-v1", seeds=range(3)))
+@pytest.mark.parametrize("kept", [1, 4096])
+def test_replays_go_on_only_from_their_own_history(kept, monkeypatch):
+    monkeypatch.setattr(gymnasium_stepping, "MOST_KEPT", kept)
+    world = from_gymnasium(environments.Forgetful(), method="step", horizon=10)
+    plans = torch.randint(2, (1, 12, 8), generator=seeded(6))
+    whole = world.rollout(world.reset(1), plans, keep_states=True)
+    seen = world.observe(whole.states[0].flatten(0, 1)).view(12, 8, -1)
+    other = from_gymnasium(environments.Forgetful(), method="step", horizon=10)
+    state = other.reset(12)
+    for t in range(8):  # step by step, the last row's environment is there when the first row's is needed
+        state, reward = other.step(state, plans[0, :, t])
+        assert other.observe(state).equal(seen[:, t])
+        assert reward.equal(whole.rewards[0, :, t])
+
+
+def test_a_plan_takes_as_many_steps_as_it_has_actions(monkeypatch):
+    taken = []
+    step = environments.Corridor.step
+    monkeypatch.setattr(environments.Corridor, "step", lambda env, action: taken.append(action) or step(env, action))
+    left = torch.zeros(1, 1, 8, dtype=torch.long)
+    for env in (environments.Forgetful, environments.Corridor):
+        world = from_gymnasium(env(), method="step", horizon=10)
+        taken.clear()
+        world.rollout(world.reset(1), left)
+        assert len(taken) == 8
+        world.rollout(world.reset(1), left)
+        assert len(taken) == 8
+    # Copies go on from the seven steps that two plans share.
+    world.rollout(world.reset(1), left.index_fill(2, torch.tensor([7]), 1))
+    assert len(taken) == 9
+
+
+def test_a_stepped_minigrid_conforms():
     check_world(from_gymnasium("MiniGrid-DoorKey-5x5-v0", method="step"), num_states=10)
 
 
