@@ -161,15 +161,15 @@ def collected(
     on pieces as long as the plans reaches more, and trains in a fifth of the time.
     """
 
-    def chosen(planner: Planner) -> tuple[Plans, Tensor]:
+    def chosen(planner: Planner, above: float | None) -> Plans:
         state = dry[torch.randint(len(dry), (study.training_plans,), generator=generator)]
-        return _until_water(world, collect(planner, world, state=state, context="step", generator=generator))
+        return collect(planner, world, state=state, context="step", above=above, generator=generator)
 
-    looked, _ = chosen(ExhaustivePlanner(DEPTH, objective="return"))
-    shot, there = chosen(SamplingPlanner(UniformPrior(4), SHOT_LENGTH, SHOTS, objective="return"))
-    if int(there.sum()) < 20:
-        raise ValueError(f"training_plans: {int(there.sum())} plans reached the water; at least 20 are needed")
-    return {"mice": _cut(mice_plans, max(study.lengths)), "planner": looked, "reached": shot[there]}
+    looked = chosen(ExhaustivePlanner(DEPTH, objective="return"), None)
+    shot = chosen(SamplingPlanner(UniformPrior(4), SHOT_LENGTH, SHOTS, objective="return"), 0.0)
+    if len(shot) < 20:
+        raise ValueError(f"training_plans: {len(shot)} plans reached the water; at least 20 are needed")
+    return {"mice": _cut(mice_plans, max(study.lengths)), "planner": looked, "reached": shot}
 
 
 def _cut(plans: Plans, length: int) -> Plans:
@@ -182,15 +182,6 @@ def _cut(plans: Plans, length: int) -> Plans:
 
     group = torch.arange(len(plans)).repeat_interleave(pieces)
     return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group)
-
-
-def _until_water(world: TabularWorld, plans: Plans) -> tuple[Plans, Tensor]:
-    """The plans, each ending with its arrival at the water, and which of them do `[N]`."""
-    assert plans.context is not None
-    arrives = world.next_state[plans.context, plans.actions.long()] == WATER
-    reached = arrives.any(1)
-    lengths = torch.where(reached, arrives.int().argmax(1) + 1, plans.max_length)
-    return replace(plans, lengths=lengths), reached
 
 
 def _count_based(

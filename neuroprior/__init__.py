@@ -1,6 +1,16 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
 
-from neuroprior.planners import Decision, ExhaustivePlanner, Planner, SamplingPlanner, collect, expected_score, oracle
+from neuroprior.planners import (
+    Decision,
+    ExhaustivePlanner,
+    Growth,
+    Planner,
+    SamplingPlanner,
+    collect,
+    expected_score,
+    grow,
+    oracle,
+)
 from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.priors import (
     ContextTreePrior,
@@ -24,9 +34,12 @@ from neuroprior.worlds import (
     TabularWorld,
     World,
     cube,
+    egocentric,
+    four_rooms,
     from_gymnasium,
     gridworld,
     labyrinth,
+    maze,
 )
 
 __version__ = "0.1.0"
@@ -38,6 +51,7 @@ __all__ = [
     "ExhaustivePlanner",
     "GRUPrior",
     "GridWorld",
+    "Growth",
     "MarkovPrior",
     "MixturePrior",
     "Planner",
@@ -54,8 +68,12 @@ __all__ = [
     "World",
     "collect",
     "cube",
+    "egocentric",
+    "expected_score",
+    "four_rooms",
     "from_gymnasium",
     "gridworld",
+    "grow",
     "labyrinth",
     "load",
     "maze",

@@ -256,6 +256,8 @@ def _check_views(world: World, state: Tensor) -> None:
         len(seen) == len(state) and (index or (seen.is_floating_point() and seen.dim() == 2)),
         f"observe must give indices [N] or floating point features [N, C], not {seen.dtype} {list(seen.shape)}",
     )
+    over = world.is_over(state)
+    _require(over.dtype == torch.bool and over.shape == state.shape[:1], f"is_over must be bool [{len(state)}]")
     legal = world.legal(state)
     shape = [len(state), world.num_actions]
     _require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal must be bool {shape}")

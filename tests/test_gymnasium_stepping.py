@@ -45,6 +45,7 @@ def test_rollouts_are_the_environments(name):
             shown = world.observe(rollout.states[b, p])
             assert shown[:taken].tolist() == [pytest.approx(seen.tolist()) for seen in observations[1:]]
             assert rollout.final_state[b, p].equal(rollout.states[b, p, -1])
+    assert world.num_layouts == 2
     assert world.layout(rollout.final_state).tolist() == [[0] * 6, [1] * 6]
 
 

@@ -3,8 +3,19 @@
 from neuroprior.planners.collect import collect
 from neuroprior.planners.exhaustive import ExhaustivePlanner
 from neuroprior.planners.expected import expected_score
+from neuroprior.planners.growth import Growth, grow
 from neuroprior.planners.oracle import oracle
 from neuroprior.planners.planner import Decision, Planner
 from neuroprior.planners.sampling import SamplingPlanner
 
-__all__ = ["Decision", "ExhaustivePlanner", "Planner", "SamplingPlanner", "collect", "expected_score", "oracle"]
+__all__ = [
+    "Decision",
+    "ExhaustivePlanner",
+    "Growth",
+    "Planner",
+    "SamplingPlanner",
+    "collect",
+    "expected_score",
+    "grow",
+    "oracle",
+]

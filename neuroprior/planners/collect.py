@@ -19,6 +19,7 @@ def collect(
     *,
     state: Tensor | None = None,
     context: Literal["plan", "step"] | None = None,
+    above: float | None = None,
     generator: torch.Generator | None = None,
 ) -> Plans:
     """Plan from many starts and keep the plans that were chosen.
@@ -30,13 +31,16 @@ def collect(
         state: or plan from these, `[N, ...]`.
         context: what is recorded beside the plans: "plan": `world.observe` of the start; "step": of the state before
             each action; None: nothing.
+        above: keep only the plans whose score is higher: those that led somewhere, where most do not. None: all.
         generator: draws the starts and whatever the planner draws.
 
     Returns:
-        N plans. In a table with several reward maps, the map is the plan's group.
+        N plans, fewer with `above`, each up to where it was over (`World.is_over`). In a table of several worlds, the
+        world is the plan's group, see `TabularWorld.group`.
 
     Raises:
-        ValueError: neither or both of `num_plans` and `state` are given, or one is out of range.
+        ValueError: neither or both of `num_plans` and `state` are given, one is out of range, or no plan scored more
+            than `above`.
     """
     if (num_plans is None) == (state is None):
         raise ValueError("collect: give either num_plans or state")
@@ -47,7 +51,14 @@ def collect(
         if num_plans < 1:
             raise ValueError(f"num_plans: at least 1 is expected, not {num_plans}")
         state = world.reset(num_plans, generator)
-    plan, _, _, _, lengths = planner.plan(world, state, generator)
+    plan, score, _, _, lengths = planner.plan(world, state, generator)
+    lengths = _executed(world, state, plan, lengths, generator)
+    if above is not None:
+        kept = score > above
+        if not kept.any():
+            most = f"; the best {float(score.max())}" if len(score) else ""
+            raise ValueError(f"above: none of {len(state)} plans scored more than {above}{most}")
+        plan, state, lengths = plan[kept], state[kept], None if lengths is None else lengths[kept]
     seen = None
     if context is not None and sees_each_step(world.observe(state[:1])):
         raise ValueError("observe: indices [N] or floating point features [N, C] are expected of a world")
@@ -57,8 +68,21 @@ def collect(
         seen = torch.stack(list(_observations(world, state, plan, generator)), 1)
     group, names = None, None
     if isinstance(world, TabularWorld):
-        group, names = (world.reward_map(state) if world.num_maps > 1 else None), world.action_names
+        group, names = world.group(state), world.action_names
     return Plans(plan, world.num_actions, lengths, names, seen, group)
+
+
+def _executed(
+    world: World, state: Tensor, plan: Tensor, lengths: Tensor | None, generator: torch.Generator | None
+) -> Tensor | None:
+    """How many actions of each plan are executed `[N]`: none after it is over; None: all."""
+    executed = torch.zeros(len(plan), dtype=torch.long, device=plan.device)
+    for t in range(plan.shape[1]):
+        executed += ~world.is_over(state)
+        state, _ = world.step(state, plan[:, t].long(), generator)
+    if lengths is not None:
+        return torch.minimum(executed, lengths)
+    return executed if bool((executed < plan.shape[1]).any()) else None
 
 
 def _observations(world: World, state: Tensor, plan: Tensor, generator: torch.Generator | None) -> Iterator[Tensor]:

@@ -82,8 +82,7 @@ class SamplingPlanner(Planner):
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
         if world.stochastic:
-            sees = self.prior.takes_context
-            plans = self._along(world, state, generator)[0] if sees else self._blind(len(state), generator)
+            plans = self.proposals(world, state, generator)
             score, ends = mean_scores(self, world, state, plans, self.num_rollouts, generator)
         else:
             plans, rollout = self.candidates(world, state, generator)
@@ -92,6 +91,12 @@ class SamplingPlanner(Planner):
             else:
                 score, ends = self.prefix_scores(rollout.rewards, rollout.states), rollout.states
         return decide(plans, score, ends, self._steps(world), generator)
+
+    def proposals(self, world: World, state: Tensor, generator: torch.Generator) -> Tensor:
+        """Candidate plans `[B, P, L]` for starts `[B, ...]`, before they are scored."""
+        if self.prior.takes_context or not world.all_legal:
+            return self._along(world, state, generator)[0]
+        return self._blind(len(state), generator)
 
     def candidates(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Rollout]:
         """The candidate plans `[B, P, L]` for starts `[B, ...]`, and what came of them."""

@@ -2,7 +2,7 @@
 
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
-from neuroprior.worlds.grid import GridWorld, gridworld
+from neuroprior.worlds.grid import GridWorld, egocentric, gridworld, local_view
 from neuroprior.worlds.gymnasium_stepping import SteppedWorld
 from neuroprior.worlds.gymnasium_worlds import from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
@@ -19,7 +19,11 @@ __all__ = [
     "TabularWorld",
     "World",
     "cube",
+    "egocentric",
+    "four_rooms",
     "from_gymnasium",
     "gridworld",
     "labyrinth",
+    "local_view",
+    "maze",
 ]

@@ -29,13 +29,17 @@ class PocketCube(World):
     the lexicographic number of the cubies in the seven places, the orientation the twists of the first six in base 3.
 
     Attributes:
-        turns, scramble: see `cube`.
+        turns, scramble, absorbing: see `cube`.
         reward_kind: "solved" or "distance".
         action_names: such as ("U", "U2", "U'", ...).
     """
 
     def __init__(
-        self, turns: Literal["half", "quarter"], scramble: int, reward: Literal["solved", "distance"] = "solved"
+        self,
+        turns: Literal["half", "quarter"],
+        scramble: int,
+        reward: Literal["solved", "distance"] = "solved",
+        absorbing: bool = False,
     ) -> None:
         if turns not in ("half", "quarter"):
             raise ValueError(f'cube: turns must be "half" or "quarter", not {turns!r}')
@@ -43,7 +47,7 @@ class PocketCube(World):
             raise ValueError(f'cube: reward must be "solved" or "distance", not {reward!r}')
         if scramble < 0:
             raise ValueError(f"cube: scramble must be a number of moves, at least 0, not {scramble}")
-        self.turns, self.scramble, self.reward_kind = turns, scramble, reward
+        self.turns, self.scramble, self.reward_kind, self.absorbing = turns, scramble, reward, absorbing
         permutations, orientations = _all_permutations(), _all_orientations()
         names, permutation_moves, orientation_moves = [], [], []
         for face, name in enumerate(FACES):
@@ -84,6 +88,11 @@ class PocketCube(World):
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         after = self._after(state, action)
+        if self.absorbing:
+            over = state == 0
+            after = after.masked_fill(over, 0)
+            gained = (after == 0) & ~over if self.reward_kind == "solved" else -self._distances[after]
+            return after, gained.float()
         if self.reward_kind == "solved":
             return after, (after == 0).float()
         return after, -self._distances[after].float()
@@ -127,6 +136,10 @@ class PocketCube(World):
         orientation = state - permutation * _ORIENTATIONS
         return torch.cat([self._permutation_features[permutation], self._orientation_features[orientation]], -1)
 
+    def is_over(self, state: Tensor) -> Tensor:
+        """Where the cube is solved, if that is the end."""
+        return (state == 0) & self.absorbing
+
     def check_state(self, state: Tensor) -> None:
         if not isinstance(state, Tensor) or state.dim() != 1 or state.dtype != torch.int64:
             raise ValueError("state: int64 of shape [B] is expected: numbers of states of the cube")
@@ -138,6 +151,7 @@ def cube(
     *,
     scramble: int = 14,
     reward: Literal["solved", "distance"] = "solved",
+    absorbing: bool = False,
 ) -> PocketCube:
     """The 2 x 2 x 2 cube, solved from scrambled states.
 
@@ -150,11 +164,12 @@ def cube(
         scramble: `reset` makes so many random moves from the solved state.
         reward: "solved": 1 for a move that arrives at the solved state, else 0. "distance": minus the exact number of
             moves that are left after the move.
+        absorbing: the solved state ends it all: every move leads from there to there, without reward.
 
     Raises:
         ValueError: an argument is out of range.
     """
-    return PocketCube(turns, scramble, reward)
+    return PocketCube(turns, scramble, reward, absorbing)
 
 
 def _all_permutations() -> Tensor:

@@ -17,11 +17,14 @@ class EpisodicWorld(TabularWorld):
         starts: floating point `[S]`: the probability that an episode starts there.
         ended: `[S]` bool: where the episode is over: every action stays there, without reward.
         layouts: integers `[S]`: the layout that each state belongs to; None: there is one.
-        features: floating point `[S, C]`: what `observe` returns; None: the number of the state.
+        features: floating point `[S, C]`: what `observe` returns; None: the number of the cell.
 
     Attributes:
         starts, ended, features: the same.
         num_layouts: number of layouts.
+
+    Raises:
+        ValueError: a shape or value is wrong, as `TabularWorld` says, or an action leads away from an end.
     """
 
     def __init__(
@@ -37,6 +40,16 @@ class EpisodicWorld(TabularWorld):
         features: Tensor | None = None,
     ) -> None:
         super().__init__(next_state, reward, None, action_names, probability=probability)
+        for name, table in (("starts", starts), ("ended", ended), ("layouts", layouts), ("features", features)):
+            if table is not None and len(table) != self.num_states:
+                raise ValueError(
+                    f"{name}: one entry for each of {self.num_states} states is expected, not {len(table)}"
+                )
+        if not (starts >= 0).all() or not starts.sum() > 0:
+            raise ValueError("starts: probabilities are expected, not all of them 0")
+        here = ended.nonzero()[:, 0]
+        if not (self.next_state[here].flatten(1) == here[:, None]).all():
+            raise ValueError("ended: every action must stay where an episode has ended")
         self.starts, self.ended, self.features = starts, ended, features
         self._layouts = torch.zeros_like(ended, dtype=torch.long) if layouts is None else layouts.long()
         self.num_layouts = int(self._layouts.max()) + 1
@@ -48,13 +61,18 @@ class EpisodicWorld(TabularWorld):
         return self
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """States `[batch_size]`, drawn as episodes start."""
+        """States `[batch_size]`, drawn as episodes start; uniform over reward maps."""
         generator = generator_on(generator, self.device)
         where = self.starts.nonzero()[:, 0]
         upper = self.starts[where].double().cumsum(0)
         uniform = torch.rand(batch_size, generator=generator, device=self.device, dtype=torch.float64)
         drawn = torch.searchsorted(upper, uniform * upper[-1], right=True)
-        return where[drawn.clamp(max=len(where) - 1)]
+        cell = where[drawn.clamp(max=len(where) - 1)]
+        if self.num_maps == 1:
+            return cell
+        return cell + self.num_states * torch.randint(
+            self.num_maps, (batch_size,), generator=generator, device=self.device
+        )
 
     def layout(self, state: Tensor) -> Tensor:
         """The layout of each state: int64 of the shape of `state`."""

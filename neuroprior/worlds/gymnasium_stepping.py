@@ -40,7 +40,9 @@ class SteppedWorld(World):
 
     Attributes:
         copies: whether copies of the environment go on as it does, and are used; else histories are replayed.
-        seeds, horizon, action_names: what was given, and what the environment calls its actions, or None.
+        seeds, horizon: as given.
+        num_layouts: number of seeds.
+        action_names: what the environment calls its actions, or None.
 
     Raises:
         ValueError: the environment does not repeat itself from a seed; the message says what differed.
@@ -55,7 +57,7 @@ class SteppedWorld(World):
                     f"env: {difference} differs between two courses of the same actions from seed {seed}:"
                     " it cannot be replayed, and no plan be tried in it"
                 )
-        self.seeds, self.horizon = tuple(seeds), horizon
+        self.seeds, self.num_layouts, self.horizon = tuple(seeds), len(seeds), horizon
         self.num_actions, self.action_names = self._episode.num_actions, action_names(env)
         self._copier = exact_copier(self._episode, seeds[0])
         self.copies = self._copier is not None
@@ -102,8 +104,12 @@ class SteppedWorld(World):
         return stacked(seen).to(state.device)[which.to(state.device)]
 
     def layout(self, state: Tensor) -> Tensor:
-        """The number of the seed from which each state `[..., 3 + horizon]` comes, between 0 and len(seeds) - 1."""
+        """The number of the seed from which each state `[..., 3 + horizon]` comes, between 0 and num_layouts - 1."""
         return state[..., _SEED]
+
+    def is_over(self, state: Tensor) -> Tensor:
+        """Where the episode has ended."""
+        return state[:, _ENDED] == 1
 
     def check_state(self, state: Tensor) -> None:
         width = _ACTIONS + self.horizon

@@ -104,6 +104,10 @@ class TabularWorld(World):
         """The reward map of each state, between 0 and W - 1."""
         return state.div(self.num_states, rounding_mode="floor")
 
+    def group(self, state: Tensor) -> Tensor | None:
+        """Which of the worlds in this table each state is in, its reward map; None where there is but one."""
+        return self.reward_map(state) if self.num_maps > 1 else None
+
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`, uniform over cells and reward maps."""
         generator = generator_on(generator, self.device)
@@ -195,6 +199,16 @@ class TabularWorld(World):
         if self.legal_actions is None:
             return super().legal(state)
         return self.legal_actions[self.cell(state)]
+
+    def is_over(self, state: Tensor) -> Tensor:
+        """Where every action stays, without reward."""
+        cell = self.cell(state)
+        stays = self.next_state[cell].flatten(1) == cell[:, None]
+        over = stays.all(1)
+        if over.any():
+            gains = self.mean_reward()[self.reward_map(state), cell]
+            over &= (gains == 0).all(1)
+        return over
 
     def check_state(self, state: Tensor) -> None:
         if state.dim() != 1:

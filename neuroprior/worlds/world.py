@@ -96,6 +96,13 @@ class World(ABC):
         """Which actions exist in `state [N, ...]`: `[N, A]` bool, at least one a row. Default: all."""
         return torch.ones(state.shape[0], self.num_actions, dtype=torch.bool, device=state.device)
 
+    def is_over(self, state: Tensor) -> Tensor:
+        """Where nothing can happen any more in `state [N, ...]`, so that no action is executed: `[N]` bool.
+
+        Default: nowhere.
+        """
+        return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
+
     def check_state(self, state: Tensor) -> None:
         """Raise ValueError where `state` cannot be a batch of this world's states. Default: it must have a batch."""
         if not isinstance(state, Tensor) or state.dim() == 0:

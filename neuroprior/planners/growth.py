@@ -1,0 +1,78 @@
+"""Growing the horizon: plan with a prior, learn from those plans, plan longer, learn again."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, NamedTuple
+
+import torch
+
+from neuroprior.planners.collect import collect
+from neuroprior.planners.sampling import SamplingPlanner
+from neuroprior.plans import Plans
+from neuroprior.priors.prior import Prior
+from neuroprior.worlds.world import World
+
+
+class Growth(NamedTuple):
+    """A round of `grow`.
+
+    Attributes:
+        length: number of actions in the plans that the prior has learned from last.
+        plans: these plans.
+    """
+
+    length: int
+    plans: Plans
+
+
+def grow(
+    prior: Prior,
+    plans: Plans,
+    world: World,
+    lengths: Sequence[int],
+    *,
+    num_starts: int,
+    num_plans: int = 256,
+    objective: Literal["terminal", "return"] = "terminal",
+    discount: float = 1.0,
+    any_prefix: bool = False,
+    above: float | None = None,
+    generator: torch.Generator | None = None,
+    **settings: Any,
+) -> Iterator[Growth]:
+    """Let a prior learn from short plans, plan longer with it, learn from those plans, and so on.
+
+    All plans of a length are soon too many to be tried, so that only short plans can be had by trying them all. A prior
+    that has learned from them proposes longer ones, the best of which are the next to learn from.
+
+    Args:
+        prior: learns in place, by its `fit`, which takes a neural prior on from the weights that it has.
+        plans: what it learns from first, such as an `ExhaustivePlanner` collects. The prior goes on seeing what
+            these plans have as context: what is seen at the start, before each action, or nothing.
+        world: where longer plans are looked for.
+        lengths: numbers of actions of the further rounds, one after another.
+        num_starts: from so many starts plans are looked for in each round.
+        num_plans: candidate plans for each.
+        objective, discount, any_prefix: see `Planner`.
+        above: plans that scored no more than this are not learned from, see `collect`.
+        generator: draws the starts and candidates, and is passed on to a prior's `fit` where there are settings.
+        settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
+
+    Yields:
+        After the first plans, and after each length: what was learned from. The prior is as it is after that round.
+
+    Raises:
+        ValueError: an argument is out of range, or no plan of a round scored more than `above`.
+    """
+    if any(length < 1 for length in lengths):
+        raise ValueError(f"lengths: at least 1 is expected each, not {list(lengths)}")
+    if settings:
+        settings |= {"generator": generator}
+    prior.fit(plans, **settings)
+    yield Growth(plans.max_length, plans)
+    for length in lengths:
+        planner = SamplingPlanner(
+            prior, length, num_plans, objective=objective, discount=discount, any_prefix=any_prefix
+        )
+        plans = collect(planner, world, num_starts, context=prior.context_per, above=above, generator=generator)
+        prior.fit(plans, **settings)
+        yield Growth(length, plans)

@@ -1,0 +1,162 @@
+"""Growing the horizon: what is planned, what is learned from, and that it reaches what short plans do not."""
+
+import pytest
+import torch
+
+from neuroprior import (
+    ExhaustivePlanner,
+    GRUPrior,
+    MarkovPrior,
+    SamplingPlanner,
+    TabularWorld,
+    UniformPrior,
+    collect,
+    grow,
+)
+from neuroprior.testing import check_world
+from neuroprior.worlds import cube, four_rooms, gridworld, labyrinth, maze
+from neuroprior.worlds.labyrinth import WATER
+from tests.sources import refuses, seeded
+
+LENGTH = 40
+
+
+def line(maps: int = 1) -> TabularWorld:
+    """A line of cells and the moves left and right; the further from the middle, the better."""
+    cell = torch.arange(2 * LENGTH + 1)
+    moves = torch.stack([(cell - 1).clamp(min=0), (cell + 1).clamp(max=2 * LENGTH)], 1)
+    return TabularWorld(moves, (cell - LENGTH).abs().float().expand(maps, -1))
+
+
+class FromTheMiddle(TabularWorld):
+    """The line, in which all plans start in the middle."""
+
+    def __init__(self):
+        known = line()
+        super().__init__(known.next_state, known.reward)
+
+    def reset(self, batch_size, generator=None):
+        return torch.full((batch_size,), LENGTH)
+
+
+def test_what_short_plans_teach_reaches_far():
+    """The best three moves are three the same. Who repeats goes straight on for 20 moves, which chance never does."""
+    world, generator = FromTheMiddle(), seeded(0)
+    plans = collect(ExhaustivePlanner(3), world, 200, generator=generator)
+    prior = MarkovPrior(2, 1)
+    rounds = list(grow(prior, plans, world, (6, 12, 20), num_starts=200, num_plans=64, generator=generator))
+    assert [one.length for one in rounds] == [3, 6, 12, 20]
+    assert rounds[0].plans is plans
+    for one in rounds[1:]:
+        assert one.plans.actions.shape == (200, one.length)
+    repeats = rounds[-1].plans.actions
+    assert float((repeats[:, 1:] == repeats[:, :-1]).float().mean()) > 0.99
+    start = torch.full((100,), LENGTH)
+    found = SamplingPlanner(prior, 20, 16).plan(world, start, seeded(1)).score
+    by_chance = SamplingPlanner(UniformPrior(2), 20, 16).plan(world, start, seeded(1)).score
+    assert float(found.mean()) > 19.5
+    assert float(by_chance.max()) < 19
+
+
+def test_the_prior_is_as_it_was_after_each_round():
+    world, generator = FromTheMiddle(), seeded(0)
+    plans, prior = collect(ExhaustivePlanner(3), world, 50, generator=generator), MarkovPrior(2, 1)
+    rounds = grow(prior, plans, world, (6,), num_starts=50, generator=generator)
+    next(rounds)
+    first = MarkovPrior(2, 1).fit(plans)
+    every = torch.cartesian_prod(*[torch.arange(2)] * 4)
+    assert torch.allclose(prior.log_prob(every), first.log_prob(every))
+    grown = next(rounds)
+    assert torch.allclose(prior.log_prob(every), MarkovPrior(2, 1).fit(grown.plans).log_prob(every))
+    assert next(rounds, None) is None
+
+
+@pytest.mark.parametrize("per", [None, "plan", "step"])
+def test_neural_priors_see_what_their_plans_recorded(per):
+    world, generator = gridworld(5, 5, num_worlds=2), seeded(0)
+    plans = collect(ExhaustivePlanner(2), world, 40, context=per, generator=generator)
+    prior = GRUPrior(4, 8, num_contexts=None if per is None else 25)
+    *_, last = grow(
+        prior, plans, world, (4, 6), num_starts=30, num_plans=8, generator=generator, max_steps=3, progress=False
+    )
+    assert prior.context_per == per
+    assert last.plans.actions.shape == (30, 6)
+    shape = None if last.plans.context is None else last.plans.context.shape
+    assert shape == {None: None, "plan": (30,), "step": (30, 6)}[per]
+
+
+def test_same_seed_same_plans():
+    def grown(seed: int) -> torch.Tensor:
+        world, generator = gridworld(6, 6), seeded(seed)
+        plans = collect(ExhaustivePlanner(2), world, 40, generator=generator)
+        how = {"num_starts": 20, "num_plans": 8, "generator": generator, "max_steps": 2, "progress": False}
+        *_, last = grow(GRUPrior(4, 8), plans, world, (4,), **how)
+        return last.plans.actions
+
+    assert torch.equal(grown(3), grown(3))
+    assert not torch.equal(grown(3), grown(4))
+
+
+def test_only_plans_that_led_somewhere():
+    """A goal is seldom in reach of three moves; those that found it end in it."""
+    world = four_rooms(7, 7, reward="goal", num_worlds=4, num_layouts=3)
+    state = world.reset(500, seeded(0))
+    planner = ExhaustivePlanner(3, any_prefix=True)
+    reached = planner.plan(world, state, seeded(1)).score > 0
+    plans = collect(planner, world, state=state, above=0.0, generator=seeded(1))
+    assert 0 < int(reached.sum()) == len(plans) < 500
+    assert plans.group is not None
+    assert torch.equal(plans.group, world.reward_map(state[reached]) * 3 + world.layout(state[reached]))
+    ends = world.rollout(state[reached], plans.actions[:, None], keep_states=True).rewards[:, 0]
+    assert plans.lengths is not None
+    assert bool((ends.gather(1, plans.lengths[:, None] - 1) == 1).all())
+
+
+def test_plans_end_where_it_is_over():
+    """Chosen for their reward at the water or the solved cube, wherever they would have led on from there."""
+    world = labyrinth(absorbing=True)
+    assert world.is_over(torch.arange(127)).nonzero()[:, 0].tolist() == [WATER]
+    assert not labyrinth().is_over(torch.arange(127)).any()
+    plans = collect(ExhaustivePlanner(6, objective="return"), world, 400, context="step", above=0.0)
+    assert plans.context is not None
+    after = world.next_state[plans.context, plans.actions.long()]
+    lengths = plans.mask().sum(1)
+    assert bool((after.gather(1, lengths[:, None] - 1) == WATER).all())
+    assert not bool((plans.mask() & (plans.context == WATER)).any())
+    assert 1 <= int(lengths.min()) < int(lengths.max()) == 6
+
+
+def test_the_solved_cube_may_be_the_end():
+    world, free = cube(absorbing=True), cube()
+    state = torch.arange(2000).repeat_interleave(9)
+    action = torch.arange(9).repeat(2000)
+    after, reward = world.step(state, action)
+    want, gained = free.step(state, action)
+    assert torch.equal(world.is_over(state), state == 0)
+    assert not free.is_over(state).any()
+    assert torch.equal(after, torch.where(state == 0, 0, want))
+    assert torch.equal(reward, torch.where(state == 0, 0.0, gained))
+    check_world(world)
+
+
+def test_each_layout_and_reward_map_is_a_group():
+    world = maze(5, 5, num_layouts=3, num_worlds=2)
+    state = world.reset(300, seeded(0))
+    plans = collect(ExhaustivePlanner(2), world, state=state)
+    assert plans.group is not None
+    assert torch.equal(plans.group, world.reward_map(state) * 3 + world.layout(state))
+    assert plans.group.unique().tolist() == [*range(6)]
+    assert maze(5, 5).group(torch.arange(4)) is None
+    assert four_rooms(num_worlds=2).group(torch.tensor([4, 13 * 13])).tolist() == [0, 1]
+
+
+def test_bad_input():
+    world, plans = FromTheMiddle(), collect(ExhaustivePlanner(2), FromTheMiddle(), 10)
+    with refuses("lengths: at least 1"):
+        next(grow(MarkovPrior(2, 1), plans, world, (0,), num_starts=5))
+    with refuses("none of 10 plans scored more than 99"):
+        collect(ExhaustivePlanner(2), world, 10, above=99)
+    with refuses("none of 0 plans"):
+        collect(ExhaustivePlanner(2), world, state=torch.zeros(0, dtype=torch.long), above=0.0)
+    with refuses("num_plans"):
+        list(grow(MarkovPrior(2, 1), plans, world, (4,), num_starts=5, num_plans=0))
