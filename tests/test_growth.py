@@ -14,7 +14,7 @@ from neuroprior import (
     grow,
 )
 from neuroprior.testing import check_world
-from neuroprior.worlds import cube, four_rooms, gridworld, labyrinth, maze
+from neuroprior.worlds import EpisodicWorld, cube, four_rooms, gridworld, labyrinth, maze
 from neuroprior.worlds.labyrinth import WATER
 from tests.sources import refuses, seeded
 
@@ -147,6 +147,11 @@ def test_each_layout_and_reward_map_is_a_group():
     assert torch.equal(plans.group, world.reward_map(state) * 3 + world.layout(state))
     assert plans.group.unique().tolist() == [*range(6)]
     assert maze(5, 5).group(torch.arange(4)) is None
+    made = [torch.tensor([[1], [1], [3], [3]]), torch.tensor([0.0, 1, 0, 1]), ["on"], torch.ones(4)]
+    ends = torch.tensor([False, True, False, True])
+    episodes = EpisodicWorld(*made, ends, layouts=torch.tensor([0, 0, 1, 1]))
+    assert episodes.group(torch.arange(4)).tolist() == [0, 0, 1, 1]
+    assert EpisodicWorld(*made, ends).group(torch.arange(4)) is None
     assert four_rooms(num_worlds=2).group(torch.tensor([4, 13 * 13])).tolist() == [0, 1]
 
 

@@ -200,7 +200,7 @@ def test_planners_and_priors_in_mazes():
     assert plans.context.shape == (60, 6, 24)
     assert torch.equal(plans.context[:, 0], local_view(world)(state))
     assert plans.action_names == ("left", "right", "forward")
-    assert torch.equal(plans.group, world.reward_map(state))
+    assert torch.equal(plans.group, world.reward_map(state) * 5 + world.layout(state))
 
 
 def test_an_open_grid_is_as_it_was():
