@@ -105,12 +105,16 @@ class FigureBox:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page with a line in its contents: paragraphs, then figures, then tables."""
+    """A part of a page with a line in its contents: paragraphs, then figures, then tables.
+
+    Where `beside` is set, figures stand beside one another as far as there is room: small ones, up to 3 inches wide.
+    """
 
     title: str
     text: Sequence[str] = ()
     tables: Sequence[Table] = ()
     figures: Sequence[FigureBox] = ()
+    beside: bool = False
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,212 @@
+"""What a comparison found: in words, as differences between priors, and what seeing and growth add."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from eval import compare_figures as figures
+from eval.compare_figures import Estimate, Style, key_of, styles
+from eval.compare_pairs import BEST, points, question_of, shown_plans
+from eval.compare_rows import Cells, Rows
+from eval.page import FigureBox, Section, Table, svg
+
+INTERVALS = "Intervals: 95 %, over seeds, each with worlds and priors of its own."
+
+PLAIN = ("nothing", False)
+"""The question that is answered first: of priors that see nothing and have not grown."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All that the page is made of: cells, and the rows that `compare_rows` and its like make of them.
+
+    Attributes:
+        cells: one a world and seed.
+        num_plans: numbers of candidate plans that were asked for.
+        rows, curves: shares of the oracle with these numbers, and with all there are.
+        paired, words, efficiency, bits, growth: see the functions that make them.
+        style: of priors in figures, by name.
+    """
+
+    cells: Cells
+    num_plans: Sequence[int]
+    rows: Rows
+    curves: Rows
+    paired: Rows
+    words: Rows
+    efficiency: Rows
+    bits: Rows
+    growth: Rows
+
+    @property
+    def style(self) -> dict[str, Style]:
+        return styles(row["prior"] for row in [*self.rows, *self.growth] if row["prior"])
+
+    @property
+    def worlds(self) -> list[str]:
+        return list(dict.fromkeys(cell["world"] for cell in self.cells))
+
+    def strong(self, rows: Rows) -> list[str]:
+        """The priors of rows of one world to be drawn with a band: all but the chains that are not the best."""
+        number = shown_plans(self.num_plans)
+        asked = [row for row in rows if row["num_plans"] == number] or rows
+        share = {row["prior"]: row["oracle_share"] for row in asked}
+        chains = [row["prior"] for row in asked if key_of(row).kind == "markov"]
+        best = max(chains, key=share.__getitem__, default=None)
+        return [prior for prior in share if prior == best or prior not in chains]
+
+
+def lead(comparison: Comparison) -> str:
+    """The findings in a few sentences."""
+    main = [row for row in comparison.words if question_of(row) == PLAIN] or comparison.words
+    number = shown_plans(comparison.num_plans)
+    said = []
+    best = [row for row in main if row["what"] == BEST]
+    if best:
+        better = {side: sum(row["better"] == row[side] for row in best) for side in ("first", "second")}
+        rest = len(best) - sum(better.values())
+        worlds = f"{len(best)} worlds" if len(best) > 1 else "the one world"
+        said.append(
+            f"With {number:,} candidate plans, in {better['first']} of {worlds} the best neural prior is better than"
+            f" the best Markov chain, in {better['second']} the chain is better, and in {rest} they cannot be told"
+            " apart."
+        )
+    factors: dict[str, list[float]] = {}
+    for row in comparison.efficiency:
+        if (row["sees"], row["rounds"] > 0) == PLAIN and row["prior"] != "uniform":
+            factors.setdefault(row["world"], []).append(row["factor"] or 0.0)
+    if factors:
+        most = max(row["most"] for row in comparison.efficiency)
+        middle = [float(np.median(own)) for own in factors.values()]
+        ends = dict.fromkeys(times(end) for end in (min(middle), max(middle)))
+        said.append(
+            f"For what random search finds with {most:,} candidates, the middle one of the priors of each world needs"
+            f" {' to '.join(ends)} times fewer."
+        )
+    seeds = {cell["seed"] for cell in comparison.cells}
+    said.append(f"{len(seeds)} seeds." if len(seeds) > 1 else "One seed: nothing is told of chance.")
+    return " ".join(said)
+
+
+def times(factor: float) -> str:
+    """How many times, in two digits where it is less than ten."""
+    return "less than 1" if factor <= 0 else f"{factor:,.0f}" if factor >= 10 else f"{factor:.2g}"
+
+
+def words_section(comparison: Comparison) -> Section:
+    """What is said of each world."""
+    text = [*told(comparison, PLAIN)]
+    if not text:
+        text = ["There are no priors to be compared."]
+    text.append(
+        "The best prior of each kind is chosen on half of the seeds and compared on the other half, both ways, so that"
+        " the choice does not favour it. p: paired t-test over seeds, corrected for the number of worlds (Holm). A"
+        " number of plans in the middle was fixed for these words beforehand; other numbers are in the tables."
+    )
+    return Section("In plain words", text, _gap_tables(comparison), _gap_boxes(comparison, PLAIN))
+
+
+def told(comparison: Comparison, question: tuple[str, bool]) -> Iterator[str]:
+    """The words of all worlds on a question."""
+    yield from (row["words"] for row in comparison.words if question_of(row) == question)
+
+
+def _gap_boxes(comparison: Comparison, question: tuple[str, bool]) -> list[FigureBox]:
+    rows = [row for row in comparison.words if question_of(row) == question and row["what"] == BEST]
+    if not rows:
+        return []
+    number = shown_plans(comparison.num_plans)
+    caption = f"Best neural minus best Markov prior with {number:,} plans, points of the oracle."
+    alt = "; ".join(f"{row['world']} {points(row['difference'], True)}" for row in rows)
+    drawn = svg(figures.gap_figure(rows, ("Markov better", "neural better")))
+    return [FigureBox(drawn, f"{caption} Hollow: may be chance. {INTERVALS}", alt)]
+
+
+def _gap_tables(comparison: Comparison) -> list[Table]:
+    rows = [row for row in comparison.paired if row["what"] == BEST and row["sees"] == "nothing"]
+    return gain_tables(rows, comparison.num_plans, "Best neural minus best Markov prior")
+
+
+def gain_tables(rows: Rows, num_plans: Sequence[int], what: str) -> list[Table]:
+    """Differences by number of plans, a row a world and pair."""
+    cells: dict[tuple[str, str], dict[int, str]] = {}
+    for row in rows:
+        grown = "" if row["rounds"] == "0" or "-" in row["rounds"] else ", grown"
+        sees = "" if row["sees"] == "nothing" else f", sees {row['sees']}"
+        # Which ones are the best may differ with the number of plans.
+        pair = "neural - Markov" if row["what"] == BEST else f"{row['first']} - {row['second']}"
+        pair = row["first"] if row["first"] == row["second"] else pair
+        star = "*" if row["p_holm"] is not None and row["p_holm"] < 0.05 else " "
+        half = "" if row["low"] is None else f" ±{100 * (row['high'] - row['low']) / 2:.1f}{star}"
+        own = cells.setdefault((row["world"], pair + sees + grown), {})
+        own[row["num_plans"]] = f"{100 * row['difference']:+.1f}{half}"
+    if not cells:
+        return []
+    numbers = sorted(num_plans)
+    table = [[*place, *(own.get(number, "") for number in numbers)] for place, own in cells.items()]
+    caption = f"{what}: points of the oracle, by candidate plans. *: p < 0.05, corrected for all pairs of the world."
+    return [
+        Table(
+            ("world", "priors", *(f"{number:,}" for number in numbers)),
+            table,
+            f"{caption} {INTERVALS}",
+            "ll" + "r" * len(numbers),
+        )
+    ]
+
+
+def seeing_section(comparison: Comparison) -> Section | None:
+    """What priors gain by seeing."""
+    return _gain_section(comparison, "seeing minus not", "What seeing adds", lambda asked: asked[0] != "nothing")
+
+
+def grown_gain_section(comparison: Comparison) -> Section | None:
+    """What priors gain by growth."""
+    return _gain_section(comparison, "grown minus not", "What growing the horizon adds", lambda asked: asked[1])
+
+
+def _gain_section(
+    comparison: Comparison, what: str, title: str, asked: Callable[[tuple[str, bool]], bool]
+) -> Section | None:
+    rows = [row for row in comparison.paired if row["what"] == what]
+    if not rows:
+        return None
+    text, boxes = [], []
+    for question in dict.fromkeys(question_of(row) for row in comparison.words):
+        # Told once: of what has both seen and grown, where seeing is.
+        if asked(question) and (question[0] == "nothing" or what.startswith("seeing")):
+            text += [_asked(question), *told(comparison, question)]
+            boxes += _gap_boxes(comparison, question)
+    boxes = [*_gain_boxes(comparison, rows), *boxes]
+    return Section(title, text, gain_tables(rows, comparison.num_plans, what.capitalize()), boxes)
+
+
+def _gain_boxes(comparison: Comparison, rows: Rows) -> Iterator[FigureBox]:
+    """A figure for each way to see and to have grown."""
+    number = shown_plans(comparison.num_plans)
+    shown: dict[tuple[str, bool], dict[str, dict[str, Estimate]]] = {}
+    for row in rows:
+        if row["num_plans"] == number:
+            low, high = (None if row[end] is None else 100 * row[end] for end in ("low", "high"))
+            estimates = shown.setdefault((row["sees"], row["rounds"] != "0"), {}).setdefault(row["world"], {})
+            estimates[row["first"]] = (100 * row["difference"], low, high)
+    for (sees, grown), estimates in shown.items():
+        how = f"{rows[0]['what']} (sees: {sees}{', grown' * grown})".capitalize()
+        drawn = svg(figures.dots_figure(estimates, comparison.style, "points of the oracle"))
+        yield FigureBox(drawn, f"{how}: points of the oracle with {number:,} plans. {INTERVALS}", how)
+
+
+def _asked(question: tuple[str, bool]) -> str:
+    sees = {"nothing": "", "start": " that see where they start", "each step": " that see where they are at each step"}
+    return f"Of priors{sees[question[0]]}{' after growth' * question[1]}:"
+
+
+def pairs_section(comparison: Comparison) -> Section | None:
+    """Each neural with each Markov prior, and saved priors with others, with the number of plans of the words."""
+    kinds = ("neural minus Markov", "saved minus other")
+    number = shown_plans(comparison.num_plans)
+    rows = [r for r in comparison.paired if r["what"] in kinds and r["num_plans"] == number and r["rounds"] == "0"]
+    tables = gain_tables([row for row in rows if row["sees"] == "nothing"], [number], "Prior minus prior")
+    text = ["More pairs and numbers of plans are in paired.csv."]
+    return Section("Each prior against each other", text, tables) if tables else None

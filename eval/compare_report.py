@@ -1,0 +1,132 @@
+"""The report of a comparison: tables in the terminal, CSV files, `results.json`, and one HTML page."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from eval import compare_findings as findings
+from eval import compare_sections as sections
+from eval.compare_efficiency import efficiency
+from eval.compare_findings import PLAIN, Comparison
+from eval.compare_pairs import paired, words
+from eval.compare_rows import Cells, Rows, bits_rows, growth_rows, rows
+from eval.page import Page, Section, write_page
+from eval.plan_report import printed
+from neuroprior.output import versions, write_csv, write_json
+
+Settings = Mapping[str, Any]
+
+
+def compared(cells: Cells, num_plans: Sequence[int]) -> Comparison:
+    """All rows of a comparison.
+
+    Raises:
+        ValueError: there are no cells, or they lack one of the numbers of plans.
+    """
+    if not cells:
+        raise ValueError("cells: at least one is expected; without any there is nothing to compare")
+    every = sorted({number for cell in cells for number in cell["budgets"]})
+    return Comparison(
+        cells,
+        sorted(num_plans),
+        rows(cells, sorted(num_plans)),
+        rows(cells, every),
+        paired(cells, sorted(num_plans)),
+        words(cells, num_plans),
+        efficiency(cells),
+        bits_rows(cells),
+        growth_rows(cells),
+    )
+
+
+def write_report(
+    cells: Cells, num_plans: Sequence[int], settings: Settings, command: str, folder: Path, console: Console
+) -> None:
+    """Print the tables, and write `report.html`, `results.json` and a CSV file for each kind of row.
+
+    The same cells and settings give the same files.
+
+    Args:
+        cells: of all worlds and seeds, in any order within a world.
+        num_plans: numbers of candidate plans that were asked for.
+        settings: how the cells were made, by name.
+        command: the command line.
+        folder: where to write.
+        console: where to print.
+
+    Raises:
+        ValueError: there are no cells, or they do not belong together.
+    """
+    comparison = compared(cells, num_plans)
+    made = [
+        findings.words_section(comparison),
+        sections.share_section(comparison),
+        sections.efficiency_section(comparison),
+        findings.seeing_section(comparison),
+        findings.grown_gain_section(comparison),
+        sections.grown_section(comparison),
+        sections.growth_section(comparison.growth),
+        sections.bits_section(comparison),
+        sections.plans_section(comparison),
+        sections.transition_section(comparison),
+        sections.worlds_section(comparison),
+        sections.tables_section(comparison),
+        findings.pairs_section(comparison),
+    ]
+    parts = [section for section in made if section is not None]
+    _print(comparison, parts, console)
+    names = ("rows", "paired", "efficiency", "bits", "words", "growth")
+    title = f"Priors compared in {', '.join(comparison.worlds)}"
+    if len(comparison.worlds) > 3:
+        title = f"Priors compared in {len(comparison.worlds)} worlds"
+    page = Page(title, findings.lead(comparison), command, _told(settings), parts)
+    _write(folder, page, {name: getattr(comparison, name) for name in names}, settings)
+    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def write_growth_report(cells: Cells, settings: Settings, command: str, folder: Path, console: Console) -> None:
+    """The same of curves of growth alone: see `write_report`.
+
+    Raises:
+        ValueError: the cells have no growth.
+    """
+    growth = growth_rows(cells)
+    curves, tables = sections.growth_section(growth), sections.growth_tables(growth)
+    if curves is None:
+        raise ValueError("cells: at least one with rounds of growth is expected")
+    for table in tables:
+        console.print(printed(table.caption.split(":")[0], table))
+    parts = [curves, Section("Tables", (), tables)]
+    worlds = ", ".join(dict.fromkeys(str(cell["world"]) for cell in cells))
+    page = Page(f"Growth of the horizon in {worlds}", sections.growth_lead(growth), command, _told(settings), parts)
+    _write(folder, page, {"growth": growth}, settings)
+    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _print(comparison: Comparison, parts: Sequence[Section], console: Console) -> None:
+    """The tables that fit a terminal, and then the words, which are read first there."""
+    for world, tables in sections.share_tables(comparison).items():
+        for table in tables:
+            console.print(printed(world, table))
+    wanted = ("Search efficiency", "What seeing adds", "What growing the horizon adds", "Bits per action")
+    for section in parts:
+        if section.title.startswith((*wanted, "In plain words")):
+            for table in section.tables:
+                console.print(printed(section.title, table))
+    for line in [*findings.told(comparison, PLAIN), findings.lead(comparison)]:
+        console.print(line, highlight=False, markup=False)
+
+
+def _told(settings: Settings) -> dict[str, Any]:
+    return {**settings} | {f"version: {name}": number for name, number in versions().items()}
+
+
+def _write(folder: Path, page: Page, files: Mapping[str, Rows], settings: Settings) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, some in files.items():
+        if some:
+            write_csv(folder / f"{name}.csv", some)
+    write_json(folder / "results.json", {**files, "settings": {**settings}, "versions": versions()})
+    write_page(folder / "report.html", page)
