@@ -18,7 +18,7 @@ from eval.page import INK, clean
 SMALL = (3.0, 3.0)
 """Size of a figure beside others, inches."""
 
-PHONE = 5.0
+PHONE = 4.5
 """Width of a figure that a phone shows whole, inches."""
 
 LETTERS = 8
@@ -93,7 +93,8 @@ def growth_figure(rows: Sequence[Mapping[str, Any]], strong: Sequence[str], styl
         points = [(row["round"], row["oracle_share"], row["low"], row["high"]) for row in own]
         _curve(axes, points, prior, style[prior], prior in strong)
     axes.set_xticks(sorted(lengths), [f"{one}\n{lengths[one]}" for one in sorted(lengths)])
-    _finish(axes, "round, and actions in a plan", "share of the oracle, %", rows[0]["world"])
+    seeing = "" if rows[0]["sees"] == "nothing" else f", sees {rows[0]['sees']}"
+    _finish(axes, "round, and actions in a plan", "share of the oracle, %", rows[0]["world"] + seeing)
     return figure
 
 
@@ -195,7 +196,7 @@ def dots_figure(
     axes.tick_params(axis="x", labelsize=LETTERS + 1)
     axes.set_xlabel(label)
     marks = [_mark(prior, *style[prior]) for prior in priors]
-    figure.legend(handles=marks, loc="outside upper left", ncols=4, fontsize=9, handletextpad=0.3, columnspacing=1.0)
+    figure.legend(handles=marks, loc="outside upper left", ncols=4, fontsize=9, handletextpad=0.2, columnspacing=0.8)
     return figure
 
 

@@ -1,7 +1,8 @@
 """What a comparison found: in words, as differences between priors, and what seeing and growth add."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from eval.compare_rows import Cells, Rows
 from eval.page import FigureBox, Section, Table, svg
 
 INTERVALS = "Intervals: 95 %, over seeds, each with worlds and priors of its own."
+
+STARRED = "*: p < 0.05, corrected for all pairs of the world (Holm)."
 
 PLAIN = ("nothing", False)
 """The question that is answered first: of priors that see nothing and have not grown."""
@@ -65,12 +68,13 @@ def lead(comparison: Comparison) -> str:
     best = [row for row in main if row["what"] == BEST]
     if best:
         better = {side: sum(row["better"] == row[side] for row in best) for side in ("first", "second")}
+        count = {side: str(number or "none") for side, number in better.items()}
         rest = len(best) - sum(better.values())
         worlds = f"{len(best)} worlds" if len(best) > 1 else "the one world"
         said.append(
-            f"With {number:,} candidate plans, in {better['first']} of {worlds} the best neural prior is better than"
-            f" the best Markov chain, in {better['second']} the chain is better, and in {rest} they cannot be told"
-            " apart."
+            f"With {number:,} candidate plans, in {count['first']} of {worlds} the best neural prior is better than"
+            f" the best Markov chain, in {count['second']} the chain is better, and in {rest or 'none'} they cannot be"
+            " told apart."
         )
     factors: dict[str, list[float]] = {}
     for row in comparison.efficiency:
@@ -117,43 +121,45 @@ def _gap_boxes(comparison: Comparison, question: tuple[str, bool]) -> list[Figur
     if not rows:
         return []
     number = shown_plans(comparison.num_plans)
-    caption = f"Best neural minus best Markov prior with {number:,} plans, points of the oracle."
+    caption = f"Best neural minus best Markov, of {_priors(question)}: points of the oracle with {number:,} plans."
     alt = "; ".join(f"{row['world']} {points(row['difference'], True)}" for row in rows)
     drawn = svg(figures.gap_figure(rows, ("Markov better", "neural better")))
     return [FigureBox(drawn, f"{caption} Hollow: may be chance. {INTERVALS}", alt)]
 
 
 def _gap_tables(comparison: Comparison) -> list[Table]:
-    rows = [row for row in comparison.paired if row["what"] == BEST and row["sees"] == "nothing"]
-    return gain_tables(rows, comparison.num_plans, "Best neural minus best Markov prior")
+    numbers, cells = comparison.num_plans, {}
+    for row in comparison.paired:
+        if (row["what"], row["sees"], row["rounds"]) == (BEST, "nothing", "0"):
+            # A long name may be broken where its words end.
+            cells.setdefault(row["world"].replace("_", "_\N{ZERO WIDTH SPACE}"), {})[row["num_plans"]] = _gap(row)
+    rows = [[world, *(own.get(number, "") for number in numbers)] for world, own in cells.items()]
+    caption = f"Best neural minus best Markov prior: points of the oracle, by candidate plans. {STARRED} {INTERVALS}"
+    return [Table(("world", *(f"{number:,}" for number in numbers)), rows, caption)] if rows else []
 
 
-def gain_tables(rows: Rows, num_plans: Sequence[int], what: str) -> list[Table]:
-    """Differences by number of plans, a row a world and pair."""
-    cells: dict[tuple[str, str], dict[int, str]] = {}
-    for row in rows:
-        grown = "" if row["rounds"] == "0" or "-" in row["rounds"] else ", grown"
-        sees = "" if row["sees"] == "nothing" else f", sees {row['sees']}"
-        # Which ones are the best may differ with the number of plans.
-        pair = "neural - Markov" if row["what"] == BEST else f"{row['first']} - {row['second']}"
-        pair = row["first"] if row["first"] == row["second"] else pair
-        star = "*" if row["p_holm"] is not None and row["p_holm"] < 0.05 else " "
-        half = "" if row["low"] is None else f" ±{100 * (row['high'] - row['low']) / 2:.1f}{star}"
-        own = cells.setdefault((row["world"], pair + sees + grown), {})
-        own[row["num_plans"]] = f"{100 * row['difference']:+.1f}{half}"
-    if not cells:
-        return []
-    numbers = sorted(num_plans)
-    table = [[*place, *(own.get(number, "") for number in numbers)] for place, own in cells.items()]
-    caption = f"{what}: points of the oracle, by candidate plans. *: p < 0.05, corrected for all pairs of the world."
-    return [
-        Table(
-            ("world", "priors", *(f"{number:,}" for number in numbers)),
-            table,
-            f"{caption} {INTERVALS}",
-            "ll" + "r" * len(numbers),
-        )
-    ]
+def _gap(row: Mapping[str, Any]) -> str:
+    star = "*" if row["p_holm"] is not None and row["p_holm"] < 0.05 else " "
+    half = "" if row["low"] is None else f" ±{100 * (row['high'] - row['low']) / 2:.1f}{star}"
+    return f"{100 * row['difference']:+.1f}{half}"
+
+
+def pair_table(comparison: Comparison, world: str) -> Iterator[Table]:
+    """All differences of a world by number of plans."""
+    numbers = comparison.num_plans
+    cells: dict[str, dict[int, str]] = {}
+    for row in comparison.paired:
+        if row["world"] == world:
+            sees = "" if row["sees"] == "nothing" else f", sees {row['sees']}"
+            grown = "" if row["rounds"] == "0" else f", rounds {row['rounds']}" if "-" in row["rounds"] else ", grown"
+            pair = row["first"] if row["first"] == row["second"] else f"{row['first']} - {row['second']}"
+            # Which ones are the best may differ with the number of plans.
+            pair = "best neural - best Markov" if row["what"] == BEST else pair
+            cells.setdefault(pair + sees + grown, {})[row["num_plans"]] = _gap(row)
+    if cells:
+        rows = [[pair, *(own.get(number, "") for number in numbers)] for pair, own in cells.items()]
+        caption = f"{world}: differences between priors, points of the oracle, by candidate plans, paired. {STARRED}"
+        yield Table(("first - second", *(f"{number:,}" for number in numbers)), rows, caption)
 
 
 def seeing_section(comparison: Comparison) -> Section | None:
@@ -176,10 +182,10 @@ def _gain_section(
     for question in dict.fromkeys(question_of(row) for row in comparison.words):
         # Told once: of what has both seen and grown, where seeing is.
         if asked(question) and (question[0] == "nothing" or what.startswith("seeing")):
-            text += [_asked(question), *told(comparison, question)]
+            text += [f"Of {_priors(question)}:", *told(comparison, question)]
             boxes += _gap_boxes(comparison, question)
     boxes = [*_gain_boxes(comparison, rows), *boxes]
-    return Section(title, text, gain_tables(rows, comparison.num_plans, what.capitalize()), boxes)
+    return Section(title, text, (), boxes)
 
 
 def _gain_boxes(comparison: Comparison, rows: Rows) -> Iterator[FigureBox]:
@@ -197,16 +203,6 @@ def _gain_boxes(comparison: Comparison, rows: Rows) -> Iterator[FigureBox]:
         yield FigureBox(drawn, f"{how}: points of the oracle with {number:,} plans. {INTERVALS}", how)
 
 
-def _asked(question: tuple[str, bool]) -> str:
-    sees = {"nothing": "", "start": " that see where they start", "each step": " that see where they are at each step"}
-    return f"Of priors{sees[question[0]]}{' after growth' * question[1]}:"
-
-
-def pairs_section(comparison: Comparison) -> Section | None:
-    """Each neural with each Markov prior, and saved priors with others, with the number of plans of the words."""
-    kinds = ("neural minus Markov", "saved minus other")
-    number = shown_plans(comparison.num_plans)
-    rows = [r for r in comparison.paired if r["what"] in kinds and r["num_plans"] == number and r["rounds"] == "0"]
-    tables = gain_tables([row for row in rows if row["sees"] == "nothing"], [number], "Prior minus prior")
-    text = ["More pairs and numbers of plans are in paired.csv."]
-    return Section("Each prior against each other", text, tables) if tables else None
+def _priors(question: tuple[str, bool]) -> str:
+    sees = {"nothing": "", "start": " that see the start", "each step": " that see each step"}[question[0]]
+    return f"priors{sees}" + (", after growth" if sees else " after growth") * question[1]

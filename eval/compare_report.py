@@ -73,7 +73,6 @@ def write_report(
         sections.transition_section(comparison),
         sections.worlds_section(comparison),
         sections.tables_section(comparison),
-        findings.pairs_section(comparison),
     ]
     parts = [section for section in made if section is not None]
     _print(comparison, parts, console)
@@ -106,15 +105,12 @@ def write_growth_report(cells: Cells, settings: Settings, command: str, folder: 
 
 
 def _print(comparison: Comparison, parts: Sequence[Section], console: Console) -> None:
-    """The tables that fit a terminal, and then the words, which are read first there."""
-    for world, tables in sections.share_tables(comparison).items():
+    """The tables of each world and those of the words; below them the words, which are read first there."""
+    for world, tables in sections.world_tables(comparison).items():
         for table in tables:
             console.print(printed(world, table))
-    wanted = ("Search efficiency", "What seeing adds", "What growing the horizon adds", "Bits per action")
-    for section in parts:
-        if section.title.startswith((*wanted, "In plain words")):
-            for table in section.tables:
-                console.print(printed(section.title, table))
+    for table in parts[0].tables:
+        console.print(printed(parts[0].title, table))
     for line in [*findings.told(comparison, PLAIN), findings.lead(comparison)]:
         console.print(line, highlight=False, markup=False)
 

@@ -45,7 +45,7 @@ class Key(NamedTuple):
     @property
     def label(self) -> str:
         """Its name in tables and figures."""
-        seeing = {"nothing": "", "start": ", sees the start", "each step": ", sees each step"}[self.sees]
+        seeing = "" if self.sees == "nothing" else f", sees {self.sees}"
         return (self.prior or self.planner) + seeing + (", grown" if self.rounds else "")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from eval import compare_figures as figures
 from eval.compare_figures import Estimate, key_of, styles
-from eval.compare_findings import INTERVALS, Comparison, times
+from eval.compare_findings import Comparison, pair_table, times
 from eval.compare_pairs import shown_plans
 from eval.compare_rows import Rows
 from eval.matrix_figures import transition_figure
@@ -20,10 +20,10 @@ def worlds_section(comparison: Comparison) -> Section:
     rows = []
     for world in comparison.worlds:
         own = [cell for cell in comparison.cells if cell["world"] == world]
-        rows.append([world, str(own[0]["length"]), f"{own[0]['num_starts']:,}", str(len(own)), own[0]["about"]])
-    table = Table(
-        ("world", "actions", "starts", "seeds", "about"), rows, "actions: in a plan; starts: of each seed.", "lrrrl"
-    )
+        numbers = (str(own[0]["length"]), f"{own[0]['num_starts']:,}", str(len(own)))
+        rows.append([world.replace("_", "_\N{ZERO WIDTH SPACE}"), *numbers])
+    caption = "actions: in a plan; starts: of each seed. What the worlds are stands below the first figures."
+    table = Table(("world", "actions", "starts", "seeds"), rows, caption)
     text = [
         "Plans are learned from in training worlds and looked for in held-out ones. The share of the oracle is what a"
         " planner scores of what the best of all plans would, from the same starts; 0 is a plan of random moves where"
@@ -45,7 +45,7 @@ def grown_section(comparison: Comparison) -> Section | None:
 
 
 def _share_section(comparison: Comparison, grown: bool, title: str) -> Section:
-    boxes = []
+    boxes, about = [], {cell["world"]: cell["about"] for cell in comparison.cells}
     for world in comparison.worlds:
         rows = [row for row in comparison.curves if row["world"] == world and row["sees"] == "nothing"]
         rows = [row for row in rows if bool(row["rounds"]) == grown or row["prior"] in (None, "uniform")]
@@ -54,7 +54,7 @@ def _share_section(comparison: Comparison, grown: bool, title: str) -> Section:
         drawn = svg(figures.share_figure(rows, comparison.strong(rows), comparison.style))
         last = [row for row in rows if row["num_plans"] == shown_plans(comparison.num_plans)]
         alt = f"{world}: " + ", ".join(f"{row['prior']} {100 * row['oracle_share']:.0f} %" for row in last)
-        boxes.append(FigureBox(drawn, "", alt))
+        boxes.append(FigureBox(drawn, "" if grown else f"{world}: {about[world]}.", alt))
     text = [
         "Bands: 95 % bootstrap intervals over seeds. Thin lines: the other Markov chains. Dotted: the planner that"
         " tries all short plans, at a cost of its own."
@@ -80,17 +80,22 @@ def efficiency_section(comparison: Comparison) -> Section | None:
         drawn = svg(figures.dots_figure(estimates, comparison.style, "candidate plans needed", most))
         caption = "Plans needed for what random search finds with the most; arrow: more than that. Medians over seeds."
         boxes = [FigureBox(drawn, caption, "plans needed by each prior in each world")]
-    cells = [
-        [row["world"], key_of(row).label, _needed(row), _times(row), f"{row['reached']} of {row['seeds']}"]
-        for row in comparison.efficiency
-    ]
+    text = [f"How many plans from a prior find as much as {most:,} random ones. The numbers are in the tables below."]
+    return Section("Search efficiency", text, (), boxes)
+
+
+def _efficiency_table(comparison: Comparison, world: str) -> Iterator[Table]:
+    rows = [row for row in comparison.efficiency if row["world"] == world]
+    if not any(row["prior"] != "uniform" for row in rows):
+        return
+    most = f"{rows[0]['most']:,}"
+    cells = [[key_of(r).label, _needed(r), _times(r), f"{r['reached']} of {r['seeds']}"] for r in rows]
     caption = (
-        "Medians over seeds with 95 % intervals (sign test). times fewer: than random search needs, which is less than"
-        f" {most:,} where it gains nothing by more. got there: seeds in which the prior did with {most:,} plans."
+        f"{world}: plans needed for what {most} random ones find; medians over seeds with 95 % intervals (sign test)."
+        " times fewer: than random search needs, which is less where it gains nothing by more. got there: seeds in"
+        f" which the prior did with {most} plans."
     )
-    headings = ("world", "prior", "plans needed", "times fewer", "got there")
-    text = [f"How many plans from a prior find as much as {most:,} random ones."]
-    return Section("Search efficiency", text, [Table(headings, cells, caption, "llrrr")], boxes)
+    yield Table(("prior", "plans needed", "times fewer", "got there"), cells, caption)
 
 
 def _needed(row: Mapping[str, Any]) -> str:
@@ -124,9 +129,8 @@ def growth_section(growth: Rows) -> Section | None:
         chains = [prior for prior in ends if "markov" in prior]
         strong = [prior for prior in ends if prior not in chains or prior == max(chains, key=ends.__getitem__)]
         drawn = svg(figures.growth_figure(rows, strong, style))
-        seeing = "" if sees == "nothing" else f"Priors that see {sees if sees != 'start' else 'the start'}."
         alt = f"{world}: " + ", ".join(f"{prior} {100 * share:.0f} %" for prior, share in ends.items())
-        boxes.append(FigureBox(drawn, seeing, alt))
+        boxes.append(FigureBox(drawn, "", alt))
     number = ", ".join(f"{one:,}" for one in sorted({row["num_plans"] for row in growth}))
     text = [
         "A prior learns from all short plans that were tried, plans longer, learns from those plans, and so on. Below"
@@ -147,14 +151,20 @@ def bits_section(comparison: Comparison) -> Section | None:
         if own:
             alt = f"{world}: " + ", ".join(f"{key_of(r).label} {r['bits_per_action']:.3f}" for r in own)
             boxes.append(FigureBox(svg(figures.bits_figure(own, comparison.style)), "", alt))
-    cells = [[row["world"], key_of(row).label, _plus_minus(row, "bits_per_action", 1, 3), _more(row)] for row in rows]
-    caption = f"more: bits more than the best Markov chain that sees as much takes, paired. {INTERVALS}"
     text = [
         "What the held-out plans of the planner that tries all short ones cost under each prior: the fewer bits, the"
-        " more of their structure it holds. Hollow: sees nothing; filled, below: sees the start, or each step."
+        " more of their structure it holds. Hollow: sees nothing; filled, below: sees the start, or each step. The"
+        " numbers are in the tables below."
     ]
-    table = Table(("world", "prior", "bits per action", "more"), cells, caption, "llrr")
-    return Section("Bits per action of held-out plans", text, [table], boxes, beside=True)
+    return Section("Bits per action of held-out plans", text, (), boxes, beside=True)
+
+
+def _bits_table(comparison: Comparison, world: str) -> Iterator[Table]:
+    rows = [row for row in comparison.bits if row["world"] == world and not row["rounds"]]
+    if rows:
+        cells = [[key_of(row).label, _plus_minus(row, "bits_per_action", 1, 3), _more(row)] for row in rows]
+        caption = f"{world}: bits per held-out action; more: than the best Markov chain that sees as much, paired."
+        yield Table(("prior", "bits per action", "more"), cells, caption)
 
 
 def _more(row: Mapping[str, Any]) -> str:
@@ -199,7 +209,7 @@ def transition_section(comparison: Comparison) -> Section | None:
                 seen = (sums > 0).sum(0)
                 mean = np.divide(matrices.sum(0), seen, out=np.full(matrices.shape[1:], np.nan), where=seen > 0)
                 names = own[0]["action_names"] or [str(action) for action in range(len(mean))]
-                drawn = svg(transition_figure(mean, names, f"{world}: {prior}"))
+                drawn = svg(transition_figure(mean, names, f"{world}: {prior}", small=True))
                 boxes.append(FigureBox(drawn, "", f"transition matrix of {prior} in {world}"))
     if not boxes:
         return None
@@ -207,32 +217,41 @@ def transition_section(comparison: Comparison) -> Section | None:
     return Section("What follows what", text, (), boxes, beside=True)
 
 
-def share_tables(comparison: Comparison) -> dict[str, list[Table]]:
-    """Of each world: shares of the oracle, and shares of starts at the oracle with times."""
-    return {world: [*_share_tables(comparison, world)] for world in comparison.worlds}
+def world_tables(comparison: Comparison) -> dict[str, list[Table]]:
+    """Of each world: shares of the oracle and their differences, plans needed, bits, starts at the oracle and times."""
+    made = (_share_table, pair_table, _efficiency_table, _bits_table, _oracle_table)
+    return {world: [table for make in made for table in make(comparison, world)] for world in comparison.worlds}
 
 
-def _share_tables(comparison: Comparison, world: str) -> Iterator[Table]:
-    rows = [row for row in comparison.rows if row["world"] == world]
-    numbers = sorted(comparison.num_plans)
-    by_key: dict[str, dict[int, dict[str, Any]]] = {}
+def _share_table(comparison: Comparison, world: str) -> Iterator[Table]:
     caption = f"{world}: share of the oracle, %, by candidate plans. ±: the longer side of the 95 % interval."
-    for row in rows:
-        if row["num_plans"] is None:
+    for row in comparison.rows:
+        if row["world"] == world and row["num_plans"] is None:
             share = _plus_minus(row, "oracle_share", 100, 1)
             caption += f" {row['planner'].capitalize()}, {row['model_steps']:,} model steps: {share}."
-        else:
-            by_key.setdefault(key_of(row).label, {})[row["num_plans"]] = row
-    headings = tuple(f"{number:,}" for number in numbers)
-    shares = [[name, *(_plus_minus(own[n], "oracle_share", 100, 1) for n in numbers)] for name, own in by_key.items()]
-    yield Table(("prior", *headings), shares, caption)
-    shown = shown_plans(numbers)
+    own = _by_prior(comparison, world)
     cells = [
-        [name, *(f"{100 * own[n]['at_oracle']:.1f}" for n in numbers), _milliseconds(own[shown])]
-        for name, own in by_key.items()
+        [name, *(_plus_minus(some[n], "oracle_share", 100, 1) for n in sorted(some))] for name, some in own.items()
+    ]
+    yield Table(("prior", *(f"{number:,}" for number in comparison.num_plans)), cells, caption)
+
+
+def _oracle_table(comparison: Comparison, world: str) -> Iterator[Table]:
+    shown = shown_plans(comparison.num_plans)
+    cells = [
+        [name, *(f"{100 * own[n]['at_oracle']:.1f}" for n in sorted(own)), _milliseconds(own[shown])]
+        for name, own in _by_prior(comparison, world).items()
     ]
     caption = f"{world}: starts at the oracle, %, by candidate plans; ms: for a decision with {shown:,} plans."
-    yield Table(("prior", *headings, "ms"), cells, caption)
+    yield Table(("prior", *(f"{number:,}" for number in comparison.num_plans), "ms"), cells, caption)
+
+
+def _by_prior(comparison: Comparison, world: str) -> dict[str, dict[int, dict[str, Any]]]:
+    found: dict[str, dict[int, dict[str, Any]]] = {}
+    for row in comparison.rows:
+        if row["world"] == world and row["num_plans"] is not None:
+            found.setdefault(key_of(row).label, {})[row["num_plans"]] = row
+    return found
 
 
 def _milliseconds(row: Mapping[str, Any]) -> str:
@@ -240,9 +259,9 @@ def _milliseconds(row: Mapping[str, Any]) -> str:
 
 
 def tables_section(comparison: Comparison) -> Section:
-    """All shares, world by world."""
-    tables = [table for own in share_tables(comparison).values() for table in own]
-    return Section("Share of the oracle, world by world", (), tables)
+    """All numbers, world by world."""
+    tables = [table for own in world_tables(comparison).values() for table in own]
+    return Section("Tables, world by world", (), tables)
 
 
 def growth_tables(growth: Rows) -> list[Table]:

@@ -51,25 +51,27 @@ GAMMA = 0.7
 
 
 @drawn
-def transition_figure(matrix: ArrayLike, names: Sequence[str], title: str = "") -> Figure:
+def transition_figure(matrix: ArrayLike, names: Sequence[str], title: str = "", small: bool = False) -> Figure:
     """A transition matrix as a heat map; actions that nothing was seen to follow (NaN) are hatched.
 
     Args:
         matrix: `[A, A]`, probabilities, from row to column.
         names: A of them.
         title: above the matrix.
+        small: to stand beside others, 3 inches wide and without a scale.
     """
     probs = np.asarray(matrix, dtype=np.float64)
     numbered = len(probs) <= NUMBERED
     side = 1.6 + (0.62 * len(probs) if numbered else min(max(0.125 * len(probs), 4.4), 7.4))
-    figure, (axes,) = panels(1, 1, (side + 0.9, side))
+    figure, (axes,) = panels(1, 1, (3.0, 3.0) if small else (side + 0.9, side))
     top = 1.0 if numbered else float(np.nanmax(probs, initial=0)) or 1.0
     _cells(axes, probs / top, PLAIN)
     for a, b in np.argwhere(np.isfinite(probs)) if numbered else []:
-        axes.text(b, a, f"{probs[a, b]:.2f}", ha="center", va="center", fontsize=9)
-    _named(axes, names, 10 if len(probs) <= 20 else 7.5)
+        axes.text(b, a, f"{probs[a, b]:.2f}", ha="center", va="center", fontsize=7.5 if small else 9)
+    _named(axes, names, 7.5 if small or len(probs) > 20 else 10)
     axes.set(xlabel="next action", ylabel="last action", title=clean(title))
-    _scale(axes, 0, top, PLAIN, "probability")
+    if not small:
+        _scale(axes, 0, top, PLAIN, "probability")
     return figure
 
 
