@@ -102,12 +102,12 @@ def _curve(
     axes: Axes, points: Sequence[tuple[float, float, Number, Number]], name: str, style: Style, strong: bool
 ) -> None:
     color, line = style
-    percent = [(at, *(None if value is None else 100 * value for value in some)) for at, *some in points]
     if strong:
-        band(axes, percent, color, short(name, 20), line)  # type: ignore[arg-type]
+        percent = [(at, *_percent(*estimate)) for at, *estimate in points]
+        band(axes, percent, color, short(name, 20), line)
         axes.lines[-1].set(markersize=3, linewidth=1.6)
     else:
-        axes.plot([at for at, *_ in percent], [one[1] for one in percent], line, color=color, lw=0.8, alpha=0.6)
+        axes.plot([one[0] for one in points], [100 * one[1] for one in points], line, color=color, lw=0.8, alpha=0.6)
 
 
 def _finish(axes: Axes, across: str, up: str, title: str) -> None:
@@ -118,8 +118,8 @@ def _finish(axes: Axes, across: str, up: str, title: str) -> None:
     axes.set(xlabel=across, ylabel=up, title=clean(title))
     axes.grid(axis="y")
     axes.tick_params(labelsize=LETTERS)
-    axes.xaxis.label.set_size(LETTERS + 1)
-    axes.yaxis.label.set_size(LETTERS + 1)
+    axes.xaxis.label.set_fontsize(LETTERS + 1)
+    axes.yaxis.label.set_fontsize(LETTERS + 1)
     handles = axes.get_legend_handles_labels()[0]
     if handles:
         how: dict[str, Any] = {"handlelength": 1.4, "columnspacing": 1.0, "handletextpad": 0.4}
@@ -152,8 +152,9 @@ def gap_figure(rows: Sequence[Mapping[str, Any]], better: tuple[str, str]) -> Fi
     return figure
 
 
-def _percent(*values: Number) -> list[Number]:
-    return [None if value is None else 100 * value for value in values]
+def _percent(*values: Number) -> Estimate:
+    mean, low, high = (None if value is None else 100 * value for value in values)
+    return mean, low, high
 
 
 @drawn
@@ -183,14 +184,14 @@ def dots_figure(
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         axes.minorticks_off()
     axes.axvline(most or 0, color=INK, lw=0.8, ls=":" if most else "-")
-    for at, own in enumerate(reversed(estimates.values())):
+    for at, own in enumerate(reversed(list(estimates.values()))):
         for place, prior in enumerate(priors):
             if prior in own:
                 shift = 0.7 * ((len(priors) - 1) / 2 - place) / len(priors)
                 dot(axes, at + shift, own[prior], style[prior][0], style[prior][1] != "-", limits)
     for between in range(len(estimates) - 1):
         axes.axhline(between + 0.5, color=INK, lw=0.5, alpha=0.25)
-    names_down(axes, [short(world) for world in reversed(estimates)])
+    names_down(axes, [short(world) for world in reversed(list(estimates))])
     axes.grid(visible=False, axis="y")
     axes.grid(axis="x")
     axes.tick_params(axis="x", labelsize=LETTERS + 1)
@@ -227,7 +228,7 @@ def bits_figure(rows: Sequence[Mapping[str, Any]], style: Mapping[str, Style]) -
     names_down(axes, [short(prior, 16) for prior in reversed(priors)])
     axes.tick_params(labelsize=LETTERS)
     axes.set(xlabel="bits per action", title=clean(rows[0]["world"]))
-    axes.xaxis.label.set_size(LETTERS + 1)
+    axes.xaxis.label.set_fontsize(LETTERS + 1)
     return figure
 
 

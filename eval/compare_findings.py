@@ -128,7 +128,8 @@ def _gap_boxes(comparison: Comparison, question: tuple[str, bool]) -> list[Figur
 
 
 def _gap_tables(comparison: Comparison) -> list[Table]:
-    numbers, cells = comparison.num_plans, {}
+    numbers = comparison.num_plans
+    cells: dict[str, dict[int, str]] = {}
     for row in comparison.paired:
         if (row["what"], row["sees"], row["rounds"]) == (BEST, "nothing", "0"):
             # A long name may be broken where its words end.
@@ -197,9 +198,9 @@ def _gain_boxes(comparison: Comparison, rows: Rows) -> Iterator[FigureBox]:
             low, high = (None if row[end] is None else 100 * row[end] for end in ("low", "high"))
             estimates = shown.setdefault((row["sees"], row["rounds"] != "0"), {}).setdefault(row["world"], {})
             estimates[row["first"]] = (100 * row["difference"], low, high)
-    for (sees, grown), estimates in shown.items():
+    for (sees, grown), by_world in shown.items():
         how = f"{rows[0]['what']} (sees: {sees}{', grown' * grown})".capitalize()
-        drawn = svg(figures.dots_figure(estimates, comparison.style, "points of the oracle"))
+        drawn = svg(figures.dots_figure(by_world, comparison.style, "points of the oracle"))
         yield FigureBox(drawn, f"{how}: points of the oracle with {number:,} plans. {INTERVALS}", how)
 
 

@@ -133,19 +133,19 @@ def words(cells: Cells, num_plans: Sequence[int]) -> Rows:
     for world, results in by_world(cells).items():
         keys = results.priors("neural", "markov", "saved")
         for like in dict.fromkeys(key[2:] for key in keys):
-            gaps = (difference(results, pair, number) for pair in _headlines(results, like))
+            told = ((pair, difference(results, pair, number)) for pair in _headlines(results, like))
             # The first pair that can be compared.
-            gap = next((gap for gap in gaps if gap is not None), None)
-            if gap is not None:
-                found.append({"world": world} | gap | {"sees": like[0], "rounds": like[1]})
-    for question in {question_of(row) for row in found}:
-        asked = [row for row in found if question_of(row) == question]
-        _correct(asked, "p_holm")
-        for row in asked:
-            told = row["p_holm"] is not None and row["p_holm"] < 0.05
-            row["better"] = (row["first"] if row["difference"] > 0 else row["second"]) if told else None
-            row["words"] = f"{row['world']}: {_sentence(row, len(asked))}"
-    return found
+            pair, gap = next(((pair, gap) for pair, gap in told if gap is not None), (None, None))
+            if pair is not None and gap is not None:
+                found.append((pair, {"world": world} | gap | {"sees": like[0], "rounds": like[1]}))
+    for question in {question_of(row) for _, row in found}:
+        asked = [(pair, row) for pair, row in found if question_of(row) == question]
+        _correct([row for _, row in asked], "p_holm")
+        for pair, row in asked:
+            clear = row["p_holm"] is not None and row["p_holm"] < 0.05
+            row["better"] = (row["first"] if row["difference"] > 0 else row["second"]) if clear else None
+            row["words"] = f"{row['world']}: {_sentence(pair, row, len(asked))}"
+    return [row for _, row in found]
 
 
 def question_of(row: Mapping[str, Any]) -> tuple[str, bool]:
@@ -167,8 +167,8 @@ def _headlines(results: Results, like: tuple[str, int]) -> Iterator[Pair]:
         yield Pair("learned minus random", keys[:1], [UNIFORM])
 
 
-def _sentence(row: Mapping[str, Any], worlds: int) -> str:
-    first, second = (_named(row, side) for side in ("first", "second"))
+def _sentence(pair: Pair, row: Mapping[str, Any], worlds: int) -> str:
+    first, second = _named(pair.first, row["first"]), _named(pair.second, row["second"])
     plans = f"with {row['num_plans']:,} plans" if row["num_plans"] > 1 else "with a single plan"
     if row["p_value"] is None:
         gap = f"{first} minus {second}: {points(row['difference'], True)} points of the oracle {plans}"
@@ -188,13 +188,13 @@ def _sentence(row: Mapping[str, Any], worlds: int) -> str:
     )
 
 
-def _named(row: Mapping[str, Any], side: str) -> str:
-    name = row[side]
-    if row["what"] == BEST:
-        return f"the best {'neural prior' if side == 'first' else 'Markov chain'} ({name.replace(' / ', ' or ')})"
-    if name == "uniform":
-        return "random search"
-    return f"the best learned prior ({name.replace(' / ', ' or ')})" if "best" in row["what"] else str(name)
+def _named(keys: Sequence[Key], name: str) -> str:
+    """One prior, or the best of several with the names of what was chosen."""
+    if len(keys) == 1:
+        return "random search" if keys[0] == UNIFORM else name
+    kinds = {key.kind for key in keys}
+    what = {"neural": "neural prior", "markov": "Markov chain"}.get(kinds.pop() if len(kinds) == 1 else "", "prior")
+    return f"the best {what} ({name.replace(' / ', ' or ')})"
 
 
 def points(share: float, signed: bool = False) -> str:

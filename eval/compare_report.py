@@ -27,6 +27,8 @@ def compared(cells: Cells, num_plans: Sequence[int]) -> Comparison:
     """
     if not cells:
         raise ValueError("cells: at least one is expected; without any there is nothing to compare")
+    worlds = list(dict.fromkeys(cell["world"] for cell in cells))
+    cells = sorted(cells, key=lambda cell: (worlds.index(cell["world"]), int(cell["seed"])))
     every = sorted({number for cell in cells for number in cell["budgets"]})
     return Comparison(
         cells,
@@ -49,7 +51,7 @@ def write_report(
     The same cells and settings give the same files.
 
     Args:
-        cells: of all worlds and seeds, in any order within a world.
+        cells: of all worlds and seeds; worlds are reported in the order in which they come first.
         num_plans: numbers of candidate plans that were asked for.
         settings: how the cells were made, by name.
         command: the command line.

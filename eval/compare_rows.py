@@ -192,7 +192,8 @@ def chosen(values: Array) -> NDArray[np.int64]:
     (cross-fitting: Chernozhukov et al. 2018, definition 3.1). G is at least 2.
     """
     best = np.array([values[:, half].mean(1).argmax() for half in halves(values.shape[1])])
-    return best[halves(values.shape[1])[0].astype(int)]
+    mine: NDArray[np.int64] = best[halves(values.shape[1])[0].astype(int)]
+    return mine
 
 
 def bits_rows(cells: Cells) -> Rows:

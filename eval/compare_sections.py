@@ -191,7 +191,12 @@ def plans_section(comparison: Comparison) -> Section | None:
             boxes.append(FigureBox(drawn, caption, f"plans in {cell['world']}"))
     if not boxes:
         return None
-    return Section("Plans drawn in the worlds", ["Candidate plans of some priors from one start."], (), boxes)
+    return Section(
+        "Plans drawn in the worlds",
+        ["Candidate plans of some priors from one start, after growth where they grew."],
+        (),
+        boxes,
+    )
 
 
 def transition_section(comparison: Comparison) -> Section | None:
@@ -213,7 +218,9 @@ def transition_section(comparison: Comparison) -> Section | None:
                 boxes.append(FigureBox(drawn, "", f"transition matrix of {prior} in {world}"))
     if not boxes:
         return None
-    text = ["How often each action follows each in plans that are sampled from a prior: means over seeds."]
+    text = [
+        "How often each action follows each in plans sampled from a prior, after growth where it grew: means over seeds."
+    ]
     return Section("What follows what", text, (), boxes, beside=True)
 
 
