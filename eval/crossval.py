@@ -2,16 +2,10 @@
 
 import hashlib
 import json
-import multiprocessing
 import os
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +14,7 @@ import torch
 from torch import Tensor
 
 from eval import fits
+from eval.processes import do_each
 from neuroprior import __version__
 from neuroprior.comparison import units
 from neuroprior.output import write_json, written_whole
@@ -185,26 +180,7 @@ def run(study: Study, todo: list[Job], processes: int, done: Callable[[Job], Non
     for job in todo:
         if job not in missing:
             done(job)
-    if processes == 1 or len(missing) < 2:
-        for job in missing:
-            do(study, job)
-            done(job)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(missing)), context, _in_process) as pool:
-        try:
-            with _no_interrupt():
-                running = {pool.submit(do, study, job): job for job in missing}
-            for future in as_completed(running):
-                future.result()
-                done(running[future])
-        except BrokenProcessPool as error:
-            raise MemoryError("a process was killed, probably for want of memory; try --processes 1") from error
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+    do_each(partial(do, study), missing, processes, done)
 
 
 def do(study: Study, job: Job) -> None:
@@ -219,28 +195,6 @@ def do(study: Study, job: Job) -> None:
         found = fits.outcomes(job.kind, learned, scored, mask[index], unit, study.design, job.fold)
     with written_whole(study.folder / job.name, "wb") as file:
         np.savez_compressed(file, **fits.packed(found))
-
-
-@contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Ctrl-C is held back, and never reaches processes that are started here: the main one ends them."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _in_process() -> None:
-    # Where the main process is killed, nobody else would end this one.
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 @lru_cache(maxsize=2)

@@ -9,13 +9,13 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from eval import crossval, held_out, saved_priors
 from eval.crossval import ACTIONS, CONTEXT, Design, Study
 from eval.fits import KINDS
 from eval.held_out import Model
 from eval.plan_report import Report, write_report
+from eval.processes import progress_bar
 from eval.saved_priors import numbers
 from neuroprior import load
 from neuroprior.comparison import Score, unit_name
@@ -208,8 +208,7 @@ def _of_fitted(
     if (counted := int(study.mask().sum())) < FEWEST_UNITS:
         raise ValueError(f"skip: {counted} actions are left to score after the first {design.skip} of each plan")
     todo = crossval.jobs(design, [kind for kind in KINDS if kind in kinds], seen)
-    bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*bar, TimeRemainingColumn(), transient=True) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("fitting models", total=len(todo))
         try:
             crossval.run(study, todo, processes or os.cpu_count() or 1, lambda job: progress.advance(task))
