@@ -17,6 +17,10 @@ def _run(arguments: Sequence[str]) -> None:
     from jsonargparse import ArgumentError, ArgumentParser
 
     from eval.bench import bench
+    from eval.compare import LISTS as COMPARE_LISTS
+    from eval.compare import compare
+    from eval.grow import LISTS as GROW_LISTS
+    from eval.grow import grow
     from eval.mice import LISTS as MICE_LISTS
     from eval.mice import mice
     from eval.paper import paper
@@ -28,9 +32,11 @@ def _run(arguments: Sequence[str]) -> None:
     parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False)
     commands = parser.add_subcommands()
     by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality, "mice": mice}
+    by_name |= {"compare": compare, "grow": grow}
     # Lists are given as words, `--priors a b`, which functions cannot say.
     numbers = {key: {"type": int, "default": [*some], "help": what} for key, (some, what) in MICE_LISTS.items()}
     lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
+    lists |= {"compare": COMPARE_LISTS, "grow": GROW_LISTS}
     for name, command in by_name.items():
         sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False)
         own = lists.get(name, {})

@@ -1,0 +1,128 @@
+"""`python -m eval compare`: do neural priors help a planner more than Markov chains, in many worlds at equal budget?"""
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from eval import compare_cell
+from eval.compare_cell import Settings
+from eval.compare_jobs import Study, cells_of, run_cells
+from eval.compare_report import write_report
+from eval.suite import TASKS
+from eval.world_priors import load_for
+
+KINDS = ("markov", "gru", "transformer")
+SEES = ("nothing", "start", "each step")
+MOST_PLANS = 2**20
+LISTS: dict[str, dict[str, Any]] = {
+    "worlds": {"default": list(TASKS), "choices": tuple(TASKS), "help": "worlds to compare priors in"},
+    "num_plans": {"type": int, "default": [16, 64, 256, 1024, 4096], "help": "candidate plans, powers of two"},
+    "priors": {"help": "model folders to compare, such as `python -m train` writes; nothing is fitted without --kinds"},
+    "kinds": {"choices": KINDS, "help": "kinds of priors that are fitted; all of them by default"},
+    "sees": {"default": ["nothing"], "choices": SEES, "help": "what priors see: nothing but the plan so far, or more"},
+}
+"""Options that take several words."""
+
+
+def compare(
+    worlds: list[str] = list(TASKS),  # noqa: B006
+    seeds: int = 20,
+    num_plans: Sequence[int] = (16, 64, 256, 1024, 4096),
+    priors: list[str] | None = None,
+    kinds: list[str] | None = None,
+    sees: list[str] = ["nothing"],  # noqa: B006
+    rounds: int = 3,
+    steps: int = 300,
+    starts: int = 32,
+    training_starts: int = 1000,
+    seed: int = 0,
+    processes: int | None = None,
+    out: str = "runs/compare",
+) -> None:
+    """Do neural priors help a planner more than Markov chains, in many worlds at equal budget?
+
+    In each world, for each seed: a planner without a prior plans in training worlds, priors learn from its plans, and
+    planners draw candidate plans from each prior in held-out worlds. Prints tables; writes them (CSV), results.json and
+    report.html to a folder. Interrupted, the same command goes on; `torchrun -m eval compare` shares the work out.
+
+    Args:
+        worlds: to compare priors in.
+        seeds: repeats in each world, each with training and held-out worlds and priors of its own; intervals are over
+            them.
+        num_plans: numbers of candidate plans, powers of two.
+        priors: model folders to compare, such as `python -m train` writes.
+        kinds: of priors that are fitted: markov, gru, transformer; all by default, but none where there are saved ones.
+        sees: what priors see: nothing but the plan so far, the start as well, or each step.
+        rounds: of horizon growth: a prior learns from plans that were found with it, each time longer ones; 0: none.
+        steps: of training of each neural prior, at most.
+        starts: held-out starts to plan from.
+        training_starts: from so many starts plans are collected to learn from.
+        seed: of everything random.
+        processes: how many cells, a world and a seed each, are done at a time; all cores by default, and a single one
+            in each process that torchrun started.
+        out: folder for the report, and for finished cells, from which an interrupted run goes on.
+    """
+    saved = tuple(priors or ())
+    if kinds is None:
+        kinds = [] if saved else list(KINDS)
+    if not kinds and not saved:
+        raise ValueError("kinds: at least one kind of prior, or --priors, is expected")
+    settings = Settings(
+        tuple(num_plans), tuple(kinds), tuple(sees), rounds, steps, starts, training_starts, seed, saved
+    )
+    check(worlds, seeds, processes, settings)
+    check_saved(saved, worlds)
+    folder = Path(out)
+    study = Study.prepare(folder, settings, compare_cell.run_cell)
+    cells = run_cells(study, cells_of(worlds, seeds), processes)
+    if cells is not None:
+        told = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
+        write_report(cells, told, folder, Console(), command("compare"))
+
+
+def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Settings) -> None:
+    """Raise ValueError, naming the option, where one is out of range, not known or given twice."""
+    words = {"worlds": (worlds, TASKS), "kinds": (settings.kinds, KINDS), "sees": (settings.sees, SEES)}
+    for name, (given, known) in words.items():
+        if unknown := [word for word in given if word not in known]:
+            raise ValueError(f"{name}: {unknown[0]!r} is not known; there are {', '.join(known)}")
+    lists = {"worlds": worlds, "num_plans": settings.num_plans, "sees": settings.sees}
+    for name, some in lists.items():
+        if not some:
+            raise ValueError(f"{name}: at least one is expected")
+    for name, some in (
+        lists | {"kinds": settings.kinds, "priors": settings.priors, "lengths": settings.lengths}
+    ).items():
+        if len(set(some)) < len(some):
+            raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, some))}")
+    for number in settings.num_plans:
+        if not 1 <= number <= MOST_PLANS or number & (number - 1):
+            raise ValueError(f"num_plans: powers of two from 1 to {MOST_PLANS:,} are expected, not {number}")
+    least = {"rounds": 0, "steps": 1, "starts": 1, "training_starts": 2}
+    numbers = {name: getattr(settings, name) for name in least} | {"seeds": seeds}
+    if processes is not None:
+        numbers["processes"] = processes
+    for name, number in numbers.items():
+        if number < least.get(name, 1):
+            raise ValueError(f"{name}: at least {least.get(name, 1)} is expected, not {number}")
+    if not 0 <= settings.seed < 2**50:
+        raise ValueError(f"seed: an integer from 0 to 2**50 - 1 is expected, not {settings.seed}")
+
+
+def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
+    """Raise ValueError unless saved priors know the actions of all worlds; before hours of work, not after them."""
+    for folder in folders:
+        for world in worlds:
+            task = TASKS[world]
+            load_for(folder, world, task.num_actions, task.action_names)
+
+
+def command(name: str) -> str:
+    """The command line that this program was started with, or that of its defaults."""
+    given = sys.argv[1:] if sys.argv[1:2] == [name] else [name]
+    return "python -m eval " + shlex.join(given)
