@@ -3,6 +3,8 @@
 import hashlib
 import json
 import os
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -20,7 +22,6 @@ from eval.suite import TASKS, Task
 from neuroprior import __version__
 from neuroprior.output import write_json, write_whole
 from neuroprior.threads import one_thread
-from neuroprior.training import quiet
 
 if TYPE_CHECKING:
     from lightning import Fabric
@@ -155,6 +156,9 @@ def launched() -> Iterator["Fabric | None"]:
     from lightning.fabric.plugins.environments import TorchElasticEnvironment
     from lightning.fabric.strategies import DDPStrategy
 
+    from neuroprior.training import quiet
+
+    threading.Thread(target=_end_without, args=(os.getppid(),), daemon=True).start()
     count, here = (int(os.environ[name]) for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
     strategy = DDPStrategy(
         cluster_environment=TorchElasticEnvironment(), process_group_backend="gloo", timeout=LONGEST_WAIT
@@ -164,6 +168,13 @@ def launched() -> Iterator["Fabric | None"]:
         fabric.launch()
     yield fabric
     torch.distributed.destroy_process_group()
+
+
+def _end_without(parent: int) -> None:
+    """End this process when torchrun, in whose session it is not, was killed: else it went on for hours by itself."""
+    while os.getppid() == parent:
+        time.sleep(0.2)
+    os._exit(1)
 
 
 def _do(study: Study, cells: Sequence[Cell], processes: int, fabric: "Fabric | None" = None) -> None:

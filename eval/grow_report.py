@@ -63,7 +63,7 @@ def _gained(row: Mapping[str, Any]) -> str:
 
 def _over(rows: Rows) -> str:
     seeds = max(row["seeds"] for row in rows)
-    return f"95 % bootstrap intervals over {seeds} seeds" if seeds > 1 else "one seed, no intervals"
+    return f"95 % bootstrap intervals over {seeds} seeds" if seeds > 1 else "intervals, which one seed does not have"
 
 
 @drawn
