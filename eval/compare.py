@@ -82,7 +82,7 @@ def compare(
     cells = run_cells(study, cells_of(worlds, seeds), processes)
     if cells is not None:
         told = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-        write_report(cells, told, folder, Console(), command("compare"))
+        write_report(cells, num_plans, settings=told, command=command("compare"), folder=folder, console=Console())
 
 
 def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Settings) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,7 +10,7 @@ from matplotlib.ticker import PercentFormatter
 from rich.console import Console
 
 from eval.compare_rows import estimated, growth_rows
-from eval.drawing import WIDTH, band, drawn, legend, lines, panels, whole_numbers
+from eval.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels, short
 from eval.page import FigureBox, Page, Section, Table, svg, write_page
 from eval.plan_report import printed
 from neuroprior.output import versions, write_csv, write_json
@@ -43,13 +43,15 @@ def gain_rows(cells: Rows) -> list[dict[str, Any]]:
     ]
 
 
-def words(rows: Rows, gains: Rows, world: str) -> str:
-    """A line of plain words: what growth gave each prior. No prior is picked out, which would favour the lucky ones."""
-    own = [row for row in rows if row["world"] == world]
-    longest = max(row["length"] for row in own)
-    said = f"{world}, {own[0]['num_plans']:,} plans of {longest} actions: in points of the oracle, growth "
-    told = [_gained(row) for row in gains if row["world"] == world]
-    return said + ("was not tried" if not told else ", ".join(told)) + f" ({_over(own)})."
+def words(rows: Rows, gains: Rows) -> str:
+    """A line of plain words on one world: what growth gave each prior.
+
+    No prior is picked out, which would favour the lucky ones.
+    """
+    longest = max(row["length"] for row in rows)
+    told = ", ".join(_gained(row) for row in gains) or "what growth gives is not told by plans of one length"
+    said = f"in points of the oracle, growth {told} ({_over(rows)})" if gains else told
+    return f"{rows[0]['world']}, {rows[0]['num_plans']:,} plans of {longest} actions: {said}."
 
 
 def _gained(row: Mapping[str, Any]) -> str:
@@ -66,48 +68,74 @@ def _over(rows: Rows) -> str:
     return f"95 % bootstrap intervals over {seeds} seeds" if seeds > 1 else "intervals, which one seed does not have"
 
 
+class View(NamedTuple):
+    """A curve a prior: what is told of it, what goes across, what goes there by place, and the rows."""
+
+    told: str
+    across: str
+    places: dict[int, str]
+    rows: list[Mapping[str, Any]]
+    by: str
+
+
+def views(rows: Rows) -> list[View]:
+    """How the rows of one world are looked at: round by round with the longest plans, and after the last by length.
+
+    Where each round was looked at with plans as long as its own alone, there is one view: round by round.
+    """
+    longest, last = max(row["length"] for row in rows), max(row["round"] for row in rows)
+    by_round = [row for row in rows if row["length"] == longest]
+    by_length = [row for row in rows if row["round"] == last]
+    if len({row["round"] for row in by_round}) == 1 < len({row["round"] for row in rows}):
+        lengths = {row["round"]: row["length"] for row in rows}
+        places = {turn: f"{turn} ({lengths[turn]})" for turn in sorted(lengths)}
+        return [View("each round's own plans", "round of growth (actions in a plan)", places, list(rows), "round")]
+    turns, lengths_tried = (
+        sorted({row[by] for row in some}) for by, some in (("round", by_round), ("length", by_length))
+    )
+    return [
+        View(f"plans of {longest} actions", "rounds of growth", {n: str(n) for n in turns}, by_round, "round"),
+        View(f"after {last} rounds", "actions in a plan", {n: str(n) for n in lengths_tried}, by_length, "length"),
+    ]
+
+
 @drawn
 def growth_figure(rows: Rows) -> Figure:
-    """Share of the oracle of one world: at the longest plans round by round, and after the last round by length."""
-    figure, axes = panels(1, 2, (WIDTH, 3.4), sharey=True)
+    """Share of the oracle of one world's priors, a panel a view.
+
+    Raises:
+        ValueError: there are no rows.
+    """
+    expect_some("rows", rows)
+    shown = views(rows)
+    figure, axes = panels(1, len(shown), (WIDTH, 3.4), sharey=True)
     names = list(dict.fromkeys(_name(row) for row in rows))
-    longest, last = max(row["length"] for row in rows), max(row["round"] for row in rows)
-    for name, (color, line) in zip(names, lines(names), strict=True):
-        own = [row for row in rows if _name(row) == name]
-        for place, by, other, held in ((0, "round", "length", longest), (1, "length", "round", last)):
-            curve = sorted((row for row in own if row[other] == held), key=lambda row: int(row[by]))
-            points = [(row[by], row["oracle_share"], row["low"], row["high"]) for row in curve]
-            if points:
-                band(axes[place], points, color, name, line)
-    whole_numbers(axes[0], "rounds of growth", "share of the oracle")
-    whole_numbers(axes[1], "actions in a plan", "")
-    axes[0].set_title(f"plans of {longest} actions")
-    axes[1].set_title(f"after round {last}")
+    for panel, view in zip(axes, shown, strict=True):
+        for name, (color, line) in zip(names, lines(names), strict=True):
+            own = sorted((row for row in view.rows if _name(row) == name), key=lambda row: int(row[view.by]))
+            if own:
+                points = [(row[view.by], row["oracle_share"], row["low"], row["high"]) for row in own]
+                band(panel, points, color, short(name, 40), line)
+        panel.set_xticks(list(view.places), list(view.places.values()))
+        panel.set_xlabel(view.across)
+        panel.set_title(view.told)
+        panel.grid(axis="y")
+    axes[0].set_ylabel("share of the oracle")
     axes[0].yaxis.set_major_formatter(PercentFormatter(1))
     legend(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 
-def tables(rows: Rows, world: str) -> list[Table]:
-    """Two tables of a world: by round at the longest plans, and by length after the last round."""
-    own = [row for row in rows if row["world"] == world]
-    longest, last = max(row["length"] for row in own), max(row["round"] for row in own)
+def tables(rows: Rows) -> list[Table]:
+    """A table a view of one world."""
     made = []
-    for by, other, held, told in (
-        ("round", "length", longest, f"plans of {longest} actions, by rounds of growth"),
-        ("length", "round", last, f"after {last} rounds, by actions in a plan"),
-    ):
-        some = [row for row in own if row[other] == held]
-        places = sorted({row[by] for row in some})
-        at = {(_name(row), row[by]): row for row in some}
-        cells = [
-            [name, *(_told(at.get((name, place))) for place in places)]
-            for name in dict.fromkeys(_name(row) for row in some)
-        ]
-        caption = (
-            f"Share of the oracle, %: {told}; {some[0]['num_plans']:,} candidates. ±: the wider half of {_over(own)}."
-        )
-        made.append(Table(("prior", *map(str, places)), cells, caption))
+    for view in views(rows):
+        at = {(_name(row), row[view.by]): row for row in view.rows}
+        names = dict.fromkeys(_name(row) for row in view.rows)
+        cells = [[name, *(_told(at.get((name, place))) for place in view.places)] for name in names]
+        counted = f"{rows[0]['num_plans']:,} candidates. ±: the wider half of {_over(rows)}"
+        caption = f"Share of the oracle, %: {view.told}, by {view.across}; {counted}."
+        made.append(Table(("prior", *view.places.values()), cells, caption))
     return made
 
 
@@ -115,11 +143,11 @@ def write_report(cells: Rows, settings: Mapping[str, Any], folder: Path, console
     """Print the tables, and write `report.html`, `results.json`, `grow.csv` and `gains.csv`."""
     rows, gains = growth_rows(cells), gain_rows(cells)
     worlds = list(dict.fromkeys(row["world"] for row in rows))
-    told = {world: tables(rows, world) for world in worlds}
+    told = {world: tables([row for row in rows if row["world"] == world]) for world in worlds}
     for world, made in told.items():
         for table in made:
             console.print(printed(world, table))
-    said = [words(rows, gains, world) for world in worlds]
+    said = [words(*([row for row in some if row["world"] == world] for some in (rows, gains))) for world in worlds]
     console.print("\n".join(said), highlight=False, markup=False)
     write_csv(folder / "grow.csv", rows)
     if gains:

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from eval.compare_cell import Settings
 from eval.suite import TASKS
 from neuroprior.output import write_json
@@ -65,10 +63,10 @@ def torn(task: Any, seed: int, settings: Settings) -> dict[str, Any]:
 
 
 def quick_report(
-    cells: Sequence[dict[str, Any]], settings: dict[str, Any], folder: Path, console: Console, command: str
+    cells: Sequence[dict[str, Any]], num_plans: Sequence[int], settings: dict[str, Any], folder: Path, **more: Any
 ) -> None:
     """All that a report is made of, in one file."""
-    write_json(folder / "results.json", {"cells": cells, "settings": settings})
+    write_json(folder / "results.json", {"cells": cells, "num_plans": num_plans, "settings": settings})
 
 
 if __name__ == "__main__":
