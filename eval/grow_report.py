@@ -48,24 +48,46 @@ def words(rows: Rows, gains: Rows) -> str:
 
     No prior is picked out, which would favour the lucky ones.
     """
-    longest = max(row["length"] for row in rows)
-    told = ", ".join(_gained(row) for row in gains) or "what growth gives is not told by plans of one length"
-    said = f"in points of the oracle, growth {told} ({_over(rows)})" if gains else told
-    return f"{rows[0]['world']}, {rows[0]['num_plans']:,} plans of {longest} actions: {said}."
+    at = f"{rows[0]['world']}, {rows[0]['num_plans']:,} plans of {max(row['length'] for row in rows)} actions"
+    if not gains:
+        return f"{at}: what growth gives is not told, as each round has plans of its own length."
+    clear = [row for row in gains if row["low"] is None or not _holds_zero(row)]
+    unclear = [row for row in gains if row not in clear]
+    said = ["changes " + ", ".join(f"{_name(row)} by {_points(row)}" for row in clear)] if clear else []
+    if unclear:
+        said.append("cannot be told to change " + ", ".join(f"{_name(row)} ({_points(row)})" for row in unclear))
+    return f"{at}: growth {', and '.join(said)}; points of the oracle, {_over(rows)}."
 
 
-def _gained(row: Mapping[str, Any]) -> str:
+def lead(gains: Rows) -> str:
+    """How often growth helped, in a sentence or two."""
+    about = "How much priors gain by planning with them, learning from those plans, and planning longer."
+    counted = [row for row in gains if row["low"] is not None]
+    if not counted:
+        return about
+    more, less = sum(row["low"] > 0 for row in counted), sum(row["high"] < 0 for row in counted)
+    worlds = len({row["world"] for row in counted})
+    told = (
+        f"Of {len(counted)} cases, a prior in one of {worlds} world{'s' * (worlds > 1)}, it helped in {more} and harmed"
+    )
+    return f"{about} {told} in {less}, each by its own 95 % interval; in the others no change can be told."
+
+
+def _holds_zero(row: Mapping[str, Any]) -> bool:
+    return bool(row["low"] <= 0 <= row["high"])
+
+
+def _points(row: Mapping[str, Any]) -> str:
+    gain = f"{100 * row['gain']:+.1f}"
     if row["low"] is None:
-        return f"changes {_name(row)} by {100 * row['gain']:+.1f}"
-    between = f"({100 * row['low']:+.1f} to {100 * row['high']:+.1f})"
-    if row["low"] <= 0 <= row["high"]:
-        return f"cannot be told to change {_name(row)} {between}"
-    return f"changes {_name(row)} by {100 * row['gain']:+.1f} {between}"
+        return gain
+    between = f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
+    return between if _holds_zero(row) else f"{gain} ({between})"
 
 
 def _over(rows: Rows) -> str:
     seeds = max(row["seeds"] for row in rows)
-    return f"95 % bootstrap intervals over {seeds} seeds" if seeds > 1 else "intervals, which one seed does not have"
+    return f"95 % bootstrap intervals over {seeds} seeds" if seeds > 1 else "a single seed, so no intervals"
 
 
 class View(NamedTuple):
@@ -133,7 +155,8 @@ def tables(rows: Rows) -> list[Table]:
         at = {(_name(row), row[view.by]): row for row in view.rows}
         names = dict.fromkeys(_name(row) for row in view.rows)
         cells = [[name, *(_told(at.get((name, place))) for place in view.places)] for name in names]
-        counted = f"{rows[0]['num_plans']:,} candidates. ±: the wider half of {_over(rows)}"
+        half = "±: the wider half of " if max(row["seeds"] for row in rows) > 1 else ""
+        counted = f"{rows[0]['num_plans']:,} candidates; {half}{_over(rows)}"
         caption = f"Share of the oracle, %: {view.told}, by {view.across}; {counted}."
         made.append(Table(("prior", *view.places.values()), cells, caption))
     return made
@@ -160,9 +183,8 @@ def write_report(cells: Rows, settings: Mapping[str, Any], folder: Path, console
         Section("Share of the oracle against rounds and length", [], figures=boxes),
         Section("Tables", [], tables=[_named(world, table) for world, made in told.items() for table in made]),
     ]
-    lead = "How much priors gain by planning with them, learning from those plans, and planning longer. " + said[0]
     shown = dict(settings) | {f"version: {name}": number for name, number in versions().items()}
-    write_page(folder / "report.html", Page("Growing the horizon", lead, command, shown, sections))
+    write_page(folder / "report.html", Page("Growing the horizon", lead(gains), command, shown, sections))
     console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.compare_cell import Settings
+from eval.processes import LAUNCHED
 from eval.suite import TASKS
 from neuroprior.output import write_json
 
@@ -53,6 +54,11 @@ def broken(task: Any, seed: int, settings: Settings) -> dict[str, Any]:
     if seed == 1:
         raise ValueError("no plan scored more than 0")
     return made_up(task, seed, settings)
+
+
+def environment(task: Any, seed: int, settings: Settings) -> dict[str, Any]:
+    """A cell that tells the process and what it knows of torchrun."""
+    return {"process": os.getpid(), "launched": sorted(name for name in os.environ if name.startswith(LAUNCHED))}
 
 
 def torn(task: Any, seed: int, settings: Settings) -> dict[str, Any]:

@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,8 +20,9 @@ from eval import compare_cell, compare_jobs
 from eval.__main__ import main
 from eval.compare_cell import Settings
 from eval.compare_jobs import Cell, Study, cells_of, gather, run_cells
+from eval.processes import do_each
 from neuroprior import MarkovPrior, save
-from tests.made_up_cells import broken, made_up, quick_report, torn
+from tests.made_up_cells import broken, environment, made_up, quick_report, torn
 from tests.sources import refuses
 
 SETTINGS = Settings((2, 4), ("markov",), ("nothing",), 1, 3, 4, 5, 0)
@@ -151,6 +154,19 @@ def test_a_cell_takes_one_thread(tmp_path):
     assert study.read(CELLS[0]) == {"threads": 1}
 
 
+def test_cells_do_not_take_part_in_torchrun(tmp_path, monkeypatch):
+    """Lightning would take a prior's training for a part of one training by all processes that torchrun started."""
+    given = {"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1", "MASTER_PORT": "1", "TORCHELASTIC_RUN_ID": "x"}
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    study = study_in(tmp_path, environment)
+    do_each(partial(compare_jobs.do, study), CELLS[:1], 1, lambda cell: None, apart=True)
+    found = study.read(CELLS[0])
+    assert found["launched"] == []
+    assert found["process"] != os.getpid()
+    assert given.items() <= os.environ.items()
+
+
 class Wire:
     """What Fabric does for `gather`, for processes that run one after another: the first hears what others would say.
 
@@ -189,6 +205,15 @@ def test_machines_without_a_shared_folder_send_what_they_found(tmp_path):
     assert (first.folder / CELLS[0].file).read_text() == "its own"
     assert [first.finished(cell) for cell in CELLS] == [cell.seed < 2 for cell in CELLS]
     assert [first.read(cell) for cell in CELLS if cell.seed == 1] == [cell for cell in whole if cell["seed"] == 1]
+
+
+def test_machines_that_would_give_other_results_are_told(tmp_path, monkeypatch):
+    """Another version of torch there, and the study has another name."""
+    wire = Wire(1, [{}, {}])
+    monkeypatch.setattr(wire, "broadcast", lambda what: "another")
+    monkeypatch.setattr(compare_jobs, "launched", lambda: nullcontext(wire))
+    with refuses("versions", "this machine"):
+        run_cells(study_in(tmp_path), CELLS, 1)
 
 
 @pytest.fixture(scope="module")

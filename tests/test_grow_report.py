@@ -5,7 +5,7 @@ import warnings
 import pytest
 
 from eval.compare_rows import growth_rows
-from eval.grow_report import gain_rows, growth_figure, tables, views, words
+from eval.grow_report import gain_rows, growth_figure, lead, tables, views, words
 from tests.sources import refuses
 
 
@@ -43,6 +43,15 @@ def test_no_gain_cannot_be_told():
     assert row["gain"] == pytest.approx(0)
     assert row["low"] < 0 < row["high"]
     assert "cannot be told to change gru" in words(growth_rows(cells), [row])
+
+
+def test_the_lead_counts_what_can_be_told():
+    shares = [lambda s, turn, n: 0.5 + turn / 10, lambda s, turn, n: 0.5 - turn / 10, lambda s, turn, n: 0.5 + turn * s]
+    sees = ("nothing", "start", "each step")
+    cells = [cell(s - 2, share, sees=seen) for share, seen in zip(shares, sees, strict=True) for s in range(5)]
+    said = lead(gain_rows(cells))
+    assert "Of 3 cases, a prior in one of 1 world, it helped in 1 and harmed in 1" in said
+    assert "Of" not in lead(gain_rows([diagonal(0)]))
 
 
 def test_one_seed_has_no_interval():
