@@ -219,7 +219,7 @@ def transition_section(comparison: Comparison) -> Section | None:
     if not boxes:
         return None
     text = [
-        "How often each action follows each in plans sampled from a prior, after growth where it grew: means over seeds."
+        "How often each action follows each in plans sampled from a prior, after growth if it grew: means over seeds."
     ]
     return Section("What follows what", text, (), boxes, beside=True)
 

@@ -1,6 +1,29 @@
-"""The worlds of the comparison."""
+"""The worlds of `python -m eval compare`: where plans are learned from, and where they are tried."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroprior import World, cube, four_rooms, from_gymnasium, gridworld, maze
+from neuroprior.worlds import EpisodicWorld
+from neuroprior.worlds.grid import MOVES, TURNS
+
+TRAINING_MAPS, HELD_OUT_MAPS = 20, 20
+"""Worlds to learn in and to be compared in, of each seed, where they cost nothing to make."""
+
+LAYOUTS = 3
+"""The same, for layouts of MiniGrid, whose states are searched one by one."""
+
+
+class Pair(NamedTuple):
+    """Worlds of a seed: plans are collected in `training`, priors are compared in `held_out`."""
+
+    training: World
+    held_out: World
 
 
 @dataclass(frozen=True)
@@ -8,28 +31,237 @@ class Task:
     """A world of the comparison.
 
     Attributes:
-        name: of the world.
-        num_actions: of the world.
-        action_names: of its actions, or None.
+        name: as in `TASKS`.
+        action_names: of its actions, in the order of their numbers.
+        about: what it is, what differs between training and held-out worlds, and what is optimised.
+        worlds: makes the worlds of a seed.
+        depth: of the exhaustive planner whose plans are learned from first.
+        lengths: numbers of actions in the plans of the rounds of growth; the last is that of the comparison.
+        objective, discount, any_prefix: what planners optimise, see `neuroprior.Planner`.
+        above: plans that scored no more than this are not learned from; None: all are.
+        sees: what `World.observe` of these worlds shows, for priors that see; None: nothing that would be of use.
     """
 
     name: str
-    num_actions: int = 4
-    action_names: tuple[str, ...] | None = None
+    action_names: tuple[str, ...]
+    about: str
+    worlds: Callable[[int], Pair]
+    depth: int
+    lengths: tuple[int, ...]
+    objective: Literal["terminal", "return"] = "terminal"
+    discount: float = 1.0
+    any_prefix: bool = False
+    above: float | None = None
+    sees: str | None = None
+
+    @property
+    def num_actions(self) -> int:
+        """Number of actions."""
+        return len(self.action_names)
+
+    @property
+    def length(self) -> int:
+        """Actions in the plans that are compared."""
+        return self.lengths[-1]
+
+    @property
+    def scoring(self) -> dict[str, Any]:
+        """What planners optimise, as their arguments."""
+        return {"objective": self.objective, "discount": self.discount, "any_prefix": self.any_prefix}
 
 
-MOVES = ("up", "right", "down", "left")
-TASKS: dict[str, Task] = {
-    "grid": Task("grid", 4, MOVES),
-    "four_rooms": Task("four_rooms", 4, MOVES),
-    "maze": Task("maze", 4, MOVES),
-    "egocentric": Task("egocentric", 3, ("left", "forward", "right")),
-    "taxi": Task("taxi", 6),
-    "cliff": Task("cliff"),
-    "frozen_lake": Task("frozen_lake"),
-    "slippery": Task("slippery"),
-    "minigrid_four_rooms": Task("minigrid_four_rooms", 7),
-    "minigrid_multi_room": Task("minigrid_multi_room", 7),
-    "minigrid_door_key": Task("minigrid_door_key", 7),
-    "cube": Task("cube", 9),
-}
+def _both(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
+    """Worlds of unlike seeds, even ones to learn in."""
+
+    def made(seed: int) -> Pair:
+        return Pair(make(seed=2 * seed, **how), make(seed=2 * seed + 1, **how))
+
+    return made
+
+
+def _layouts(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
+    """Grids with new walls and new rewards."""
+    return _both(make, num_layouts=TRAINING_MAPS, view=1, **how)
+
+
+def _split(name: str, **options: Any) -> Callable[[int], Pair]:
+    """One environment, started in any state that can be reached: a random half to learn from, the other held out."""
+
+    def made(seed: int) -> Pair:
+        halves = []
+        for half in (0, 1):
+            world = from_gymnasium(name, starts="any", **options)
+            assert isinstance(world, EpisodicWorld)
+            where = world.starts.nonzero()[:, 0]
+            where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
+            kept = where[: len(where) // 2] if half == 0 else where[len(where) // 2 :]
+            world.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
+            halves.append(world)
+        return Pair(*halves)
+
+    return made
+
+
+def _lake(slippery: bool) -> Callable[[int], Pair]:
+    """Frozen lakes, each seed with holes of its own."""
+
+    def made(seed: int) -> Pair:
+        from gymnasium.envs.toy_text.frozen_lake import generate_random_map
+
+        maps = [generate_random_map(size=8, seed=2 * seed + half) for half in (0, 1)]
+        lakes = [from_gymnasium("FrozenLake-v1", desc=one, is_slippery=slippery, starts="any") for one in maps]
+        return Pair(*lakes)
+
+    return made
+
+
+def _minigrid(name: str) -> Callable[[int], Pair]:
+    """MiniGrid: each seed with layouts of its own, some to learn in and some held out; starts are all that can be."""
+
+    def made(seed: int) -> Pair:
+        first = 2 * LAYOUTS * seed
+        seeds = (range(first, first + LAYOUTS), range(first + LAYOUTS, first + 2 * LAYOUTS))
+        return Pair(
+            *(from_gymnasium(name, seeds=some, starts="any", observations=True, progress=False) for some in seeds)
+        )
+
+    return made
+
+
+# Later is worth less, so that the best plans go straight there.
+_goal: dict[str, Any] = {"objective": "return", "discount": 0.95, "above": 0.0}
+_neighbours = "which of the eight squares around it are free"
+_grid_about = "the reward where a plan ends; new walls and rewards held out"
+
+_minigrid_moves = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
+
+_tasks = (
+    Task(
+        "grid",
+        MOVES,
+        "the paper's grid: 20 x 20, a torus, independent rewards; the reward where a plan ends; new rewards held out",
+        _both(partial(gridworld, 20, 20, edges="torus"), num_worlds=TRAINING_MAPS),
+        4,
+        (6, 8),
+    ),
+    Task(
+        "four_rooms",
+        MOVES,
+        f"four rooms, 13 x 13, doors at random places, four moves; {_grid_about}",
+        _layouts(partial(four_rooms, reward_power=8.0)),
+        5,
+        (8, 12, 16),
+        sees=_neighbours,
+    ),
+    Task(
+        "maze",
+        MOVES,
+        f"mazes with some loops, 15 x 15, four moves; {_grid_about}",
+        _layouts(partial(maze, reward_power=8.0)),
+        5,
+        (8, 12, 16),
+        sees=_neighbours,
+    ),
+    Task(
+        "egocentric",
+        TURNS,
+        f"the same mazes for an agent that turns left, turns right or goes forward; {_grid_about}",
+        _layouts(partial(maze, reward_power=8.0, egocentric=True)),
+        7,
+        (10, 13, 16),
+        sees=_neighbours + ", as it is turned",
+    ),
+    Task(
+        "taxi",
+        ("south", "north", "east", "west", "pickup", "dropoff"),
+        "Taxi: fetch a passenger and bring it; the sum of rewards; half of all states to start from held out",
+        _split("Taxi-v4"),
+        5,
+        (8, 12, 16),
+        "return",
+        sees="the whole state",
+    ),
+    Task(
+        "cliff",
+        MOVES,
+        "CliffWalking: go around a cliff; the sum of rewards; half of all squares to start from held out",
+        _split("CliffWalking-v1"),
+        5,
+        (8, 12, 16),
+        "return",
+        sees="the square",
+    ),
+    Task(
+        "frozen_lake",
+        ("left", "down", "right", "up"),
+        "FrozenLake, 8 x 8, not slippery: to the goal, between holes; reaching it; new lakes held out",
+        _lake(slippery=False),
+        5,
+        (8, 11, 14),
+        **_goal,
+    ),
+    Task(
+        "slippery",
+        ("left", "down", "right", "up"),
+        "FrozenLake, 8 x 8, slippery: a third of the moves go where they should; how likely a plan reaches the goal;"
+        " new lakes held out",
+        _lake(slippery=True),
+        5,
+        (8, 11, 14),
+        "return",
+    ),
+    Task(
+        "minigrid_four_rooms",
+        _minigrid_moves,
+        "MiniGrid FourRooms: to a goal square, seven actions; reaching it; new layouts held out",
+        _minigrid("MiniGrid-FourRooms-v0"),
+        5,
+        (8, 12, 16),
+        sees="the seven by seven squares before it",
+        **_goal,
+    ),
+    Task(
+        "minigrid_multi_room",
+        _minigrid_moves,
+        "MiniGrid MultiRoom: through the doors of four rooms to a goal square; reaching it; new layouts held out",
+        _minigrid("MiniGrid-MultiRoom-N4-S5-v0"),
+        5,
+        (8, 12, 16),
+        sees="the seven by seven squares before it",
+        **_goal,
+    ),
+    Task(
+        "minigrid_door_key",
+        _minigrid_moves,
+        "MiniGrid DoorKey, 6 x 6: fetch a key, open a door, go to a goal square; reaching it; new layouts held out",
+        _minigrid("MiniGrid-DoorKey-6x6-v0"),
+        5,
+        (8, 12, 16),
+        sees="the seven by seven squares before it",
+        **_goal,
+    ),
+    Task(
+        "cube",
+        cube().action_names,
+        "the 2 x 2 x 2 cube after seven random moves, quarter and half turns; passing the solved state; new scrambles",
+        lambda seed: Pair(cube(scramble=6, absorbing=True), cube(scramble=7, absorbing=True)),
+        4,
+        (5, 6, 7),
+        sees="the whole cube",
+        **_goal,
+    ),
+)
+TASKS = {task.name: task for task in _tasks}
+"""By name."""
+
+
+def best_score(task: Task, world: World, state: Tensor, length: int) -> Tensor:
+    """What the best plan of `length` actions (with chance, the best policy) scores from each of `state [B]`: `[B]`."""
+    from neuroprior import PocketCube, TabularWorld, oracle
+
+    if isinstance(world, PocketCube):
+        distance = world.distance(state)
+        there = (distance > 0) & (distance <= length)
+        return torch.where(there, task.discount ** (distance.float() - 1), 0.0)
+    assert isinstance(world, TabularWorld)
+    return oracle(world, state, length, **task.scoring)

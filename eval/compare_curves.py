@@ -1,0 +1,141 @@
+"""What a prior's candidate plans reach against their number: the curves behind `python -m eval compare`."""
+
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from eval.suite import Task, best_score
+from neuroprior import Prior, SamplingPlanner, TabularWorld, World, expected_score
+from neuroprior.planners.chance import mean_scores
+
+ROLLOUTS = 16
+"""Of each candidate, where chance decides."""
+
+ROWS = 2**15
+"""Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
+
+CLOSE = 1e-6
+"""A score this near to the oracle's is as good."""
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Where planners are compared: B starts of a world, with the best that can be had from each.
+
+    Attributes:
+        task: what is optimised.
+        world: the held-out world.
+        state: `[B, ...]`.
+        length: number of actions in a plan.
+        best: `[B]`: the oracle's scores.
+        reference: the score that counts as nothing: 0 where rewards are never negative, else what a single plan of
+            random moves scores in the mean.
+    """
+
+    task: Task
+    world: World
+    state: Tensor
+    length: int
+    best: Tensor
+    reference: float
+
+    def share(self, score: Tensor) -> float:
+        """The share of the oracle that scores `[B]` are, between the reference and the oracle."""
+        return float((score - self.reference).mean() / (self.best - self.reference).mean())
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What was reached with each number of candidates: means over starts.
+
+    Attributes:
+        share: of the oracle.
+        at_oracle: share of starts at which the best plan was found.
+        score: what was scored.
+    """
+
+    share: list[float]
+    at_oracle: list[float]
+    score: list[float]
+
+
+def starts_of(task: Task, world: World, number: int, length: int, generator: torch.Generator) -> Starts:
+    """Random starts, where something can be had: with rewards that are never negative the oracle scores above 0.
+
+    Raises:
+        ValueError: there are hardly any.
+    """
+    state = world.reset(20 * number, generator)
+    best = best_score(task, world, state, length)
+    reference = 0.0
+    if isinstance(world, TabularWorld) and float(world.reward.min()) < 0:
+        plans = torch.randint(world.num_actions, (len(state), 1, length), generator=generator)
+        reference = float(_worth(task, world, state, plans).mean())
+    else:
+        state, best = state[best > 0], best[best > 0]
+    if len(state) < number:
+        raise ValueError(f"only {len(state)} of {20 * number} starts are such that a plan of {length} actions gains")
+    return Starts(task, world, state[:number], length, best[:number], reference)
+
+
+def candidate_scores(starts: Starts, prior: Prior, num_plans: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """What a planner takes its candidates to be worth, and what they are worth; these differ where chance decides.
+
+    Returns:
+        Twice `[B, num_plans]`.
+    """
+    planner = SamplingPlanner(prior, starts.length, num_plans, num_rollouts=ROLLOUTS, **starts.task.scoring)
+    told, true = [], []
+    for state in starts.state.split(max(ROWS // num_plans, 1)):
+        if starts.world.stochastic:
+            plans = planner.proposals(starts.world, state, generator)
+            told.append(mean_scores(planner, starts.world, state, plans, ROLLOUTS, generator)[0])
+            true.append(_worth(starts.task, starts.world, state, plans))
+            continue
+        _, rollout = planner.candidates(starts.world, state, generator)
+        if rollout.states is None:
+            score = planner.score(rollout.rewards, rollout.final_state)
+        else:
+            score = planner.prefix_scores(rollout.rewards, rollout.states).amax(-1)
+        told.append(score)
+        true.append(score)
+    return torch.cat(told), torch.cat(true)
+
+
+def curve(starts: Starts, prior: Prior, budgets: list[int], generator: torch.Generator) -> Curve:
+    """What a sampling planner reaches with each number of candidates.
+
+    The most are drawn once from each start. Fewer are blocks of them, each block a planner's decision.
+    """
+    told, true = candidate_scores(starts, prior, max(budgets), generator)
+    found = Curve([], [], [])
+    for budget in budgets:
+        blocks = told.shape[1] // budget
+        shape = (len(told), blocks, budget)
+        chosen = told[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
+        score = true[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0].double()
+        found.share.append(starts.share(score.mean(1)))
+        found.at_oracle.append(float((score >= starts.best[:, None] - CLOSE).double().mean()))
+        found.score.append(float(score.mean()))
+    return found
+
+
+def seconds_per_decision(
+    starts: Starts, prior: Prior, num_plans: int, number: int, generator: torch.Generator
+) -> tuple[float, int]:
+    """How long a planner takes for each of `number` starts planned from together, and its model steps for each."""
+    planner = SamplingPlanner(prior, starts.length, num_plans, num_rollouts=ROLLOUTS, **starts.task.scoring)
+    state = starts.state[:number]
+    begin = perf_counter()
+    decision = planner.plan(starts.world, state, generator)
+    return (perf_counter() - begin) / len(state), decision.model_steps
+
+
+def _worth(task: Task, world: World, state: Tensor, plans: Tensor) -> Tensor:
+    """The exact mean scores `[B, P]` of plans in a table."""
+    assert isinstance(world, TabularWorld)
+    how: dict[str, Any] = {"objective": task.objective, "discount": task.discount}
+    return expected_score(world, state, plans, **how)
