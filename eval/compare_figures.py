@@ -8,11 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter
 
 from eval.compare_rows import Key
-from eval.drawing import FEWER, MORE, Number, band, dot, drawn, expect_some, lines, names_down, panels, short
+from eval.drawing import FEWER, MORE, Array, Number, band, dot, drawn, expect_some, lines, names_down, panels, short
 from eval.page import INK, clean
 
 SMALL = (3.0, 3.0)
@@ -23,6 +22,9 @@ PHONE = 4.5
 
 LETTERS = 8
 """Size of text in small figures, points."""
+
+WALL, REWARD = (0.49, 0.51, 0.55), (0.18, 0.62, 0.36)
+"""Colours of what stands in a drawn world, seen on light and dark pages."""
 
 JITTER = 0.17
 """How far the paths of a drawing are moved apart, squares."""
@@ -112,9 +114,12 @@ def _curve(
 
 def _finish(axes: Axes, across: str, up: str, title: str) -> None:
     low, high = axes.get_ylim()
-    # Shares end at the oracle; noise about it may not.
-    axes.set_ylim(max(low, -20), max(high, 102 if high > 90 else high))
-    axes.axhline(100, color=INK, lw=0.8, alpha=0.6) if axes.get_ylim()[1] >= 100 else None
+    low = max(low, -20)
+    # The oracle's line has its place where it is near.
+    near = high > 100 - 0.15 * (100 - low)
+    axes.set_ylim(low, max(high, 100 + 0.03 * (100 - low)) if near else high)
+    if near:
+        axes.axhline(100, color=INK, lw=0.8, alpha=0.6)
     axes.set(xlabel=across, ylabel=up, title=clean(title))
     axes.grid(axis="y")
     axes.tick_params(labelsize=LETTERS)
@@ -233,47 +238,36 @@ def bits_figure(rows: Sequence[Mapping[str, Any]], style: Mapping[str, Style]) -
 
 
 @drawn
-def plans_figure(plans: Mapping[str, Any], style: Mapping[str, Style]) -> Figure:
-    """Candidate plans of some priors from one start, drawn in their world: a panel a prior.
+def plans_figure(plans: Mapping[str, Any], prior: str, color: str, title: str) -> Figure:
+    """Candidate plans of a prior from one start, drawn in their world.
 
     Args:
         plans: `height`, `width`, `walls` (rows of bools), `start` (row, column), `paths` (of each prior, lists of
-            places), `reward` (rows of numbers, the darker the more) or None.
-        style: of the priors by name.
+            places), `reward` (rows of numbers, the greener the more) or None.
+        prior: whose plans.
+        color: of their lines.
+        title: above.
     """
-    paths = plans["paths"]
-    across = min(len(paths), 3)
-    down = -(-len(paths) // across)
-    side = PHONE / max(across, 2)
-    size = (side * across, (side * plans["height"] / plans["width"] + 0.35) * down)
-    figure, cells = panels(down, across, size)
-    rng = np.random.default_rng(0)
-    for axes, prior in zip(cells, paths, strict=False):
-        _world(axes, plans)
-        walks = np.array(paths[prior], dtype=np.float64)
-        walks += rng.uniform(-JITTER, JITTER, (len(walks), 1, 2))
-        courses = LineCollection(list(walks[..., ::-1]), colors=style[prior][0], lw=1.3, alpha=0.75, capstyle="round")
-        axes.add_collection(courses)
-        axes.plot(*walks[:, -1, ::-1].T, "o", color=style[prior][0], ms=3, mew=0)
-        axes.plot(plans["start"][1], plans["start"][0], "s", color=INK, ms=5)
-        axes.set_title(short(prior, 16), fontsize=9)
-    for axes in cells[len(paths) :]:
-        axes.set_visible(False)
+    height = (SMALL[0] - 0.1) * plans["height"] / plans["width"] + 0.35
+    figure, (axes,) = panels(1, 1, (SMALL[0], height))
+    axes.imshow(_shades(plans), interpolation="none")
+    walks = np.array(plans["paths"][prior], dtype=np.float64)
+    walks += np.random.default_rng(0).uniform(-JITTER, JITTER, (len(walks), 1, 2))
+    axes.add_collection(LineCollection(list(walks[..., ::-1]), colors=color, lw=1.6, alpha=0.8, capstyle="round"))
+    axes.plot(*walks[:, -1, ::-1].T, "o", color=color, ms=4, mew=0)
+    axes.plot(plans["start"][1], plans["start"][0], "s", color=INK, ms=7)
+    axes.set(xlim=(-0.5, plans["width"] - 0.5), ylim=(plans["height"] - 0.5, -0.5), aspect="equal")
+    axes.set(xticks=[], yticks=[], title=short(title, 36))
+    axes.spines[:].set(visible=True, alpha=0.3)
     return figure
 
 
-def _world(axes: Axes, plans: Mapping[str, Any]) -> None:
-    """Walls, and rewards as shades, of a world seen from above."""
+def _shades(plans: Mapping[str, Any]) -> Array:
+    """Colours `[height, width, 4]` of walls and rewards; the page shows through elsewhere."""
     walls = np.array(plans["walls"], dtype=bool)
-    if plans.get("reward") is not None:
-        reward = np.array(plans["reward"], dtype=np.float64)
-        top = reward[~walls].max(initial=0)
-        shade = np.zeros((*reward.shape, 4))
-        shade[..., :3] = (0.18, 0.62, 0.36)
-        shade[..., 3] = np.where(walls, 0, 0.55 * np.clip(reward / (top if top > 0 else 1), 0, 1))
-        axes.imshow(shade, interpolation="none")
-    for row, column in np.argwhere(walls):
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, color=INK, alpha=0.55, lw=0))
-    axes.set(xlim=(-0.5, plans["width"] - 0.5), ylim=(plans["height"] - 0.5, -0.5), aspect="equal")
-    axes.set(xticks=[], yticks=[])
-    axes.spines[:].set(visible=True, alpha=0.3)
+    reward = np.zeros(walls.shape) if plans.get("reward") is None else np.array(plans["reward"], dtype=np.float64)
+    top = reward[~walls].max(initial=0)
+    shades = np.zeros((*walls.shape, 4))
+    shades[..., :3] = np.where(walls[..., None], WALL, REWARD)
+    shades[..., 3] = np.where(walls, 0.45, 0.6 * np.clip(reward / (top if top > 0 else 1), 0, 1))
+    return shades

@@ -205,5 +205,5 @@ def _gain_boxes(comparison: Comparison, rows: Rows) -> Iterator[FigureBox]:
 
 
 def _priors(question: tuple[str, bool]) -> str:
-    sees = {"nothing": "", "start": " that see the start", "each step": " that see each step"}[question[0]]
-    return f"priors{sees}" + (", after growth" if sees else " after growth") * question[1]
+    sees = "the start" if question[0] == "start" else question[0]
+    return f"priors that see {sees}" + ", after growth" * question[1]

@@ -185,18 +185,17 @@ def plans_section(comparison: Comparison) -> Section | None:
     """Plans drawn in the worlds."""
     boxes = []
     for cell in comparison.cells:
-        if cell.get("plans"):
-            caption = f"{cell['world']}: square: start; dots: where plans end; green: rewards; filled: walls."
-            drawn = svg(figures.plans_figure(cell["plans"], comparison.style))
-            boxes.append(FigureBox(drawn, caption, f"plans in {cell['world']}"))
+        for prior in (cell.get("plans") or {"paths": ()})["paths"]:
+            title = f"{cell['world']}: {prior}"
+            drawn = svg(figures.plans_figure(cell["plans"], prior, comparison.style[prior][0], title))
+            boxes.append(FigureBox(drawn, "", f"plans of {prior} in {cell['world']}"))
     if not boxes:
         return None
-    return Section(
-        "Plans drawn in the worlds",
-        ["Candidate plans of some priors from one start, after growth where they grew."],
-        (),
-        boxes,
-    )
+    text = [
+        "Candidate plans of some priors from one start, as they are after the last round. Square: the start; dots:"
+        " where plans end; green: rewards; grey: walls."
+    ]
+    return Section("Plans drawn in the worlds", text, (), boxes, beside=True)
 
 
 def transition_section(comparison: Comparison) -> Section | None:
@@ -218,9 +217,7 @@ def transition_section(comparison: Comparison) -> Section | None:
                 boxes.append(FigureBox(drawn, "", f"transition matrix of {prior} in {world}"))
     if not boxes:
         return None
-    text = [
-        "How often each action follows each in plans sampled from a prior, after growth if it grew: means over seeds."
-    ]
+    text = ["How often each action follows each in plans from a prior as it is after the last round: means over seeds."]
     return Section("What follows what", text, (), boxes, beside=True)
 
 

@@ -83,7 +83,7 @@ def test_page(everything):
         assert f"<p>{row['words']}</p>" in page.replace("&#39;", "'")
     assert "python -m eval compare" in page
     assert "With 256 candidate plans, in " in page
-    assert page.count('<div class="beside">') == 5
+    assert page.count('<div class="beside">') == 6
 
 
 def test_printed(everything):
@@ -213,21 +213,26 @@ def test_plans_needed_beyond_the_most_are_arrows():
 
 def test_plans_are_drawn_in_their_world():
     plans = drawing(np.random.default_rng(0), ["uniform", "gru"])
-    figure = figures.plans_figure(plans, STYLE)
-    assert [axes.get_title(loc="left") for axes in figure.axes] == ["uniform", "gru"]
-    axes = figure.axes[1]
-    assert {patch.get_xy() for patch in axes.patches} == {(column - 0.5, 1.5) for column in (3, 4, 5, 6)}
+    (axes,) = figures.plans_figure(plans, "gru", STYLE["gru"][0], "maze: gru").axes
+    assert axes.get_title(loc="left") == "maze: gru"
     (courses,) = axes.collections
     assert to_hex(courses.get_colors()[0]) == STYLE["gru"][0]
     ends = np.array([segment[-1] for segment in courses.get_segments()])
     assert np.abs(ends[:, ::-1] - np.array(plans["paths"]["gru"])[:, -1]).max() <= figures.JITTER
-    shade = axes.images[0].get_array()[..., 3]
-    assert shade[2, 4] == 0
-    reward = np.array(plans["reward"])
-    free = ~np.array(plans["walls"])
-    assert np.corrcoef(shade[free], reward[free])[0, 1] > 0.999
-    bare = figures.plans_figure(plans | {"reward": None}, STYLE)
-    assert not bare.axes[0].images
+    shades, walls = axes.images[0].get_array(), np.array(plans["walls"])
+    assert np.allclose(shades[walls], [*figures.WALL, 0.45])
+    assert np.corrcoef(shades[~walls][:, 3], np.array(plans["reward"])[~walls])[0, 1] > 0.999
+    bare = figures.plans_figure(plans | {"reward": None}, "gru", "#000000", "").axes[0].images[0].get_array()
+    assert np.array_equal(bare[..., 3] > 0, walls)
+
+
+def test_the_oracle_is_drawn_where_it_is_near():
+    high = [entry("gru", [share] * 13) for share in (0.999, 0.5)]
+    tops = [
+        figures.share_figure(rows([cell("maze", 0, [one])], BUDGETS), ["gru"], STYLE).axes[0].get_ylim() for one in high
+    ]
+    assert tops[0][1] > 100 > 99.9 > tops[0][0] > 90
+    assert tops[1][1] < 60
 
 
 @pytest.mark.parametrize(
