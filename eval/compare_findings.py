@@ -14,7 +14,7 @@ from eval.page import FigureBox, Section, Table, svg
 
 INTERVALS = "Intervals: 95 %, over seeds, each with worlds and priors of its own."
 
-STARRED = "*: p < 0.05, corrected for all pairs of the world (Holm)."
+STARRED = "±: the longer side of the interval. *: p < 0.05, corrected for all pairs of the world (Holm)."
 
 PLAIN = ("nothing", False)
 """The question that is answered first: of priors that see nothing and have not grown."""
@@ -105,8 +105,10 @@ def words_section(comparison: Comparison) -> Section:
         text = ["There are no priors to be compared."]
     text.append(
         "The best prior of each kind is chosen on half of the seeds and compared on the other half, both ways, so that"
-        " the choice does not favour it. p: paired t-test over seeds, corrected for the number of worlds (Holm). A"
-        " number of plans in the middle was fixed for these words beforehand; other numbers are in the tables."
+        " the choice does not favour it. Intervals and p hold whichever prior is the best of its kind: better is one"
+        " that is better than every prior of the other kind (paired t-tests over seeds, corrected for the number of"
+        " priors, and p for the number of worlds: Bonferroni, Holm). A number of plans in the middle was fixed for"
+        " these words beforehand; other numbers are in the tables."
     )
     return Section("In plain words", text, _gap_tables(comparison), _gap_boxes(comparison, PLAIN))
 
@@ -141,8 +143,9 @@ def _gap_tables(comparison: Comparison) -> list[Table]:
 
 def _gap(row: Mapping[str, Any]) -> str:
     star = "*" if row["p_holm"] is not None and row["p_holm"] < 0.05 else " "
-    half = "" if row["low"] is None else f" ±{100 * (row['high'] - row['low']) / 2:.1f}{star}"
-    return f"{100 * row['difference']:+.1f}{half}"
+    gap = row["difference"]
+    half = "" if row["low"] is None else f" ±{100 * max(row['high'] - gap, gap - row['low']):.1f}{star}"
+    return f"{100 * gap:+.1f}{half}"
 
 
 def pair_table(comparison: Comparison, world: str) -> Iterator[Table]:

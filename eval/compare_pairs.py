@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from eval.compare_rows import UNIFORM, Array, Cells, Key, Results, Rows, by_world, chosen
-from neuroprior.statistics import holm, paired_difference
+from eval.compare_best import best_difference, chosen
+from eval.compare_rows import UNIFORM, Array, Cells, Key, Results, Rows, by_world
+from neuroprior.statistics import holm
 
 BEST = "best neural minus best Markov"
 
@@ -23,8 +24,9 @@ def paired(cells: Cells, num_plans: Sequence[int]) -> Rows:
     """Differences in the share of the oracle between priors with as many plans, over the seeds that have both.
 
     What is compared: the best neural with the best Markov prior; each neural with each Markov prior; each saved prior
-    with every other; grown with not grown; seeing with not seeing. All else is equal. Which prior is best is chosen on
-    half of the seeds and compared on the other half, for both halves, so that the choice favours none.
+    with every other; grown with not grown; seeing with not seeing. All else is equal. The best are chosen on half of
+    the seeds and compared on the other half, for both halves, so that the choice favours none; their intervals and
+    p-values hold whichever are the best: see `best_difference`.
 
     Returns:
         A row a world, pair and number of plans: `difference` with Student's interval (`low`, `high`), `p_value` of
@@ -75,12 +77,12 @@ def difference(results: Results, pair: Pair, num_plans: int) -> dict[str, Any] |
     if len(seeds) < 1 + choice:
         return None
     place = results.budgets.index(num_plans)
-    sides, names = [], []
+    sides: list[Array] = []
+    names = []
     for keys in (pair.first, pair.second):
         shares = np.array([[results.entries[key][seed]["share"][place] for seed in seeds] for key in keys])
-        best = chosen(shares) if len(keys) > 1 else np.zeros(len(seeds), dtype=np.int64)
-        sides.append(shares[best, np.arange(len(seeds))])
-        names.append(" / ".join(dict.fromkeys(str(keys[one].prior) for one in best)))
+        sides.append(shares)
+        names.append(" / ".join(dict.fromkeys(str(keys[one].prior) for one in chosen(shares))))
     first, second = pair.first[0], pair.second[0]
     return {
         "what": pair.what,
@@ -93,13 +95,12 @@ def difference(results: Results, pair: Pair, num_plans: int) -> dict[str, Any] |
 
 
 def _tested(first: Array, second: Array) -> dict[str, Any]:
-    # Rounded, so that differences that are all the same are seen to be.
-    gaps = np.round(first - second, 9)
-    row: dict[str, Any] = {"difference": float(gaps.mean()), "low": None, "high": None, "p_value": None}
-    if len(gaps) > 1:
-        gap = paired_difference(gaps, np.zeros_like(gaps))
-        row |= {"low": gap.low, "high": gap.high, "p_value": gap.p_value}
-    return row | {"seeds": len(gaps)}
+    number = first.shape[1]
+    if number < 2:
+        gap = {"difference": float((first - second).mean()), "low": None, "high": None, "p_value": None}
+    else:
+        gap = dict(zip(("difference", "low", "high", "p_value"), best_difference(first, second), strict=True))
+    return gap | {"seeds": number}
 
 
 def _correct(rows: Rows, name: str) -> None:

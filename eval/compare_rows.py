@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from neuroprior.statistics import paired_difference
+from eval.compare_best import best_difference
 
 Array = NDArray[np.float64]
 Cells = Sequence[Mapping[str, Any]]
@@ -179,28 +179,11 @@ def _row(results: Results, key: Key, num_plans: int | None, share: Mapping[str, 
     }
 
 
-def halves(number: int) -> NDArray[np.bool_]:
-    """`[2, number]`: every other seed, and the rest."""
-    first = np.arange(number) % 2 == 0
-    return np.stack([first, ~first])
-
-
-def chosen(values: Array) -> NDArray[np.int64]:
-    """Of K alternatives `[K, G]` the best for each seed, by the mean over the half that the seed is not in: `[G]`.
-
-    A choice among noisy means favours what it chooses; what the choice has not seen tells its worth without favour
-    (cross-fitting: Chernozhukov et al. 2018, definition 3.1). G is at least 2.
-    """
-    best = np.array([values[:, half].mean(1).argmax() for half in halves(values.shape[1])])
-    mine: NDArray[np.int64] = best[halves(values.shape[1])[0].astype(int)]
-    return mine
-
-
 def bits_rows(cells: Cells) -> Rows:
     """Held-out bits per action of each prior, and how many more than the best Markov chain takes.
 
-    The best chain that sees as much and has not grown, chosen for each half of the seeds on the other half. `more` has
-    Student's interval and its p-value, of two-sided paired tests, not corrected for their number.
+    The best chain of those that see as much and have not grown: see `best_difference` for `more`, its interval and its
+    p-value, which is not corrected for the number of priors.
     """
     found: Rows = []
     for world, results in by_world(cells).items():
@@ -223,10 +206,10 @@ def _more(bits: Mapping[int, float], chains: Sequence[Mapping[int, float]]) -> d
     common = [seed for seed in bits if all(seed in chain for chain in chains)]
     if not chains or len(common) < 2:
         return dict.fromkeys(("more", "more_low", "more_high", "p_value"))
-    taken = np.array([[chain[seed] for seed in common] for chain in chains])
-    best = taken[chosen(-taken), np.arange(len(common))]
-    gap = paired_difference([bits[seed] for seed in common], best)
-    return {"more": gap.mean, "more_low": gap.low, "more_high": gap.high, "p_value": gap.p_value}
+    own, *taken = (np.array([one[seed] for seed in common]) for one in (bits, *chains))
+    # The fewer bits, the better.
+    gap = best_difference(-own[None], -np.stack(taken))
+    return {"more": -gap.mean, "more_low": -gap.high, "more_high": -gap.low, "p_value": gap.p_value}
 
 
 def growth_rows(cells: Cells) -> Rows:

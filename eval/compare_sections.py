@@ -170,7 +170,8 @@ def _bits_table(comparison: Comparison, world: str) -> Iterator[Table]:
 def _more(row: Mapping[str, Any]) -> str:
     if row["more"] is None:
         return ""
-    return f"{row['more']:+.3f} ±{row['more_high'] - row['more']:.3f}"
+    half = max(row["more_high"] - row["more"], row["more"] - row["more_low"])
+    return f"{row['more']:+.3f} ±{half:.3f}"
 
 
 def _plus_minus(row: Mapping[str, Any], name: str, factor: float, digits: int) -> str:
