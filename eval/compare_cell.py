@@ -182,7 +182,10 @@ class _Contest:
                 prior = MarkovPrior(first.num_actions, order, **sizes)
                 yield from self._grown(f"markov-{order}", sees, prior, counted, worlds, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
-            prior = NEURAL[kind](first.num_actions, seed=draw_seed(self.generator), **sizes_of(self.worlds, first))
+            # A GRU reads on beyond the length that it was trained at, as well as in a window, and far quicker.
+            how = {"window": self.task.length} if kind == "gru" else {}
+            sizes = sizes_of(self.worlds, first) | how
+            prior = NEURAL[kind](first.num_actions, seed=draw_seed(self.generator), **sizes)
             training = {"max_steps": self.settings.steps, "progress": False}
             yield from self._grown(kind, sees, prior, first, self.worlds, training)
 
