@@ -8,7 +8,16 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
-from eval.compare_curves import CLOSE, ROLLOUTS, curve, seconds_per_decision, starts_of
+from eval.compare_curves import (
+    CLOSE,
+    ROLLOUTS,
+    TEMPERATURES,
+    best_temperature,
+    curve,
+    planner_of,
+    seconds_per_decision,
+    starts_of,
+)
 from eval.compare_pictures import drawn_plans, transitions
 from eval.compare_sight import numbered, sizes_of
 from eval.suite import TASKS, Pair, Task
@@ -32,6 +41,9 @@ ORDERS = range(5)
 """Of the Markov priors."""
 
 NEURAL: dict[str, Any] = {"gru": GRUPrior, "transformer": TransformerPrior}
+
+LAGS = 1
+"""Of GRUs: in plans this short they remember without being shown their last inputs again, and are far quicker."""
 
 SEES: dict[str, Literal["plan", "step"] | None] = {"nothing": None, "start": "plan", "each step": "step"}
 """How a prior's context is called in tables, and by `collect`."""
@@ -83,7 +95,7 @@ class Settings:
 def recipe() -> str:
     """All that decides a cell beside its settings; after a change of it, finished cells do not count."""
     worlds = [(task.name, task.about, task.depth, task.lengths, task.scoring, task.above) for task in TASKS.values()]
-    return repr((worlds, ORDERS, [*NEURAL], GROWN_WITH, ROLLOUTS, TIMED_STARTS, VERSION))
+    return repr((worlds, ORDERS, [*NEURAL], GROWN_WITH, ROLLOUTS, TEMPERATURES, LAGS, TIMED_STARTS, VERSION))
 
 
 def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
@@ -159,6 +171,7 @@ class _Contest:
         self.rounds, self.lengths = len(self.longer), tuple(sorted({task.depth, *self.longer}))
         held_out = self.worlds.held_out
         self.starts = starts_of(task, held_out, settings.starts, task.length, self.generator)
+        self.familiar = starts_of(task, self.worlds.training, settings.starts, task.length, self.generator)
         self.starts_at = {
             length: starts_of(task, held_out, settings.starts, length, self.generator) for length in self.lengths
         }
@@ -183,7 +196,7 @@ class _Contest:
                 yield from self._grown(f"markov-{order}", sees, prior, counted, worlds, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
             # A GRU reads on beyond the length that it was trained at, as well as in a window, and far quicker.
-            how = {"window": self.task.length} if kind == "gru" else {}
+            how = {"window": self.task.length, "lags": LAGS} if kind == "gru" else {}
             sizes = sizes_of(self.worlds, first) | how
             prior = NEURAL[kind](first.num_actions, seed=draw_seed(self.generator), **sizes)
             training = {"max_steps": self.settings.steps, "progress": False}
@@ -216,9 +229,15 @@ class _Contest:
     def entry(self, one: _Contestant) -> dict[str, Any]:
         """What a prior's plans reach in the held-out worlds, and how well it tells those that were chosen there."""
         starts = replace(self.starts, world=one.worlds.held_out)
-        entry = _named(one) | asdict(curve(starts, one.prior, self.settings.budgets, self.generator))
+        # Chosen where it learned, for all alike; sampling them at a temperature changes nothing for uniform plans.
+        familiar = replace(self.familiar, world=one.worlds.training)
+        heat = 1.0 if one.label == "uniform" else best_temperature(familiar, one.prior, GROWN_WITH, self.generator)
+        entry = _named(one) | {"temperature": heat}
+        entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, heat))
         timed = {
-            budget: seconds_per_decision(starts, one.prior, budget, TIMED_STARTS, self.generator)
+            budget: seconds_per_decision(
+                starts, planner_of(starts, one.prior, budget, heat), TIMED_STARTS, self.generator
+            )
             for budget in self.settings.num_plans
         }
         seconds, steps = ([timed[b][k] if b in timed else None for b in self.settings.budgets] for k in (0, 1))

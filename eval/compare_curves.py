@@ -17,6 +17,9 @@ ROLLOUTS = 16
 ROWS = 2**15
 """Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
 
+TEMPERATURES = (1.0, 1.5, 2.0)
+"""At which priors may be sampled: one that is too sure of itself tries the same plans again and again."""
+
 CLOSE = 1e-6
 """A score this near to the oracle's is as good."""
 
@@ -81,15 +84,20 @@ def starts_of(task: Task, world: World, number: int, length: int, generator: tor
     return Starts(task, world, state[:number], length, best[:number], reference)
 
 
-def candidate_scores(starts: Starts, prior: Prior, num_plans: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def planner_of(starts: Starts, prior: Prior, num_plans: int, temperature: float) -> SamplingPlanner:
+    """A planner that draws its candidates from a prior."""
+    how = starts.task.scoring | {"num_rollouts": ROLLOUTS, "temperature": temperature}
+    return SamplingPlanner(prior, starts.length, num_plans, **how)
+
+
+def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """What a planner takes its candidates to be worth, and what they are worth; these differ where chance decides.
 
     Returns:
-        Twice `[B, num_plans]`.
+        Twice `[B, P]`, of the planner's P candidates.
     """
-    planner = SamplingPlanner(prior, starts.length, num_plans, num_rollouts=ROLLOUTS, **starts.task.scoring)
     told, true = [], []
-    for state in starts.state.split(max(ROWS // num_plans, 1)):
+    for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
         if starts.world.stochastic:
             plans = planner.proposals(starts.world, state, generator)
             told.append(mean_scores(planner, starts.world, state, plans, ROLLOUTS, generator)[0])
@@ -105,12 +113,20 @@ def candidate_scores(starts: Starts, prior: Prior, num_plans: int, generator: to
     return torch.cat(told), torch.cat(true)
 
 
-def curve(starts: Starts, prior: Prior, budgets: list[int], generator: torch.Generator) -> Curve:
+def best_temperature(starts: Starts, prior: Prior, budget: int, generator: torch.Generator) -> float:
+    """The one of `TEMPERATURES` at which a prior's plans reach the most from these starts."""
+    shares = {t: curve(starts, prior, [budget], generator, t).share[0] for t in TEMPERATURES}
+    return max(shares, key=lambda t: shares[t])
+
+
+def curve(
+    starts: Starts, prior: Prior, budgets: list[int], generator: torch.Generator, temperature: float = 1.0
+) -> Curve:
     """What a sampling planner reaches with each number of candidates.
 
     The most are drawn once from each start. Fewer are blocks of them, each block a planner's decision.
     """
-    told, true = candidate_scores(starts, prior, max(budgets), generator)
+    told, true = candidate_scores(starts, planner_of(starts, prior, max(budgets), temperature), generator)
     found = Curve([], [], [])
     for budget in budgets:
         blocks = told.shape[1] // budget
@@ -124,10 +140,9 @@ def curve(starts: Starts, prior: Prior, budgets: list[int], generator: torch.Gen
 
 
 def seconds_per_decision(
-    starts: Starts, prior: Prior, num_plans: int, number: int, generator: torch.Generator
+    starts: Starts, planner: SamplingPlanner, number: int, generator: torch.Generator
 ) -> tuple[float, int]:
     """How long a planner takes for each of `number` starts planned from together, and its model steps for each."""
-    planner = SamplingPlanner(prior, starts.length, num_plans, num_rollouts=ROLLOUTS, **starts.task.scoring)
     state = starts.state[:number]
     begin = perf_counter()
     decision = planner.plan(starts.world, state, generator)

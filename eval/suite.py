@@ -81,7 +81,7 @@ def _both(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
 
 def _layouts(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
     """Grids with new walls and new rewards."""
-    return _both(make, num_layouts=TRAINING_MAPS, view=1, **how)
+    return _both(make, num_layouts=TRAINING_MAPS, view=2, **how)
 
 
 def _split(name: str, **options: Any) -> Callable[[int], Pair]:
@@ -130,7 +130,7 @@ def _minigrid(name: str) -> Callable[[int], Pair]:
 
 # Later is worth less, so that the best plans go straight there.
 _goal: dict[str, Any] = {"objective": "return", "discount": 0.95, "above": 0.0}
-_neighbours = "which of the eight squares around it are free"
+_neighbours = "which of the 24 squares around it are free"
 _grid_about = "the reward where a plan ends; new walls and rewards held out"
 
 _minigrid_moves = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
@@ -244,7 +244,7 @@ _tasks = (
         "cube",
         cube().action_names,
         "the 2 x 2 x 2 cube after seven random moves, quarter and half turns; passing the solved state; new scrambles",
-        lambda seed: Pair(cube(scramble=6, absorbing=True), cube(scramble=7, absorbing=True)),
+        lambda seed: Pair(cube(scramble=7, absorbing=True), cube(scramble=7, absorbing=True)),
         4,
         (5, 6, 7),
         sees="the whole cube",
