@@ -7,6 +7,7 @@ from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
 import torch
+from torch import Tensor
 
 from eval.compare_curves import (
     CLOSE,
@@ -40,7 +41,20 @@ from neuroprior.randomness import draw_seed
 ORDERS = range(5)
 """Of the Markov priors."""
 
-NEURAL: dict[str, Any] = {"gru": GRUPrior, "transformer": TransformerPrior}
+
+class UnlimitedGRU(GRUPrior):
+    """A GRU that goes on with its memory beyond the length that it was trained at.
+
+    It tells longer plans as well as one that reads their last actions in a window, and far quicker.
+    """
+
+    def prepare(self, plans: Plans | Tensor, window: int) -> Plans:
+        plans = super().prepare(plans, window)
+        self.window = None
+        return plans
+
+
+NEURAL: dict[str, Any] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
 
 LAGS = 1
 """Of GRUs: in plans this short they remember without being shown their last inputs again, and are far quicker."""
@@ -195,10 +209,8 @@ class _Contest:
                 prior = MarkovPrior(first.num_actions, order, **sizes)
                 yield from self._grown(f"markov-{order}", sees, prior, counted, worlds, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
-            # A GRU reads on beyond the length that it was trained at, as well as in a window, and far quicker.
-            how = {"window": self.task.length, "lags": LAGS} if kind == "gru" else {}
-            sizes = sizes_of(self.worlds, first) | how
-            prior = NEURAL[kind](first.num_actions, seed=draw_seed(self.generator), **sizes)
+            how = sizes_of(self.worlds, first) | ({"lags": LAGS} if kind == "gru" else {})
+            prior = NEURAL[kind](first.num_actions, seed=draw_seed(self.generator), **how)
             training = {"max_steps": self.settings.steps, "progress": False}
             yield from self._grown(kind, sees, prior, first, self.worlds, training)
 
