@@ -65,7 +65,7 @@ SEES: dict[str, Literal["plan", "step"] | None] = {"nothing": None, "start": "pl
 GROWN_WITH = 256
 """Candidate plans in the rounds of growth."""
 
-VERSION = 1
+VERSION = 2
 """Of the way in which a cell is done; counts up with each change of it."""
 
 TIMED_STARTS = 4

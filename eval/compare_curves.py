@@ -47,7 +47,8 @@ class Starts:
 
     def share(self, score: Tensor) -> float:
         """The share of the oracle that scores `[B]` are, between the reference and the oracle."""
-        return float((score - self.reference).mean() / (self.best - self.reference).mean())
+        gained, most = (values.double() - self.reference for values in (score, self.best))
+        return float(gained.mean() / most.mean())
 
 
 @dataclass(frozen=True)

@@ -224,7 +224,7 @@ _tasks = (
         "minigrid_multi_room",
         _minigrid_moves,
         "MiniGrid MultiRoom: through the doors of four rooms to a goal square; reaching it; new layouts held out",
-        _minigrid("MiniGrid-MultiRoom-N4-S5-v0"),
+        _minigrid("MiniGrid-MultiRoom-N4-S5-v1"),
         5,
         (8, 12, 16),
         sees="the seven by seven squares before it",

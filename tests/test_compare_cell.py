@@ -1,0 +1,248 @@
+"""Cells of `eval compare`: curves with known values, starts, sights by number, and whole cells of small worlds."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from eval import compare_cell
+from eval.compare_cell import Settings, recipe, run_cell, run_growth
+from eval.compare_curves import best_temperature, curve, planner_of, seconds_per_decision, starts_of
+from eval.compare_sight import Sights, numbered, sizes_of
+from eval.suite import TASKS, Pair, Task, best_score
+from neuroprior import (
+    ExhaustivePlanner,
+    MarkovPrior,
+    TabularWorld,
+    UniformPrior,
+    collect,
+    cube,
+    four_rooms,
+    gridworld,
+    maze,
+    save,
+)
+from tests.sources import refuses, seeded
+
+SMALL = Settings((4, 16), ("markov", "gru"), ("nothing", "each step"), 1, 3, 4, 30, 0)
+TINY = Task(
+    "tiny",
+    ("left", "right", "forward"),
+    "a small maze",
+    lambda seed: Pair(*(maze(5, 5, num_layouts=3, egocentric=True, view=1, seed=2 * seed + half) for half in (0, 1))),
+    3,
+    (5,),
+    sees="the squares around it",
+)
+
+
+def bandit(actions: int, probability: float | None = None) -> TabularWorld:
+    """One step: action 0 is rewarded, or, with chance, sometimes."""
+    reward = torch.zeros(1, 1, actions)
+    reward[..., 0] = 1.0
+    if probability is None:
+        return TabularWorld(torch.zeros(1, actions, dtype=torch.long), reward)
+    chances = torch.tensor([probability, 1 - probability]).expand(1, actions, 2)
+    outcomes = torch.zeros(1, 1, actions, 2)
+    outcomes[..., 0] = 1.0
+    return TabularWorld(torch.zeros(1, actions, 2, dtype=torch.long), outcomes, probability=chances)
+
+
+def one_step(world: TabularWorld) -> Task:
+    names = tuple(str(action) for action in range(world.num_actions))
+    return Task("bandit", names, "one step", lambda seed: Pair(world, world), 1, (1,), "return")
+
+
+def test_the_curve_of_a_lottery():
+    """One of five plans wins: n candidates hold it with 1 - 0.8 ** n. 4,096 draws at each of 50 starts; 6 errors."""
+    world = bandit(5)
+    starts = starts_of(one_step(world), world, 50, 1, seeded(0))
+    budgets = [1, 2, 4, 8, 16]
+    found = curve(starts, UniformPrior(5), [*budgets, 4096], seeded(1))
+    for budget, share, at in zip(budgets, found.share, found.at_oracle, strict=False):
+        truth = 1 - 0.8**budget
+        error = (truth * (1 - truth) / (50 * 4096 // budget)) ** 0.5
+        assert share == pytest.approx(truth, abs=6 * error)
+        assert at == pytest.approx(share, abs=1e-9)
+    assert found.share[-1] == found.at_oracle[-1] == 1.0
+
+
+def test_with_chance_plans_count_for_what_they_are_worth():
+    """All plans gain 1 with probability 0.3, some seem to gain more: the best of many is worth 0.3 still."""
+    world = bandit(4, 0.3)
+    starts = starts_of(one_step(world), world, 20, 1, seeded(0))
+    found = curve(starts, UniformPrior(4), [1, 64], seeded(1))
+    assert found.share == pytest.approx([1.0, 1.0])
+    assert found.score == pytest.approx([0.3, 0.3])
+    decision = planner_of(starts, UniformPrior(4), 64, 1.0).plan(world, starts.state, seeded(2))
+    assert float(decision.score.mean()) > 0.3  # what the planner thinks
+
+
+def test_a_share_lies_between_the_reference_and_the_oracle():
+    """Rewards of -1 and -3: a random plan of two gets -4 in the mean, the best -2."""
+    world = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.tensor([[[-1.0, -3.0]]]))
+    task = one_step(world)
+    starts = starts_of(task, world, 200, 2, seeded(0))
+    assert starts.best.tolist() == [-2.0] * 200
+    assert starts.reference == pytest.approx(-4.0, abs=6 * (2 / 4000) ** 0.5)
+    assert starts.share(torch.full((200,), -2.0)) == 1.0
+    assert starts.share(torch.full((200,), starts.reference)) == 0.0
+
+
+def test_starts_are_such_that_something_can_be_had():
+    world = four_rooms(9, 9, num_layouts=4, reward="goal")
+    task = replace(TASKS["four_rooms"], objective="return")
+    starts = starts_of(task, world, 30, 4, seeded(0))
+    assert starts.state.shape == (30,)
+    assert float(starts.best.min()) > 0
+    nothing = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.zeros(1, 1))
+    with refuses("only 0 of 600 starts"):
+        starts_of(task, nothing, 30, 4, seeded(0))
+
+
+def test_the_oracle_of_the_cube():
+    task, world = TASKS["cube"], cube(scramble=3, absorbing=True)
+    state = world.reset(300, seeded(0))
+    found = ExhaustivePlanner(3, **task.scoring).plan(world, state, seeded(1)).score
+    assert torch.allclose(best_score(task, world, state, 3), found)
+
+
+def test_the_best_temperature():
+    """A prior that is nearly sure of a plan that fails finds the other one when it is hot."""
+    world = bandit(2)
+    starts = starts_of(one_step(world), world, 40, 1, seeded(0))
+    sure = MarkovPrior(2, 0).fit(torch.tensor([[1]] * 97 + [[0]] * 3))
+    assert best_temperature(starts, sure, 8, seeded(1)) == 2.0
+    right = MarkovPrior(2, 0).fit(torch.tensor([[0]] * 97 + [[1]] * 3))
+    assert best_temperature(starts, right, 1, seeded(1)) == 1.0
+
+
+def test_a_decision_is_timed_at_some_of_the_starts():
+    world = bandit(3)
+    starts = starts_of(one_step(world), world, 6, 1, seeded(0))
+    seconds, steps = seconds_per_decision(starts, planner_of(starts, UniformPrior(3), 8, 1.0), 2, seeded(0))
+    assert 0 < seconds < 5
+    assert steps == 8
+
+
+def test_sights_have_numbers():
+    features = torch.randint(2, (500, 24), generator=seeded(0)).float()
+    sights = Sights(features[:300])
+    _, which = features[:300].unique(dim=0, return_inverse=True)
+    number = sights(features)
+    assert sights.number == int(which.max()) + 2
+    same = which[:, None] == which
+    assert torch.equal(number[:300, None] == number[:300], same)
+    known = (features[300:, None] == features[:300]).all(-1).any(1)
+    assert torch.equal(number[300:] == sights.number - 1, ~known)
+    assert torch.equal(sights(features.view(5, 100, 24)), number.view(5, 100))
+
+
+def test_counts_see_what_networks_see():
+    pair = TINY.worlds(0)
+    plans = collect(ExhaustivePlanner(3), pair.training, 60, context="step", generator=seeded(0))
+    assert sizes_of(pair, plans) == {"context_size": 8}
+    worlds, counted, sizes = numbered(pair, plans)
+    state = pair.training.reset(50, seeded(1))
+    assert counted.context is not None
+    assert plans.context is not None
+    assert counted.context.shape == plans.context.shape[:2]
+    seen, number = pair.training.observe(state), worlds.training.observe(state)
+    for one in range(50):
+        same = (seen == seen[one]).all(1)
+        assert number[same].unique().tolist() == [int(number[one])]
+    assert MarkovPrior(3, 1, **sizes).fit(counted).num_contexts == sizes["num_contexts"] > 5
+    assert pair.training.observe(state).is_floating_point()  # the world itself is as it was
+    grid = Pair(gridworld(4, 4), gridworld(4, 4, seed=1))
+    plans = collect(ExhaustivePlanner(2), grid.training, 20, context="plan")
+    assert numbered(grid, plans) == (grid, plans, {"num_contexts": 16})
+
+
+@pytest.fixture(scope="module")
+def cell() -> dict:
+    return run_cell(TINY, 0, SMALL)
+
+
+def test_a_cell_holds_every_prior_before_and_after_growth(cell):
+    entries = [(one["prior"], one["sees"], one["rounds"]) for one in cell["entries"]]
+    fitted = [f"markov-{order}" for order in range(5)] + ["gru"]
+    expected = [(None, "nothing", 0), ("uniform", "nothing", 0)]
+    expected += [(prior, sees, turn) for sees in ("nothing", "each step") for prior in fitted for turn in (0, 1)]
+    assert entries == expected
+    assert json.loads(json.dumps(cell))["budgets"] == [1, 2, 4, 8, 16]
+    for one in cell["entries"][1:]:
+        assert len(one["share"]) == len(one["at_oracle"]) == len(one["seconds"]) == 5
+        assert one["share"] == sorted(one["share"])
+        assert 0 < one["share"][0] <= one["share"][-1] <= 1 + 1e-12
+        assert one["model_steps"] == [None, None, 20, None, 80]
+        assert 0 < one["bits"] < 3
+    growth = [(one["prior"], one["sees"], one["round"], one["length"]) for one in cell["growth"]]
+    assert growth == [(p, s, r, (3, 5)[r]) for s in ("nothing", "each step") for p in fitted for r in (0, 1)]
+    for matrix in cell["transitions"].values():
+        assert torch.allclose(torch.tensor(matrix).sum(1), torch.ones(3))
+    assert set(cell["plans"]["paths"]) == {"uniform", "markov-2", "gru"}
+    assert torch.tensor(cell["plans"]["paths"]["gru"]).shape == (12, 6, 2)
+
+
+def test_the_same_seed_gives_the_same_cell(cell):
+    def told(found: dict) -> str:
+        kept = {key: value for key, value in found.items() if key not in ("seconds", "entries")}
+        entries = [{key: value for key, value in one.items() if key != "seconds"} for one in found["entries"]]
+        return json.dumps(kept | {"entries": entries})
+
+    assert told(run_cell(TINY, 0, SMALL)) == told(cell)
+    assert told(run_cell(TINY, 1, SMALL)) != told(cell)
+
+
+def test_saved_priors_are_compared_as_they_are(tmp_path):
+    plans = collect(ExhaustivePlanner(3), TINY.worlds(0).training, 40, generator=seeded(0))
+    folder = str(save(MarkovPrior(3, 1).fit(plans), tmp_path / "mine"))
+    found = run_cell(TINY, 0, replace(SMALL, kinds=(), priors=(folder,)))
+    assert [one["prior"] for one in found["entries"]] == [None, "uniform", folder]
+    assert found["growth"] == []
+
+
+def test_growth_alone_with_lengths_of_its_own():
+    settings = replace(SMALL, kinds=("markov",), sees=("nothing",), rounds=2, lengths=(4, 6), num_plans=(8,))
+    found = run_growth(TINY, 0, settings)
+    assert {(one["round"], one["length"]) for one in found["growth"]} == {(r, n) for r in range(3) for n in (3, 4, 6)}
+    assert {one["num_plans"] for one in found["growth"]} == {8}
+
+
+def test_the_recipe_is_the_same_in_every_process():
+    assert recipe() == recipe()
+    assert " at 0x" not in recipe()
+
+
+SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name.startswith("minigrid")]
+
+
+@pytest.mark.parametrize("name", [*(name for name in TASKS if not name.startswith("minigrid")), *SEARCHED])
+def test_worlds_of_the_suite(name):
+    """Training and held-out worlds are not the same, actions are named, and something can be had."""
+    task = TASKS[name]
+    assert task.name == name
+    training, held_out = task.worlds(3)
+    for world in (training, held_out):
+        assert world.num_actions == task.num_actions
+        assert tuple(world.action_names) == task.action_names
+        starts = starts_of(task, world, 5, task.length, seeded(0))
+        assert float((starts.best - starts.reference).mean()) > 0
+    if name in ("taxi", "cliff"):
+        assert not bool(((training.starts > 0) & (held_out.starts > 0)).any())
+    elif name != "cube":
+        tables = [torch.cat([world.next_state.flatten(), world.reward.flatten()]) for world in (training, held_out)]
+        assert not torch.equal(*tables)
+    assert all(later > earlier for earlier, later in zip((task.depth, *task.lengths), task.lengths, strict=False))
+
+
+def test_a_gru_of_the_comparison_goes_on_with_its_memory():
+    prior = compare_cell.NEURAL["gru"](3, 8).fit(
+        torch.randint(3, (40, 4), generator=seeded(0)), max_steps=2, progress=False
+    )
+    assert prior.window is None
+    _, state = prior.start(2)
+    for _ in range(10):
+        _, state = prior.step(torch.zeros(2, dtype=torch.long), state)
+    assert state.dim() == 2
