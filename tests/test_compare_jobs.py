@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -23,6 +22,7 @@ from eval.compare_jobs import Cell, Study, cells_of, gather, run_cells
 from eval.processes import do_each
 from neuroprior import MarkovPrior, save
 from tests.made_up_cells import broken, environment, made_up, quick_report, torn
+from tests.sessions import gone, wait_for
 from tests.sources import refuses
 
 SETTINGS = Settings((2, 4), ("markov",), ("nothing",), 1, 3, 4, 5, 0)
@@ -250,22 +250,6 @@ TORCHRUN = ("torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-
 
 def cells_in(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.rglob("*-*.json")}
-
-
-def wait_for(what, seconds: float = 120) -> None:
-    until = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < until, "it takes too long"
-        time.sleep(0.02)
-
-
-def gone(leader: int) -> bool:
-    """Whether no process of a session is left."""
-    try:
-        os.killpg(leader, 0)
-    except ProcessLookupError:
-        return True
-    return False
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])

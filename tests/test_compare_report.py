@@ -3,8 +3,6 @@
 import csv
 import json
 import re
-import shutil
-import subprocess
 import warnings
 from io import StringIO
 
@@ -17,9 +15,9 @@ from eval import compare_figures as figures
 from eval.compare_report import compared, write_growth_report, write_report
 from eval.compare_rows import growth_rows, rows
 from eval.drawing import FEWER, MORE
+from tests.browser import check_in_browser
 from tests.compare_cells import BUDGETS, TIMES, cell, curve, drawing, entry, worlds
 from tests.reports import FROM_ELSEWHERE
-from tests.test_page import GATHER, MEASURE
 
 ASKED = (16, 256, 4096)
 SETTINGS = {"seeds": 4, "worlds": ["maze", "a_world_with_a_long_name"]}
@@ -151,24 +149,7 @@ def test_growth_alone(tmp_path):
 
 
 def test_a_browser_shows_the_page_on_a_phone_and_a_desktop(everything, tmp_path):
-    browser = shutil.which("chromium")
-    if browser is None:
-        pytest.skip("needs chromium on PATH")
-    page = everything[1].replace("<head>", "<head>" + MEASURE)
-    (tmp_path / "page.html").write_text(page)
-    (tmp_path / "wide.html").write_text(page.replace("<main>", '<main><div style="width: 600px">wide</div>'))
-    (tmp_path / "gather.html").write_text(GATHER)
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
-    command += ["--virtual-time-budget=10000", "--enable-logging=stderr", "--dump-dom"]
-    run = subprocess.run([*command, (tmp_path / "gather.html").as_uri()], capture_output=True, text=True, timeout=120)
-    told = json.loads(re.search("<pre>(.*)</pre>", run.stdout)[1])
-    assert told["control"]["needs"] > 600
-    assert ":CONSOLE" not in run.stderr
-    for one in (told["phone"], told["desktop"]):
-        assert one["needs"] <= one["width"]
-        assert one["errors"] == []
-        assert one["follows"]
-        assert one["smallest"] >= 9.4
+    check_in_browser(everything[1], tmp_path)
 
 
 def test_curves_stand_where_they_are():

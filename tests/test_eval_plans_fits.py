@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from neuroprior.comparison import BACKOFFS_TRIED
 from neuroprior.plans import write_plans
 from tests.chains import markov_plans, markov_probs
 from tests.reports import QUICK, bits, fails, report
+from tests.sessions import gone, wait_for
 from tests.sources import seeded
 
 
@@ -204,21 +204,6 @@ def program(plans: Path, out: Path) -> subprocess.Popen[str]:
     )
 
 
-def wait_for(what, seconds: float = 120) -> None:
-    until = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < until, "it takes too long"
-        time.sleep(0.05)
-
-
-def empty_session(leader: int) -> bool:
-    try:
-        os.killpg(leader, 0)
-    except ProcessLookupError:
-        return True
-    return False
-
-
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_run_goes_on(how, alone):
     """Ctrl-C or a killed main process: nobody is left behind, nothing that is finished is done again.
@@ -234,9 +219,9 @@ def test_an_interrupted_run_goes_on(how, alone):
         else:
             os.kill(running.pid, how)
         output, said = running.communicate(timeout=60)
-        wait_for(lambda: empty_session(running.pid), 60)
+        wait_for(lambda: gone(running.pid), 60)
     finally:
-        if not empty_session(running.pid):
+        if not gone(running.pid):
             os.killpg(running.pid, signal.SIGKILL)
     if how == signal.SIGINT:
         assert running.returncode == 130

@@ -1,9 +1,6 @@
 """The page of results: escaped, self-contained, the same bytes each time, and legible figures of the right numbers."""
 
-import json
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -35,6 +32,7 @@ from eval.plan_figures import (
     order_figure,
     score_figure,
 )
+from tests.browser import check_in_browser
 
 HOSTILE = ["<b>\"&'", "</svg><script>alert(1)</script>", "$x$ $\\frac{$", "\x00\x1b\ud800", "http://evil.org", "_x"]
 MANY = [f"groom left forepaw while rearing {n}" for n in range(57)]
@@ -377,49 +375,6 @@ def test_nothing_to_draw_is_an_error(make):
         make([] if make in (score_figure, motif_figure) else {})
 
 
-MEASURE = """<script>
-const errors = [];
-for (const kind of ["error", "securitypolicyviolation"])
-  addEventListener(kind, e => errors.push(e.message || kind), true);
-addEventListener("load", () => {
-  const root = document.documentElement, text = document.querySelector("svg text");
-  parent.postMessage({
-    name: location.hash, errors, width: innerWidth, needs: Math.max(root.scrollWidth, document.body.scrollWidth),
-    follows: getComputedStyle(text).fill == getComputedStyle(document.body).color,
-    smallest: Math.min(...[...document.querySelectorAll("svg text")].map(t =>
-      parseFloat(getComputedStyle(t).fontSize) * t.getScreenCTM().d).filter(height => height > 0)),
-  }, "*");
-});
-</script>"""
-GATHER = """<iframe src="page.html#phone" width="390" height="800"></iframe>
-<iframe src="page.html#desktop" width="1280" height="800"></iframe>
-<iframe src="wide.html#control" width="390" height="800"></iframe><pre></pre><script>
-const told = {};
-addEventListener("message", e => {
-  told[e.data.name.slice(1)] = e.data; document.querySelector("pre").textContent = JSON.stringify(told);
-});
-</script>"""
-
-
 def test_a_browser_shows_the_page_on_a_phone_and_a_desktop(drawings, tmp_path):
-    """The page is never wider than the window, and nothing is amiss; a page that is too wide is told apart."""
-    browser = shutil.which("chromium")
-    if browser is None:
-        pytest.skip("needs chromium on PATH")
     boxes = [FigureBox(text, "caption", "alt") for case in drawings.values() for text in case.values()]
-    text = written(tmp_path, page_of("averylongnamewithoutanyspaces" * 4, boxes)).replace("<head>", "<head>" + MEASURE)
-    (tmp_path / "page.html").write_text(text)
-    (tmp_path / "wide.html").write_text(text.replace("<main>", '<main><div style="width: 600px">wide</div>'))
-    (tmp_path / "gather.html").write_text(GATHER)
-    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
-    command += ["--virtual-time-budget=10000", "--enable-logging=stderr", "--dump-dom"]
-    run = subprocess.run([*command, (tmp_path / "gather.html").as_uri()], capture_output=True, text=True, timeout=120)
-    told = json.loads(re.search("<pre>(.*)</pre>", run.stdout)[1])
-    assert (told["phone"]["width"], told["desktop"]["width"]) == (390, 1280)
-    assert told["control"]["needs"] > 600
-    assert ":CONSOLE" not in run.stderr
-    for one in (told["phone"], told["desktop"]):
-        assert one["needs"] <= one["width"]
-        assert one["errors"] == []
-        assert one["follows"]
-        assert one["smallest"] >= 9.4
+    check_in_browser(written(tmp_path, page_of("averylongnamewithoutanyspaces" * 4, boxes)), tmp_path)
