@@ -29,7 +29,7 @@ def _run(arguments: Sequence[str]) -> None:
     from eval.quality import quality
 
     about = "Compare behavioural priors. Dashes and underscores in option names are the same."
-    parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False)
+    parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False, allow_abbrev=True)
     commands = parser.add_subcommands()
     by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality, "mice": mice}
     by_name |= {"compare": compare, "grow": grow}
@@ -38,7 +38,7 @@ def _run(arguments: Sequence[str]) -> None:
     lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
     lists |= {"compare": COMPARE_LISTS, "grow": GROW_LISTS}
     for name, command in by_name.items():
-        sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False)
+        sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False, allow_abbrev=True)
         own = lists.get(name, {})
         sub.add_function_arguments(command, as_group=False, as_positional=True, skip=set(own))
         for option, how in own.items():

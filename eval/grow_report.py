@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from rich.console import Console
 
-from eval.compare_rows import estimated, growth_rows
+from eval.compare_rows import growth_rows
 from eval.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels, short
 from eval.page import FigureBox, Page, Section, Table, svg, write_page
 from eval.plan_report import printed
 from neuroprior.output import versions, write_csv, write_json
+from neuroprior.statistics import paired_difference
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -21,7 +22,8 @@ Rows = Sequence[Mapping[str, Any]]
 def gain_rows(cells: Rows) -> list[dict[str, Any]]:
     """What growth gave: the share of the oracle after the last round minus that before the first, at the longest plans.
 
-    A row a world and prior, with 95 % bootstrap intervals of the difference, which is paired over seeds.
+    A row a world and prior, with Student's 95 % interval of the difference, which is paired over seeds: a bootstrap of
+    few seeds would be too sure.
     """
     found: dict[tuple[str, str, str], dict[str, Any]] = {}
     for cell in cells:
@@ -33,7 +35,7 @@ def gain_rows(cells: Rows) -> list[dict[str, Any]]:
             if min(share) < max(share):
                 row["gains"].append(share[max(share)] - share[min(share)])
     kept = {key: row for key, row in found.items() if row["gains"]}
-    gains = estimated(np.array(row["gains"]) for row in kept.values())
+    gains = [_gain(row["gains"]) for row in kept.values()]
     names = ("world", "prior", "sees")
     return [
         dict(zip(names, key, strict=True))
@@ -41,6 +43,15 @@ def gain_rows(cells: Rows) -> list[dict[str, Any]]:
         | {name: gain[name] for name in ("low", "high", "seeds")}
         for (key, row), gain in zip(kept.items(), gains, strict=True)
     ]
+
+
+def _gain(gains: Sequence[float]) -> dict[str, Any]:
+    """The mean gain over seeds, and its interval; a single seed has none."""
+    if len(gains) < 2:
+        return {"mean": gains[0], "low": None, "high": None, "seeds": 1}
+    # Rounded, so that gains that are all the same are seen to be.
+    mean, low, high, _ = paired_difference(np.round(gains, 12), np.zeros(len(gains)))
+    return {"mean": mean, "low": low, "high": high, "seeds": len(gains)}
 
 
 def words(rows: Rows, gains: Rows) -> str:
@@ -56,7 +67,7 @@ def words(rows: Rows, gains: Rows) -> str:
     said = ["changes " + ", ".join(f"{_name(row)} by {_points(row)}" for row in clear)] if clear else []
     if unclear:
         said.append("cannot be told to change " + ", ".join(f"{_name(row)} ({_points(row)})" for row in unclear))
-    return f"{at}: growth {', and '.join(said)}; points of the oracle, {_over(rows)}."
+    return f"{at}: growth {', and '.join(said)}; points of the oracle, {_paired(rows)}."
 
 
 def lead(gains: Rows) -> str:
@@ -88,6 +99,11 @@ def _points(row: Mapping[str, Any]) -> str:
 def _over(rows: Rows) -> str:
     seeds = max(row["seeds"] for row in rows)
     return f"95 % bootstrap intervals over {seeds} seeds" if seeds > 1 else "a single seed, so no intervals"
+
+
+def _paired(rows: Rows) -> str:
+    seeds = max(row["seeds"] for row in rows)
+    return f"paired 95 % intervals over {seeds} seeds (Student's)" if seeds > 1 else "a single seed, so no intervals"
 
 
 class View(NamedTuple):
