@@ -62,20 +62,11 @@ class Comparison:
 
 def lead(comparison: Comparison) -> str:
     """The findings in a few sentences."""
-    main = [row for row in comparison.words if question_of(row) == PLAIN] or comparison.words
-    number = shown_plans(comparison.num_plans)
     said = []
-    best = [row for row in main if row["what"] == BEST]
-    if best:
-        better = {side: sum(row["better"] == row[side] for row in best) for side in ("first", "second")}
-        count = {side: str(number or "none") for side, number in better.items()}
-        rest = len(best) - sum(better.values())
-        worlds = f"{len(best)} worlds" if len(best) > 1 else "the one world"
-        said.append(
-            f"With {number:,} candidate plans, in {count['first']} of {worlds} the best neural prior is better than"
-            f" the best Markov chain, in {count['second']} the chain is better, and in {rest or 'none'} they cannot be"
-            " told apart."
-        )
+    for question in dict.fromkeys([PLAIN, *map(question_of, comparison.words)]):
+        best = [row for row in comparison.words if (question_of(row), row["what"]) == (question, BEST)]
+        if best:
+            said.append(_counted(best, question, shown_plans(comparison.num_plans)))
     factors: dict[str, list[float]] = {}
     for row in comparison.efficiency:
         if (row["sees"], row["rounds"] > 0) == PLAIN and row["prior"] != "uniform":
@@ -91,6 +82,19 @@ def lead(comparison: Comparison) -> str:
     seeds = {cell["seed"] for cell in comparison.cells}
     said.append(f"{len(seeds)} seeds." if len(seeds) > 1 else "One seed: nothing is told of chance.")
     return " ".join(said)
+
+
+def _counted(best: Rows, question: tuple[str, bool], number: int) -> str:
+    """In how many worlds which kind of prior is the better."""
+    better = {side: sum(row["better"] == row[side] for row in best) for side in ("first", "second")}
+    count = {side: str(number or "none") for side, number in better.items()}
+    rest = len(best) - sum(better.values())
+    worlds = f"{len(best)} worlds" if len(best) > 1 else "the one world"
+    where = f"With {number:,} candidate plans, in" if question == PLAIN else f"Of {_priors(question)}, in"
+    return (
+        f"{where} {count['first']} of {worlds} the best neural prior is better than the best Markov chain, in"
+        f" {count['second']} the chain is better, and in {rest or 'none'} they cannot be told apart."
+    )
 
 
 def times(factor: float) -> str:
@@ -111,6 +115,14 @@ def words_section(comparison: Comparison) -> Section:
         " these words beforehand; other numbers are in the tables."
     )
     return Section("In plain words", text, _gap_tables(comparison), _gap_boxes(comparison, PLAIN))
+
+
+def told_of_others(comparison: Comparison) -> Iterator[str]:
+    """The words on all further questions, each after what it is about."""
+    for question in dict.fromkeys(question_of(row) for row in comparison.words):
+        if question != PLAIN:
+            yield f"Of {_priors(question)}:"
+            yield from told(comparison, question)
 
 
 def told(comparison: Comparison, question: tuple[str, bool]) -> Iterator[str]:

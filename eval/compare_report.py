@@ -1,6 +1,7 @@
 """The report of a comparison: tables in the terminal, CSV files, `results.json`, and one HTML page."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -87,25 +88,6 @@ def write_report(
     console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
 
 
-def write_growth_report(cells: Cells, settings: Settings, command: str, folder: Path, console: Console) -> None:
-    """The same of curves of growth alone: see `write_report`.
-
-    Raises:
-        ValueError: the cells have no growth.
-    """
-    growth = growth_rows(cells)
-    curves, tables = sections.growth_section(growth), sections.growth_tables(growth)
-    if curves is None:
-        raise ValueError("cells: at least one with rounds of growth is expected")
-    for table in tables:
-        console.print(printed(table.caption.split(":")[0], table))
-    parts = [curves, Section("Tables", (), tables)]
-    worlds = ", ".join(dict.fromkeys(str(cell["world"]) for cell in cells))
-    page = Page(f"Growth of the horizon in {worlds}", sections.growth_lead(growth), command, _told(settings), parts)
-    _write(folder, page, {"growth": growth}, settings)
-    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
-
-
 def _print(comparison: Comparison, parts: Sequence[Section], console: Console) -> None:
     """The tables of each world and those of the words; below them the words, which are read first there."""
     for world, tables in sections.world_tables(comparison).items():
@@ -113,7 +95,8 @@ def _print(comparison: Comparison, parts: Sequence[Section], console: Console) -
             console.print(printed(world, table))
     for table in parts[0].tables:
         console.print(printed(parts[0].title, table))
-    for line in [*findings.told(comparison, PLAIN), findings.lead(comparison)]:
+    said = findings.told(comparison, PLAIN), findings.told_of_others(comparison), [findings.lead(comparison)]
+    for line in chain(*said):
         console.print(line, highlight=False, markup=False)
 
 

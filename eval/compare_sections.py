@@ -283,15 +283,3 @@ def growth_tables(growth: Rows) -> list[Table]:
         caption = f"{world}: share of the oracle, %, by round (actions in a plan). ±: the longer side of the interval."
         tables.append(Table(headings, rows, caption))
     return tables
-
-
-def growth_lead(growth: Rows) -> str:
-    """From where to where each world's best prior went."""
-    said = []
-    for world in dict.fromkeys(row["world"] for row in growth):
-        own = [row for row in growth if row["world"] == world]
-        last = max(row["round"] for row in own)
-        best = max((row for row in own if row["round"] == last), key=lambda row: float(row["oracle_share"]))
-        share = f"{_plus_minus(best, 'oracle_share', 100, 1)} % of the oracle's score"
-        said.append(f"{world}: {key_of(best).label} ends highest, at {share} with {best['length']} actions.")
-    return " ".join(said)

@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from rich.console import Console
 
 from eval import compare_figures as figures
-from eval.compare_report import compared, write_growth_report, write_report
+from eval.compare_report import compared, write_report
 from eval.compare_rows import growth_rows, rows
 from eval.drawing import FEWER, MORE
 from tests.browser import check_in_browser
@@ -129,23 +129,6 @@ def test_nothing_but_random_plans(tmp_path):
 def test_no_cells_are_refused(tmp_path):
     with pytest.raises(ValueError, match="cells: at least one is expected"):
         reported([], tmp_path)
-    with pytest.raises(ValueError, match="cells: at least one with rounds of growth is expected"):
-        write_growth_report(worlds(["maze"], 1), {}, "", tmp_path, Console(file=StringIO()))
-
-
-def test_growth_alone(tmp_path):
-    cells = worlds(["maze", "taxi"], 3, noise=0, rounds=2)
-    console = Console(width=80, file=StringIO())
-    write_growth_report(cells, SETTINGS, "python -m eval grow", tmp_path, console)
-    results = json.loads((tmp_path / "results.json").read_text())
-    assert results["growth"] == growth_rows(cells)
-    page = (tmp_path / "report.html").read_text()
-    assert not re.search(FROM_ELSEWHERE, page)
-    best = f"gru ends highest, at {100 * curve(16)[-1]:.1f} ±0.0 % of the oracle&#39;s score with 8 actions."
-    assert f"maze: {best} taxi: {best}" in page
-    line = next(line for line in console.file.getvalue().splitlines() if line.strip().startswith("gru"))
-    shares = [one for share in curve(16)[-3:] for one in (f"{100 * share:.1f}", "±0.0")]
-    assert line.split() == ["gru", *shares]
 
 
 def test_a_browser_shows_the_page_on_a_phone_and_a_desktop(everything, tmp_path):
