@@ -20,7 +20,7 @@ from eval.compare_curves import (
     starts_of,
 )
 from eval.compare_pictures import drawn_plans, transitions
-from eval.compare_sight import numbered, sizes_of
+from eval.compare_sight import best_counted, sizes_of
 from eval.suite import TASKS, Pair, Task
 from eval.world_priors import load_for
 from neuroprior import (
@@ -65,7 +65,7 @@ SEES: dict[str, Literal["plan", "step"] | None] = {"nothing": None, "start": "pl
 GROWN_WITH = 256
 """Candidate plans in the rounds of growth."""
 
-VERSION = 2
+VERSION = 3
 """Of the way in which a cell is done; counts up with each change of it."""
 
 TIMED_STARTS = 4
@@ -204,8 +204,8 @@ class _Contest:
     def _learners(self, sees: str) -> Iterator[_Contestant]:
         first = self.collected(self.worlds.training, sees, self.settings.training_starts)
         if "markov" in self.settings.kinds:
-            worlds, counted, sizes = numbered(self.worlds, first)
             for order in ORDERS:
+                worlds, counted, sizes = best_counted(self.worlds, first, self.task.near, order, self.generator)
                 prior = MarkovPrior(first.num_actions, order, **sizes)
                 yield from self._grown(f"markov-{order}", sees, prior, counted, worlds, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):

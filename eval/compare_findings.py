@@ -89,7 +89,7 @@ def _counted(best: Rows, question: tuple[str, bool], number: int) -> str:
     better = {side: sum(row["better"] == row[side] for row in best) for side in ("first", "second")}
     count = {side: str(number or "none") for side, number in better.items()}
     rest = len(best) - sum(better.values())
-    worlds = f"{len(best)} worlds" if len(best) > 1 else "the one world"
+    worlds = f"{len(best)} world{'s' * (len(best) > 1)}"
     where = f"With {number:,} candidate plans, in" if question == PLAIN else f"Of {_priors(question)}, in"
     return (
         f"{where} {count['first']} of {worlds} the best neural prior is better than the best Markov chain, in"

@@ -267,19 +267,3 @@ def tables_section(comparison: Comparison) -> Section:
     """All numbers, world by world."""
     tables = [table for own in world_tables(comparison).values() for table in own]
     return Section("Tables, world by world", (), tables)
-
-
-def growth_tables(growth: Rows) -> list[Table]:
-    """Shares of the oracle by round, a table a world."""
-    tables = []
-    for world in dict.fromkeys(row["world"] for row in growth):
-        own = [row for row in growth if row["world"] == world]
-        rounds = {row["round"]: row["length"] for row in own}
-        cells: dict[str, dict[int, str]] = {}
-        for row in own:
-            cells.setdefault(key_of(row).label, {})[row["round"]] = _plus_minus(row, "oracle_share", 100, 1)
-        rows = [[name, *(some.get(one, "") for one in sorted(rounds))] for name, some in cells.items()]
-        headings = ("prior", *(f"{one} ({rounds[one]})" for one in sorted(rounds)))
-        caption = f"{world}: share of the oracle, %, by round (actions in a plan). ±: the longer side of the interval."
-        tables.append(Table(headings, rows, caption))
-    return tables

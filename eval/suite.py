@@ -39,6 +39,7 @@ class Task:
         lengths: numbers of actions in the plans of the rounds of growth; the last is that of the comparison.
         objective, discount, any_prefix: what planners optimise, see `neuroprior.Planner`.
         above: plans that scored no more than this are not learned from; None: all are.
+        near: the features of it that are nearest; chains may see these alone, as they must have met what they see.
         sees: what `World.observe` of these worlds shows, for priors that see; None: nothing that would be of use.
     """
 
@@ -53,6 +54,7 @@ class Task:
     any_prefix: bool = False
     above: float | None = None
     sees: str | None = None
+    near: tuple[int, ...] | None = None
 
     @property
     def num_actions(self) -> int:
@@ -131,6 +133,7 @@ def _minigrid(name: str) -> Callable[[int], Pair]:
 # Later is worth less, so that the best plans go straight there.
 _goal: dict[str, Any] = {"objective": "return", "discount": 0.95, "above": 0.0}
 _neighbours = "which of the 24 squares around it are free"
+_nearest = (6, 7, 8, 11, 12, 15, 16, 17)
 _grid_about = "the reward where a plan ends; new walls and rewards held out"
 
 _minigrid_moves = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
@@ -152,6 +155,7 @@ _tasks = (
         5,
         (8, 12, 16),
         sees=_neighbours,
+        near=_nearest,
     ),
     Task(
         "maze",
@@ -161,6 +165,7 @@ _tasks = (
         5,
         (8, 12, 16),
         sees=_neighbours,
+        near=_nearest,
     ),
     Task(
         "egocentric",
@@ -170,6 +175,7 @@ _tasks = (
         7,
         (10, 13, 16),
         sees=_neighbours + ", as it is turned",
+        near=_nearest,
     ),
     Task(
         "taxi",

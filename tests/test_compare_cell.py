@@ -9,7 +9,7 @@ import torch
 from eval import compare_cell
 from eval.compare_cell import Settings, recipe, run_cell, run_growth
 from eval.compare_curves import best_temperature, curve, planner_of, seconds_per_decision, starts_of
-from eval.compare_sight import Sights, numbered, sizes_of
+from eval.compare_sight import Sights, best_counted, numbered, sizes_of
 from eval.suite import TASKS, Pair, Task, best_score
 from neuroprior import (
     ExhaustivePlanner,
@@ -23,6 +23,7 @@ from neuroprior import (
     maze,
     save,
 )
+from neuroprior.worlds import local_view
 from tests.sources import refuses, seeded
 
 SMALL = Settings((4, 16), ("markov", "gru"), ("nothing", "each step"), 1, 3, 4, 30, 0)
@@ -157,6 +158,20 @@ def test_counts_see_what_networks_see():
     grid = Pair(gridworld(4, 4), gridworld(4, 4, seed=1))
     plans = collect(ExhaustivePlanner(2), grid.training, 20, context="plan")
     assert numbered(grid, plans) == (grid, plans, {"num_contexts": 16})
+
+
+def test_chains_may_see_what_is_near_alone():
+    """The eight squares around; with few plans, in which large sights are new, chains do better to see no more."""
+    task = TASKS["egocentric"]
+    worlds = task.worlds(0)
+    state = worlds.training.reset(200, seeded(0))
+    nearest = worlds.training.observe(state)[:, list(task.near)]
+    assert torch.equal(nearest, local_view(worlds.training, 1)(state))
+    plans = collect(ExhaustivePlanner(4), worlds.training, 200, context="step", generator=seeded(0))
+    assert best_counted(worlds, plans, task.near, 1, seeded(0)).sizes == numbered(worlds, plans, task.near).sizes
+    full = numbered(worlds, plans).sizes
+    assert best_counted(worlds, plans, None, 1, seeded(0)).sizes == full
+    assert full["num_contexts"] > 2 * numbered(worlds, plans, task.near).sizes["num_contexts"]
 
 
 @pytest.fixture(scope="module")
