@@ -103,20 +103,25 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
     for number in settings.num_plans:
         if not 1 <= number <= MOST_PLANS or number & (number - 1):
             raise ValueError(f"num_plans: powers of two from 1 to {MOST_PLANS:,} are expected, not {number}")
-    least = {"rounds": 0, "steps": 1, "starts": 1, "training_starts": 2}
+    least = {"rounds": 0, "steps": 1, "starts": 1, "training_starts": 8}
     numbers = {name: getattr(settings, name) for name in least} | {"seeds": seeds}
     if processes is not None:
         numbers["processes"] = processes
     for name, number in numbers.items():
         if number < least.get(name, 1):
             raise ValueError(f"{name}: at least {least.get(name, 1)} is expected, not {number}")
-    if not 0 <= settings.seed < 2**50:
-        raise ValueError(f"seed: an integer from 0 to 2**50 - 1 is expected, not {settings.seed}")
+    if not 0 <= settings.seed < 2**40:
+        raise ValueError(f"seed: an integer from 0 to 2**40 - 1 is expected, not {settings.seed}")
+    blind = [world for world in worlds if TASKS[world].sees is None]
+    if blind and "nothing" not in settings.sees:
+        raise ValueError(f"sees: {blind[0]} shows nothing that would be of use; leave it out, or add nothing to --sees")
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
     """Raise ValueError unless saved priors know the actions of all worlds; before hours of work, not after them."""
     for folder in folders:
+        if folder == "uniform" or folder in KINDS or folder.startswith("markov-"):
+            raise ValueError(f"priors: {folder} is also the name of a fitted prior; give the folder as ./{folder}")
         for world in worlds:
             task = TASKS[world]
             load_for(folder, world, task.num_actions, task.action_names)

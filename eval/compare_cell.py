@@ -65,7 +65,7 @@ SEES: dict[str, Literal["plan", "step"] | None] = {"nothing": None, "start": "pl
 GROWN_WITH = 256
 """Candidate plans in the rounds of growth."""
 
-VERSION = 3
+VERSION = 4
 """Of the way in which a cell is done; counts up with each change of it."""
 
 TIMED_STARTS = 4
@@ -198,8 +198,17 @@ class _Contest:
             sees = next(name for name, per in SEES.items() if per == prior.context_per)
             yield _Contestant(folder, sees, prior, 0, None, self.worlds)
         for sees in self.settings.sees:
-            if sees == "nothing" or self.task.sees is not None:
+            if sees == "nothing" or self._shows(sees):
                 yield from self._learners(sees)
+
+    def _shows(self, sees: str) -> bool:
+        """Whether there is something to be seen that held-out worlds have in common with training worlds.
+
+        Numbers of states to start from have nothing in common: other starts are held out.
+        """
+        if self.task.sees is None:
+            return False
+        return sees == "each step" or self.worlds.training.observe(self.familiar.state[:1]).is_floating_point()
 
     def _learners(self, sees: str) -> Iterator[_Contestant]:
         first = self.collected(self.worlds.training, sees, self.settings.training_starts)
@@ -225,6 +234,7 @@ class _Contest:
             num_starts=self.settings.training_starts,
             num_plans=GROWN_WITH,
             above=self.task.above,
+            num_rollouts=ROLLOUTS,
             generator=self.generator,
             **self.task.scoring,
             **training,

@@ -135,7 +135,8 @@ def growth_section(growth: Rows) -> Section | None:
     text = [
         "A prior learns from all short plans that were tried, plans longer, learns from those plans, and so on. Below"
         " the axis: the round, and the number of actions in its plans, each against the best plans of as many actions.",
-        f"{number} candidate plans. Bands: 95 % bootstrap intervals over seeds; thin lines: the other Markov chains.",
+        f"{number} candidate plans, sampled at temperature 1. Bands: 95 % bootstrap intervals over seeds; thin lines:"
+        " the other Markov chains.",
     ]
     return Section("Growing the horizon", text, (), boxes, beside=True)
 

@@ -89,6 +89,8 @@ def best_counted(
     if near is not None and plans.context is not None:
         tried.append(numbered(worlds, plans, near))
     seed = draw_seed(generator)
+    if len(tried) == 1:
+        return tried[0]
     bits = []
     for one in tried:
         training, validation = one.plans.split(VALIDATION, torch.Generator().manual_seed(seed))

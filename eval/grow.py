@@ -65,6 +65,11 @@ def grow(
     for before, after in zip((0, *longer), longer, strict=False):
         if after <= before:
             raise ValueError(f"lengths: from 1, each longer than the one before, not {' '.join(map(str, longer))}")
+    if too_deep := [world for world in worlds if longer and world in TASKS and TASKS[world].depth >= longer[0]]:
+        depth = TASKS[too_deep[0]].depth
+        raise ValueError(
+            f"lengths: more than {depth} is expected first: in {too_deep[0]} all plans of {depth} are tried"
+        )
     if not kinds:
         raise ValueError("kinds: at least one is expected")
     rounds = len(longer) or ROUNDS

@@ -30,14 +30,18 @@ BAD = [
     (["--rounds", "-1"], "rounds: at least 0"),
     (["--steps", "0"], "steps: at least 1"),
     (["--starts", "0"], "starts: at least 1"),
-    (["--training-starts", "1"], "training_starts: at least 2"),
+    (["--training-starts", "1"], "training_starts: at least 8"),
     (["--seed", "-1"], "seed: an integer from 0"),
     (["--processes", "0"], "processes: at least 1 is expected, not 0"),
     (["--priors", "nowhere"], "nowhere"),
+    (["--priors", "gru"], "priors: gru is also the name of a fitted prior; give the folder as ./gru"),
+    (["--worlds", "grid", "--sees", "start"], "sees: grid shows nothing"),
+    (["--seed", str(2**41)], "seed: an integer from 0"),
 ]
 GROW_BAD = [
     (["--lengths", "4", "4"], "lengths: from 1, each longer than the one before, not 4 4"),
     (["--lengths", "0", "4"], "lengths: from 1"),
+    (["--lengths", "2", "4"], "lengths: more than"),
     (["--num-plans", "100"], "num_plans: powers of two"),
     (["--worlds", "nowhere"], "worlds"),
     (["--processes", "0"], "processes"),
@@ -141,8 +145,8 @@ def test_grow_writes_curves(tmp_path, capsys):
         "maze",
         "grid",
         "--lengths",
-        "3",
         "6",
+        "8",
         "--seeds",
         "3",
         "--processes",
@@ -153,7 +157,7 @@ def test_grow_writes_curves(tmp_path, capsys):
     assert main(["grow", *options, "--out", str(tmp_path)]) == 0
     found = results(tmp_path)
     assert found["settings"]["rounds"] == 2
-    assert found["settings"]["lengths"] == [3, 6]
+    assert found["settings"]["lengths"] == [6, 8]
     assert len(found["rows"]) == 2 * 2 * 3 * 2  # worlds, priors, rounds from 0, lengths
     with open(tmp_path / "grow.csv") as file:
         assert [float(row["oracle_share"]) for row in csv.DictReader(file)] == [

@@ -210,6 +210,14 @@ def test_the_same_seed_gives_the_same_cell(cell):
     assert told(run_cell(TINY, 1, SMALL)) != told(cell)
 
 
+def test_starts_that_are_numbers_are_not_looked_at():
+    """Where other states to start from are held out, the number of a start says nothing."""
+    settings = replace(SMALL, kinds=("markov",), sees=("nothing", "start", "each step"), rounds=0)
+    found = run_cell(TASKS["cliff"], 0, settings)
+    assert {one["sees"] for one in found["entries"]} == {"nothing", "each step"}
+    assert {one["sees"] for one in run_cell(TINY, 0, settings)["entries"]} == {"nothing", "start", "each step"}
+
+
 def test_saved_priors_are_compared_as_they_are(tmp_path):
     plans = collect(ExhaustivePlanner(3), TINY.worlds(0).training, 40, generator=seeded(0))
     folder = str(save(MarkovPrior(3, 1).fit(plans), tmp_path / "mine"))
@@ -246,7 +254,11 @@ def test_worlds_of_the_suite(name):
         assert float((starts.best - starts.reference).mean()) > 0
     if name in ("taxi", "cliff"):
         assert not bool(((training.starts > 0) & (held_out.starts > 0)).any())
-    elif name != "cube":
+    elif name == "cube":
+        scrambles = [set(world.reset(2000, seeded(1)).tolist()) for world in (training, held_out)]
+        assert not scrambles[0] & scrambles[1]
+        assert min(map(len, scrambles)) > 1000
+    else:
         tables = [torch.cat([world.next_state.flatten(), world.reward.flatten()]) for world in (training, held_out)]
         assert not torch.equal(*tables)
     assert all(later > earlier for earlier, later in zip((task.depth, *task.lengths), task.lengths, strict=False))

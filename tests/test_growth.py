@@ -126,6 +126,41 @@ def test_plans_end_where_it_is_over():
     assert 1 <= int(lengths.min()) < int(lengths.max()) == 6
 
 
+def slippery() -> TabularWorld:
+    """A line of six cells that ends at 5; each step goes on or stays, by chance."""
+    cell = torch.arange(6)
+    after = torch.stack([cell, (cell + 1).clamp(max=5)], 1)[:, None]
+    reward = torch.zeros(6, 1, 2)
+    reward[4, 0, 1] = 1.0
+    return TabularWorld(after, reward, probability=torch.full((6, 1, 2), 0.5))
+
+
+def test_with_chance_a_plan_is_executed_once():
+    """What is recorded as seen before its last executed action is not the end."""
+    world, planner = slippery(), SamplingPlanner(UniformPrior(1), 12, 2, objective="return")
+    plans = collect(planner, world, state=torch.zeros(400, dtype=torch.long), context="step", generator=seeded(0))
+    assert plans.context is not None
+    assert not bool((plans.mask() & (plans.context == 5)).any())
+    shorter = plans.mask().sum(1) < 12
+    assert 0 < int(shorter.sum()) < 400
+    beyond = plans.context.gather(1, plans.mask().sum(1).clamp(max=11)[:, None])[:, 0]
+    assert bool((beyond[shorter] == 5).all())
+
+
+def test_growth_with_chance_scores_by_several_rollouts():
+    """Two actions gain 1: one with chance 0.5, one always. A single rollout often takes the former for as good."""
+    next_state = torch.zeros(1, 2, 2, dtype=torch.long)
+    outcomes, chances = torch.tensor([[[0.0, 1.0], [1.0, 1.0]]]), torch.full((1, 2, 2), 0.5)
+    world = TabularWorld(next_state, outcomes[None], probability=chances)
+    plans = collect(ExhaustivePlanner(1, objective="return", num_rollouts=16), world, 300, generator=seeded(0))
+    assert bool((plans.actions == 1).all())
+    how = {"num_starts": 300, "num_plans": 40, "objective": "return", "generator": seeded(1)}
+    even = collect(SamplingPlanner(UniformPrior(2), 1, 1), world, 300, generator=seeded(2))
+    for rollouts, sure in ((1, False), (16, True)):
+        *_, last = grow(MarkovPrior(2, 0), even, world, (1,), num_rollouts=rollouts, **how)
+        assert bool((last.plans.actions == 1).all()) == sure
+
+
 def test_the_solved_cube_may_be_the_end():
     world, free = cube(absorbing=True), cube()
     state = torch.arange(2000).repeat_interleave(9)

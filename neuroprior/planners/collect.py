@@ -1,6 +1,5 @@
 """Collecting executed plans: what a planner chooses in a world is what a prior learns from."""
 
-from collections.abc import Iterator
 from typing import Literal
 
 import torch
@@ -52,41 +51,40 @@ def collect(
             raise ValueError(f"num_plans: at least 1 is expected, not {num_plans}")
         state = world.reset(num_plans, generator)
     plan, score, _, _, lengths = planner.plan(world, state, generator)
-    lengths = _executed(world, state, plan, lengths, generator)
+    course = _course(world, state, plan, generator)
+    lengths = _executed(world, course, lengths)
     if above is not None:
         kept = score > above
         if not kept.any():
             most = f"; the best {float(score.max())}" if len(score) else ""
             raise ValueError(f"above: none of {len(state)} plans scored more than {above}{most}")
         plan, state, lengths = plan[kept], state[kept], None if lengths is None else lengths[kept]
+        course = [before[kept] for before in course]
     seen = None
     if context is not None and sees_each_step(world.observe(state[:1])):
         raise ValueError("observe: indices [N] or floating point features [N, C] are expected of a world")
     if context == "plan":
         seen = world.observe(state)
     elif context == "step":
-        seen = torch.stack(list(_observations(world, state, plan, generator)), 1)
+        seen = torch.stack([world.observe(before) for before in course], 1)
     group, names = None, None
     if isinstance(world, TabularWorld):
         group, names = world.group(state), world.action_names
     return Plans(plan, world.num_actions, lengths, names, seen, group)
 
 
-def _executed(
-    world: World, state: Tensor, plan: Tensor, lengths: Tensor | None, generator: torch.Generator | None
-) -> Tensor | None:
-    """How many actions of each plan are executed `[N]`: none after it is over; None: all."""
-    executed = torch.zeros(len(plan), dtype=torch.long, device=plan.device)
+def _course(world: World, state: Tensor, plan: Tensor, generator: torch.Generator | None) -> list[Tensor]:
+    """The states `[N, ...]` before each action of `plan [N, L]`; with chance, of one course of events."""
+    course = []
     for t in range(plan.shape[1]):
-        executed += ~world.is_over(state)
+        course.append(state)
         state, _ = world.step(state, plan[:, t].long(), generator)
+    return course
+
+
+def _executed(world: World, course: list[Tensor], lengths: Tensor | None) -> Tensor | None:
+    """How many actions of each plan are executed `[N]`: none after it is over; None: all."""
+    executed = torch.stack([~world.is_over(before) for before in course]).sum(0)
     if lengths is not None:
         return torch.minimum(executed, lengths)
-    return executed if bool((executed < plan.shape[1]).any()) else None
-
-
-def _observations(world: World, state: Tensor, plan: Tensor, generator: torch.Generator | None) -> Iterator[Tensor]:
-    """What is seen before each action of `plan [N, L]`."""
-    for t in range(plan.shape[1]):
-        yield world.observe(state)
-        state, _ = world.step(state, plan[:, t].long(), generator)
+    return executed if bool((executed < len(course)).any()) else None

@@ -36,13 +36,15 @@ def grow(
     discount: float = 1.0,
     any_prefix: bool = False,
     above: float | None = None,
+    num_rollouts: int = 1,
     generator: torch.Generator | None = None,
     **settings: Any,
 ) -> Iterator[Growth]:
     """Let a prior learn from short plans, plan longer with it, learn from those plans, and so on.
 
     All plans of a length are soon too many to be tried, so that only short plans can be had by trying them all. A prior
-    that has learned from them proposes longer ones, the best of which are the next to learn from.
+    that has learned from them proposes longer ones, the best of which are the next to learn from. Priors that count
+    learn anew from the plans of each round alone; neural ones go on from the weights that they have.
 
     Args:
         prior: learns in place, by its `fit`, which takes a neural prior on from the weights that it has.
@@ -54,6 +56,7 @@ def grow(
         num_plans: candidate plans for each.
         objective, discount, any_prefix: see `Planner`.
         above: plans that scored no more than this are not learned from, see `collect`.
+        num_rollouts: of each candidate where chance decides, see `SamplingPlanner`.
         generator: draws the starts and candidates, and is passed on to a prior's `fit` where there are settings.
         settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
 
@@ -71,7 +74,13 @@ def grow(
     yield Growth(plans.max_length, plans)
     for length in lengths:
         planner = SamplingPlanner(
-            prior, length, num_plans, objective=objective, discount=discount, any_prefix=any_prefix
+            prior,
+            length,
+            num_plans,
+            objective=objective,
+            discount=discount,
+            any_prefix=any_prefix,
+            num_rollouts=num_rollouts,
         )
         plans = collect(planner, world, num_starts, context=prior.context_per, above=above, generator=generator)
         prior.fit(plans, **settings)

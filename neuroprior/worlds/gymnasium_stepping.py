@@ -92,9 +92,9 @@ class SteppedWorld(World):
         after, rewards = self._try(each, plans.reshape(batch * num_plans, length).long())
         final = after[:, -1] if length else each
         return Rollout(
-            final.reshape(batch, num_plans, -1),
+            final.reshape(batch, num_plans, state.shape[1]),
             rewards.view(batch, num_plans, length),
-            after.view(batch, num_plans, length, -1) if keep_states else None,
+            after.view(batch, num_plans, length, state.shape[1]) if keep_states else None,
         )
 
     def observe(self, state: Tensor) -> Tensor:
