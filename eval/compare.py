@@ -16,8 +16,8 @@ from eval.compare_report import write_report
 from eval.suite import TASKS
 from eval.world_priors import load_for
 
-KINDS = ("markov", "gru", "transformer")
-SEES = ("nothing", "start", "each step")
+KINDS = ("markov", *compare_cell.NEURAL)
+SEES = tuple(compare_cell.SEES)
 MOST_PLANS = 2**20
 LISTS: dict[str, dict[str, Any]] = {
     "worlds": {"default": list(TASKS), "choices": tuple(TASKS), "help": "worlds to compare priors in"},

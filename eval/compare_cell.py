@@ -1,7 +1,6 @@
 """One cell of `python -m eval compare`: everything about one world and one seed."""
 
 from collections.abc import Iterator
-from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
@@ -137,7 +136,7 @@ def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
         if one.rounds in (0, contest.rounds):
             entries.append(contest.entry(one))
         if one.sees == "nothing":
-            last[one.label] = deepcopy(one.prior)
+            last[one.label] = one.prior  # which goes on learning until all are done
     cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "length": task.length}
     cell |= {"num_starts": settings.starts, "budgets": settings.budgets, "entries": entries, "growth": growth}
     cell |= {"action_names": task.action_names}
@@ -254,7 +253,8 @@ class _Contest:
         # Chosen where it learned, for all alike; sampling them at a temperature changes nothing for uniform plans.
         familiar = replace(self.familiar, world=one.worlds.training)
         heat = 1.0 if one.label == "uniform" else best_temperature(familiar, one.prior, GROWN_WITH, self.generator)
-        entry = _named(one) | {"temperature": heat}
+        entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
+        entry |= {"temperature": heat}
         entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, heat))
         timed = {
             budget: seconds_per_decision(
@@ -295,7 +295,3 @@ class _Contest:
         entry |= {"share": [self.starts.share(decision.score.double())], "at_oracle": [reached]}
         entry |= {"score": [float(decision.score.double().mean())], "model_steps": [decision.model_steps]}
         return entry | {"seconds": [seconds], "bits": None, "actions": 0}
-
-
-def _named(one: _Contestant) -> dict[str, Any]:
-    return {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from eval.compare_best import best_difference
+from eval.compare_cell import NEURAL
 
 Array = NDArray[np.float64]
 Cells = Sequence[Mapping[str, Any]]
@@ -20,9 +21,6 @@ Rows = list[dict[str, Any]]
 
 RESAMPLES = 9_999
 """Of the bootstrap."""
-
-NEURAL = ("gru", "transformer")
-"""Neural priors fitted in the comparison."""
 
 
 class Key(NamedTuple):

@@ -67,7 +67,8 @@ def words(rows: Rows, gains: Rows) -> str:
     said = ["changes " + ", ".join(f"{_name(row)} by {_points(row)}" for row in clear)] if clear else []
     if unclear:
         said.append("cannot be told to change " + ", ".join(f"{_name(row)} ({_points(row)})" for row in unclear))
-    return f"{at}: growth {', and '.join(said)}; points of the oracle, {_paired(rows)}."
+    intervals = _over(rows, "paired 95 % intervals over {} seeds (Student's)")
+    return f"{at}: growth {', and '.join(said)}; points of the oracle, {intervals}."
 
 
 def lead(gains: Rows) -> str:
@@ -96,14 +97,9 @@ def _points(row: Mapping[str, Any]) -> str:
     return between if _holds_zero(row) else f"{gain} ({between})"
 
 
-def _over(rows: Rows) -> str:
+def _over(rows: Rows, told: str = "95 % bootstrap intervals over {} seeds") -> str:
     seeds = max(row["seeds"] for row in rows)
-    return f"95 % bootstrap intervals over {seeds} seeds" if seeds > 1 else "a single seed, so no intervals"
-
-
-def _paired(rows: Rows) -> str:
-    seeds = max(row["seeds"] for row in rows)
-    return f"paired 95 % intervals over {seeds} seeds (Student's)" if seeds > 1 else "a single seed, so no intervals"
+    return told.format(seeds) if seeds > 1 else "a single seed, so no intervals"
 
 
 class View(NamedTuple):

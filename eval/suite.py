@@ -1,6 +1,7 @@
 """The worlds of `python -m eval compare`: where plans are learned from, and where they are tried."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -8,12 +9,13 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior import PocketCube, World, cube, four_rooms, from_gymnasium, gridworld, maze
+from neuroprior import PocketCube, World, four_rooms, from_gymnasium, gridworld, maze
 from neuroprior.worlds import EpisodicWorld
+from neuroprior.worlds.cube import FACES
 from neuroprior.worlds.grid import MOVES, TURNS
 
-TRAINING_MAPS, HELD_OUT_MAPS = 20, 20
-"""Worlds to learn in and to be compared in, of each seed, where they cost nothing to make."""
+MAPS = 20
+"""Reward maps or layouts to learn in, and as many to be compared in, of each seed, where they cost nothing to make."""
 
 LAYOUTS = 3
 """The same, for layouts of MiniGrid, whose states are searched one by one."""
@@ -39,8 +41,8 @@ class Task:
         lengths: numbers of actions in the plans of the rounds of growth; the last is that of the comparison.
         objective, discount, any_prefix: what planners optimise, see `neuroprior.Planner`.
         above: plans that scored no more than this are not learned from; None: all are.
-        near: the features of it that are nearest; chains may see these alone, as they must have met what they see.
         sees: what `World.observe` of these worlds shows, for priors that see; None: nothing that would be of use.
+        near: the features of it that are nearest; chains may see these alone, as they must have met what they see.
     """
 
     name: str
@@ -83,22 +85,20 @@ def _both(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
 
 def _layouts(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
     """Grids with new walls and new rewards."""
-    return _both(make, num_layouts=TRAINING_MAPS, view=2, **how)
+    return _both(make, num_layouts=MAPS, view=2, **how)
 
 
 def _split(name: str, **options: Any) -> Callable[[int], Pair]:
     """One environment, started in any state that can be reached: a random half to learn from, the other held out."""
 
     def made(seed: int) -> Pair:
-        halves = []
-        for half in (0, 1):
-            world = from_gymnasium(name, starts="any", **options)
-            assert isinstance(world, EpisodicWorld)
-            where = world.starts.nonzero()[:, 0]
-            where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
-            kept = where[: len(where) // 2] if half == 0 else where[len(where) // 2 :]
-            world.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
-            halves.append(world)
+        world = from_gymnasium(name, starts="any", **options)
+        assert isinstance(world, EpisodicWorld)
+        where = world.starts.nonzero()[:, 0]
+        where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
+        halves = [copy(world), copy(world)]
+        for half, kept in zip(halves, where.tensor_split([len(where) // 2]), strict=True):
+            half.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
         return Pair(*halves)
 
     return made
@@ -117,20 +117,6 @@ def _lake(slippery: bool) -> Callable[[int], Pair]:
     return made
 
 
-def _minigrid(name: str) -> Callable[[int], Pair]:
-    """MiniGrid: each seed with layouts of its own, some to learn in and some held out; starts are all that can be."""
-
-    def made(seed: int) -> Pair:
-        first = 2 * LAYOUTS * seed
-        seeds = (range(first, first + LAYOUTS), range(first + LAYOUTS, first + 2 * LAYOUTS))
-        return Pair(
-            *(from_gymnasium(name, seeds=some, starts="any", observations=True, progress=False) for some in seeds)
-        )
-
-    return made
-
-
-# Later is worth less, so that the best plans go straight there.
 class _Scrambles(PocketCube):
     """The cube with half of its scrambled states, told by their number: those of one half are never in the other."""
 
@@ -146,19 +132,33 @@ class _Scrambles(PocketCube):
         return own[:batch_size]
 
 
+# Later is worth less, so that the best plans go straight there.
 _goal: dict[str, Any] = {"objective": "return", "discount": 0.95, "above": 0.0}
 _neighbours = "which of the 24 squares around it are free"
 _nearest = (6, 7, 8, 11, 12, 15, 16, 17)
 _grid_about = "the reward where a plan ends; new walls and rewards held out"
 
-_minigrid_moves = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
+
+def _minigrid(name: str, about: str, environment: str) -> Task:
+    """MiniGrid: each seed with layouts of its own, some to learn in and some held out; starts are all that can be."""
+
+    def made(seed: int) -> Pair:
+        first = 2 * LAYOUTS * seed
+        seeds = (range(first, first + LAYOUTS), range(first + LAYOUTS, first + 2 * LAYOUTS))
+        how: dict[str, Any] = {"starts": "any", "observations": True, "progress": False}
+        return Pair(*(from_gymnasium(environment, seeds=some, **how) for some in seeds))
+
+    moves = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
+    about = f"MiniGrid {about}; reaching it; new layouts held out"
+    return Task(name, moves, about, made, 5, (8, 12, 16), sees="the seven by seven squares before it", **_goal)
+
 
 _tasks = (
     Task(
         "grid",
         MOVES,
         "the paper's grid: 20 x 20, a torus, independent rewards; the reward where a plan ends; new rewards held out",
-        _both(partial(gridworld, 20, 20, edges="torus"), num_worlds=TRAINING_MAPS),
+        _both(partial(gridworld, 20, 20, edges="torus"), num_worlds=MAPS),
         4,
         (6, 8),
     ),
@@ -231,39 +231,18 @@ _tasks = (
         (8, 11, 14),
         "return",
     ),
-    Task(
-        "minigrid_four_rooms",
-        _minigrid_moves,
-        "MiniGrid FourRooms: to a goal square, seven actions; reaching it; new layouts held out",
-        _minigrid("MiniGrid-FourRooms-v0"),
-        5,
-        (8, 12, 16),
-        sees="the seven by seven squares before it",
-        **_goal,
-    ),
-    Task(
+    _minigrid("minigrid_four_rooms", "FourRooms: to a goal square, seven actions", "MiniGrid-FourRooms-v0"),
+    _minigrid(
         "minigrid_multi_room",
-        _minigrid_moves,
-        "MiniGrid MultiRoom: through the doors of four rooms to a goal square; reaching it; new layouts held out",
-        _minigrid("MiniGrid-MultiRoom-N4-S5-v1"),
-        5,
-        (8, 12, 16),
-        sees="the seven by seven squares before it",
-        **_goal,
+        "MultiRoom: through the doors of four rooms to a goal square",
+        "MiniGrid-MultiRoom-N4-S5-v1",
     ),
-    Task(
-        "minigrid_door_key",
-        _minigrid_moves,
-        "MiniGrid DoorKey, 6 x 6: fetch a key, open a door, go to a goal square; reaching it; new layouts held out",
-        _minigrid("MiniGrid-DoorKey-6x6-v0"),
-        5,
-        (8, 12, 16),
-        sees="the seven by seven squares before it",
-        **_goal,
+    _minigrid(
+        "minigrid_door_key", "DoorKey, 6 x 6: fetch a key, open a door, go to a goal square", "MiniGrid-DoorKey-6x6-v0"
     ),
     Task(
         "cube",
-        cube().action_names,
+        tuple(face + turn for face in FACES for turn in ("", "2", "'")),
         "the 2 x 2 x 2 cube after seven random moves, half turns too; passing the solved state; half of them held out",
         lambda seed: Pair(_Scrambles(0), _Scrambles(1)),
         4,

@@ -1,6 +1,8 @@
 """Programs that are interrupted or killed, with all processes that they started; for tests."""
 
 import os
+import signal
+import subprocess
 import time
 from collections.abc import Callable
 
@@ -20,3 +22,25 @@ def gone(leader: int) -> bool:
     except ProcessLookupError:
         return True
     return False
+
+
+def interrupted(running: subprocess.Popen[str], how: signal.Signals, once: Callable[[], object]) -> tuple[str, str]:
+    """Stop a program that leads a session, once something is so, and wait until nobody is left behind.
+
+    Args:
+        running: the program.
+        how: SIGINT, which all of the session get, as from a terminal; another signal is for the program alone.
+        once: when.
+
+    Returns:
+        What it had printed, and told of errors.
+    """
+    try:
+        wait_for(once)
+        (os.killpg if how == signal.SIGINT else os.kill)(running.pid, how)
+        told = running.communicate(timeout=60)
+        wait_for(lambda: gone(running.pid), 60)
+    finally:
+        if not gone(running.pid):
+            os.killpg(running.pid, signal.SIGKILL)
+    return told

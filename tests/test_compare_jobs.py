@@ -22,7 +22,7 @@ from eval.compare_jobs import Cell, Study, cells_of, gather, run_cells
 from eval.processes import do_each
 from neuroprior import MarkovPrior, save
 from tests.made_up_cells import broken, environment, made_up, quick_report, torn
-from tests.sessions import gone, wait_for
+from tests.sessions import interrupted, wait_for
 from tests.sources import refuses
 
 SETTINGS = Settings((2, 4), ("markov",), ("nothing",), 1, 3, 4, 5, 0)
@@ -256,17 +256,7 @@ def cells_in(out: Path) -> dict[str, bytes]:
 def test_an_interrupted_run_goes_on(how, alone, tmp_path):
     """Ctrl-C or a killed main process: nobody is left behind, and what another run finishes is the same to the byte."""
     running = started(out=tmp_path, SLOW="0.3")
-    try:
-        wait_for(lambda: cells_in(tmp_path))
-        if how == signal.SIGINT:
-            os.killpg(running.pid, how)
-        else:
-            os.kill(running.pid, how)
-        output, said = running.communicate(timeout=60)
-        wait_for(lambda: gone(running.pid), 60)
-    finally:
-        if not gone(running.pid):
-            os.killpg(running.pid, signal.SIGKILL)
+    output, said = interrupted(running, how, lambda: cells_in(tmp_path))
     if how == signal.SIGINT:
         assert running.returncode == 130
         assert said.startswith("interrupted; finished cells are kept in")

@@ -18,7 +18,7 @@ from neuroprior.comparison import BACKOFFS_TRIED
 from neuroprior.plans import write_plans
 from tests.chains import markov_plans, markov_probs
 from tests.reports import QUICK, bits, fails, report
-from tests.sessions import gone, wait_for
+from tests.sessions import interrupted
 from tests.sources import seeded
 
 
@@ -212,17 +212,7 @@ def test_an_interrupted_run_goes_on(how, alone):
     """
     out = alone / how.name
     running = program(alone / "new.npz", out)
-    try:
-        wait_for(lambda: list(out.rglob("fold*-*.npz")))
-        if how == signal.SIGINT:
-            os.killpg(running.pid, how)
-        else:
-            os.kill(running.pid, how)
-        output, said = running.communicate(timeout=60)
-        wait_for(lambda: gone(running.pid), 60)
-    finally:
-        if not gone(running.pid):
-            os.killpg(running.pid, signal.SIGKILL)
+    output, said = interrupted(running, how, lambda: list(out.rglob("fold*-*.npz")))
     if how == signal.SIGINT:
         assert running.returncode == 130
         assert said.startswith(f"interrupted; fits that were finished are kept in {out}")

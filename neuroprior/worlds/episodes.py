@@ -78,12 +78,6 @@ class EpisodicWorld(TabularWorld):
         """The layout of each state: int64 of the shape of `state`."""
         return self._layouts[self.cell(state)]
 
-    def group(self, state: Tensor) -> Tensor | None:
-        """The world that each state is in, `reward_map * num_layouts + layout`; None where there is but one."""
-        if self.num_layouts == 1:
-            return super().group(state)
-        return self.reward_map(state) * self.num_layouts + self.layout(state)
-
     def observe(self, state: Tensor) -> Tensor:
         """The features `[N, C]` of each state, or its number `[N]` where there are none."""
         return super().observe(state) if self.features is None else self.features[self.cell(state)]

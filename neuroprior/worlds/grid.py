@@ -96,12 +96,6 @@ class GridWorld(TabularWorld):
             return super().observe(state)
         return self._seen.index_select(0, self.cell(state)).float()
 
-    def group(self, state: Tensor) -> Tensor | None:
-        """The world that each state is in, `reward_map * M + layout`; None where there is but one."""
-        if self.num_layouts == 1:
-            return super().group(state)
-        return self.reward_map(state) * self.num_layouts + self.layout(state)
-
     def square(self, state: Tensor) -> Tensor:
         """The square of each state among all layouts' squares, `layout * height * width + row * width + column`."""
         return self.cell(state).div(4, rounding_mode="floor") if self.egocentric else self.cell(state)

@@ -34,10 +34,13 @@ class TabularWorld(World):
     Attributes:
         next_state, reward: as they came, `reward` always with a dimension for the maps.
         probability: `[S, A, K]` float64, or None.
+        num_layouts: number of layouts, see `layout`; 1 unless a subclass has more.
 
     Raises:
         ValueError: a shape, dtype or value is wrong.
     """
+
+    num_layouts: int = 1
 
     def __init__(
         self,
@@ -104,9 +107,15 @@ class TabularWorld(World):
         """The reward map of each state, between 0 and W - 1."""
         return state.div(self.num_states, rounding_mode="floor")
 
+    def layout(self, state: Tensor) -> Tensor:
+        """The layout of each state, between 0 and `num_layouts` - 1: parts of a table that no action joins."""
+        return torch.zeros_like(state)
+
     def group(self, state: Tensor) -> Tensor | None:
-        """Which of the worlds in this table each state is in, its reward map; None where there is but one."""
-        return self.reward_map(state) if self.num_maps > 1 else None
+        """The world that each state is in, `reward_map * num_layouts + layout`; None where there is but one."""
+        if self.num_maps * self.num_layouts == 1:
+            return None
+        return self.reward_map(state) * self.num_layouts + self.layout(state)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`, uniform over cells and reward maps."""
