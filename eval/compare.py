@@ -9,22 +9,23 @@ from typing import Any
 
 from rich.console import Console
 
-from eval import compare_cell
-from eval.compare_cell import Settings
+from eval import compare_cell, compare_settings
 from eval.compare_jobs import Study, cells_of, run_cells
+from eval.compare_priors import NEURAL
 from eval.compare_report import write_report
+from eval.compare_settings import Settings
 from eval.suite import TASKS
 from eval.world_priors import load_for
 
-KINDS = ("markov", *compare_cell.NEURAL)
-SEES = tuple(compare_cell.SEES)
+KINDS = ("markov", *NEURAL)
+SEES = tuple(compare_settings.SEES)
 MOST_PLANS = 2**20
 LISTS: dict[str, dict[str, Any]] = {
     "worlds": {"default": list(TASKS), "choices": tuple(TASKS), "help": "worlds to compare priors in"},
     "num_plans": {"type": int, "default": [16, 64, 256, 1024, 4096], "help": "candidate plans, powers of two"},
     "priors": {"help": "model folders to compare, such as `python -m train` writes; nothing is fitted without --kinds"},
     "kinds": {"choices": KINDS, "help": "kinds of priors that are fitted; all of them by default"},
-    "sees": {"default": ["nothing"], "choices": SEES, "help": "what priors see: nothing but the plan so far, or more"},
+    "sees": {"choices": SEES, "help": "what priors see: nothing but the plan so far, or more; as suits each world"},
 }
 """Options that take several words."""
 
@@ -35,8 +36,8 @@ def compare(
     num_plans: Sequence[int] = (16, 64, 256, 1024, 4096),
     priors: list[str] | None = None,
     kinds: list[str] | None = None,
-    sees: list[str] = ["nothing"],  # noqa: B006
-    rounds: int = 3,
+    sees: list[str] | None = None,
+    rounds: int = 4,
     steps: int = 300,
     starts: int = 32,
     training_starts: int = 1000,
@@ -57,11 +58,13 @@ def compare(
         num_plans: numbers of candidate plans, powers of two.
         priors: model folders to compare, such as `python -m train` writes.
         kinds: of priors that are fitted: markov, gru, transformer; all by default, but none where there are saved ones.
-        sees: what priors see: nothing but the plan so far, the start as well, or each step.
+        sees: what priors see: nothing but the plan so far, the start as well, or each step; by default nothing and, in
+            worlds where it could help, one or both of the others.
         rounds: of horizon growth: a prior learns from plans that were found with it, each time longer ones; 0: none.
         steps: of training of each neural prior, at most.
         starts: held-out starts to plan from.
-        training_starts: from so many starts plans are collected to learn from.
+        training_starts: from so many starts plans are collected to learn from; from several times as many in worlds
+            where most starts lead nowhere.
         seed: of everything random.
         processes: how many cells, a world and a seed each, are done at a time; all cores by default, and a single one
             in each process that torchrun started.
@@ -73,7 +76,7 @@ def compare(
     if not kinds and not saved:
         raise ValueError("kinds: at least one kind of prior, or --priors, is expected")
     settings = Settings(
-        tuple(num_plans), tuple(kinds), tuple(sees), rounds, steps, starts, training_starts, seed, saved
+        tuple(num_plans), tuple(kinds), tuple(sees or ()), rounds, steps, starts, training_starts, seed, saved
     )
     check(worlds, seeds, processes, settings)
     check_saved(saved, worlds)
@@ -91,13 +94,12 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
     for name, (given, known) in words.items():
         if unknown := [word for word in given if word not in known]:
             raise ValueError(f"{name}: {unknown[0]!r} is not known; there are {', '.join(known)}")
-    lists = {"worlds": worlds, "num_plans": settings.num_plans, "sees": settings.sees}
+    lists = {"worlds": worlds, "num_plans": settings.num_plans}
     for name, some in lists.items():
         if not some:
             raise ValueError(f"{name}: at least one is expected")
-    for name, some in (
-        lists | {"kinds": settings.kinds, "priors": settings.priors, "lengths": settings.lengths}
-    ).items():
+    more = {name: getattr(settings, name) for name in ("sees", "kinds", "priors", "lengths")}
+    for name, some in (lists | more).items():
         if len(set(some)) < len(some):
             raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, some))}")
     for number in settings.num_plans:
@@ -113,7 +115,7 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
     if not 0 <= settings.seed < 2**40:
         raise ValueError(f"seed: an integer from 0 to 2**40 - 1 is expected, not {settings.seed}")
     blind = [world for world in worlds if TASKS[world].sees is None]
-    if blind and "nothing" not in settings.sees:
+    if blind and settings.sees and "nothing" not in settings.sees:
         raise ValueError(f"sees: {blind[0]} shows nothing that would be of use; leave it out, or add nothing to --sees")
 
 

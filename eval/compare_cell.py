@@ -1,17 +1,18 @@
 """One cell of `python -m eval compare`: everything about one world and one seed."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, fields, replace
+from functools import cached_property
 from time import perf_counter
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from eval.compare_curves import (
     CLOSE,
     ROLLOUTS,
     TEMPERATURES,
+    Starts,
     best_temperature,
     curve,
     planner_of,
@@ -19,16 +20,15 @@ from eval.compare_curves import (
     starts_of,
 )
 from eval.compare_pictures import drawn_plans, transitions
-from eval.compare_sight import best_counted, sizes_of
-from eval.suite import TASKS, Pair, Task
+from eval.compare_priors import NEURAL, ORDERS, RECIPE, chain, network
+from eval.compare_settings import SEES, Settings
+from eval.suite import TASKS, Task
+from eval.suite_worlds import LAYOUTS, MAPS, SCRAMBLE
 from eval.world_priors import load_for
 from neuroprior import (
     ExhaustivePlanner,
-    GRUPrior,
-    MarkovPrior,
     Plans,
     Prior,
-    TransformerPrior,
     UniformPrior,
     World,
     collect,
@@ -37,78 +37,31 @@ from neuroprior import (
 from neuroprior.comparison import score
 from neuroprior.randomness import draw_seed
 
-ORDERS = range(5)
-"""Of the Markov priors."""
-
-
-class UnlimitedGRU(GRUPrior):
-    """A GRU that goes on with its memory beyond the length that it was trained at.
-
-    It tells longer plans as well as one that reads their last actions in a window, and far quicker.
-    """
-
-    def prepare(self, plans: Plans | Tensor, window: int) -> Plans:
-        plans = super().prepare(plans, window)
-        self.window = None
-        return plans
-
-
-NEURAL: dict[str, Any] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
-
-LAGS = 1
-"""Of GRUs: in plans this short they remember without being shown their last inputs again, and are far quicker."""
-
-SEES: dict[str, Literal["plan", "step"] | None] = {"nothing": None, "start": "plan", "each step": "step"}
-"""How a prior's context is called in tables, and by `collect`."""
-
-GROWN_WITH = 256
+GROWN_WITH = 64
 """Candidate plans in the rounds of growth."""
 
-VERSION = 4
+JUDGED_WITH = 256
+"""Candidate plans with which temperatures are chosen, and growth is told."""
+
+VERSION = 5
 """Of the way in which a cell is done; counts up with each change of it."""
+
+FAMILIAR = 2
+"""For each held-out start so many where priors learned, to choose temperatures at: differences are small."""
 
 TIMED_STARTS = 4
 """Starts planned from together when a decision is timed."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """All that decides the results of a cell, beside its world and seed.
-
-    Attributes:
-        num_plans: numbers of candidate plans, powers of two.
-        kinds: of fitted priors: "markov", "gru", "transformer".
-        sees: what priors see: "nothing", "start", "each step".
-        rounds: of horizon growth, at most; a world has as many as it has lengths.
-        steps: of training of each neural prior in a round, at most.
-        starts: held-out starts to plan from.
-        training_starts: from so many starts plans are collected to learn from.
-        seed: of everything random.
-        priors: folders of saved priors.
-        lengths: actions in a plan, round by round of horizon growth; none: those of the world.
-    """
-
-    num_plans: tuple[int, ...]
-    kinds: tuple[str, ...]
-    sees: tuple[str, ...]
-    rounds: int
-    steps: int
-    starts: int
-    training_starts: int
-    seed: int
-    priors: tuple[str, ...] = ()
-    lengths: tuple[int, ...] = ()
-
-    @property
-    def budgets(self) -> list[int]:
-        """All powers of two up to the most candidates."""
-        return [2**k for k in range(max(self.num_plans).bit_length())]
-
-
 def recipe() -> str:
     """All that decides a cell beside its settings; after a change of it, finished cells do not count."""
-    worlds = [(task.name, task.about, task.depth, task.lengths, task.scoring, task.above) for task in TASKS.values()]
-    return repr((worlds, ORDERS, [*NEURAL], GROWN_WITH, ROLLOUTS, TEMPERATURES, LAGS, TIMED_STARTS, VERSION))
+    worlds = [
+        [getattr(task, field.name) for field in fields(task) if field.name != "worlds"] for task in TASKS.values()
+    ]
+    made = (MAPS, LAYOUTS, SCRAMBLE)
+    return repr(
+        (worlds, made, ORDERS, RECIPE, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, FAMILIAR, TIMED_STARTS, VERSION)
+    )
 
 
 def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
@@ -162,6 +115,13 @@ def run_growth(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
     return cell | {"seconds": perf_counter() - begin}
 
 
+def as_seen(plans: Plans, sees: str) -> Plans:
+    """Plans of which each step is seen, as priors that see less of them see them."""
+    assert plans.context is not None
+    seen = {None: None, "plan": plans.context[:, 0], "step": plans.context}[SEES[sees]]
+    return replace(plans, context=seen)
+
+
 class _Contestant(NamedTuple):
     """A prior as it is after some rounds of growth, the plans of the last of which had `length` actions."""
 
@@ -170,7 +130,6 @@ class _Contestant(NamedTuple):
     prior: Prior
     rounds: int
     length: int | None
-    worlds: Pair
 
 
 class _Contest:
@@ -183,20 +142,25 @@ class _Contest:
         self.longer = (settings.lengths or task.lengths)[: settings.rounds]
         self.rounds, self.lengths = len(self.longer), tuple(sorted({task.depth, *self.longer}))
         held_out = self.worlds.held_out
-        self.starts = starts_of(task, held_out, settings.starts, task.length, self.generator)
-        self.familiar = starts_of(task, self.worlds.training, settings.starts, task.length, self.generator)
-        self.starts_at = {
-            length: starts_of(task, held_out, settings.starts, length, self.generator) for length in self.lengths
-        }
+        self.training_starts = settings.training_starts * task.times
+        # Temperatures are chosen in the worlds that were learned in.
+        self.starts_at, self.familiar_at = (
+            {
+                length: starts_of(task, world, number, length, self.generator)
+                for length in sorted({*self.lengths, task.length})
+            }
+            for world, number in ((held_out, settings.starts), (self.worlds.training, FAMILIAR * settings.starts))
+        )
+        self.starts, self.familiar = self.starts_at[task.length], self.familiar_at[task.length]
 
     def contestants(self) -> Iterator[_Contestant]:
         """All priors, each after every round of its growth; the object is the same, and goes on learning."""
-        yield _Contestant("uniform", "nothing", UniformPrior(self.worlds.training.num_actions), 0, None, self.worlds)
+        yield _Contestant("uniform", "nothing", UniformPrior(self.worlds.training.num_actions), 0, None)
         for folder in self.settings.priors:
             prior = load_for(folder, self.task.name, self.task.num_actions, self.task.action_names)
             sees = next(name for name, per in SEES.items() if per == prior.context_per)
-            yield _Contestant(folder, sees, prior, 0, None, self.worlds)
-        for sees in self.settings.sees:
+            yield _Contestant(folder, sees, prior, 0, None)
+        for sees in self.settings.sees or self.task.sights:
             if sees == "nothing" or self._shows(sees):
                 yield from self._learners(sees)
 
@@ -210,49 +174,52 @@ class _Contest:
         return sees == "each step" or self.worlds.training.observe(self.familiar.state[:1]).is_floating_point()
 
     def _learners(self, sees: str) -> Iterator[_Contestant]:
-        first = self.collected(self.worlds.training, sees, self.settings.training_starts)
+        first = as_seen(self.first, sees)
         if "markov" in self.settings.kinds:
             for order in ORDERS:
-                worlds, counted, sizes = best_counted(self.worlds, first, self.task.near, order, self.generator)
-                prior = MarkovPrior(first.num_actions, order, **sizes)
-                yield from self._grown(f"markov-{order}", sees, prior, counted, worlds, {})
+                prior = chain(order, self.worlds.training, first, self.task.near)
+                yield from self._grown(f"markov-{order}", sees, prior, first, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
-            how = sizes_of(self.worlds, first) | ({"lags": LAGS} if kind == "gru" else {})
-            prior = NEURAL[kind](first.num_actions, seed=draw_seed(self.generator), **how)
-            training = {"max_steps": self.settings.steps, "progress": False}
-            yield from self._grown(kind, sees, prior, first, self.worlds, training)
+            prior = network(kind, self.worlds.training, first, draw_seed(self.generator))
+            yield from self._grown(kind, sees, prior, first, {"max_steps": self.settings.steps, "progress": False})
 
     def _grown(
-        self, label: str, sees: str, prior: Prior, first: Plans, worlds: Pair, training: dict[str, Any]
+        self, label: str, sees: str, prior: Prior, first: Plans, training: dict[str, Any]
     ) -> Iterator[_Contestant]:
         growth = grow(
             prior,
             first,
-            worlds.training,
+            self.worlds.training,
             self.longer,
-            num_starts=self.settings.training_starts,
+            num_starts=self.training_starts,
             num_plans=GROWN_WITH,
             above=self.task.above,
             num_rollouts=ROLLOUTS,
+            temperatures=TEMPERATURES,
             generator=self.generator,
             **self.task.scoring,
             **training,
         )
         for rounds, _ in enumerate(growth):
-            yield _Contestant(label, sees, prior, rounds, (self.task.depth, *self.longer)[rounds], worlds)
+            yield _Contestant(label, sees, prior, rounds, (self.task.depth, *self.longer)[rounds])
 
-    def collected(self, world: World, sees: str, number: int) -> Plans:
-        """What the planner that tries all short plans chooses."""
+    @cached_property
+    def first(self) -> Plans:
+        """What the planner that tries all short plans chooses in the training worlds."""
+        return self._collected(self.worlds.training, self.training_starts)
+
+    @cached_property
+    def told(self) -> Plans:
+        """The same in the held-out worlds, on which bits are told."""
+        return self._collected(self.worlds.held_out, self.training_starts // 4)
+
+    def _collected(self, world: World, number: int) -> Plans:
         planner = ExhaustivePlanner(self.task.depth, num_rollouts=ROLLOUTS, **self.task.scoring)
-        how: dict[str, Any] = {"context": SEES[sees], "above": self.task.above}
-        return collect(planner, world, number, generator=self.generator, **how)
+        return collect(planner, world, number, context="step", above=self.task.above, generator=self.generator)
 
     def entry(self, one: _Contestant) -> dict[str, Any]:
         """What a prior's plans reach in the held-out worlds, and how well it tells those that were chosen there."""
-        starts = replace(self.starts, world=one.worlds.held_out)
-        # Chosen where it learned, for all alike; sampling them at a temperature changes nothing for uniform plans.
-        familiar = replace(self.familiar, world=one.worlds.training)
-        heat = 1.0 if one.label == "uniform" else best_temperature(familiar, one.prior, GROWN_WITH, self.generator)
+        starts, heat = self.starts, self._heat(one, self.familiar)
         entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
         entry |= {"temperature": heat}
         entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, heat))
@@ -264,17 +231,20 @@ class _Contest:
         }
         seconds, steps = ([timed[b][k] if b in timed else None for b in self.settings.budgets] for k in (0, 1))
         entry |= {"seconds": seconds, "model_steps": steps}
-        plans = self.collected(one.worlds.held_out, one.sees, self.settings.training_starts // 4)
-        told = score(one.label, one.prior, plans)
-        return entry | {"bits": told.bits_per_action().mean, "actions": int(plans.mask().sum())}
+        told = score(one.label, one.prior, as_seen(self.told, one.sees))
+        return entry | {"bits": told.bits_per_action().mean, "actions": int(self.told.mask().sum())}
 
     def growth(self, one: _Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""
-        starts = replace(self.starts_at[length], world=one.worlds.held_out)
-        budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else GROWN_WITH
-        share = curve(starts, one.prior, [budget], self.generator).share[0]
+        budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else JUDGED_WITH
+        heat = self._heat(one, self.familiar_at[length])
+        share = curve(self.starts_at[length], one.prior, [budget], self.generator, heat).share[0]
         named = {"prior": one.label, "sees": one.sees, "round": one.rounds}
         return named | {"length": length, "num_plans": budget, "share": share}
+
+    def _heat(self, one: _Contestant, familiar: Starts) -> float:
+        """The temperature to sample a prior at; uniform plans are the same at all."""
+        return 1.0 if one.label == "uniform" else best_temperature(familiar, one.prior, JUDGED_WITH, self.generator)
 
     def exhaustive(self) -> dict[str, Any] | None:
         """What all short plans reach; None where longer ones cost more, which would favour the short."""

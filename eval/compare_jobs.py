@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 from eval import compare_cell
-from eval.compare_cell import Settings
+from eval.compare_settings import Settings
 from eval.processes import do_each, progress_bar
 from eval.suite import TASKS, Task
 from neuroprior import __version__

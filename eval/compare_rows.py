@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from eval.compare_best import best_difference
-from eval.compare_cell import NEURAL
+from eval.compare_priors import NEURAL
 
 Array = NDArray[np.float64]
 Cells = Sequence[Mapping[str, Any]]

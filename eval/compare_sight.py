@@ -1,22 +1,19 @@
-"""What priors see in `python -m eval compare`: features for networks, and numbers for counts, of the same sights."""
+"""Markov priors that see features, in `python -m eval compare`: a sight is a context that has to be met to be known."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from eval.suite import Pair
-from neuroprior import MarkovPrior, Plans, TabularWorld, World
+from neuroprior import MarkovPrior, Plans, Prior
 from neuroprior.comparison import score
-from neuroprior.randomness import draw_seed
 
 VALIDATION = 0.2
-"""Share of the plans on which it is chosen what a chain sees."""
+"""Share of the plans on which it is chosen what a prior sees."""
 
-SAME = 1e-6
+SAME = 1e-9
 """Sights whose codes are nearer than this are the same."""
 
 
@@ -51,56 +48,55 @@ class Sights:
         return torch.where((self.codes[place] - code).abs() < SAME, place, len(self.codes))
 
 
-def sizes_of(worlds: Pair, plans: Plans) -> dict[str, Any]:
-    """The arguments that let a prior see the context of `plans`."""
-    if plans.context is None:
-        return {}
-    if plans.context.is_floating_point():
-        return {"context_size": plans.context.shape[-1]}
-    assert isinstance(worlds.training, TabularWorld)
-    return {"num_contexts": worlds.training.num_states}
+class SeeingMarkov(Prior):
+    """A Markov prior that sees features: each sight that occurs in the plans it learns from is a context of its own.
 
+    Chains have to meet a sight to know it, and of large sights most are new. So each time it learns, all features and
+    each of the sets in `near` are tried, and those are taken with which it tells held-out plans best.
 
-class Counted(NamedTuple):
-    """Worlds and plans in which sights have numbers, for priors that count, and the arguments with which they see."""
-
-    worlds: Pair
-    plans: Plans
-    sizes: dict[str, Any]
-
-
-def numbered(worlds: Pair, plans: Plans, near: Sequence[int] | None = None) -> Counted:
-    """Numbers for all that is seen, or for the features that are `near`."""
-    if plans.context is None or not plans.context.is_floating_point():
-        return Counted(worlds, plans, sizes_of(worlds, plans))
-    sights = Sights(plans.context.reshape(-1, plans.context.shape[-1]), near)
-    pair = Pair(_seen_as(worlds.training, sights), _seen_as(worlds.held_out, sights))
-    return Counted(pair, replace(plans, context=sights(plans.context)), {"num_contexts": sights.number})
-
-
-def best_counted(
-    worlds: Pair, plans: Plans, near: Sequence[int] | None, order: int, generator: torch.Generator
-) -> Counted:
-    """What a chain sees: all, or only what is near, whichever lets it tell held-out plans better.
-
-    Chains have to meet a sight to know it; of large sights most are new.
+    Args:
+        num_actions, order: see `MarkovPrior`.
+        context_size: number of features, C.
+        near: sets of features.
     """
-    tried = [numbered(worlds, plans)]
-    if near is not None and plans.context is not None:
-        tried.append(numbered(worlds, plans, near))
-    seed = draw_seed(generator)
-    if len(tried) == 1:
-        return tried[0]
-    bits = []
-    for one in tried:
-        training, validation = one.plans.split(VALIDATION, torch.Generator().manual_seed(seed))
-        chain = MarkovPrior(plans.num_actions, order, **one.sizes).fit(training)
-        bits.append(score("", chain, validation).bits_per_action().mean)
-    return tried[bits.index(min(bits))]
 
+    def __init__(self, num_actions: int, order: int, context_size: int, near: Sequence[tuple[int, ...]] = ()) -> None:
+        super().__init__(num_actions, context_size=context_size)
+        self.order, self.near = order, tuple(near)
+        self.chain = MarkovPrior(num_actions, order, num_contexts=1)
+        self.sights = Sights(torch.zeros(0, context_size))
 
-def _seen_as(world: World, sights: Sights) -> World:
-    """The same world, in which sights are observed by their numbers."""
-    twin, observe = copy(world), world.observe
-    twin.observe = lambda state: sights(observe(state))  # type: ignore[method-assign]
-    return twin
+    def fit(self, plans: Plans | Tensor) -> Self:
+        """Choose what to see, number it and count; returns self.
+
+        Raises:
+            ValueError: plans that a Markov prior cannot learn from, or that do not show so many features.
+        """
+        plans = self.training_plans(plans)
+        best: Sequence[int] | None = None
+        if self.near:
+            training, validation = plans.split(VALIDATION, torch.Generator().manual_seed(0))
+            bits = {near: self._learn(training, near)._bits(validation) for near in (None, *self.near)}
+            best = min(bits, key=lambda near: bits[near])
+        return self._learn(plans, best)
+
+    def _learn(self, plans: Plans, near: Sequence[int] | None) -> Self:
+        assert plans.context is not None
+        self.sights = Sights(plans.context.flatten(0, -2), near)
+        self.chain = MarkovPrior(self.num_actions, self.order, num_contexts=self.sights.number)
+        self.chain.fit(replace(plans, context=self.sights(plans.context)))
+        return self
+
+    def _bits(self, plans: Plans) -> float:
+        return score("", self, plans).bits_per_action().mean
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return self.chain.start(batch_size, None if context is None else self.sights(context))
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return self.chain.step(action, state, None if context is None else self.sights(context))
+
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        logits = self.chain(plans, None if context is None else self.sights(context))
+        assert isinstance(logits, Tensor)
+        return logits

@@ -9,17 +9,17 @@ from rich.console import Console
 
 from eval import compare_cell
 from eval.compare import KINDS, SEES, check, command
-from eval.compare_cell import Settings
 from eval.compare_jobs import Study, cells_of, run_cells
+from eval.compare_settings import Settings
 from eval.grow_report import write_report
 from eval.suite import TASKS
 
-ROUNDS = 3
-"""Of growth, where no lengths are given."""
+ROUNDS = 4
+"""Of growth at most, where no lengths are given."""
 
 LISTS: dict[str, dict[str, Any]] = {
     "worlds": {"default": list(TASKS), "choices": tuple(TASKS), "help": "worlds to plan in"},
-    "lengths": {"type": int, "help": f"actions in the plans of each round; {ROUNDS} lengths of the world by default"},
+    "lengths": {"type": int, "help": "actions in the plans of each round; those of the world by default"},
     "kinds": {"default": list(KINDS), "choices": KINDS, "help": "kinds of priors that grow"},
     "sees": {"default": ["nothing"], "choices": SEES, "help": "what priors see: nothing but the plan so far, or more"},
 }
@@ -55,7 +55,8 @@ def grow(
         sees: what priors see: nothing but the plan so far, the start as well, or each step.
         steps: of training of each neural prior in a round, at most.
         starts: held-out starts to plan from.
-        training_starts: from so many starts plans are collected to learn from, in each round.
+        training_starts: from so many starts plans are collected to learn from, in each round; from several times as
+            many in worlds where most starts lead nowhere.
         seed: of everything random.
         processes: how many cells, a world and a seed each, are done at a time; all cores by default, and a single one
             in each process that torchrun started.

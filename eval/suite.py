@@ -1,31 +1,18 @@
-"""The worlds of `python -m eval compare`: where plans are learned from, and where they are tried."""
+"""The worlds of `python -m eval compare`, and what is optimised, seen and learned from in each."""
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from neuroprior import PocketCube, World, four_rooms, from_gymnasium, gridworld, maze
-from neuroprior.worlds import EpisodicWorld
+from eval import minigrid_worlds
+from eval.suite_worlds import MAPS, Pair, both, goal_mazes, lake, layouts, minigrid, scrambles, split
+from neuroprior import PocketCube, TabularWorld, World, four_rooms, gridworld, maze, oracle
 from neuroprior.worlds.cube import FACES
 from neuroprior.worlds.grid import MOVES, TURNS
-
-MAPS = 20
-"""Reward maps or layouts to learn in, and as many to be compared in, of each seed, where they cost nothing to make."""
-
-LAYOUTS = 3
-"""The same, for layouts of MiniGrid, whose states are searched one by one."""
-
-
-class Pair(NamedTuple):
-    """Worlds of a seed: plans are collected in `training`, priors are compared in `held_out`."""
-
-    training: World
-    held_out: World
 
 
 @dataclass(frozen=True)
@@ -42,7 +29,9 @@ class Task:
         objective, discount, any_prefix: what planners optimise, see `neuroprior.Planner`.
         above: plans that scored no more than this are not learned from; None: all are.
         sees: what `World.observe` of these worlds shows, for priors that see; None: nothing that would be of use.
-        near: the features of it that are nearest; chains may see these alone, as they must have met what they see.
+        near: sets of its features; chains may see one of them alone, as they must have met what they see.
+        sights: what priors see where nothing else is asked for, see `eval.compare_cell.SEES`.
+        times: plans are looked for from so many times as many starts, where most starts lead nowhere.
     """
 
     name: str
@@ -56,7 +45,9 @@ class Task:
     any_prefix: bool = False
     above: float | None = None
     sees: str | None = None
-    near: tuple[int, ...] | None = None
+    near: tuple[tuple[int, ...], ...] = ()
+    sights: tuple[str, ...] = ("nothing",)
+    times: int = 1
 
     @property
     def num_actions(self) -> int:
@@ -74,83 +65,20 @@ class Task:
         return {"objective": self.objective, "discount": self.discount, "any_prefix": self.any_prefix}
 
 
-def _both(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
-    """Worlds of unlike seeds, even ones to learn in."""
-
-    def made(seed: int) -> Pair:
-        return Pair(make(seed=2 * seed, **how), make(seed=2 * seed + 1, **how))
-
-    return made
-
-
-def _layouts(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
-    """Grids with new walls and new rewards."""
-    return _both(make, num_layouts=MAPS, view=2, **how)
-
-
-def _split(name: str, **options: Any) -> Callable[[int], Pair]:
-    """One environment, started in any state that can be reached: a random half to learn from, the other held out."""
-
-    def made(seed: int) -> Pair:
-        world = from_gymnasium(name, starts="any", **options)
-        assert isinstance(world, EpisodicWorld)
-        where = world.starts.nonzero()[:, 0]
-        where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
-        halves = [copy(world), copy(world)]
-        for half, kept in zip(halves, where.tensor_split([len(where) // 2]), strict=True):
-            half.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
-        return Pair(*halves)
-
-    return made
-
-
-def _lake(slippery: bool) -> Callable[[int], Pair]:
-    """Frozen lakes, each seed with holes of its own."""
-
-    def made(seed: int) -> Pair:
-        from gymnasium.envs.toy_text.frozen_lake import generate_random_map
-
-        maps = [generate_random_map(size=8, seed=2 * seed + half) for half in (0, 1)]
-        lakes = [from_gymnasium("FrozenLake-v1", desc=one, is_slippery=slippery, starts="any") for one in maps]
-        return Pair(*lakes)
-
-    return made
-
-
-class _Scrambles(PocketCube):
-    """The cube with half of its scrambled states, told by their number: those of one half are never in the other."""
-
-    def __init__(self, half: int) -> None:
-        super().__init__("half", 7, absorbing=True)
-        self.half = half
-
-    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        own = torch.zeros(0, dtype=torch.long)
-        while len(own) < batch_size:
-            state = super().reset(2 * batch_size + 100, generator)
-            own = torch.cat([own, state[(state * 2_654_435_761 >> 8) % 2 == self.half]])
-        return own[:batch_size]
-
-
 # Later is worth less, so that the best plans go straight there.
 _goal: dict[str, Any] = {"objective": "return", "discount": 0.95, "above": 0.0}
 _neighbours = "which of the 24 squares around it are free"
-_nearest = (6, 7, 8, 11, 12, 15, 16, 17)
+# The eight squares around, and those before, left and right, of five rows of five without the one in the middle.
+_nearest = ((6, 7, 8, 11, 12, 15, 16, 17), (7, 11, 12))
 _grid_about = "the reward where a plan ends; new walls and rewards held out"
 
 
 def _minigrid(name: str, about: str, environment: str) -> Task:
-    """MiniGrid: each seed with layouts of its own, some to learn in and some held out; starts are all that can be."""
-
-    def made(seed: int) -> Pair:
-        first = 2 * LAYOUTS * seed
-        seeds = (range(first, first + LAYOUTS), range(first + LAYOUTS, first + 2 * LAYOUTS))
-        how: dict[str, Any] = {"starts": "any", "observations": True, "progress": False}
-        return Pair(*(from_gymnasium(environment, seeds=some, **how) for some in seeds))
-
-    moves = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
+    """One of MiniGrid's worlds."""
+    how: dict[str, Any] = {"near": minigrid_worlds.NEAR, "sights": ("nothing", "each step"), "times": 3} | _goal
     about = f"MiniGrid {about}; reaching it; new layouts held out"
-    return Task(name, moves, about, made, 5, (8, 12, 16), sees="the seven by seven squares before it", **_goal)
+    sees = "the seven by seven squares before it"
+    return Task(name, minigrid_worlds.MOVES, about, minigrid(environment), 5, (9, 16), sees=sees, **how)
 
 
 _tasks = (
@@ -158,7 +86,7 @@ _tasks = (
         "grid",
         MOVES,
         "the paper's grid: 20 x 20, a torus, independent rewards; the reward where a plan ends; new rewards held out",
-        _both(partial(gridworld, 20, 20, edges="torus"), num_worlds=MAPS),
+        both(partial(gridworld, 20, 20, edges="torus"), num_worlds=MAPS),
         4,
         (6, 8),
     ),
@@ -166,59 +94,82 @@ _tasks = (
         "four_rooms",
         MOVES,
         f"four rooms, 13 x 13, doors at random places, four moves; {_grid_about}",
-        _layouts(partial(four_rooms, reward_power=8.0)),
+        layouts(partial(four_rooms, reward_power=8.0)),
         5,
-        (8, 12, 16),
+        (10, 16),
         sees=_neighbours,
         near=_nearest,
+        sights=("nothing", "start"),
+        times=2,
     ),
     Task(
         "maze",
         MOVES,
         f"mazes with some loops, 15 x 15, four moves; {_grid_about}",
-        _layouts(partial(maze, reward_power=8.0)),
+        layouts(partial(maze, reward_power=8.0)),
         5,
-        (8, 12, 16),
+        (10, 16),
         sees=_neighbours,
         near=_nearest,
+        sights=("nothing", "start"),
+        times=2,
     ),
     Task(
         "egocentric",
         TURNS,
         f"the same mazes for an agent that turns left, turns right or goes forward; {_grid_about}",
-        _layouts(partial(maze, reward_power=8.0, egocentric=True)),
+        layouts(partial(maze, reward_power=8.0, egocentric=True)),
         7,
-        (10, 13, 16),
+        (11, 16),
         sees=_neighbours + ", as it is turned",
         near=_nearest,
+        sights=("nothing", "start", "each step"),
+        times=2,
+    ),
+    Task(
+        "goal_maze",
+        TURNS,
+        "the same mazes with a goal, and one more way to look: where the goal lies; reaching it; new walls and goals"
+        " held out",
+        goal_mazes,
+        7,
+        (11, 16),
+        sees=_neighbours + ", and how far ahead and aside the goal is",
+        # With the side on which the goal is, and no more, chains meet the same sights again.
+        near=tuple((*squares, 26, 27) for squares in _nearest),
+        sights=("nothing", "each step"),
+        times=8,
+        **_goal,
     ),
     Task(
         "taxi",
         ("south", "north", "east", "west", "pickup", "dropoff"),
         "Taxi: fetch a passenger and bring it; the sum of rewards; half of all states to start from held out",
-        _split("Taxi-v4"),
+        split("Taxi-v4"),
         5,
-        (8, 12, 16),
+        (10, 16),
         "return",
         sees="the whole state",
+        sights=("nothing", "each step"),
     ),
     Task(
         "cliff",
         MOVES,
         "CliffWalking: go around a cliff; the sum of rewards; half of all squares to start from held out",
-        _split("CliffWalking-v1"),
+        split("CliffWalking-v1"),
         5,
-        (8, 12, 16),
+        (10, 16),
         "return",
         sees="the square",
+        sights=("nothing", "each step"),
     ),
     Task(
         "frozen_lake",
         ("left", "down", "right", "up"),
         "FrozenLake, 8 x 8, not slippery: to the goal, between holes; reaching it; new lakes held out",
-        _lake(slippery=False),
+        lake(slippery=False),
         5,
-        (8, 11, 14),
+        (9, 14),
         **_goal,
     ),
     Task(
@@ -226,9 +177,9 @@ _tasks = (
         ("left", "down", "right", "up"),
         "FrozenLake, 8 x 8, slippery: a third of the moves go where they should; how likely a plan reaches the goal;"
         " new lakes held out",
-        _lake(slippery=True),
+        lake(slippery=True),
         5,
-        (8, 11, 14),
+        (9, 14),
         "return",
     ),
     _minigrid("minigrid_four_rooms", "FourRooms: to a goal square, seven actions", "MiniGrid-FourRooms-v0"),
@@ -243,11 +194,13 @@ _tasks = (
     Task(
         "cube",
         tuple(face + turn for face in FACES for turn in ("", "2", "'")),
-        "the 2 x 2 x 2 cube after seven random moves, half turns too; passing the solved state; half of them held out",
-        lambda seed: Pair(_Scrambles(0), _Scrambles(1)),
+        "the 2 x 2 x 2 cube after nine random moves, half turns too; passing the solved state; half of them held out",
+        scrambles,
         4,
-        (5, 6, 7),
+        (6, 8),
         sees="the whole cube",
+        sights=("nothing", "each step"),
+        times=8,
         **_goal,
     ),
 )
@@ -257,8 +210,6 @@ TASKS = {task.name: task for task in _tasks}
 
 def best_score(task: Task, world: World, state: Tensor, length: int) -> Tensor:
     """What the best plan of `length` actions (with chance, the best policy) scores from each of `state [B]`: `[B]`."""
-    from neuroprior import TabularWorld, oracle
-
     if isinstance(world, PocketCube):
         distance = world.distance(state)
         there = (distance > 0) & (distance <= length)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.compare_cell import Settings
+from eval.compare_settings import Settings
 from eval.processes import LAUNCHED
 from eval.suite import TASKS
 from neuroprior.output import write_json

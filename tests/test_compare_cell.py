@@ -6,14 +6,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from eval import compare_cell
-from eval.compare_cell import Settings, recipe, run_cell, run_growth
-from eval.compare_curves import best_temperature, curve, planner_of, seconds_per_decision, starts_of
-from eval.compare_sight import Sights, best_counted, numbered, sizes_of
-from eval.suite import TASKS, Pair, Task, best_score
+from eval import compare_priors
+from eval.compare_cell import recipe, run_cell, run_growth
+from eval.compare_curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
+from eval.compare_priors import chain, network, sizes_of
+from eval.compare_settings import Settings
+from eval.compare_sight import SeeingMarkov, Sights
+from eval.suite import TASKS, Task, best_score
+from eval.suite_worlds import Pair
 from neuroprior import (
     ExhaustivePlanner,
     MarkovPrior,
+    Plans,
+    Prior,
     TabularWorld,
     UniformPrior,
     collect,
@@ -114,7 +119,7 @@ def test_the_best_temperature():
     world = bandit(2)
     starts = starts_of(one_step(world), world, 40, 1, seeded(0))
     sure = MarkovPrior(2, 0).fit(torch.tensor([[1]] * 97 + [[0]] * 3))
-    assert best_temperature(starts, sure, 8, seeded(1)) == 2.0
+    assert best_temperature(starts, sure, 8, seeded(1)) == max(TEMPERATURES)
     right = MarkovPrior(2, 0).fit(torch.tensor([[0]] * 97 + [[1]] * 3))
     assert best_temperature(starts, right, 1, seeded(1)) == 1.0
 
@@ -141,23 +146,34 @@ def test_sights_have_numbers():
 
 
 def test_counts_see_what_networks_see():
+    """A chain over features is a chain over the numbers of these features."""
     pair = TINY.worlds(0)
     plans = collect(ExhaustivePlanner(3), pair.training, 60, context="step", generator=seeded(0))
-    assert sizes_of(pair, plans) == {"context_size": 8}
-    worlds, counted, sizes = numbered(pair, plans)
-    state = pair.training.reset(50, seeded(1))
-    assert counted.context is not None
-    assert plans.context is not None
-    assert counted.context.shape == plans.context.shape[:2]
-    seen, number = pair.training.observe(state), worlds.training.observe(state)
-    for one in range(50):
-        same = (seen == seen[one]).all(1)
-        assert number[same].unique().tolist() == [int(number[one])]
-    assert MarkovPrior(3, 1, **sizes).fit(counted).num_contexts == sizes["num_contexts"] > 5
-    assert pair.training.observe(state).is_floating_point()  # the world itself is as it was
-    grid = Pair(gridworld(4, 4), gridworld(4, 4, seed=1))
-    plans = collect(ExhaustivePlanner(2), grid.training, 20, context="plan")
-    assert numbered(grid, plans) == (grid, plans, {"num_contexts": 16})
+    assert sizes_of(pair.training, plans) == {"context_size": 8}
+    prior = chain(2, pair.training, plans, ()).fit(plans)
+    _, number = plans.context.flatten(0, 1).unique(dim=0, return_inverse=True)
+    counted = replace(plans, context=number.view(60, 3))
+    plain = MarkovPrior(3, 2, num_contexts=int(number.max()) + 1).fit(counted)
+    told = prior.log_prob(plans.actions, plans.context)
+    assert torch.allclose(told, plain.log_prob(counted.actions, counted.context), atol=1e-5)
+    assert torch.allclose(told, stepped(prior, plans), atol=1e-5)
+    grid = gridworld(4, 4)
+    plans = collect(ExhaustivePlanner(2), grid, 20, context="step")
+    assert sizes_of(grid, plans) == {"num_contexts": 16}
+    assert isinstance(chain(1, grid, plans, ()), MarkovPrior)
+    assert network("gru", grid, plans, 0).num_contexts == 16
+
+
+def stepped(prior: Prior, plans: Plans) -> torch.Tensor:
+    """Log-probabilities of whole plans, step by step."""
+    logits, state = prior.start(len(plans), plans.context[:, 0])
+    told = torch.zeros(len(plans))
+    for t in range(plans.max_length):
+        action = plans.actions[:, t].long()
+        told += logits.log_softmax(-1).gather(1, action[:, None])[:, 0]
+        if t + 1 < plans.max_length:
+            logits, state = prior.step(action, state, plans.context[:, t + 1])
+    return told
 
 
 def test_chains_may_see_what_is_near_alone():
@@ -165,13 +181,17 @@ def test_chains_may_see_what_is_near_alone():
     task = TASKS["egocentric"]
     worlds = task.worlds(0)
     state = worlds.training.reset(200, seeded(0))
-    nearest = worlds.training.observe(state)[:, list(task.near)]
+    nearest, beside = (worlds.training.observe(state)[:, list(near)] for near in task.near)
     assert torch.equal(nearest, local_view(worlds.training, 1)(state))
+    assert torch.equal(beside, nearest[:, [1, 3, 4]])
     plans = collect(ExhaustivePlanner(4), worlds.training, 200, context="step", generator=seeded(0))
-    assert best_counted(worlds, plans, task.near, 1, seeded(0)).sizes == numbered(worlds, plans, task.near).sizes
-    full = numbered(worlds, plans).sizes
-    assert best_counted(worlds, plans, None, 1, seeded(0)).sizes == full
-    assert full["num_contexts"] > 2 * numbered(worlds, plans, task.near).sizes["num_contexts"]
+    bits = {}
+    for near in ((), task.near):
+        prior = SeeingMarkov(3, 1, 24, near).fit(plans)
+        bits[near] = prior.sights.number
+    assert bits[task.near] < bits[()] / 2
+    far = replace(plans, context=plans.context.index_fill(-1, torch.tensor(sum(task.near, ())), 0))
+    assert SeeingMarkov(3, 1, 24, task.near).fit(far).sights.number > 2  # what is near tells nothing here
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +285,7 @@ def test_worlds_of_the_suite(name):
 
 
 def test_a_gru_of_the_comparison_goes_on_with_its_memory():
-    prior = compare_cell.NEURAL["gru"](3, 8).fit(
+    prior = compare_priors.UnlimitedGRU(3, 8).fit(
         torch.randint(3, (40, 4), generator=seeded(0)), max_steps=2, progress=False
     )
     assert prior.window is None

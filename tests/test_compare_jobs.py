@@ -17,8 +17,8 @@ import torch
 
 from eval import compare_cell, compare_jobs
 from eval.__main__ import main
-from eval.compare_cell import Settings
 from eval.compare_jobs import Cell, Study, cells_of, gather, run_cells
+from eval.compare_settings import Settings
 from eval.processes import do_each
 from neuroprior import MarkovPrior, save
 from tests.made_up_cells import broken, environment, made_up, quick_report, torn

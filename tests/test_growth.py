@@ -7,6 +7,7 @@ from neuroprior import (
     ExhaustivePlanner,
     GRUPrior,
     MarkovPrior,
+    Plans,
     SamplingPlanner,
     TabularWorld,
     UniformPrior,
@@ -69,6 +70,30 @@ def test_the_prior_is_as_it_was_after_each_round():
     grown = next(rounds)
     assert torch.allclose(prior.log_prob(every), MarkovPrior(2, 1).fit(grown.plans).log_prob(every))
     assert next(rounds, None) is None
+
+
+def test_the_temperature_of_a_round_is_that_which_finds_most():
+    """Nine in ten plans that were learned from lead the wrong way; the hotter, the more go the other way."""
+
+    class OneWay(FromTheMiddle):
+        """The line, in which only what lies to the right counts."""
+
+        def __init__(self):
+            super().__init__()
+            self._set_maps((torch.arange(2 * LENGTH + 1) - LENGTH).clamp(min=0).float()[None])
+
+    world, lefts = OneWay(), torch.zeros(30, 6, dtype=torch.long)
+    lefts[:3] = 1
+    found = {}
+    for heat in ((1.0,), (1.0, 3.0), (3.0,)):
+        plans = Plans(lefts, 2)
+        how = {"num_starts": 200, "num_plans": 4, "temperatures": heat, "generator": seeded(0)}
+        *_, last = grow(MarkovPrior(2, 0), plans, world, (6,), **how)
+        found[heat] = float(last.plans.actions.float().mean())
+    assert found[(1.0, 3.0)] == pytest.approx(found[(3.0,)], abs=0.05)
+    assert found[(1.0, 3.0)] > found[(1.0,)] + 0.1
+    with refuses("temperatures: at least one"):
+        next(grow(MarkovPrior(2, 0), Plans(lefts, 2), world, (6,), num_starts=5, temperatures=()))
 
 
 @pytest.mark.parametrize("per", [None, "plan", "step"])

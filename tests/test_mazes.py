@@ -15,7 +15,7 @@ from neuroprior import (
     maze,
     oracle,
 )
-from neuroprior.worlds import local_view
+from neuroprior.worlds import goal_direction, local_view
 from tests.sources import FALSE_ALARM, p_value, refuses, seeded
 
 OFFSETS = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left
@@ -149,6 +149,23 @@ def test_views_square_by_square(edges, radius):
                     inside = 0 <= there[0] < 4 and 0 <= there[1] < 5
                     want.append(float(inside and not WALLS[layout, there[0], there[1]]))
             assert seen[s].tolist() == want
+
+
+@pytest.mark.parametrize("egocentric", [False, True])
+def test_who_follows_the_direction_is_at_the_goal(egocentric):
+    world = maze(9, 7, reward="goal", num_layouts=4, num_worlds=3, egocentric=egocentric, seed=2)
+    state = world.reset(300, seeded(0))
+    away = goal_direction(world)(state)
+    assert away.dtype == torch.float32
+    offsets = torch.tensor(OFFSETS)
+    heading = world.heading(state) if egocentric else torch.zeros_like(state)
+    way = away[:, :1] * offsets[heading] + away[:, 1:] * offsets[(heading + 1) % 4]
+    row, column = (world.coordinates(state) + way).long().unbind(-1)
+    square = (world.layout(state) * 9 + row) * 7 + column
+    reward = world.reward[world.reward_map(state), square * (4 if egocentric else 1)]
+    assert reward.tolist() == [1.0] * 300
+    with refuses("not a torus"):
+        goal_direction(gridworld(4, 4, edges="torus"))
 
 
 def test_a_view_turns_with_the_agent():

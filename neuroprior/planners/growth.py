@@ -11,6 +11,9 @@ from neuroprior.plans import Plans
 from neuroprior.priors.prior import Prior
 from neuroprior.worlds.world import World
 
+TRIED = 128
+"""Starts at which temperatures are tried before a round."""
+
 
 class Growth(NamedTuple):
     """A round of `grow`.
@@ -37,6 +40,7 @@ def grow(
     any_prefix: bool = False,
     above: float | None = None,
     num_rollouts: int = 1,
+    temperatures: Sequence[float] = (1.0,),
     generator: torch.Generator | None = None,
     **settings: Any,
 ) -> Iterator[Growth]:
@@ -57,6 +61,9 @@ def grow(
         objective, discount, any_prefix: see `Planner`.
         above: plans that scored no more than this are not learned from, see `collect`.
         num_rollouts: of each candidate where chance decides, see `SamplingPlanner`.
+        temperatures: at which candidates may be drawn; before each round that one is chosen with which most is scored
+            from a few starts. A prior that has learned from few plans is often so sure of itself that it finds no
+            longer ones unless it is sampled at more than 1.
         generator: draws the starts and candidates, and is passed on to a prior's `fit` where there are settings.
         settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
 
@@ -68,20 +75,28 @@ def grow(
     """
     if any(length < 1 for length in lengths):
         raise ValueError(f"lengths: at least 1 is expected each, not {list(lengths)}")
+    if not temperatures:
+        raise ValueError("temperatures: at least one is expected")
     if settings:
         settings |= {"generator": generator}
+    how: dict[str, Any] = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
+    how |= {"num_rollouts": num_rollouts}
     prior.fit(plans, **settings)
     yield Growth(plans.max_length, plans)
     for length in lengths:
-        planner = SamplingPlanner(
-            prior,
-            length,
-            num_plans,
-            objective=objective,
-            discount=discount,
-            any_prefix=any_prefix,
-            num_rollouts=num_rollouts,
-        )
+        planners = [SamplingPlanner(prior, length, num_plans, temperature=heat, **how) for heat in temperatures]
+        planner = _best(planners, world, min(num_starts, TRIED), generator)
         plans = collect(planner, world, num_starts, context=prior.context_per, above=above, generator=generator)
         prior.fit(plans, **settings)
         yield Growth(length, plans)
+
+
+def _best(
+    planners: Sequence[SamplingPlanner], world: World, number: int, generator: torch.Generator | None
+) -> SamplingPlanner:
+    """The planner that scores most from so many starts, the same for all; the first of equals."""
+    if len(planners) == 1:
+        return planners[0]
+    state = world.reset(number, generator)
+    scores = [float(planner.plan(world, state, generator).score.double().mean()) for planner in planners]
+    return planners[scores.index(max(scores))]

@@ -2,7 +2,7 @@
 
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
-from neuroprior.worlds.grid import GridWorld, egocentric, gridworld, local_view
+from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridworld, local_view
 from neuroprior.worlds.gymnasium_stepping import SteppedWorld
 from neuroprior.worlds.gymnasium_worlds import from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
@@ -22,6 +22,7 @@ __all__ = [
     "egocentric",
     "four_rooms",
     "from_gymnasium",
+    "goal_direction",
     "gridworld",
     "labyrinth",
     "local_view",

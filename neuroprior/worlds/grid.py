@@ -185,6 +185,37 @@ def local_view(world: GridWorld, radius: int = 2) -> Callable[[Tensor], Tensor]:
     return lambda state: table.index_select(0, world.cell(state)).float()
 
 
+def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
+    """Where the goal is, as features for a prior: how many squares ahead and to the right.
+
+    Args:
+        world: a grid whose edges are walls; the goal of a layout is its square of highest reward, in each reward map
+            (`maze(reward="goal")` has one).
+
+    Returns:
+        A function from states `[N]` to float32 `[N, 2]`: rows up and columns to the right from the agent to the goal;
+        in an egocentric grid squares ahead and to the right of its heading.
+
+    Raises:
+        ValueError: the grid is a torus, where there are several ways to count.
+    """
+    if world.edges == "torus":
+        raise ValueError("goal_direction: a grid whose edges are walls is expected, not a torus")
+    area = world.height * world.width
+    reward = world.reward[:, ::4] if world.egocentric else world.reward
+    goal = reward.view(world.num_maps, world.num_layouts, area).argmax(-1)
+
+    def seen(state: Tensor) -> Tensor:
+        square = goal[world.reward_map(state), world.layout(state)]
+        where = torch.stack([square.div(world.width, rounding_mode="floor"), square % world.width], -1)
+        away = where - world.coordinates(state)
+        heading = world.heading(state) if world.egocentric else torch.zeros_like(state)
+        compass = _ROW_COLUMN.to(state.device)
+        return torch.stack([(away * compass[(heading + turn) % 4]).sum(-1) for turn in (0, 1)], -1).float()
+
+    return seen
+
+
 def _moves(walls: Tensor, edges: str) -> Tensor:
     """The transition table `[M * H * W, 4]`."""
     layouts, height, width = walls.shape

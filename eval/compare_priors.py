@@ -1,0 +1,55 @@
+"""The priors that `python -m eval compare` fits: Markov chains of some orders, and networks."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
+
+from eval.compare_sight import SeeingMarkov
+from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World
+
+ORDERS = range(5)
+"""Of the Markov priors."""
+
+
+class UnlimitedGRU(GRUPrior):
+    """A GRU that goes on with its memory beyond the length that it was trained at.
+
+    It tells longer plans as well as one that reads their last actions in a window, and far quicker.
+    """
+
+    def prepare(self, plans: Plans | Tensor, window: int) -> Plans:
+        plans = super().prepare(plans, window)
+        self.window = None
+        return plans
+
+
+NEURAL: dict[str, Any] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
+
+RECIPE: dict[str, dict[str, Any]] = {"gru": {"lags": 1, "dropout": 0.2}, "transformer": {"dropout": 0.2}}
+"""Of networks. In plans this short GRUs remember without being shown their last inputs again, and are far quicker."""
+
+
+def chain(order: int, world: World, plans: Plans, near: Sequence[tuple[int, ...]]) -> Prior:
+    """A Markov prior for plans like these, which sees what they show; features, or sets of them, as one number."""
+    sizes = sizes_of(world, plans)
+    if "context_size" in sizes:
+        return SeeingMarkov(plans.num_actions, order, near=near, **sizes)
+    return MarkovPrior(plans.num_actions, order, **sizes)
+
+
+def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:
+    """A network for plans like these, which sees what they show; one of `NEURAL`."""
+    prior = NEURAL[kind](plans.num_actions, seed=seed, **sizes_of(world, plans), **RECIPE[kind])
+    assert isinstance(prior, Prior)
+    return prior
+
+
+def sizes_of(world: World, plans: Plans) -> dict[str, Any]:
+    """The arguments that let a prior see the context of `plans`, which is observed in `world`."""
+    if plans.context is None:
+        return {}
+    if plans.context.is_floating_point():
+        return {"context_size": plans.context.shape[-1]}
+    assert isinstance(world, TabularWorld)
+    return {"num_contexts": world.num_states}
