@@ -9,7 +9,21 @@ import torch
 from torch import Tensor
 
 from eval import minigrid_worlds
-from eval.suite_worlds import MAPS, Pair, both, goal_mazes, lake, layouts, minigrid, scrambles, split
+from eval.suite_worlds import (
+    LAST,
+    MAPS,
+    TAKEN,
+    Pair,
+    both,
+    goal_mazes,
+    lake,
+    layouts,
+    minigrid,
+    scrambles,
+    split,
+    under_way,
+)
+from eval.under_way import UnderWay
 from neuroprior import PocketCube, TabularWorld, World, four_rooms, gridworld, maze, oracle
 from neuroprior.worlds.cube import FACES
 from neuroprior.worlds.grid import MOVES, TURNS
@@ -142,6 +156,18 @@ _tasks = (
         **_goal,
     ),
     Task(
+        "under_way",
+        TURNS,
+        f"the egocentric mazes, planning anew after the first {TAKEN} of {LAST} moves; {_grid_about}",
+        under_way,
+        7,
+        (11, 16),
+        sees="what is left of the last plan",
+        near=tuple(tuple(range(len(TURNS) * left)) for left in (1, 2)),
+        sights=("nothing", "start"),
+        times=2,
+    ),
+    Task(
         "taxi",
         ("south", "north", "east", "west", "pickup", "dropoff"),
         "Taxi: fetch a passenger and bring it; the sum of rewards; half of all states to start from held out",
@@ -214,5 +240,7 @@ def best_score(task: Task, world: World, state: Tensor, length: int) -> Tensor:
         distance = world.distance(state)
         there = (distance > 0) & (distance <= length)
         return torch.where(there, task.discount ** (distance.float() - 1), 0.0)
+    if isinstance(world, UnderWay):
+        return best_score(task, world.world, state[:, 0], length)
     assert isinstance(world, TabularWorld)
     return oracle(world, state, length, **task.scoring)

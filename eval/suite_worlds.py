@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from copy import copy
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from eval import minigrid_worlds
-from neuroprior import PocketCube, World, from_gymnasium, maze
+from eval.under_way import UnderWay
+from neuroprior import ExhaustivePlanner, PocketCube, TabularWorld, World, from_gymnasium, maze
 from neuroprior.worlds import EpisodicWorld, goal_direction
 
 MAPS = 100
@@ -19,6 +21,10 @@ LAYOUTS = (6, 2)
 
 SCRAMBLE = 9
 """Random moves before the cube is to be solved."""
+
+
+LAST, TAKEN = 7, 3
+"""Actions of the plan that is under way, and how many of them were executed."""
 
 
 class Pair(NamedTuple):
@@ -119,3 +125,11 @@ def _guided(seed: int) -> World:
 def goal_mazes(seed: int) -> Pair:
     """Mazes with goals."""
     return Pair(_guided(2 * seed), _guided(2 * seed + 1))
+
+
+def under_way(seed: int) -> Pair:
+    """The egocentric mazes after the first moves of a plan of the best seven."""
+    planner = ExhaustivePlanner(LAST)
+    mazes = layouts(partial(maze, reward_power=8.0, egocentric=True))(seed)
+    first, second = (UnderWay(world, planner, TAKEN) for world in mazes if isinstance(world, TabularWorld))
+    return Pair(first, second)
