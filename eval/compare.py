@@ -38,7 +38,7 @@ def compare(
     kinds: list[str] | None = None,
     sees: list[str] | None = None,
     rounds: int = 4,
-    steps: int = 300,
+    steps: int = 600,
     starts: int = 32,
     training_starts: int = 1000,
     seed: int = 0,

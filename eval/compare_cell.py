@@ -20,7 +20,7 @@ from eval.compare_curves import (
     starts_of,
 )
 from eval.compare_pictures import drawn_plans, transitions
-from eval.compare_priors import NEURAL, ORDERS, RECIPE, chain, network
+from eval.compare_priors import MANY, NEURAL, ORDERS, RECIPE, TRAINING, WIDE, chain, network
 from eval.compare_settings import SEES, Settings
 from eval.suite import TASKS, Task
 from eval.suite_worlds import LAYOUTS, MAPS, SCRAMBLE
@@ -58,10 +58,8 @@ def recipe() -> str:
     worlds = [
         [getattr(task, field.name) for field in fields(task) if field.name != "worlds"] for task in TASKS.values()
     ]
-    made = (MAPS, LAYOUTS, SCRAMBLE)
-    return repr(
-        (worlds, made, ORDERS, RECIPE, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, FAMILIAR, TIMED_STARTS, VERSION)
-    )
+    made = (MAPS, LAYOUTS, SCRAMBLE, ORDERS, RECIPE, WIDE, MANY, TRAINING)
+    return repr((worlds, made, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, FAMILIAR, TIMED_STARTS, VERSION))
 
 
 def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
@@ -181,7 +179,7 @@ class _Contest:
                 yield from self._grown(f"markov-{order}", sees, prior, first, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
             prior = network(kind, self.worlds.training, first, draw_seed(self.generator))
-            yield from self._grown(kind, sees, prior, first, {"max_steps": self.settings.steps, "progress": False})
+            yield from self._grown(kind, sees, prior, first, TRAINING | {"max_steps": self.settings.steps})
 
     def _grown(
         self, label: str, sees: str, prior: Prior, first: Plans, training: dict[str, Any]

@@ -29,6 +29,15 @@ NEURAL: dict[str, Any] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
 RECIPE: dict[str, dict[str, Any]] = {"gru": {"lags": 1, "dropout": 0.2}, "transformer": {"dropout": 0.2}}
 """Of networks. In plans this short GRUs remember without being shown their last inputs again, and are far quicker."""
 
+WIDE: dict[str, dict[str, Any]] = {"gru": {"hidden_size": 128}, "transformer": {"width": 128}}
+"""Of networks that see at least `MANY` features."""
+
+MANY = 50
+"""Features."""
+
+TRAINING = {"weight_decay": 0.3, "progress": False}
+"""Of networks: few plans are learned from, again and again."""
+
 
 def chain(order: int, world: World, plans: Plans, near: Sequence[tuple[int, ...]]) -> Prior:
     """A Markov prior for plans like these, which sees what they show; features, or sets of them, as one number."""
@@ -40,7 +49,9 @@ def chain(order: int, world: World, plans: Plans, near: Sequence[tuple[int, ...]
 
 def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:
     """A network for plans like these, which sees what they show; one of `NEURAL`."""
-    prior = NEURAL[kind](plans.num_actions, seed=seed, **sizes_of(world, plans), **RECIPE[kind])
+    sizes = sizes_of(world, plans)
+    wide = WIDE[kind] if sizes.get("context_size", 0) >= MANY else {}
+    prior = NEURAL[kind](plans.num_actions, seed=seed, **sizes, **RECIPE[kind], **wide)
     assert isinstance(prior, Prior)
     return prior
 

@@ -33,7 +33,7 @@ def grow(
     num_plans: int = 256,
     kinds: list[str] = list(KINDS),  # noqa: B006
     sees: list[str] = ["nothing"],  # noqa: B006
-    steps: int = 300,
+    steps: int = 600,
     starts: int = 32,
     training_starts: int = 1000,
     seed: int = 0,
