@@ -10,6 +10,7 @@ from eval import compare_figures as figures
 from eval.compare_figures import Estimate, Style, key_of, styles
 from eval.compare_pairs import BEST, points, question_of, shown_plans
 from eval.compare_rows import Cells, Rows
+from eval.compare_summary import summary_table
 from eval.page import FigureBox, Section, Table, svg
 
 INTERVALS = "Intervals: 95 %, over seeds, each with worlds and priors of its own."
@@ -28,7 +29,7 @@ class Comparison:
         cells: one a world and seed.
         num_plans: numbers of candidate plans that were asked for.
         rows, curves: shares of the oracle with these numbers, and with all there are.
-        paired, words, efficiency, bits, growth: see the functions that make them.
+        paired, words, efficiency, bits, growth, reasons: see the functions that make them.
         style: of priors in figures, by name.
     """
 
@@ -41,6 +42,7 @@ class Comparison:
     efficiency: Rows
     bits: Rows
     growth: Rows
+    reasons: Rows
 
     @property
     def style(self) -> dict[str, Style]:
@@ -114,7 +116,9 @@ def words_section(comparison: Comparison) -> Section:
         " priors, and p for the number of worlds: Bonferroni, Holm). A number of plans in the middle was fixed for"
         " these words beforehand; other numbers are in the tables."
     )
-    return Section("In plain words", text, _gap_tables(comparison), _gap_boxes(comparison, PLAIN))
+    summary = summary_table(comparison.words, comparison.rows, comparison.num_plans)
+    tables = [*([summary] if summary else []), *_gap_tables(comparison)]
+    return Section("In plain words", text, tables, _gap_boxes(comparison, PLAIN))
 
 
 def told_of_others(comparison: Comparison) -> Iterator[str]:

@@ -13,6 +13,7 @@ from eval.compare_efficiency import efficiency
 from eval.compare_findings import PLAIN, Comparison
 from eval.compare_pairs import paired, words
 from eval.compare_rows import Cells, Rows, bits_rows, growth_rows, rows
+from eval.compare_summary import reasons, reasons_in_words, reasons_section
 from eval.page import Page, Section, write_page
 from eval.plan_report import printed
 from neuroprior.output import versions, write_csv, write_json
@@ -31,16 +32,16 @@ def compared(cells: Cells, num_plans: Sequence[int]) -> Comparison:
     worlds = list(dict.fromkeys(cell["world"] for cell in cells))
     cells = sorted(cells, key=lambda cell: (worlds.index(cell["world"]), int(cell["seed"])))
     every = sorted({number for cell in cells for number in cell["budgets"]})
+    tables = {"rows": rows(cells, sorted(num_plans)), "paired": paired(cells, sorted(num_plans))}
+    tables |= {"words": words(cells, num_plans), "bits": bits_rows(cells)}
     return Comparison(
         cells,
         sorted(num_plans),
-        rows(cells, sorted(num_plans)),
-        rows(cells, every),
-        paired(cells, sorted(num_plans)),
-        words(cells, num_plans),
-        efficiency(cells),
-        bits_rows(cells),
-        growth_rows(cells),
+        curves=rows(cells, every),
+        efficiency=efficiency(cells),
+        growth=growth_rows(cells),
+        reasons=reasons(**tables, num_plans=num_plans),
+        **tables,
     )
 
 
@@ -65,6 +66,7 @@ def write_report(
     comparison = compared(cells, num_plans)
     made = [
         findings.words_section(comparison),
+        reasons_section(comparison.reasons),
         sections.share_section(comparison),
         sections.efficiency_section(comparison),
         findings.seeing_section(comparison),
@@ -79,7 +81,7 @@ def write_report(
     ]
     parts = [section for section in made if section is not None]
     _print(comparison, parts, console)
-    names = ("rows", "paired", "efficiency", "bits", "words", "growth")
+    names = ("rows", "paired", "efficiency", "bits", "words", "growth", "reasons")
     title = f"Priors compared in {', '.join(comparison.worlds)}"
     if len(comparison.worlds) > 3:
         title = f"Priors compared in {len(comparison.worlds)} worlds"
@@ -89,13 +91,14 @@ def write_report(
 
 
 def _print(comparison: Comparison, parts: Sequence[Section], console: Console) -> None:
-    """The tables of each world and those of the words; below them the words, which are read first there."""
+    """The tables of each world and those of the findings; below them the words, which are read first there."""
     for world, tables in sections.world_tables(comparison).items():
         for table in tables:
             console.print(printed(world, table))
     for table in parts[0].tables:
         console.print(printed(parts[0].title, table))
-    said = findings.told(comparison, PLAIN), findings.told_of_others(comparison), [findings.lead(comparison)]
+    why = reasons_in_words(comparison.reasons)
+    said = findings.told(comparison, PLAIN), findings.told_of_others(comparison), why, [findings.lead(comparison)]
     for line in chain(*said):
         console.print(line, highlight=False, markup=False)
 

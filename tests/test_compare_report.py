@@ -45,7 +45,7 @@ def everything(tmp_path_factory):
 
 def test_files(everything):
     results, _, _, folder, cells = everything
-    assert set(results) == {*NAMES, "settings", "versions"}
+    assert set(results) == {*NAMES, "reasons", "settings", "versions"}
     assert results["settings"] == SETTINGS
     made = compared(cells, ASKED)
     for name in NAMES:
@@ -94,6 +94,7 @@ def test_printed(everything):
     (row,) = (
         row for row in results["rows"] if (row["world"], row["prior"], row["num_plans"]) == ("maze", "uniform", 256)
     )
+    assert "The best prior of each kind: % of the oracle with 256 plans" in flat
     half = max(row["high"] - row["oracle_share"], row["oracle_share"] - row["low"])
     line = next(line for line in printed.splitlines() if line.strip().startswith("uniform"))
     assert line.split()[3:5] == [f"{100 * row['oracle_share']:.1f}", f"±{100 * half:.1f}"]
