@@ -1,5 +1,6 @@
 """One cell of `python -m eval compare`: everything about one world and one seed."""
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import asdict, fields, replace
 from functools import cached_property
@@ -22,7 +23,7 @@ from eval.compare_curves import (
 from eval.compare_pictures import drawn_plans, transitions
 from eval.compare_priors import MANY, NEURAL, ORDERS, RECIPE, TRAINING, WIDE, chain, network
 from eval.compare_settings import SEES, Settings
-from eval.suite import TASKS, Task
+from eval.suite import Task
 from eval.suite_worlds import LAYOUTS, MAPS, SCRAMBLE
 from eval.world_priors import load_for
 from neuroprior import (
@@ -54,12 +55,16 @@ TIMED_STARTS = 4
 
 
 def recipe() -> str:
-    """All that decides a cell beside its settings; after a change of it, finished cells do not count."""
-    worlds = [
-        [getattr(task, field.name) for field in fields(task) if field.name != "worlds"] for task in TASKS.values()
-    ]
-    made = (MAPS, LAYOUTS, SCRAMBLE, ORDERS, RECIPE, WIDE, MANY, TRAINING)
-    return repr((worlds, made, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, FAMILIAR, TIMED_STARTS, VERSION))
+    """All that decides a cell beside its world and settings; after a change of it, finished cells do not count."""
+    priors = (ORDERS, RECIPE, WIDE, MANY, TRAINING)
+    return repr((priors, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, FAMILIAR, TIMED_STARTS, VERSION))
+
+
+def digest(task: Task) -> str:
+    """Eight letters for all that decides a world; after a change of it, its finished cells do not count."""
+    names = [field.name for field in fields(Task) if field.name != "worlds"]
+    told = repr(([getattr(task, name) for name in names], MAPS, LAYOUTS, SCRAMBLE))
+    return hashlib.sha256(told.encode()).hexdigest()[:8]
 
 
 def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:

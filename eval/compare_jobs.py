@@ -38,8 +38,8 @@ class Cell(NamedTuple):
 
     @property
     def file(self) -> str:
-        """Its name."""
-        return f"{self.world}-{self.seed}.json"
+        """The name of its file, by what the world is, too: another world of that name has other cells."""
+        return f"{self.world}-{self.seed}-{compare_cell.digest(TASKS[self.world])}.json"
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,9 @@ class Sights:
     def __init__(self, features: Tensor, near: Sequence[int] | None = None) -> None:
         # A sum with random weights tells features apart; one number is quicker to look up than many.
         generator = torch.Generator().manual_seed(0)
-        self.weights = torch.rand(features.shape[-1], generator=generator, dtype=torch.float64)
-        if near is not None:
-            self.weights *= torch.zeros_like(self.weights).index_fill(0, torch.tensor(near), 1)
-        codes = (features.double() @ self.weights).sort().values
+        self.columns = slice(None) if near is None else torch.tensor(near)
+        self.weights = torch.rand(features[:, self.columns].shape[-1], generator=generator, dtype=torch.float64)
+        codes = self._code(features).sort().values
         new = torch.ones_like(codes, dtype=torch.bool)
         new[1:] = codes.diff() > SAME
         self.codes = codes[new]
@@ -43,9 +42,12 @@ class Sights:
 
     def __call__(self, features: Tensor) -> Tensor:
         """The numbers `[...]` of features `[..., C]`."""
-        code = features.double() @ self.weights
+        code = self._code(features)
         place = torch.searchsorted(self.codes, code - SAME / 2).clamp(max=len(self.codes) - 1)
         return torch.where((self.codes[place] - code).abs() < SAME, place, len(self.codes))
+
+    def _code(self, features: Tensor) -> Tensor:
+        return features[..., self.columns].double() @ self.weights
 
 
 class SeeingMarkov(Prior):

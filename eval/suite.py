@@ -223,7 +223,7 @@ _tasks = (
         "the 2 x 2 x 2 cube after nine random moves, half turns too; passing the solved state; half of them held out",
         scrambles,
         4,
-        (6, 8),
+        (6, 7, 8),
         sees="the whole cube",
         sights=("nothing", "each step"),
         times=8,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from eval import compare_priors
-from eval.compare_cell import recipe, run_cell, run_growth
+from eval.compare_cell import digest, recipe, run_cell, run_growth
 from eval.compare_curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
 from eval.compare_priors import chain, network, sizes_of
 from eval.compare_settings import Settings
@@ -260,6 +260,8 @@ def test_growth_alone_with_lengths_of_its_own():
 def test_the_recipe_is_the_same_in_every_process():
     assert recipe() == recipe()
     assert " at 0x" not in recipe()
+    assert len({digest(task) for task in TASKS.values()}) == len(TASKS)
+    assert digest(replace(TASKS["maze"], times=3)) != digest(TASKS["maze"]) == digest(replace(TASKS["maze"]))
 
 
 SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name.startswith("minigrid")]

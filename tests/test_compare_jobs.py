@@ -136,7 +136,7 @@ def test_a_damaged_file_is_named(tmp_path):
     study = study_in(tmp_path)
     run_cells(study, CELLS, 1)
     (study.folder / CELLS[1].file).write_text('{"world": ')
-    with refuses("maze-1.json: damaged"):
+    with refuses(f"{CELLS[1].file}: damaged"):
         run_cells(study, CELLS, 1)
 
 
@@ -276,7 +276,7 @@ def test_processes_of_torchrun_share_the_cells(alone, tmp_path):
     """Two of six cells are there already; all results are those of one process."""
     (folder,) = (alone / "cells").iterdir()
     (tmp_path / "cells" / folder.name).mkdir(parents=True)
-    for name in ("maze-0.json", "grid-1.json"):
+    for name in (CELLS[0].file, CELLS[-1].file):
         shutil.copy2(folder / name, tmp_path / "cells" / folder.name)
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*-*.json")}
     running = started(*TORCHRUN, out=tmp_path)

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuroprior.priors.prior import check_sizes
 from neuroprior.statistics import Interval, ratio_difference, share_interval
-from neuroprior.worlds.world import check_range, is_integer
+from neuroprior.worlds.world import check_range, check_sizes, is_integer
 
 UNITS = 997
 """Independent units kept apart: those whose numbers are alike modulo this prime are one."""

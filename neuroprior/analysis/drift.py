@@ -12,8 +12,8 @@ from neuroprior.analysis.ranks import FEWEST_RANKED, mean_correlation, rank_corr
 from neuroprior.comparison import units
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
-from neuroprior.priors.prior import check_sizes
 from neuroprior.statistics import Difference, Interval, holm, ratio_difference
+from neuroprior.worlds.world import check_sizes
 
 
 @dataclass(frozen=True, eq=False)

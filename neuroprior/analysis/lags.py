@@ -11,8 +11,8 @@ from neuroprior.comparison import Score, action_bits, unit_name, units
 from neuroprior.plans import Plans, sees_each_step
 from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors import Prior
-from neuroprior.priors.prior import check_sizes
 from neuroprior.randomness import generator_on
+from neuroprior.worlds.world import check_sizes
 
 MOST_BLOCKS = 200
 """Units beyond this number are taken together in so many blocks, for the jackknife."""

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS
-from neuroprior.priors.prior import check_sizes
 from neuroprior.randomness import generator_on
 from neuroprior.statistics import holm
+from neuroprior.worlds.world import check_sizes
 
 ORDERS = range(1, 5)
 """Lengths of the n-grams that are compared."""

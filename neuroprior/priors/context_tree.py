@@ -8,8 +8,8 @@ from torch import Tensor
 
 from neuroprior.priors.histories import Counts, Tree
 from neuroprior.priors.history_prior import HistoryPrior
-from neuroprior.priors.prior import check_sizes
 from neuroprior.priors.weighting import Weighting, histories_of
+from neuroprior.worlds.world import check_sizes
 
 _PAIRS = ("pair_row", "pair_action", "pair_count")
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroprior.priors.neural import Embedding, NeuralPrior
-from neuroprior.priors.prior import check_sizes
+from neuroprior.worlds.world import check_sizes
 
 
 class GRUPrior(NeuralPrior):

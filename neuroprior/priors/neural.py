@@ -7,8 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from neuroprior.plans import Plans, sees_each_step
-from neuroprior.priors.prior import Prior, check_sizes
+from neuroprior.priors.prior import Prior
 from neuroprior.randomness import draw_seed, generator_on
+from neuroprior.worlds.world import check_sizes
 
 CONTEXT_SPREAD = 0.03
 """Standard deviation of the first weights of contexts. With 1, as of other vectors, few plans are learned by heart."""

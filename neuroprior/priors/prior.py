@@ -11,14 +11,7 @@ from torch import Tensor, nn
 from neuroprior import sampling
 from neuroprior.draws import after_end
 from neuroprior.plans import Plans, check_context, sees_each_step
-from neuroprior.worlds.world import check_range, is_integer
-
-
-def check_sizes(**sizes: object) -> None:
-    """Raise ValueError, naming the argument, unless all are integers of at least 1."""
-    for name, size in sizes.items():
-        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-            raise ValueError(f"{name}: an integer of at least 1 is expected, not {size!r}")
+from neuroprior.worlds.world import check_range, check_sizes, is_integer
 
 
 class Prior(nn.Module, ABC):

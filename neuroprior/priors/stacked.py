@@ -15,8 +15,9 @@ from neuroprior.priors.history_prior import HistoryPrior
 from neuroprior.priors.markov import MarkovPrior
 from neuroprior.priors.neural import NeuralPrior, context_embedding
 from neuroprior.priors.packing import pack, unpack
-from neuroprior.priors.prior import Prior, check_sizes
+from neuroprior.priors.prior import Prior
 from neuroprior.randomness import draw_seed, generator_on
+from neuroprior.worlds.world import check_sizes
 
 LEAST = -6.0
 """Log-probabilities of experts below this are taken for it."""

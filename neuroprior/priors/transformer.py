@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuroprior.priors.neural import Embedding, NeuralPrior
-from neuroprior.priors.prior import check_sizes
+from neuroprior.worlds.world import check_sizes
 
 
 class TransformerPrior(NeuralPrior):

@@ -9,6 +9,7 @@ from torch import Tensor
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.views import check_view, view_table
+from neuroprior.worlds.world import check_sizes
 
 MOVES = ("up", "right", "down", "left")
 """The four moves in the order of their numbers; the reversal of move a is (a + 2) % 4."""
@@ -140,10 +141,7 @@ def gridworld(
     """
     if not 0 < reward_power < float("inf"):
         raise ValueError(f"gridworld: reward_power must be positive and finite, not {reward_power}")
-    if num_worlds < 1:
-        raise ValueError(f"gridworld: num_worlds must be at least 1, not {num_worlds}")
-    if height < 1 or width < 1:
-        raise ValueError(f"gridworld: height and width must be at least 1, not {height} x {width}")
+    check_sizes(height=height, width=width, num_worlds=num_worlds)
     if edges not in ("wall", "torus"):
         raise ValueError(f'gridworld: edges must be "wall" or "torus", not {edges!r}')
     uniform = torch.rand(num_worlds, height * width, generator=torch.Generator().manual_seed(seed))

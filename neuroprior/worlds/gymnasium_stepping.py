@@ -99,6 +99,8 @@ class SteppedWorld(World):
 
     def observe(self, state: Tensor) -> Tensor:
         """What the environment showed after each history: float32 `[N, C]`, texts left out."""
+        if len(state) == 0:
+            return self.observe(self.reset(1).to(state.device))[:0]
         distinct, which = state.cpu().unique(dim=0, return_inverse=True)
         seen = [self._meet(history).features for history in self._histories(distinct)]
         return stacked(seen).to(state.device)[which.to(state.device)]

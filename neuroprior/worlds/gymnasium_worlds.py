@@ -80,9 +80,10 @@ def from_gymnasium(
         raise ValueError(f'starts: "initial" or "any" is expected, not {starts!r}')
     if max_states < 1 or horizon < 1:
         raise ValueError(f"max_states and horizon: at least 1 is expected, not {max_states} and {horizon}")
-    chosen = [seed] if seeds is None else list(seeds)
-    if not chosen or any(not isinstance(one, int) or one < 0 for one in chosen):
-        raise ValueError(f"seeds: one or more integers that are not negative are expected, not {chosen}")
+    given = [seed] if seeds is None else list(seeds)
+    if not given or any(not isinstance(one, int | np.integer) or one < 0 for one in given):
+        raise ValueError(f"seeds: one or more integers that are not negative are expected, not {given}")
+    chosen = [int(one) for one in given]
     opened = open_environment(env, make_options)
     if method == "auto":
         real = _has_real_numbers(opened.observation_space)

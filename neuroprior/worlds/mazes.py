@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.worlds.grid import GridWorld
+from neuroprior.worlds.world import check_sizes
 
 
 def four_rooms(
@@ -38,6 +39,7 @@ def four_rooms(
     Raises:
         ValueError: an argument is out of range.
     """
+    check_sizes(height=height, width=width)
     if height < 5 or width < 5:
         raise ValueError(f"four_rooms: height and width must be at least 5, not {height} x {width}")
     _check("four_rooms", num_layouts, num_worlds, reward, reward_power)
@@ -83,6 +85,7 @@ def maze(
     Raises:
         ValueError: an argument is out of range.
     """
+    check_sizes(height=height, width=width)
     if min(height, width) < 3 or height % 2 == 0 or width % 2 == 0:
         raise ValueError(f"maze: height and width must be odd and at least 3, not {height} x {width}")
     if not 0 <= loops <= 1:
@@ -148,8 +151,7 @@ def _rewards(walls: Tensor, num_worlds: int, kind: str, power: float, generator:
 
 
 def _check(name: str, num_layouts: int, num_worlds: int, reward: str, reward_power: float) -> None:
-    if num_layouts < 1 or num_worlds < 1:
-        raise ValueError(f"{name}: num_layouts and num_worlds must be at least 1, not {num_layouts} and {num_worlds}")
+    check_sizes(num_layouts=num_layouts, num_worlds=num_worlds)
     if reward not in ("random", "goal"):
         raise ValueError(f'{name}: reward must be "random" or "goal", not {reward!r}')
     if not 0 < reward_power < float("inf"):

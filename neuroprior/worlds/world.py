@@ -144,3 +144,10 @@ def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
         where = ((values < 0) | (values.long() >= stop)).nonzero()[0].tolist()
         value = int(values[tuple(where)])
         raise ValueError(f"{name}{where}: {value} is out of range: there are {stop} {what}, 0 to {stop - 1}")
+
+
+def check_sizes(**sizes: object) -> None:
+    """Raise ValueError, naming the argument, unless all are integers of at least 1."""
+    for name, size in sizes.items():
+        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+            raise ValueError(f"{name}: an integer of at least 1 is expected, not {size!r}")
