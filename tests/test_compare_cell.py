@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -300,3 +301,11 @@ def test_a_gru_of_the_comparison_goes_on_with_its_memory():
     for _ in range(10):
         _, state = prior.step(torch.zeros(2, dtype=torch.long), state)
     assert state.dim() == 2
+
+
+def test_the_worlds_are_told_as_they_are():
+    told = (Path(__file__).parent.parent / "docs" / "compare.md").read_text()
+    for task in TASKS.values():
+        lengths, sights = ", ".join(map(str, task.lengths)), ", ".join(task.sights)
+        row = (f"`{task.name}`", task.about, task.num_actions, task.depth, lengths, sights, task.times)
+        assert f"| {' | '.join(map(str, row))} |" in told

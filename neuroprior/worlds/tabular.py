@@ -212,11 +212,12 @@ class TabularWorld(World):
     def is_over(self, state: Tensor) -> Tensor:
         """Where every action stays, without reward."""
         cell = self.cell(state)
-        stays = self.next_state[cell].flatten(1) == cell[:, None]
-        over = stays.all(1)
-        if over.any():
-            gains = self.mean_reward()[self.reward_map(state), cell]
-            over &= (gains == 0).all(1)
+        over = (self.next_state[cell].flatten(1) == cell[:, None]).all(1)
+        here = over.nonzero()[:, 0]
+        gains = self.reward[self.reward_map(state[here]), cell[here]]
+        if gains.dim() == 3 and self.chance is not None:
+            gains = gains.masked_fill(self.chance.probability[cell[here]] == 0, 0)
+        over[here] = (gains == 0).unsqueeze(-1).flatten(1).all(1)
         return over
 
     def check_state(self, state: Tensor) -> None:
