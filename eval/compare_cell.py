@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Iterator
 from dataclasses import asdict, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -44,7 +44,7 @@ GROWN_WITH = 64
 JUDGED_WITH = 256
 """Candidate plans with which temperatures are chosen, and growth is told."""
 
-VERSION = 5
+VERSION = 6
 """Of the way in which a cell is done; counts up with each change of it."""
 
 FAMILIAR = 2
@@ -55,16 +55,25 @@ TIMED_STARTS = 4
 
 
 def recipe() -> str:
-    """All that decides a cell beside its world and settings; after a change of it, finished cells do not count."""
+    """What decides a cell beside its world and settings; after a change of it, finished cells do not count.
+
+    Changes of code are not seen: they count `VERSION` up.
+    """
     priors = (ORDERS, RECIPE, WIDE, MANY, TRAINING)
     return repr((priors, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, FAMILIAR, TIMED_STARTS, VERSION))
 
 
 def digest(task: Task) -> str:
-    """Eight letters for all that decides a world; after a change of it, its finished cells do not count."""
-    names = [field.name for field in fields(Task) if field.name != "worlds"]
-    told = repr(([getattr(task, name) for name in names], MAPS, LAYOUTS, SCRAMBLE))
-    return hashlib.sha256(told.encode()).hexdigest()[:8]
+    """Eight letters for all that is said of a world but in words; after a change, its finished cells do not count."""
+    said = [_said(getattr(task, field.name)) for field in fields(Task) if field.name != "about"]
+    return hashlib.sha256(repr((said, MAPS, LAYOUTS, SCRAMBLE)).encode()).hexdigest()[:8]
+
+
+def _said(value: Any) -> Any:
+    """A value, or the names of a function and its arguments."""
+    if isinstance(value, partial):
+        return _said(value.func), value.args, [(name, _said(given)) for name, given in sorted(value.keywords.items())]
+    return value.__qualname__ if callable(value) else value
 
 
 def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:

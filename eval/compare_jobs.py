@@ -19,12 +19,14 @@ from eval import compare_cell
 from eval.compare_settings import Settings
 from eval.processes import do_each, progress_bar
 from eval.suite import TASKS, Task
-from neuroprior import __version__
-from neuroprior.output import write_json, write_whole
+from neuroprior.output import versions, write_json, write_whole
 from neuroprior.threads import one_thread
 
 if TYPE_CHECKING:
     from lightning import Fabric
+
+DRAWN_BY = ("gymnasium", "minigrid")
+"""Packages whose other versions may make other worlds."""
 
 LONGEST_WAIT = timedelta(days=365)
 """How long a process that torchrun started waits for the others to finish their cells."""
@@ -65,7 +67,7 @@ class Study:
         """
         # Other versions and recipes give other results: cells that were finished with them do not count.
         decides = {"settings": asdict(settings), "recipe": compare_cell.recipe(), "what": run.__qualname__}
-        decides |= {"version": __version__, "torch": torch.__version__}
+        decides |= versions(*DRAWN_BY)
         digest = hashlib.sha256(json.dumps(decides, sort_keys=True).encode())
         for prior in settings.priors:
             for name in ("config.json", "model.safetensors"):

@@ -42,9 +42,9 @@ TRAINING = {"weight_decay": 0.3, "progress": False}
 def chain(order: int, world: World, plans: Plans, near: Sequence[tuple[int, ...]]) -> Prior:
     """A Markov prior for plans like these, which sees what they show; features, or sets of them, as one number."""
     sizes = sizes_of(world, plans)
-    if "context_size" in sizes:
-        return SeeingMarkov(plans.num_actions, order, near=near, **sizes)
-    return MarkovPrior(plans.num_actions, order, **sizes)
+    if sizes:
+        return SeeingMarkov(plans.num_actions, order, near, **sizes)
+    return MarkovPrior(plans.num_actions, order)
 
 
 def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:

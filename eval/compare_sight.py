@@ -1,4 +1,4 @@
-"""Markov priors that see features, in `python -m eval compare`: a sight is a context that has to be met to be known."""
+"""Markov priors that see, in `python -m eval compare`: a sight is a context that has to be met to be known."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neuroprior import MarkovPrior, Plans, Prior
 from neuroprior.comparison import score
+from neuroprior.plans import sees_each_step
 
 VALIDATION = 0.2
 """Share of the plans on which it is chosen what a prior sees."""
@@ -18,19 +19,21 @@ SAME = 1e-9
 
 
 class Sights:
-    """Numbers for features: each sight that occurs in the plans has one, and all others share the last.
+    """Numbers for what is seen: each sight that occurs in the plans has one, and all others share the last.
 
     Args:
-        features: floating point `[N, C]`, the sights that occur.
+        seen: the sights that occur: floating point `[N, C]` (features), or integers `[N]`.
         near: the features that count; None: all.
     """
 
-    def __init__(self, features: Tensor, near: Sequence[int] | None = None) -> None:
-        # A sum with random weights tells features apart; one number is quicker to look up than many.
-        generator = torch.Generator().manual_seed(0)
+    def __init__(self, seen: Tensor, near: Sequence[int] | None = None) -> None:
         self.columns = slice(None) if near is None else torch.tensor(near)
-        self.weights = torch.rand(features[:, self.columns].shape[-1], generator=generator, dtype=torch.float64)
-        codes = self._code(features).sort().values
+        self.weights = torch.ones(0, dtype=torch.float64)
+        if seen.is_floating_point():
+            # A sum with random weights tells features apart; one number is quicker to look up than many.
+            generator = torch.Generator().manual_seed(0)
+            self.weights = torch.rand(seen[:, self.columns].shape[-1], generator=generator, dtype=torch.float64)
+        codes = self._code(seen).sort().values
         new = torch.ones_like(codes, dtype=torch.bool)
         new[1:] = codes.diff() > SAME
         self.codes = codes[new]
@@ -40,39 +43,40 @@ class Sights:
         """How many numbers there are, the last among them."""
         return len(self.codes) + 1
 
-    def __call__(self, features: Tensor) -> Tensor:
-        """The numbers `[...]` of features `[..., C]`."""
-        code = self._code(features)
+    def __call__(self, seen: Tensor) -> Tensor:
+        """The numbers `[...]` of features `[..., C]` or integers `[...]`."""
+        code = self._code(seen)
         place = torch.searchsorted(self.codes, code - SAME / 2).clamp(max=len(self.codes) - 1)
         return torch.where((self.codes[place] - code).abs() < SAME, place, len(self.codes))
 
-    def _code(self, features: Tensor) -> Tensor:
-        return features[..., self.columns].double() @ self.weights
+    def _code(self, seen: Tensor) -> Tensor:
+        return seen[..., self.columns].double() @ self.weights if seen.is_floating_point() else seen.double()
 
 
 class SeeingMarkov(Prior):
-    """A Markov prior that sees features: each sight that occurs in the plans it learns from is a context of its own.
+    """A Markov prior that sees: each sight that occurs in the plans it learns from is a context of its own.
 
     Chains have to meet a sight to know it, and of large sights most are new. So each time it learns, all features and
-    each of the sets in `near` are tried, and those are taken with which it tells held-out plans best.
+    each of the sets in `near` are tried, and those are taken with which it tells held-out plans best. At a sight that
+    it has not met it goes on as a chain of the same order that sees nothing.
 
     Args:
         num_actions, order: see `MarkovPrior`.
-        context_size: number of features, C.
         near: sets of features.
+        num_contexts, context_size: see `Prior`.
     """
 
-    def __init__(self, num_actions: int, order: int, context_size: int, near: Sequence[tuple[int, ...]] = ()) -> None:
-        super().__init__(num_actions, context_size=context_size)
+    def __init__(self, num_actions: int, order: int, near: Sequence[tuple[int, ...]] = (), **sizes: int) -> None:
+        super().__init__(num_actions, **sizes)
         self.order, self.near = order, tuple(near)
-        self.chain = MarkovPrior(num_actions, order, num_contexts=1)
-        self.sights = Sights(torch.zeros(0, context_size))
+        self.blind, self.chain = MarkovPrior(num_actions, order), MarkovPrior(num_actions, order, num_contexts=1)
+        self.sights = Sights(torch.zeros(1, dtype=torch.long))
 
     def fit(self, plans: Plans | Tensor) -> Self:
         """Choose what to see, number it and count; returns self.
 
         Raises:
-            ValueError: plans that a Markov prior cannot learn from, or that do not show so many features.
+            ValueError: plans that a Markov prior cannot learn from, or that do not show what this one sees.
         """
         plans = self.training_plans(plans)
         best: Sequence[int] | None = None
@@ -83,22 +87,35 @@ class SeeingMarkov(Prior):
         return self._learn(plans, best)
 
     def _learn(self, plans: Plans, near: Sequence[int] | None) -> Self:
-        assert plans.context is not None
-        self.sights = Sights(plans.context.flatten(0, -2), near)
+        seen = plans.context
+        assert seen is not None
+        self.sights = Sights(seen.flatten(0, -2) if seen.is_floating_point() else seen.flatten(), near)
         self.chain = MarkovPrior(self.num_actions, self.order, num_contexts=self.sights.number)
-        self.chain.fit(replace(plans, context=self.sights(plans.context)))
+        self.chain.fit(replace(plans, context=self.sights(seen), context_names=None))
+        self.blind.fit(plans)
         return self
 
     def _bits(self, plans: Plans) -> float:
         return score("", self, plans).bits_per_action().mean
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return self.chain.start(batch_size, None if context is None else self.sights(context))
+        if context is None:
+            raise ValueError("context: this prior sees a context, and none was given")
+        seeing = self.chain.start(batch_size, self.sights(context))
+        return self._either(seeing, self.blind.start(batch_size))
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        return self.chain.step(action, state, None if context is None else self.sights(context))
+        sight = None if context is None else self.sights(context)
+        return self._either(self.chain.step(action, state[:, 0], sight), self.blind.step(action, state[:, 1]))
+
+    def _either(self, seeing: tuple[Tensor, Tensor], blind: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """The logits of the one or the other, by what was seen last, and the states of both."""
+        known = seeing[1] % self.sights.number < self.sights.number - 1
+        return torch.where(known[:, None], seeing[0], blind[0]), torch.stack([seeing[1], blind[1]], -1)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
-        logits = self.chain(plans, None if context is None else self.sights(context))
-        assert isinstance(logits, Tensor)
-        return logits
+        if context is None:
+            raise ValueError("context: this prior sees a context, and none was given")
+        sight = self.sights(context)
+        known = (sight if sees_each_step(context) else sight[:, None]) < self.sights.number - 1
+        return torch.where(known[..., None], self.chain(plans, sight), self.blind(plans))

@@ -82,8 +82,9 @@ class Task:
 # Later is worth less, so that the best plans go straight there.
 _goal: dict[str, Any] = {"objective": "return", "discount": 0.95, "above": 0.0}
 _neighbours = "which of the 24 squares around it are free"
-# The eight squares around, and those before, left and right, of five rows of five without the one in the middle.
+# The eight squares around, and those that actions lead or turn to, of five rows of five without the one in the middle.
 _nearest = ((6, 7, 8, 11, 12, 15, 16, 17), (7, 11, 12))
+_nearest_of_four = (_nearest[0], (7, 11, 12, 16))
 _grid_about = "the reward where a plan ends; new walls and rewards held out"
 
 
@@ -92,7 +93,9 @@ def _minigrid(name: str, about: str, environment: str) -> Task:
     how: dict[str, Any] = {"near": minigrid_worlds.NEAR, "sights": ("nothing", "each step"), "times": 3} | _goal
     about = f"MiniGrid {about}; reaching it; new layouts held out"
     sees = "the seven by seven squares before it"
-    return Task(name, minigrid_worlds.MOVES, about, minigrid(environment), 5, (9, 16), sees=sees, **how)
+    return Task(
+        name, minigrid_worlds.MOVES, about, partial(minigrid, environment=environment), 5, (9, 16), sees=sees, **how
+    )
 
 
 _tasks = (
@@ -100,7 +103,7 @@ _tasks = (
         "grid",
         MOVES,
         "the paper's grid: 20 x 20, a torus, independent rewards; the reward where a plan ends; new rewards held out",
-        both(partial(gridworld, 20, 20, edges="torus"), num_worlds=MAPS),
+        partial(both, make=gridworld, edges="torus", num_worlds=MAPS),
         4,
         (6, 8),
     ),
@@ -108,11 +111,11 @@ _tasks = (
         "four_rooms",
         MOVES,
         f"four rooms, 13 x 13, doors at random places, four moves; {_grid_about}",
-        layouts(partial(four_rooms, reward_power=8.0)),
+        partial(layouts, make=four_rooms),
         5,
         (10, 16),
         sees=_neighbours,
-        near=_nearest,
+        near=_nearest_of_four,
         sights=("nothing", "start"),
         times=2,
     ),
@@ -120,11 +123,11 @@ _tasks = (
         "maze",
         MOVES,
         f"mazes with some loops, 15 x 15, four moves; {_grid_about}",
-        layouts(partial(maze, reward_power=8.0)),
+        partial(layouts, make=maze),
         5,
         (10, 16),
         sees=_neighbours,
-        near=_nearest,
+        near=_nearest_of_four,
         sights=("nothing", "start"),
         times=2,
     ),
@@ -132,7 +135,7 @@ _tasks = (
         "egocentric",
         TURNS,
         f"the same mazes for an agent that turns left, turns right or goes forward; {_grid_about}",
-        layouts(partial(maze, reward_power=8.0, egocentric=True)),
+        partial(layouts, make=maze, egocentric=True),
         7,
         (11, 16),
         sees=_neighbours + ", as it is turned",
@@ -171,7 +174,7 @@ _tasks = (
         "taxi",
         ("south", "north", "east", "west", "pickup", "dropoff"),
         "Taxi: fetch a passenger and bring it; the sum of rewards; half of all states to start from held out",
-        split("Taxi-v4"),
+        partial(split, name="Taxi-v4"),
         5,
         (10, 16),
         "return",
@@ -182,7 +185,7 @@ _tasks = (
         "cliff",
         MOVES,
         "CliffWalking: go around a cliff; the sum of rewards; half of all squares to start from held out",
-        split("CliffWalking-v1"),
+        partial(split, name="CliffWalking-v1"),
         5,
         (10, 16),
         "return",
@@ -193,7 +196,7 @@ _tasks = (
         "frozen_lake",
         ("left", "down", "right", "up"),
         "FrozenLake, 8 x 8, not slippery: to the goal, between holes; reaching it; new lakes held out",
-        lake(slippery=False),
+        partial(lake, slippery=False),
         5,
         (9, 14),
         **_goal,
@@ -203,7 +206,7 @@ _tasks = (
         ("left", "down", "right", "up"),
         "FrozenLake, 8 x 8, slippery: a third of the moves go where they should; how likely a plan reaches the goal;"
         " new lakes held out",
-        lake(slippery=True),
+        partial(lake, slippery=True),
         5,
         (9, 14),
         "return",

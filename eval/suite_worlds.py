@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from copy import copy
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -34,47 +33,35 @@ class Pair(NamedTuple):
     held_out: World
 
 
-def both(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
+def both(seed: int, make: Callable[..., World], **how: Any) -> Pair:
     """Worlds of unlike seeds, even ones to learn in."""
-
-    def made(seed: int) -> Pair:
-        return Pair(make(seed=2 * seed, **how), make(seed=2 * seed + 1, **how))
-
-    return made
+    return Pair(make(seed=2 * seed, **how), make(seed=2 * seed + 1, **how))
 
 
-def layouts(make: Callable[..., World], **how: Any) -> Callable[[int], Pair]:
+def layouts(seed: int, make: Callable[..., World], **how: Any) -> Pair:
     """Grids with new walls and new rewards."""
-    return both(make, num_layouts=MAPS, view=2, **how)
+    return both(seed, make, num_layouts=MAPS, reward_power=8.0, view=2, **how)
 
 
-def split(name: str, **options: Any) -> Callable[[int], Pair]:
+def split(seed: int, name: str) -> Pair:
     """One environment, started in any state that can be reached: a random half to learn from, the other held out."""
-
-    def made(seed: int) -> Pair:
-        world = from_gymnasium(name, starts="any", **options)
-        assert isinstance(world, EpisodicWorld)
-        where = world.starts.nonzero()[:, 0]
-        where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
-        halves = [copy(world), copy(world)]
-        for half, kept in zip(halves, where.tensor_split([len(where) // 2]), strict=True):
-            half.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
-        return Pair(*halves)
-
-    return made
+    world = from_gymnasium(name, starts="any")
+    assert isinstance(world, EpisodicWorld)
+    where = world.starts.nonzero()[:, 0]
+    where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
+    halves = [copy(world), copy(world)]
+    for half, kept in zip(halves, where.tensor_split([len(where) // 2]), strict=True):
+        half.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
+    return Pair(*halves)
 
 
-def lake(slippery: bool) -> Callable[[int], Pair]:
+def lake(seed: int, slippery: bool) -> Pair:
     """Frozen lakes, each seed with holes of its own."""
+    from gymnasium.envs.toy_text.frozen_lake import generate_random_map
 
-    def made(seed: int) -> Pair:
-        from gymnasium.envs.toy_text.frozen_lake import generate_random_map
-
-        maps = [generate_random_map(size=8, seed=2 * seed + half) for half in (0, 1)]
-        lakes = [from_gymnasium("FrozenLake-v1", desc=one, is_slippery=slippery, starts="any") for one in maps]
-        return Pair(*lakes)
-
-    return made
+    maps = [generate_random_map(size=8, seed=2 * seed + half) for half in (0, 1)]
+    lakes = [from_gymnasium("FrozenLake-v1", desc=one, is_slippery=slippery, starts="any") for one in maps]
+    return Pair(*lakes)
 
 
 class _Scrambles(PocketCube):
@@ -97,16 +84,12 @@ def scrambles(seed: int) -> Pair:
     return Pair(_Scrambles(0), _Scrambles(1))
 
 
-def minigrid(environment: str) -> Callable[[int], Pair]:
+def minigrid(seed: int, environment: str) -> Pair:
     """Layouts of MiniGrid, each seed with its own; plans may start anywhere."""
-
-    def made(seed: int) -> Pair:
-        learned, others = LAYOUTS
-        first = seed * (learned + others)
-        here = range(first, first + learned), range(first + learned, first + learned + others)
-        return Pair(*(minigrid_worlds.layouts(environment, seeds) for seeds in here))
-
-    return made
+    learned, others = LAYOUTS
+    first = seed * (learned + others)
+    here = range(first, first + learned), range(first + learned, first + learned + others)
+    return Pair(*(minigrid_worlds.layouts(environment, seeds) for seeds in here))
 
 
 def _guided(seed: int) -> World:
@@ -128,8 +111,11 @@ def goal_mazes(seed: int) -> Pair:
 
 
 def under_way(seed: int) -> Pair:
-    """The egocentric mazes after the first moves of a plan of the best seven."""
-    planner = ExhaustivePlanner(LAST)
-    mazes = layouts(partial(maze, reward_power=8.0, egocentric=True))(seed)
-    first, second = (UnderWay(world, planner, TAKEN) for world in mazes if isinstance(world, TabularWorld))
-    return Pair(first, second)
+    """The egocentric mazes after the first moves of the best of all plans of seven."""
+
+    def middle(world: World) -> UnderWay:
+        assert isinstance(world, TabularWorld)
+        return UnderWay(world, ExhaustivePlanner(LAST), TAKEN)
+
+    training, held_out = layouts(seed, maze, egocentric=True)
+    return Pair(middle(training), middle(held_out))

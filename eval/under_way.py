@@ -43,5 +43,11 @@ class UnderWay(World):
         """The actions that are left, one by one: float32 `[N, R * A]`."""
         return nn.functional.one_hot(state[:, 1:], self.num_actions).flatten(1).float()
 
+    def legal(self, state: Tensor) -> Tensor:
+        return self.world.legal(state[:, 0])
+
+    def group(self, state: Tensor) -> Tensor | None:
+        return self.world.group(state[:, 0])
+
     def is_over(self, state: Tensor) -> Tensor:
         return self.world.is_over(state[:, 0])

@@ -7,7 +7,7 @@ import os
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from io import StringIO
 from pathlib import Path
 from typing import IO, Any
@@ -67,12 +67,13 @@ def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
             partial.unlink(missing_ok=True)
 
 
-def versions() -> dict[str, str]:
-    """The versions that results depend on."""
-    packages = ("torch", "numpy", "lightning")
-    return {"neuroprior": _own_version(), "python": platform.python_version()} | {
-        name: version(name) for name in packages
-    }
+def versions(*more: str) -> dict[str, str]:
+    """The versions that results depend on, with those of more packages; without those that are not installed."""
+    found = {"neuroprior": _own_version(), "python": platform.python_version()}
+    for name in ("torch", "numpy", "lightning", *more):
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def _own_version() -> str:

@@ -1,14 +1,17 @@
 """Cells of `eval compare`: curves with known values, starts, sights by number, and whole cells of small worlds."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from eval import compare_priors
-from eval.compare_cell import digest, recipe, run_cell, run_growth
+from eval import compare_cell, compare_priors
+from eval.compare_cell import digest, run_cell, run_growth
 from eval.compare_curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
 from eval.compare_priors import chain, network, sizes_of
 from eval.compare_settings import Settings
@@ -162,8 +165,26 @@ def test_counts_see_what_networks_see():
     grid = gridworld(4, 4)
     plans = collect(ExhaustivePlanner(2), grid, 20, context="step")
     assert sizes_of(grid, plans) == {"num_contexts": 16}
-    assert isinstance(chain(1, grid, plans, ()), MarkovPrior)
+    told = chain(1, grid, plans, ()).fit(plans).log_prob(plans.actions, plans.context)
+    assert torch.allclose(told, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans.actions, plans.context))
+    assert isinstance(chain(1, grid, replace(plans, context=None), ()), MarkovPrior)
     assert network("gru", grid, plans, 0).num_contexts == 16
+
+
+@pytest.mark.parametrize("per", ["plan", "step"])
+def test_at_sights_never_met_a_chain_goes_on_blind(per):
+    """Actions alternate, whatever is seen; where nothing seen was met, all is known of them still."""
+    actions = (torch.arange(6) + torch.arange(40)[:, None]) % 2
+    seen = torch.rand(40, 6, 3, generator=seeded(0))
+    seen = seen[:, 0] if per == "plan" else seen
+    prior, blind = SeeingMarkov(2, 2, context_size=3), MarkovPrior(2, 2).fit(actions)
+    prior.fit(Plans(actions, 2, context=seen))
+    other = seen + 5
+    assert torch.allclose(prior.log_prob(actions, other), blind.log_prob(actions), atol=1e-6)
+    if per == "step":
+        half = torch.where(torch.arange(6)[:, None] < 3, seen, other)
+        plans = Plans(actions, 2, context=half)
+        assert torch.allclose(stepped(prior, plans), prior.log_prob(actions, half), atol=1e-5)
 
 
 def stepped(prior: Prior, plans: Plans) -> torch.Tensor:
@@ -187,16 +208,16 @@ def test_chains_may_see_what_is_near_alone():
     assert torch.equal(nearest, local_view(worlds.training, 1)(state))
     assert torch.equal(beside, nearest[:, [1, 3, 4]])
     plans = collect(ExhaustivePlanner(4), worlds.training, 200, context="step", generator=seeded(0))
-    bits = {}
+    known = {}
     for near in ((), task.near):
-        prior = SeeingMarkov(3, 1, 24, near).fit(plans)
-        bits[near] = prior.sights.number
-    assert bits[task.near] < bits[()] / 2
+        prior = SeeingMarkov(3, 1, near, context_size=24).fit(plans)
+        known[near] = prior.sights.number
+    assert known[task.near] < known[()] / 2
     # Where what is far tells the action and what is near does not, all is seen: four sights, and those never met.
     seen = torch.randint(2, (300, 4, 2), generator=seeded(2)).float()
     far = Plans(seen[..., 1].long(), 2, context=seen)
-    assert SeeingMarkov(2, 0, 2, ((0,),)).fit(far).sights.number == 5
-    assert SeeingMarkov(2, 0, 2, ((1,),)).fit(far).sights.number == 3
+    assert SeeingMarkov(2, 0, ((0,),), context_size=2).fit(far).sights.number == 5
+    assert SeeingMarkov(2, 0, ((1,),), context_size=2).fit(far).sights.number == 3
 
 
 @pytest.fixture(scope="module")
@@ -259,10 +280,24 @@ def test_growth_alone_with_lengths_of_its_own():
 
 
 def test_the_recipe_is_the_same_in_every_process():
-    assert recipe() == recipe()
-    assert " at 0x" not in recipe()
-    assert len({digest(task) for task in TASKS.values()}) == len(TASKS)
-    assert digest(replace(TASKS["maze"], times=3)) != digest(TASKS["maze"]) == digest(replace(TASKS["maze"]))
+    told = (
+        "from eval.compare_cell import *; from eval.suite import TASKS; print([recipe(), *map(digest, TASKS.values())])"
+    )
+    said = [
+        subprocess.run([sys.executable, "-c", told], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True)
+        for seed in ("1", "2")
+    ]
+    assert said[0].stdout == said[1].stdout != b""
+
+
+def test_another_world_has_another_digest(monkeypatch):
+    task = TASKS["maze"]
+    same = digest(task)
+    assert digest(replace(task, about="in other words")) == same
+    others = [replace(task, times=3), replace(task, worlds=TASKS["egocentric"].worlds)]
+    assert all(digest(other) != same for other in others)
+    monkeypatch.setattr(compare_cell, "MAPS", 7)
+    assert digest(task) != same
 
 
 SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name.startswith("minigrid")]

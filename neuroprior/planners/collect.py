@@ -7,7 +7,6 @@ from torch import Tensor
 
 from neuroprior.planners.planner import Planner
 from neuroprior.plans import Plans, sees_each_step
-from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import World
 
 
@@ -35,7 +34,7 @@ def collect(
 
     Returns:
         N plans, fewer with `above`, each up to where it was over (`World.is_over`). In a table of several worlds, the
-        world is the plan's group, see `TabularWorld.group`.
+        world is the plan's group, see `World.group`.
 
     Raises:
         ValueError: neither or both of `num_plans` and `state` are given, one is out of range, or no plan scored more
@@ -67,10 +66,7 @@ def collect(
         seen = world.observe(state)
     elif context == "step":
         seen = torch.stack([world.observe(before) for before in course], 1)
-    group, names = None, None
-    if isinstance(world, TabularWorld):
-        group, names = world.group(state), world.action_names
-    return Plans(plan, world.num_actions, lengths, names, seen, group)
+    return Plans(plan, world.num_actions, lengths, world.action_names, seen, world.group(state))
 
 
 def _course(world: World, state: Tensor, plan: Tensor, generator: torch.Generator | None) -> list[Tensor]:

@@ -31,11 +31,13 @@ class World(ABC):
         num_actions: the number of actions, A.
         all_legal: True where every action exists in every state, so that nobody need ask `legal`.
         stochastic: True where chance decides what comes of an action, so that one try of a plan says little of it.
+        action_names: names of the actions, where there are any.
     """
 
     num_actions: int
     all_legal: bool = True
     stochastic: bool = False
+    action_names: tuple[str, ...] | None = None
 
     @abstractmethod
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
@@ -102,6 +104,10 @@ class World(ABC):
         Default: nowhere.
         """
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
+
+    def group(self, state: Tensor) -> Tensor | None:
+        """Which of several independent worlds each state is in, int64 `[N]`; None (the default) where there is one."""
+        return None
 
     def check_state(self, state: Tensor) -> None:
         """Raise ValueError where `state` cannot be a batch of this world's states. Default: it must have a batch."""
