@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from eval import compare_cell, compare_settings
@@ -60,7 +61,8 @@ def compare(
         kinds: of priors that are fitted: markov, gru, transformer; all by default, but none where there are saved ones.
         sees: what priors see: nothing but the plan so far, the start as well, or each step; by default nothing and, in
             worlds where it could help, one or both of the others.
-        rounds: of horizon growth: a prior learns from plans that were found with it, each time longer ones; 0: none.
+        rounds: of horizon growth, at most (worlds have two or three): a prior learns from plans found with it,
+            each time longer ones; 0: none.
         steps: of training of each neural prior, at most.
         starts: held-out starts to plan from.
         training_starts: from so many starts plans are collected to learn from; from several times as many in worlds
@@ -114,19 +116,25 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
             raise ValueError(f"{name}: at least {least.get(name, 1)} is expected, not {number}")
     if not 0 <= settings.seed < 2**40:
         raise ValueError(f"seed: an integer from 0 to 2**40 - 1 is expected, not {settings.seed}")
-    blind = [world for world in worlds if TASKS[world].sees is None]
-    if blind and settings.sees and "nothing" not in settings.sees:
+    blind = [world for world in worlds if settings.sees and not any(map(TASKS[world].shows, settings.sees))]
+    if blind:
         raise ValueError(f"sees: {blind[0]} shows nothing that would be of use; leave it out, or add nothing to --sees")
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
-    """Raise ValueError unless saved priors know the actions of all worlds; before hours of work, not after them."""
+    """Raise ValueError unless saved priors know the actions and sights of all worlds; before hours of work."""
     for folder in folders:
         if folder == "uniform" or folder in KINDS or folder.startswith("markov-"):
             raise ValueError(f"priors: {folder} is also the name of a fitted prior; give the folder as ./{folder}")
         for world in worlds:
             task = TASKS[world]
-            load_for(folder, world, task.num_actions, task.action_names)
+            prior = load_for(folder, world, task.num_actions, task.action_names)
+            if prior.takes_context:
+                held_out = task.worlds(0).held_out
+                try:
+                    prior.check_context_of(held_out.observe(held_out.reset(1, torch.Generator().manual_seed(0))), 1)
+                except ValueError as error:
+                    raise ValueError(f"{folder}: does not see what the world {world} shows ({error})") from error
 
 
 def command(name: str) -> str:

@@ -173,17 +173,8 @@ class _Contest:
             sees = next(name for name, per in SEES.items() if per == prior.context_per)
             yield _Contestant(folder, sees, prior, 0, None)
         for sees in self.settings.sees or self.task.sights:
-            if sees == "nothing" or self._shows(sees):
+            if self.task.shows(sees):
                 yield from self._learners(sees)
-
-    def _shows(self, sees: str) -> bool:
-        """Whether there is something to be seen that held-out worlds have in common with training worlds.
-
-        Numbers of states to start from have nothing in common: other starts are held out.
-        """
-        if self.task.sees is None:
-            return False
-        return sees == "each step" or self.worlds.training.observe(self.familiar.state[:1]).is_floating_point()
 
     def _learners(self, sees: str) -> Iterator[_Contestant]:
         first = as_seen(self.first, sees)

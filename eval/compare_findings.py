@@ -11,7 +11,7 @@ from eval.compare_figures import Estimate, Style, key_of, styles
 from eval.compare_pairs import BEST, points, question_of, shown_plans
 from eval.compare_rows import Cells, Rows
 from eval.compare_summary import summary_table
-from eval.page import FigureBox, Section, Table, svg
+from eval.page import FigureBox, Section, Table, breakable, svg
 
 INTERVALS = "Intervals: 95 %, over seeds, each with worlds and priors of its own."
 
@@ -116,7 +116,7 @@ def words_section(comparison: Comparison) -> Section:
         " priors, and p for the number of worlds: Bonferroni, Holm). A number of plans in the middle was fixed for"
         " these words beforehand; other numbers are in the tables."
     )
-    summary = summary_table(comparison.words, comparison.rows, comparison.num_plans)
+    summary = summary_table(comparison.words, comparison.num_plans)
     tables = [*([summary] if summary else []), *_gap_tables(comparison)]
     return Section("In plain words", text, tables, _gap_boxes(comparison, PLAIN))
 
@@ -150,8 +150,7 @@ def _gap_tables(comparison: Comparison) -> list[Table]:
     cells: dict[str, dict[int, str]] = {}
     for row in comparison.paired:
         if (row["what"], row["sees"], row["rounds"]) == (BEST, "nothing", "0"):
-            # A long name may be broken where its words end.
-            cells.setdefault(row["world"].replace("_", "_\N{ZERO WIDTH SPACE}"), {})[row["num_plans"]] = _gap(row)
+            cells.setdefault(breakable(row["world"]), {})[row["num_plans"]] = _gap(row)
     rows = [[world, *(own.get(number, "") for number in numbers)] for world, own in cells.items()]
     caption = f"Best neural minus best Markov prior: points of the oracle, by candidate plans. {STARRED} {INTERVALS}"
     return [Table(("world", *(f"{number:,}" for number in numbers)), rows, caption)] if rows else []

@@ -29,9 +29,10 @@ def paired(cells: Cells, num_plans: Sequence[int]) -> Rows:
     p-values hold whichever are the best: see `best_difference`.
 
     Returns:
-        A row a world, pair and number of plans: `difference` with Student's interval (`low`, `high`), `p_value` of
-        the two-sided paired t-test, and `p_holm`, corrected for all rows of the world. With a single seed there is a
-        difference and nothing else; the best are not chosen then.
+        A row a world, pair and number of plans: the shares of the two (`first_share`, `second_share`; of the best, as
+        they were chosen for each seed on the other half), their `difference` with Student's interval (`low`, `high`),
+        `p_value` of the two-sided paired t-test, and `p_holm`, corrected for all rows of the world. With a single seed
+        there are shares and a difference and nothing else; the best are not chosen then.
     """
     found: Rows = []
     for world, results in by_world(cells).items():
@@ -78,16 +79,20 @@ def difference(results: Results, pair: Pair, num_plans: int) -> dict[str, Any] |
         return None
     place = results.budgets.index(num_plans)
     sides: list[Array] = []
-    names = []
+    names, means = [], []
     for keys in (pair.first, pair.second):
         shares = np.array([[results.entries[key][seed]["share"][place] for seed in seeds] for key in keys])
+        best = chosen(shares)
         sides.append(shares)
-        names.append(" / ".join(dict.fromkeys(str(keys[one].prior) for one in chosen(shares))))
+        names.append(" / ".join(dict.fromkeys(str(keys[one].prior) for one in best)))
+        means.append(float(shares[best, np.arange(len(seeds))].mean()))
     first, second = pair.first[0], pair.second[0]
     return {
         "what": pair.what,
         "first": names[0],
         "second": names[1],
+        "first_share": means[0],
+        "second_share": means[1],
         "sees": " - ".join(dict.fromkeys((first.sees, second.sees))),
         "rounds": " - ".join(dict.fromkeys((str(first.rounds), str(second.rounds)))),
         "num_plans": num_plans,

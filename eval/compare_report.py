@@ -32,11 +32,11 @@ def compared(cells: Cells, num_plans: Sequence[int]) -> Comparison:
     worlds = list(dict.fromkeys(cell["world"] for cell in cells))
     cells = sorted(cells, key=lambda cell: (worlds.index(cell["world"]), int(cell["seed"])))
     every = sorted({number for cell in cells for number in cell["budgets"]})
-    tables = {"rows": rows(cells, sorted(num_plans)), "paired": paired(cells, sorted(num_plans))}
-    tables |= {"words": words(cells, num_plans), "bits": bits_rows(cells)}
+    tables = {"paired": paired(cells, sorted(num_plans)), "words": words(cells, num_plans), "bits": bits_rows(cells)}
     return Comparison(
         cells,
         sorted(num_plans),
+        rows=rows(cells, sorted(num_plans)),
         curves=rows(cells, every),
         efficiency=efficiency(cells),
         growth=growth_rows(cells),

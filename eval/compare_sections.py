@@ -12,7 +12,7 @@ from eval.compare_findings import Comparison, pair_table, times
 from eval.compare_pairs import shown_plans
 from eval.compare_rows import Rows
 from eval.matrix_figures import transition_figure
-from eval.page import FigureBox, Section, Table, svg
+from eval.page import FigureBox, Section, Table, breakable, svg
 
 
 def worlds_section(comparison: Comparison) -> Section:
@@ -21,7 +21,7 @@ def worlds_section(comparison: Comparison) -> Section:
     for world in comparison.worlds:
         own = [cell for cell in comparison.cells if cell["world"] == world]
         numbers = (str(own[0]["length"]), f"{own[0]['num_starts']:,}", str(len(own)))
-        rows.append([world.replace("_", "_\N{ZERO WIDTH SPACE}"), *numbers])
+        rows.append([breakable(world), *numbers])
     caption = "actions: in a plan; starts: of each seed. What the worlds are stands below the first figures."
     table = Table(("world", "actions", "starts", "seeds"), rows, caption)
     text = [
@@ -135,8 +135,8 @@ def growth_section(growth: Rows) -> Section | None:
     text = [
         "A prior learns from all short plans that were tried, plans longer, learns from those plans, and so on. Below"
         " the axis: the round, and the number of actions in its plans, each against the best plans of as many actions.",
-        f"{number} candidate plans, sampled at temperature 1. Bands: 95 % bootstrap intervals over seeds; thin lines:"
-        " the other Markov chains.",
+        f"{number} candidate plans, sampled at the temperature that serves best in the training worlds. Bands: 95 %"
+        " bootstrap intervals over seeds; thin lines: the other Markov chains.",
     ]
     return Section("Growing the horizon", text, (), boxes, beside=True)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from eval.compare_pairs import BEST, points, shown_plans
 from eval.compare_rows import Key, Rows
-from eval.page import Section, Table
+from eval.page import Section, Table, breakable
 
 CEILING = 0.98
 """Where the best Markov chain reaches this share of the oracle, little is left to find."""
@@ -14,17 +14,18 @@ AS_MANY_BITS = 0.01
 """Bits per action that do not count."""
 
 
-def summary_table(words: Rows, rows: Rows, num_plans: Sequence[int]) -> Table | None:
+def summary_table(words: Rows, num_plans: Sequence[int]) -> Table | None:
     """The best neural against the best Markov prior in every world, by what they see and whether they have grown."""
     number = shown_plans(num_plans)
     cells = []
     for row in _best(words):
-        markov, neural = (100 * _share(rows, row, kind, number) for kind in ("markov", "neural"))
+        neural, markov = (100 * row[f"{side}_share"] for side in ("first", "second"))
         gap = f"{100 * row['difference']:+.1f}"
         if row["low"] is not None:
             half = max(row["high"] - row["difference"], row["difference"] - row["low"])
             gap += f" ±{100 * half:.1f}{' ' if row['better'] is None else '*'}"
-        cells.append([*_where(row), f"{markov:.1f}", f"{neural:.1f}", gap])
+        world, sees = _where(row)
+        cells.append([breakable(world), sees, f"{markov:.1f}", f"{neural:.1f}", gap])
     if not cells:
         return None
     headings = ("world", "sees", "Markov", "neural", "difference")
@@ -35,13 +36,14 @@ def summary_table(words: Rows, rows: Rows, num_plans: Sequence[int]) -> Table | 
     return Table(headings, cells, caption, "llrrr")
 
 
-def reasons(words: Rows, rows: Rows, bits: Rows, paired: Rows, num_plans: Sequence[int]) -> Rows:
+def reasons(words: Rows, bits: Rows, paired: Rows, num_plans: Sequence[int]) -> Rows:
     """Why the best neural prior is not better, wherever it is not.
 
     Returns:
         A row a world, what is seen and number of rounds: the best chain's share of the oracle (`markov_share`), the
-        fewest bits per action of a network and of a chain (`neural_bits`, `markov_bits`), by how much networks are
-        ahead with the fewest plans (`early`), and `words`.
+        fewest bits per action of a network and of a chain before growth, when they learned from plans like those that
+        the bits are told of (`neural_bits`, `markov_bits`), by how much networks are ahead with the fewest plans, where
+        that is no chance (`early`), and `words`.
     """
     number, fewest = shown_plans(num_plans), min(num_plans)
     found = []
@@ -49,15 +51,19 @@ def reasons(words: Rows, rows: Rows, bits: Rows, paired: Rows, num_plans: Sequen
         if row["better"] == row["first"]:
             continue
         own = {name: row[name] for name in ("world", "sees", "rounds")}
-        own["markov_share"] = _share(rows, row, "markov", number)
+        own["markov_share"] = row["second_share"]
         own |= {f"{kind}_bits": _bits(bits, row, kind) for kind in ("neural", "markov")}
         early = [
-            one
+            one["difference"]
             for one in paired
             if (one["world"], one["what"], one["sees"], one["num_plans"]) == (row["world"], BEST, row["sees"], fewest)
             and one["rounds"] == str(row["rounds"])
+            and fewest < number
+            and one["difference"] > 0
+            and one["p_holm"] is not None
+            and one["p_holm"] < 0.05
         ]
-        own["early"] = early[0]["difference"] if early and (early[0]["low"] or 0) > 0 else None
+        own["early"] = early[0] if early else None
         found.append(own | {"words": _why(own, number, fewest)})
     return found
 
@@ -65,7 +71,7 @@ def reasons(words: Rows, rows: Rows, bits: Rows, paired: Rows, num_plans: Sequen
 def reasons_in_words(found: Rows) -> Iterator[str]:
     """The reasons, one by one."""
     for one in found:
-        world, sees = one["world"], one["sees"] + ", grown" * bool(one["rounds"])
+        world, sees = _where(one)
         yield f"{world} ({sees}): {one['words']}."
 
 
@@ -73,7 +79,7 @@ def reasons_section(found: Rows) -> Section | None:
     """Why networks are not better, as a table."""
     if not found:
         return None
-    rows = [[*_where(one), one["words"]] for one in found]
+    rows = [[breakable(one["world"]), _where(one)[1], one["words"]] for one in found]
     text = [
         "What can be learned from chosen plans sets a limit to every prior; what is left to find, to every planner. The"
         " likelier a prior holds the plans that are chosen, the fewer of its samples are needed; but the best of many"
@@ -88,37 +94,27 @@ def _why(own: Mapping[str, Any], number: int, fewest: int) -> str:
         return f"little is left to find: with {number:,} plans the best chain reaches {100 * share:.1f} % of the oracle"
     if neural is None or markov is None:
         return "no plans to tell bits of"
-    told = f"{neural:.2f} bits an action against {markov:.2f}"
+    told = f"{neural:.2f} bits an action against {markov:.2f}{', before growth' * bool(own['rounds'])}"
     if neural > markov - AS_MANY_BITS:
         return f"networks tell held-out plans no better than chains do ({told}): they know no more of their structure"
     better = f"networks tell held-out plans better ({told})"
     if own["early"] is not None:
         ahead = f"and are ahead by {points(own['early'])} points with {fewest:,} plans"
-        return f"{better}, {ahead}; with {number:,}, trying more different ones makes up for it"
-    return f"{better}, which does not make the best of {number:,} better: these have to differ, too"
+        return f"{better}, {ahead}; with {number:,} chains may make up for it by trying more different ones"
+    return f"{better}; the best of {number:,} is no better for it, for which they would have to differ, too"
 
 
 def _where(row: Mapping[str, Any]) -> tuple[str, str]:
-    """The world, broken where its words end where it has to be, and what is seen by priors that have grown or not."""
-    return row["world"].replace("_", "_\N{ZERO WIDTH SPACE}"), row["sees"] + ", grown" * bool(row["rounds"])
+    """The world, and what is seen by priors that have grown or not."""
+    return row["world"], row["sees"] + ", grown" * bool(row["rounds"])
 
 
 def _best(words: Rows) -> Iterator[Mapping[str, Any]]:
     return (row for row in words if row["what"] == BEST)
 
 
-def _own(rows: Rows, row: Mapping[str, Any], kind: str) -> Iterator[Mapping[str, Any]]:
-    """The rows of a kind of priors in the world of `row`, which see and have grown like it."""
-    like = ("world", "sees", "rounds")
-    for one in rows:
-        alike = all(one[name] == row[name] for name in like)
-        if alike and Key("sampling", one["prior"], one["sees"], one["rounds"]).kind == kind:
-            yield one
-
-
-def _share(rows: Rows, row: Mapping[str, Any], kind: str, number: int) -> float:
-    return max(one["oracle_share"] for one in _own(rows, row, kind) if one["num_plans"] == number)
-
-
 def _bits(bits: Rows, row: Mapping[str, Any], kind: str) -> float | None:
-    return min((one["bits_per_action"] for one in _own(bits, row, kind)), default=None)
+    """The fewest bits of priors of a kind before growth, in the world of `row` and seeing as much."""
+    own = (one for one in bits if (one["world"], one["sees"], one["rounds"]) == (row["world"], row["sees"], 0))
+    keys = ((Key("sampling", one["prior"], one["sees"], 0), one["bits_per_action"]) for one in own)
+    return min((told for key, told in keys if key.kind == kind), default=None)

@@ -58,6 +58,11 @@ SMALLEST = 9.5
 """Height of the smallest text of a figure, CSS pixels, down to which it shrinks with the page; then its box scrolls."""
 
 
+def breakable(name: str) -> str:
+    """A long name, which may be broken where its words end."""
+    return name.replace("_", "_\N{ZERO WIDTH SPACE}")
+
+
 @dataclass(frozen=True)
 class Table:
     """A table of text.

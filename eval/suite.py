@@ -73,6 +73,15 @@ class Task:
         """Actions in the plans that are compared."""
         return self.lengths[-1]
 
+    def shows(self, sees: str) -> bool:
+        """Whether priors that see so much (see `eval.compare_settings.SEES`) are shown something of use.
+
+        Numbers of states to start from are of none where other starts are held out.
+        """
+        if self.sees is None or sees == "nothing":
+            return sees == "nothing"
+        return sees == "each step" or getattr(self.worlds, "func", None) is not split
+
     @property
     def scoring(self) -> dict[str, Any]:
         """What planners optimise, as their arguments."""

@@ -12,7 +12,7 @@ from eval import compare, compare_cell, grow
 from eval.__main__ import main
 from eval.compare import KINDS
 from eval.suite import TASKS
-from neuroprior import MarkovPrior, Plans, save
+from neuroprior import GRUPrior, MarkovPrior, Plans, save
 from tests.made_up_cells import made_up, quick_report
 from tests.reports import FROM_ELSEWHERE
 
@@ -26,6 +26,7 @@ BAD = [
     (["--kinds", "lstm"], "kinds"),
     (["--kinds", "gru", "gru"], "kinds: each may be given once"),
     (["--sees", "everything"], "sees"),
+    (["--worlds", "maze", "cliff", "--sees", "start"], "sees: cliff shows nothing that would be of use"),
     (["--seeds", "0"], "seeds: at least 1"),
     (["--rounds", "-1"], "rounds: at least 0"),
     (["--steps", "0"], "steps: at least 1"),
@@ -96,6 +97,17 @@ def test_saved_priors_stand_alone_or_beside_fitted_ones(kinds, fitted, tmp_path)
     found = run(tmp_path / "out", "--worlds", "maze", "--priors", *folders, *kinds)
     assert found["settings"]["priors"] == folders
     assert found["settings"]["kinds"] == fitted
+
+
+def test_sights_that_do_not_fit_are_told_before_anything_is_done(tmp_path, capsys):
+    plans = Plans(torch.zeros(9, 4, dtype=torch.long), 4, context=torch.rand(9, 4, 7))
+    folder = str(save(GRUPrior(4, 4, context_size=7).fit(plans, max_steps=1, progress=False), tmp_path / "seven"))
+    assert main(["compare", "--worlds", "grid", "maze", "--priors", folder, "--out", str(tmp_path / "out")]) == 2
+    assert f"{folder}: does not see what the world grid shows" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    right = Plans(plans.actions, 4, context=torch.rand(9, 4, 24))
+    folder = str(save(GRUPrior(4, 4, context_size=24).fit(right, max_steps=1, progress=False), tmp_path / "all"))
+    run(tmp_path / "out", "--worlds", "maze", "--priors", folder)
 
 
 def test_priors_that_do_not_fit_are_told_before_anything_is_done(tmp_path, capsys):
