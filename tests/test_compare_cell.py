@@ -10,30 +10,25 @@ from pathlib import Path
 import pytest
 import torch
 
-from eval import compare_cell, compare_priors
+from eval import compare_cell
 from eval.compare_cell import digest, run_cell, run_growth
 from eval.compare_curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
-from eval.compare_priors import chain, network, sizes_of
 from eval.compare_settings import Settings
-from eval.compare_sight import SeeingMarkov, Sights
 from eval.suite import TASKS, Task, best_score
 from eval.suite_worlds import Pair
 from eval.under_way import UnderWay
 from neuroprior import (
     ExhaustivePlanner,
     MarkovPrior,
-    Plans,
-    Prior,
     TabularWorld,
     UniformPrior,
     collect,
     cube,
     four_rooms,
-    gridworld,
     maze,
     save,
 )
-from neuroprior.worlds import local_view
+from neuroprior.worlds import goal_direction, local_view
 from tests.sources import refuses, seeded
 
 SMALL = Settings((4, 16), ("markov", "gru"), ("nothing", "each step"), 1, 3, 4, 30, 0)
@@ -137,89 +132,6 @@ def test_a_decision_is_timed_at_some_of_the_starts():
     assert steps == 8
 
 
-def test_sights_have_numbers():
-    features = torch.randint(2, (500, 24), generator=seeded(0)).float()
-    sights = Sights(features[:300])
-    _, which = features[:300].unique(dim=0, return_inverse=True)
-    number = sights(features)
-    assert sights.number == int(which.max()) + 2
-    same = which[:, None] == which
-    assert torch.equal(number[:300, None] == number[:300], same)
-    known = (features[300:, None] == features[:300]).all(-1).any(1)
-    assert torch.equal(number[300:] == sights.number - 1, ~known)
-    assert torch.equal(sights(features.view(5, 100, 24)), number.view(5, 100))
-
-
-def test_counts_see_what_networks_see():
-    """A chain over features is a chain over the numbers of these features."""
-    pair = TINY.worlds(0)
-    plans = collect(ExhaustivePlanner(3), pair.training, 60, context="step", generator=seeded(0))
-    assert sizes_of(pair.training, plans) == {"context_size": 8}
-    prior = chain(2, pair.training, plans, ()).fit(plans)
-    _, number = plans.context.flatten(0, 1).unique(dim=0, return_inverse=True)
-    counted = replace(plans, context=number.view(60, 3))
-    plain = MarkovPrior(3, 2, num_contexts=int(number.max()) + 1).fit(counted)
-    told = prior.log_prob(plans.actions, plans.context)
-    assert torch.allclose(told, plain.log_prob(counted.actions, counted.context), atol=1e-5)
-    assert torch.allclose(told, stepped(prior, plans), atol=1e-5)
-    grid = gridworld(4, 4)
-    plans = collect(ExhaustivePlanner(2), grid, 20, context="step")
-    assert sizes_of(grid, plans) == {"num_contexts": 16}
-    told = chain(1, grid, plans, ()).fit(plans).log_prob(plans.actions, plans.context)
-    assert torch.allclose(told, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans.actions, plans.context))
-    assert isinstance(chain(1, grid, replace(plans, context=None), ()), MarkovPrior)
-    assert network("gru", grid, plans, 0).num_contexts == 16
-
-
-@pytest.mark.parametrize("per", ["plan", "step"])
-def test_at_sights_never_met_a_chain_goes_on_blind(per):
-    """Actions alternate, whatever is seen; where nothing seen was met, all is known of them still."""
-    actions = (torch.arange(6) + torch.arange(40)[:, None]) % 2
-    seen = torch.rand(40, 6, 3, generator=seeded(0))
-    seen = seen[:, 0] if per == "plan" else seen
-    prior, blind = SeeingMarkov(2, 2, context_size=3), MarkovPrior(2, 2).fit(actions)
-    prior.fit(Plans(actions, 2, context=seen))
-    other = seen + 5
-    assert torch.allclose(prior.log_prob(actions, other), blind.log_prob(actions), atol=1e-6)
-    if per == "step":
-        half = torch.where(torch.arange(6)[:, None] < 3, seen, other)
-        plans = Plans(actions, 2, context=half)
-        assert torch.allclose(stepped(prior, plans), prior.log_prob(actions, half), atol=1e-5)
-
-
-def stepped(prior: Prior, plans: Plans) -> torch.Tensor:
-    """Log-probabilities of whole plans, step by step."""
-    logits, state = prior.start(len(plans), plans.context[:, 0])
-    told = torch.zeros(len(plans))
-    for t in range(plans.max_length):
-        action = plans.actions[:, t].long()
-        told += logits.log_softmax(-1).gather(1, action[:, None])[:, 0]
-        if t + 1 < plans.max_length:
-            logits, state = prior.step(action, state, plans.context[:, t + 1])
-    return told
-
-
-def test_chains_may_see_what_is_near_alone():
-    """The eight squares around; with few plans, in which large sights are new, chains do better to see no more."""
-    task = TASKS["egocentric"]
-    worlds = task.worlds(0)
-    state = worlds.training.reset(200, seeded(0))
-    nearest, beside = (worlds.training.observe(state)[:, list(near)] for near in task.near)
-    assert torch.equal(nearest, local_view(worlds.training, 1)(state))
-    assert torch.equal(beside, nearest[:, [1, 3, 4]])
-    plans = collect(ExhaustivePlanner(4), worlds.training, 200, context="step", generator=seeded(0))
-    known = {}
-    for near in ((), task.near):
-        prior = SeeingMarkov(3, 1, near, context_size=24).fit(plans)
-        known[near] = prior.sights.number
-    assert known[task.near] < known[()] / 2
-    # Where what is far tells the action and what is near does not, all is seen: four sights, and those never met.
-    seen = torch.randint(2, (300, 4, 2), generator=seeded(2)).float()
-    far = Plans(seen[..., 1].long(), 2, context=seen)
-    assert SeeingMarkov(2, 0, ((0,),), context_size=2).fit(far).sights.number == 5
-    assert SeeingMarkov(2, 0, ((1,),), context_size=2).fit(far).sights.number == 3
-
-
 @pytest.fixture(scope="module")
 def cell() -> dict:
     return run_cell(TINY, 0, SMALL)
@@ -254,6 +166,26 @@ def test_the_same_seed_gives_the_same_cell(cell):
 
     assert told(run_cell(TINY, 0, SMALL)) == told(cell)
     assert told(run_cell(TINY, 1, SMALL)) != told(cell)
+
+
+def test_a_world_says_what_is_seen_there_and_from_how_many_starts_plans_are_learned(monkeypatch):
+    asked = []
+    monkeypatch.setattr(compare_cell, "collect", lambda *given, **how: asked.append(given[2]) or collect(*given, **how))
+    task = replace(TINY, sights=("nothing", "start"), times=3)
+    found = run_cell(task, 0, replace(SMALL, kinds=("markov",), sees=(), rounds=0))
+    assert {one["sees"] for one in found["entries"]} == {"nothing", "start"}
+    assert sorted(asked) == [22, 90]
+
+
+def test_who_looks_for_a_goal_sees_on_which_side_it_is():
+    task = TASKS["goal_maze"]
+    world = task.worlds(0).training
+    state = world.reset(100, seeded(0))
+    seen, away = world.observe(state), goal_direction(world)(state)
+    assert torch.equal(seen[:, :24], local_view(world)(state))
+    assert torch.equal(seen[:, 26:], away.sign())
+    assert torch.allclose(seen[:, 24:26] * 15, away)
+    assert all(near[-2:] == (26, 27) for near in task.near)
 
 
 def test_starts_that_are_numbers_are_not_looked_at():
@@ -325,17 +257,6 @@ def test_worlds_of_the_suite(name):
         tables = [torch.cat([world.next_state.flatten(), world.reward.flatten()]) for world in inner]
         assert not torch.equal(*tables)
     assert all(later > earlier for earlier, later in zip((task.depth, *task.lengths), task.lengths, strict=False))
-
-
-def test_a_gru_of_the_comparison_goes_on_with_its_memory():
-    prior = compare_priors.UnlimitedGRU(3, 8).fit(
-        torch.randint(3, (40, 4), generator=seeded(0)), max_steps=2, progress=False
-    )
-    assert prior.window is None
-    _, state = prior.start(2)
-    for _ in range(10):
-        _, state = prior.step(torch.zeros(2, dtype=torch.long), state)
-    assert state.dim() == 2
 
 
 def test_the_worlds_are_told_as_they_are():

@@ -6,6 +6,8 @@ from eval.suite import TASKS, best_score
 from eval.under_way import UnderWay
 from neuroprior import ExhaustivePlanner, SamplingPlanner, UniformPrior, collect, maze
 from neuroprior.testing import check_world
+from neuroprior.worlds import labyrinth
+from neuroprior.worlds.labyrinth import WATER
 from tests.sources import seeded
 
 
@@ -37,3 +39,18 @@ def test_the_oracle_is_that_of_the_inner_world():
     assert torch.allclose(best_score(task, world, state, 4), found)
     plans = collect(SamplingPlanner(UniformPrior(3), 4, 8), world, state=state, context="step", generator=seeded(2))
     assert torch.equal(plans.context, world.observe(state)[:, None].expand(-1, 4, -1))
+
+
+def test_it_is_over_where_the_inner_world_is():
+    world = UnderWay(labyrinth(absorbing=True), ExhaustivePlanner(3), 1)
+    state = torch.tensor([[WATER, 0, 0], [5, 0, 0]])
+    assert world.is_over(state).tolist() == [True, False]
+    assert torch.equal(world.legal(state), world.world.legal(state[:, 0]))
+
+
+def test_plans_come_in_the_groups_of_the_inner_world():
+    world = made()
+    state = world.reset(40, seeded(0))
+    plans = collect(ExhaustivePlanner(2), world, state=state)
+    assert torch.equal(plans.group, world.world.group(state[:, 0]))
+    assert plans.action_names == ("left", "right", "forward")
