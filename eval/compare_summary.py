@@ -20,7 +20,7 @@ def summary_table(words: Rows, num_plans: Sequence[int]) -> Table | None:
     cells = []
     for row in _best(words):
         neural, markov = (100 * row[f"{side}_share"] for side in ("first", "second"))
-        gap = f"{100 * row['difference']:+.1f}"
+        gap = f"{round(100 * row['difference'], 1) + 0:+.1f}"  # no minus before 0.0
         if row["low"] is not None:
             half = max(row["high"] - row["difference"], row["difference"] - row["low"])
             gap += f" ±{100 * half:.1f}{' ' if row['better'] is None else '*'}"
