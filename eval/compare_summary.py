@@ -76,16 +76,15 @@ def reasons_in_words(found: Rows) -> Iterator[str]:
 
 
 def reasons_section(found: Rows) -> Section | None:
-    """Why networks are not better, as a table."""
+    """Why networks are not better, line by line."""
     if not found:
         return None
-    rows = [[breakable(one["world"]), _where(one)[1], one["words"]] for one in found]
-    text = [
+    text = (
         "What can be learned from chosen plans sets a limit to every prior; what is left to find, to every planner. The"
         " likelier a prior holds the plans that are chosen, the fewer of its samples are needed; but the best of many"
         " samples asks for many different ones, which likelihood does not."
-    ]
-    return Section("Where networks are not better, and why", text, [Table(("world", "sees", "why"), rows, "", "lll")])
+    )
+    return Section("Where networks are not better, and why", [text, *reasons_in_words(found)])
 
 
 def _why(own: Mapping[str, Any], number: int, fewest: int) -> str:

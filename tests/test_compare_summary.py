@@ -69,5 +69,5 @@ def test_reasons(shares, bits, early, says):
     assert says in row["words"]
     assert row["markov_share"] == pytest.approx(shares[0], abs=0.002)
     assert (row["markov_bits"], row["neural_bits"]) == pytest.approx(bits)
-    assert says in reasons_section(found["reasons"]).tables[0].rows[0][2]
+    assert says in reasons_section(found["reasons"]).text[1]
     assert says in next(reasons_in_words(found["reasons"]))
