@@ -123,6 +123,7 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
     """Raise ValueError unless saved priors know the actions and sights of all worlds; before hours of work."""
+    shown: dict[str, torch.Tensor] = {}  # by world: some take long to make
     for folder in folders:
         if folder == "uniform" or folder in KINDS or folder.startswith("markov-"):
             raise ValueError(f"priors: {folder} is also the name of a fitted prior; give the folder as ./{folder}")
@@ -130,9 +131,11 @@ def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
             task = TASKS[world]
             prior = load_for(folder, world, task.num_actions, task.action_names)
             if prior.takes_context:
-                held_out = task.worlds(0).held_out
+                if world not in shown:
+                    held_out = task.worlds(0).held_out
+                    shown[world] = held_out.observe(held_out.reset(1, torch.Generator().manual_seed(0)))
                 try:
-                    prior.check_context_of(held_out.observe(held_out.reset(1, torch.Generator().manual_seed(0))), 1)
+                    prior.check_context_of(shown[world], 1)
                 except ValueError as error:
                     raise ValueError(f"{folder}: does not see what the world {world} shows ({error})") from error
 

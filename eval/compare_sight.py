@@ -82,8 +82,10 @@ class SeeingMarkov(Prior):
         best: Sequence[int] | None = None
         if self.near:
             training, validation = plans.split(VALIDATION, torch.Generator().manual_seed(0))
+            self.blind.fit(training)
             bits = {near: self._learn(training, near)._bits(validation) for near in (None, *self.near)}
             best = min(bits, key=lambda near: bits[near])
+        self.blind.fit(plans)
         return self._learn(plans, best)
 
     def _learn(self, plans: Plans, near: Sequence[int] | None) -> Self:
@@ -92,7 +94,6 @@ class SeeingMarkov(Prior):
         self.sights = Sights(seen.flatten(0, -2) if seen.is_floating_point() else seen.flatten(), near)
         self.chain = MarkovPrior(self.num_actions, self.order, num_contexts=self.sights.number)
         self.chain.fit(replace(plans, context=self.sights(seen), context_names=None))
-        self.blind.fit(plans)
         return self
 
     def _bits(self, plans: Plans) -> float:

@@ -44,7 +44,7 @@ class Task:
         above: plans that scored no more than this are not learned from; None: all are.
         sees: what `World.observe` of these worlds shows, for priors that see; None: nothing that would be of use.
         near: sets of its features; chains may see one of them alone, as they must have met what they see.
-        sights: what priors see where nothing else is asked for, see `eval.compare_cell.SEES`.
+        sights: what priors see where nothing else is asked for, see `eval.compare_settings.SEES`.
         times: plans are looked for from so many times as many starts, where most starts lead nowhere.
     """
 
