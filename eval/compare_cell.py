@@ -13,10 +13,8 @@ from eval.compare_curves import (
     CLOSE,
     ROLLOUTS,
     TEMPERATURES,
-    Starts,
     best_temperature,
     curve,
-    planner_of,
     seconds_per_decision,
     starts_of,
 )
@@ -44,11 +42,11 @@ GROWN_WITH = 64
 JUDGED_WITH = 256
 """Candidate plans with which temperatures are chosen, and growth is told."""
 
-VERSION = 6
+VERSION = 7
 """Of the way in which a cell is done; counts up with each change of it."""
 
-FAMILIAR = 2
-"""For each held-out start so many where priors learned, to choose temperatures at: differences are small."""
+CHOSEN_AT = 2
+"""For each held-out start so many in the validation worlds, to choose temperatures at: differences are small."""
 
 TIMED_STARTS = 4
 """Starts planned from together when a decision is timed."""
@@ -60,7 +58,7 @@ def recipe() -> str:
     Changes of code are not seen: they count `VERSION` up.
     """
     priors = (ORDERS, RECIPE, WIDE, MANY, TRAINING)
-    return repr((priors, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, FAMILIAR, TIMED_STARTS, VERSION))
+    return repr((priors, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, CHOSEN_AT, TIMED_STARTS, VERSION))
 
 
 def digest(task: Task) -> str:
@@ -153,17 +151,19 @@ class _Contest:
         self.worlds = task.worlds(settings.seed * 10_000 + seed)
         self.longer = (settings.lengths or task.lengths)[: settings.rounds]
         self.rounds, self.lengths = len(self.longer), tuple(sorted({task.depth, *self.longer}))
-        held_out = self.worlds.held_out
         self.training_starts = settings.training_starts * task.times
-        # Temperatures are chosen in the worlds that were learned in.
-        self.starts_at, self.familiar_at = (
+        self.starts_at, self.chosen_at = (
             {
                 length: starts_of(task, world, number, length, self.generator)
                 for length in sorted({*self.lengths, task.length})
             }
-            for world, number in ((held_out, settings.starts), (self.worlds.training, FAMILIAR * settings.starts))
+            for world, number in (
+                (self.worlds.held_out, settings.starts),
+                (self.worlds.validation, CHOSEN_AT * settings.starts),
+            )
         )
-        self.starts, self.familiar = self.starts_at[task.length], self.familiar_at[task.length]
+        self.starts = self.starts_at[task.length]
+        self._heats: dict[tuple[str, str, int, int], float] = {}
 
     def contestants(self) -> Iterator[_Contestant]:
         """All priors, each after every round of its growth; the object is the same, and goes on learning."""
@@ -222,32 +222,34 @@ class _Contest:
 
     def entry(self, one: _Contestant) -> dict[str, Any]:
         """What a prior's plans reach in the held-out worlds, and how well it tells those that were chosen there."""
-        starts, heat = self.starts, self._heat(one, self.familiar)
+        starts, heat = self.starts, self._heat(one, self.task.length)
         entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
         entry |= {"temperature": heat}
         entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, heat))
-        timed = {
-            budget: seconds_per_decision(
-                starts, planner_of(starts, one.prior, budget, heat), TIMED_STARTS, self.generator
-            )
-            for budget in self.settings.num_plans
-        }
-        seconds, steps = ([timed[b][k] if b in timed else None for b in self.settings.budgets] for k in (0, 1))
+        told = self.settings.num_plans
+        timed = seconds_per_decision(starts, one.prior, told, TIMED_STARTS, self.generator, heat)
+        by_budget = dict(zip(told, timed, strict=True))
+        seconds, steps = ([by_budget[b][k] if b in by_budget else None for b in self.settings.budgets] for k in (0, 1))
         entry |= {"seconds": seconds, "model_steps": steps}
-        told = score(one.label, one.prior, as_seen(self.told, one.sees))
-        return entry | {"bits": told.bits_per_action().mean, "actions": int(self.told.mask().sum())}
+        held_out = score(one.label, one.prior, as_seen(self.told, one.sees))
+        return entry | {"bits": held_out.bits_per_action().mean, "actions": int(self.told.mask().sum())}
 
     def growth(self, one: _Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""
         budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else JUDGED_WITH
-        heat = self._heat(one, self.familiar_at[length])
+        heat = self._heat(one, length)
         share = curve(self.starts_at[length], one.prior, [budget], self.generator, heat).share[0]
         named = {"prior": one.label, "sees": one.sees, "round": one.rounds}
         return named | {"length": length, "num_plans": budget, "share": share}
 
-    def _heat(self, one: _Contestant, familiar: Starts) -> float:
-        """The temperature to sample a prior at; uniform plans are the same at all."""
-        return 1.0 if one.label == "uniform" else best_temperature(familiar, one.prior, JUDGED_WITH, self.generator)
+    def _heat(self, one: _Contestant, length: int) -> float:
+        """The temperature to sample plans of `length` actions at, chosen once; uniform plans are the same at all."""
+        if one.label == "uniform":
+            return 1.0
+        key = one.label, one.sees, one.rounds, length
+        if key not in self._heats:
+            self._heats[key] = best_temperature(self.chosen_at[length], one.prior, JUDGED_WITH, self.generator)
+        return self._heats[key]
 
     def exhaustive(self) -> dict[str, Any] | None:
         """What all short plans reach; None where longer ones cost more, which would favour the short."""

@@ -1,5 +1,6 @@
 """What a prior's candidate plans reach against their number: the curves behind `python -m eval compare`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -141,15 +142,22 @@ def curve(
 
 
 def seconds_per_decision(
-    starts: Starts, planner: SamplingPlanner, number: int, generator: torch.Generator
-) -> tuple[float, int]:
-    """How long a planner takes for each of `number` starts planned from together, and its model steps for each."""
-    state = starts.state[:number]
+    starts: Starts, prior: Prior, budgets: Sequence[int], number: int, generator: torch.Generator, temperature: float
+) -> list[tuple[float, int]]:
+    """How long a sampling planner takes, planning from `number` starts together.
+
+    Returns:
+        For each number of candidates: seconds, and model steps, for each start.
+    """
+    state, taken = starts.state[:number], []
+    planners = [planner_of(starts, prior, budget, temperature) for budget in budgets]
     # The first call is slower than those that follow.
-    planner.plan(starts.world, state, torch.Generator(generator.device).manual_seed(0))
-    begin = perf_counter()
-    decision = planner.plan(starts.world, state, generator)
-    return (perf_counter() - begin) / len(state), decision.model_steps
+    planners[0].plan(starts.world, state, torch.Generator(generator.device).manual_seed(0))
+    for planner in planners:
+        begin = perf_counter()
+        decision = planner.plan(starts.world, state, generator)
+        taken.append(((perf_counter() - begin) / len(state), decision.model_steps))
+    return taken
 
 
 def _worth(task: Task, world: World, state: Tensor, plans: Tensor) -> Tensor:

@@ -13,8 +13,7 @@ from eval.suite_worlds import (
     LAST,
     MAPS,
     TAKEN,
-    Pair,
-    both,
+    Worlds,
     goal_mazes,
     lake,
     layouts,
@@ -22,6 +21,7 @@ from eval.suite_worlds import (
     scrambles,
     split,
     under_way,
+    unlike,
 )
 from eval.under_way import UnderWay
 from neuroprior import PocketCube, TabularWorld, World, four_rooms, gridworld, maze, oracle
@@ -46,12 +46,13 @@ class Task:
         near: sets of its features; chains may see one of them alone, as they must have met what they see.
         sights: what priors see where nothing else is asked for, see `eval.compare_settings.SEES`.
         times: plans are looked for from so many times as many starts, where most starts lead nowhere.
+        numbered: what is seen is the number of a state, which is of no use at the start, as other starts are held out.
     """
 
     name: str
     action_names: tuple[str, ...]
     about: str
-    worlds: Callable[[int], Pair]
+    worlds: Callable[[int], Worlds]
     depth: int
     lengths: tuple[int, ...]
     objective: Literal["terminal", "return"] = "terminal"
@@ -62,6 +63,7 @@ class Task:
     near: tuple[tuple[int, ...], ...] = ()
     sights: tuple[str, ...] = ("nothing",)
     times: int = 1
+    numbered: bool = False
 
     @property
     def num_actions(self) -> int:
@@ -74,13 +76,10 @@ class Task:
         return self.lengths[-1]
 
     def shows(self, sees: str) -> bool:
-        """Whether priors that see so much (see `eval.compare_settings.SEES`) are shown something of use.
-
-        Numbers of states to start from are of none where other starts are held out.
-        """
+        """Whether priors that see so much (see `eval.compare_settings.SEES`) are shown something of use."""
         if self.sees is None or sees == "nothing":
             return sees == "nothing"
-        return sees == "each step" or getattr(self.worlds, "func", None) is not split
+        return sees == "each step" or not self.numbered
 
     @property
     def scoring(self) -> dict[str, Any]:
@@ -112,7 +111,7 @@ _tasks = (
         "grid",
         MOVES,
         "the paper's grid: 20 x 20, a torus, independent rewards; the reward where a plan ends; new rewards held out",
-        partial(both, make=gridworld, edges="torus", num_worlds=MAPS),
+        partial(unlike, make=gridworld, edges="torus", num_worlds=MAPS),
         4,
         (6, 8),
     ),
@@ -182,23 +181,25 @@ _tasks = (
     Task(
         "taxi",
         ("south", "north", "east", "west", "pickup", "dropoff"),
-        "Taxi: fetch a passenger and bring it; the sum of rewards; half of all states to start from held out",
+        "Taxi: fetch a passenger and bring it; the sum of rewards; a quarter of all states to start from held out",
         partial(split, name="Taxi-v4"),
         5,
         (10, 16),
         "return",
         sees="the whole state",
+        numbered=True,
         sights=("nothing", "each step"),
     ),
     Task(
         "cliff",
         MOVES,
-        "CliffWalking: go around a cliff; the sum of rewards; half of all squares to start from held out",
+        "CliffWalking: go around a cliff; the sum of rewards; a quarter of all squares to start from held out",
         partial(split, name="CliffWalking-v1"),
         5,
         (10, 16),
         "return",
         sees="the square",
+        numbered=True,
         sights=("nothing", "each step"),
     ),
     Task(
@@ -232,7 +233,7 @@ _tasks = (
     Task(
         "cube",
         tuple(face + turn for face in FACES for turn in ("", "2", "'")),
-        "the 2 x 2 x 2 cube after nine random moves, half turns too; passing the solved state; half of them held out",
+        "the 2 x 2 x 2 cube after nine random moves, half turns too; passing the solved state; a quarter held out",
         scrambles,
         4,
         (6, 7, 8),

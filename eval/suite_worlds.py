@@ -1,7 +1,8 @@
-"""Where plans are learned from and where priors are compared in `python -m eval compare`: two worlds for each seed."""
+"""Where plans are learned from and where priors are compared in `python -m eval compare`: three worlds a seed."""
 
 from collections.abc import Callable
 from copy import copy
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -13,10 +14,10 @@ from neuroprior import ExhaustivePlanner, PocketCube, TabularWorld, World, from_
 from neuroprior.worlds import EpisodicWorld, goal_direction
 
 MAPS = 100
-"""Reward maps or layouts to learn in, and as many to be compared in, of each seed, where they cost nothing to make."""
+"""Reward maps or layouts in each of the three worlds of a seed, where they cost nothing to make."""
 
-LAYOUTS = (6, 2)
-"""The same, for layouts of MiniGrid, whose states are searched one by one: to learn in, and to be compared in."""
+LAYOUTS = (8, 2, 2)
+"""The same, for layouts of MiniGrid, whose states are searched one by one."""
 
 SCRAMBLE = 9
 """Random moves before the cube is to be solved."""
@@ -26,70 +27,74 @@ LAST, TAKEN = 7, 3
 """Actions of the plan that is under way, and how many of them were executed."""
 
 
-class Pair(NamedTuple):
-    """Worlds of a seed: plans are collected in `training`, priors are compared in `held_out`."""
+class Worlds(NamedTuple):
+    """Worlds of a seed: plans are collected in `training`, priors are compared in `held_out`.
+
+    Temperatures are chosen in `validation`: where they have learned priors are surer of themselves than elsewhere.
+    """
 
     training: World
+    validation: World
     held_out: World
 
 
-def both(seed: int, make: Callable[..., World], **how: Any) -> Pair:
-    """Worlds of unlike seeds, even ones to learn in."""
-    return Pair(make(seed=2 * seed, **how), make(seed=2 * seed + 1, **how))
+def unlike(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
+    """Worlds of seeds of their own."""
+    return Worlds(*(make(seed=len(Worlds._fields) * seed + part, **how) for part in range(len(Worlds._fields))))
 
 
-def layouts(seed: int, make: Callable[..., World], **how: Any) -> Pair:
+def layouts(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
     """Grids with new walls and new rewards."""
-    return both(seed, make, num_layouts=MAPS, reward_power=8.0, view=2, **how)
+    return unlike(seed, make, num_layouts=MAPS, reward_power=8.0, view=2, **how)
 
 
-def split(seed: int, name: str) -> Pair:
-    """One environment, started in any state that can be reached: a random half to learn from, the other held out."""
+def split(seed: int, name: str) -> Worlds:
+    """One environment, started in any state that can be reached: a random half to learn from, a quarter held out."""
     world = from_gymnasium(name, starts="any")
     assert isinstance(world, EpisodicWorld)
     where = world.starts.nonzero()[:, 0]
     where = where[torch.randperm(len(where), generator=torch.Generator().manual_seed(seed))]
-    halves = [copy(world), copy(world)]
-    for half, kept in zip(halves, where.tensor_split([len(where) // 2]), strict=True):
-        half.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
-    return Pair(*halves)
+    parts = [copy(world) for _ in Worlds._fields]
+    for part, kept in zip(parts, where.tensor_split([len(where) // 2, 3 * len(where) // 4]), strict=True):
+        part.starts = torch.zeros_like(world.starts).index_fill(0, kept, 1 / len(kept))
+    return Worlds(*parts)
 
 
-def lake(seed: int, slippery: bool) -> Pair:
-    """Frozen lakes, each seed with holes of its own."""
+def lake(seed: int, slippery: bool) -> Worlds:
+    """Frozen lakes with holes of their own."""
     from gymnasium.envs.toy_text.frozen_lake import generate_random_map
 
-    maps = [generate_random_map(size=8, seed=2 * seed + half) for half in (0, 1)]
-    lakes = [from_gymnasium("FrozenLake-v1", desc=one, is_slippery=slippery, starts="any") for one in maps]
-    return Pair(*lakes)
+    def make(seed: int) -> World:
+        holes = generate_random_map(size=8, seed=seed)
+        return from_gymnasium("FrozenLake-v1", desc=holes, is_slippery=slippery, starts="any")
+
+    return unlike(seed, make)
 
 
 class _Scrambles(PocketCube):
-    """The cube with half of its scrambled states, told by their number: those of one half are never in the other."""
+    """The cube with some quarters of its scrambled states, told by their number: those of one are never in another."""
 
-    def __init__(self, half: int) -> None:
+    def __init__(self, *quarters: int) -> None:
         super().__init__("half", SCRAMBLE, absorbing=True)
-        self.half = half
+        self.quarters = torch.tensor(quarters)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         own = torch.zeros(0, dtype=torch.long)
         while len(own) < batch_size:
-            state = super().reset(2 * batch_size + 100, generator)
-            own = torch.cat([own, state[(state * 2_654_435_761 >> 8) % 2 == self.half]])
+            state = super().reset(4 * batch_size + 100, generator)
+            own = torch.cat([own, state[torch.isin((state * 2_654_435_761 >> 8) % 4, self.quarters)]])
         return own[:batch_size]
 
 
-def scrambles(seed: int) -> Pair:
+def scrambles(seed: int) -> Worlds:
     """Cubes, the same for all seeds."""
-    return Pair(_Scrambles(0), _Scrambles(1))
+    return Worlds(_Scrambles(0, 1), _Scrambles(2), _Scrambles(3))
 
 
-def minigrid(seed: int, environment: str) -> Pair:
+def minigrid(seed: int, environment: str) -> Worlds:
     """Layouts of MiniGrid, each seed with its own; plans may start anywhere."""
-    learned, others = LAYOUTS
-    first = seed * (learned + others)
-    here = range(first, first + learned), range(first + learned, first + learned + others)
-    return Pair(*(minigrid_worlds.layouts(environment, seeds) for seeds in here))
+    bounds = pairwise(accumulate(LAYOUTS, initial=seed * sum(LAYOUTS)))
+    return Worlds(*(minigrid_worlds.layouts(environment, range(first, last)) for first, last in bounds))
 
 
 def _guided(seed: int) -> World:
@@ -105,17 +110,16 @@ def _guided(seed: int) -> World:
     return world
 
 
-def goal_mazes(seed: int) -> Pair:
+def goal_mazes(seed: int) -> Worlds:
     """Mazes with goals."""
-    return Pair(_guided(2 * seed), _guided(2 * seed + 1))
+    return unlike(seed, _guided)
 
 
-def under_way(seed: int) -> Pair:
+def under_way(seed: int) -> Worlds:
     """The egocentric mazes after the first moves of the best of all plans of seven."""
 
     def middle(world: World) -> UnderWay:
         assert isinstance(world, TabularWorld)
         return UnderWay(world, ExhaustivePlanner(LAST), TAKEN)
 
-    training, held_out = layouts(seed, maze, egocentric=True)
-    return Pair(middle(training), middle(held_out))
+    return Worlds(*map(middle, layouts(seed, maze, egocentric=True)))

@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,7 @@ from eval.compare_cell import digest, run_cell, run_growth
 from eval.compare_curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
 from eval.compare_settings import Settings
 from eval.suite import TASKS, Task, best_score
-from eval.suite_worlds import Pair
+from eval.suite_worlds import Worlds, unlike
 from eval.under_way import UnderWay
 from neuroprior import (
     ExhaustivePlanner,
@@ -36,7 +38,7 @@ TINY = Task(
     "tiny",
     ("left", "right", "forward"),
     "a small maze",
-    lambda seed: Pair(*(maze(5, 5, num_layouts=3, egocentric=True, view=1, seed=2 * seed + half) for half in (0, 1))),
+    partial(unlike, make=maze, height=5, width=5, num_layouts=3, egocentric=True, view=1),
     3,
     (5,),
     sees="the squares around it",
@@ -57,7 +59,7 @@ def bandit(actions: int, probability: float | None = None) -> TabularWorld:
 
 def one_step(world: TabularWorld) -> Task:
     names = tuple(str(action) for action in range(world.num_actions))
-    return Task("bandit", names, "one step", lambda seed: Pair(world, world), 1, (1,), "return")
+    return Task("bandit", names, "one step", lambda seed: Worlds(world, world, world), 1, (1,), "return")
 
 
 def test_the_curve_of_a_lottery():
@@ -127,9 +129,9 @@ def test_the_best_temperature():
 def test_a_decision_is_timed_at_some_of_the_starts():
     world = bandit(3)
     starts = starts_of(one_step(world), world, 6, 1, seeded(0))
-    seconds, steps = seconds_per_decision(starts, planner_of(starts, UniformPrior(3), 8, 1.0), 2, seeded(0))
-    assert 0 < seconds < 5
-    assert steps == 8
+    timed = seconds_per_decision(starts, UniformPrior(3), [2, 8], 2, seeded(0), 1.0)
+    assert [steps for _, steps in timed] == [2, 8]
+    assert all(0 < seconds < 5 for seconds, _ in timed)
 
 
 @pytest.fixture(scope="module")
@@ -237,26 +239,43 @@ SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name
 
 @pytest.mark.parametrize("name", [*(name for name in TASKS if not name.startswith("minigrid")), *SEARCHED])
 def test_worlds_of_the_suite(name):
-    """Training and held-out worlds are not the same, actions are named, and something can be had."""
+    """No two of the three worlds are the same, actions are named, and something can be had."""
     task = TASKS[name]
     assert task.name == name
-    training, held_out = task.worlds(3)
-    for world in (training, held_out):
+    worlds = task.worlds(3)
+    for world in worlds:
         assert world.num_actions == task.num_actions
         assert tuple(world.action_names) == task.action_names
         starts = starts_of(task, world, 5, task.length, seeded(0))
         assert float((starts.best - starts.reference).mean()) > 0
-    if name in ("taxi", "cliff"):
-        assert not bool(((training.starts > 0) & (held_out.starts > 0)).any())
-    elif name == "cube":
-        scrambles = [set(world.reset(2000, seeded(1)).tolist()) for world in (training, held_out)]
-        assert not scrambles[0] & scrambles[1]
-        assert min(map(len, scrambles)) > 1000
-    else:
-        inner = [world.world if isinstance(world, UnderWay) else world for world in (training, held_out)]
-        tables = [torch.cat([world.next_state.flatten(), world.reward.flatten()]) for world in inner]
-        assert not torch.equal(*tables)
+    for one, other in combinations(worlds, 2):
+        if task.numbered:
+            assert not bool(((one.starts > 0) & (other.starts > 0)).any())
+        elif name == "cube":
+            scrambles = [set(world.reset(2000, seeded(1)).tolist()) for world in (one, other)]
+            assert not scrambles[0] & scrambles[1]
+            assert min(map(len, scrambles)) > 1000
+        else:
+            inner = [world.world if isinstance(world, UnderWay) else world for world in (one, other)]
+            tables = [torch.cat([world.next_state.flatten(), world.reward.flatten()]) for world in inner]
+            assert not torch.equal(*tables)
     assert all(later > earlier for earlier, later in zip((task.depth, *task.lengths), task.lengths, strict=False))
+
+
+def test_temperatures_are_chosen_where_priors_did_not_learn(monkeypatch):
+    """Once for each prior and length, and neither in the worlds it learned in nor in those of the comparison."""
+    chosen = []
+
+    def spy(starts, prior, budget, generator):
+        chosen.append(starts)
+        return 1.0
+
+    worlds = TINY.worlds(0)
+    monkeypatch.setattr(compare_cell, "best_temperature", spy)
+    run_cell(replace(TINY, worlds=lambda seed: worlds), 0, SMALL)
+    assert all(starts.world is worlds.validation for starts in chosen)
+    # Five chains and a network that see two ways: before growth at lengths 3 and 5, after it at 5.
+    assert [sum(starts.length == length for starts in chosen) for length in (3, 5)] == [12, 24]
 
 
 def test_the_worlds_are_told_as_they_are():
