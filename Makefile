@@ -23,7 +23,7 @@ check: .venv/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy neuroprior
 
-bench: .venv/programs
+bench: .venv/bench
 	$(BIN)/python -m eval bench
 
 clean:

@@ -16,6 +16,7 @@ def _run(arguments: Sequence[str]) -> None:
     # Imported here, so that Ctrl-C is answered while the libraries load too.
     from jsonargparse import ArgumentError, ArgumentParser
 
+    from eval.bench import LISTS as BENCH_LISTS
     from eval.bench import bench
     from eval.compare import LISTS as COMPARE_LISTS
     from eval.compare import compare
@@ -36,7 +37,7 @@ def _run(arguments: Sequence[str]) -> None:
     # Lists are given as words, `--priors a b`, which functions cannot say.
     numbers = {key: {"type": int, "default": [*some], "help": what} for key, (some, what) in MICE_LISTS.items()}
     lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
-    lists |= {"compare": COMPARE_LISTS, "grow": GROW_LISTS}
+    lists |= {"compare": COMPARE_LISTS, "grow": GROW_LISTS, "bench": BENCH_LISTS}
     for name, command in by_name.items():
         sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False, allow_abbrev=True)
         own = lists.get(name, {})

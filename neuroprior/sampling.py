@@ -216,13 +216,11 @@ def _grow(
         if prefix.shape[1] < length:
             logits, state = prior.step(action, state[parent])
             logits = after_end(logits, action, draw.end)
-        else:
-            logits, state = logits[parent], state[parent]
     row = shuffled_rows(counts, root, draw.generator)
     depth = prefix.shape[1]
-    plans[:, :depth] = prefix[row]
     if depth == length:
-        return plans
+        return prefix.index_select(0, row)
+    plans[:, :depth] = prefix.index_select(0, row)
     for at in range(0, total, batch_size):
         some = row[at : at + batch_size]
         now, memory = logits[some], state[some]

@@ -1,0 +1,159 @@
+"""What a user would write in numpy or plain PyTorch in place of the library: peers of `python -m eval bench`."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, TensorDataset
+
+Array = NDArray[Any]
+
+
+def numpy_sample(probs: Array, follow: Array, start: int, num_plans: int, length: int, seed: int = 0) -> Array:
+    """Plans `[N, L]` of a Markov chain, vectorised over plans, by inverse CDF a step.
+
+    Args:
+        probs: `[H, A]`: of each action after each history.
+        follow: `[H, A]`: the history after an action.
+        start: the history of no action.
+        num_plans, length, seed: N, L, and of numpy's generator.
+    """
+    generator = np.random.default_rng(seed)
+    edges = probs.cumsum(1)[:, :-1]
+    node = np.full(num_plans, start)
+    plans = np.empty((num_plans, length), np.uint8)
+    for t in range(length):
+        action = (generator.random((num_plans, 1)) > edges[node]).sum(1)
+        plans[:, t] = action
+        node = follow[node, action]
+    return plans
+
+
+def numpy_counts(plans: Array, num_actions: int, order: int) -> Array:
+    """How often each action followed each `order` actions, `[A**order, A]`, by `np.bincount`."""
+    code = np.zeros((len(plans), plans.shape[1] - order), np.int64)
+    for t in range(order + 1):
+        code = code * num_actions + plans[:, t : plans.shape[1] - order + t]
+    return np.bincount(code.ravel(), minlength=num_actions ** (order + 1)).reshape(-1, num_actions)
+
+
+def numpy_add_at(plans: Array, num_actions: int, order: int) -> Array:
+    """The same by `np.add.at`."""
+    counts = np.zeros((num_actions,) * (order + 1), np.int64)
+    np.add.at(counts, tuple(plans[:, t : plans.shape[1] - order + t] for t in range(order + 1)), 1)
+    return counts.reshape(-1, num_actions)
+
+
+def torch_rollout(next_state: Tensor, reward: Tensor, state: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
+    """What one writes first: index two tables at every step.
+
+    Returns:
+        The last cells `[B, P]` and the rewards `[B, P, L]`.
+    """
+    cell, world = state % len(next_state), state // len(next_state)
+    cell = cell[:, None].expand(plans.shape[:2])
+    world = world[:, None].expand(plans.shape[:2])
+    rewards = []
+    for t in range(plans.shape[2]):
+        cell = next_state[cell, plans[:, :, t].long()]
+        rewards.append(reward[world, cell])
+    return cell, torch.stack(rewards, -1)
+
+
+class PlainGRU(nn.Module):
+    """Actions embedded, `nn.GRU`, a linear head: the prior that one writes first."""
+
+    def __init__(self, num_actions: int, hidden_size: int = 64) -> None:
+        super().__init__()
+        self.num_actions = num_actions
+        self.embedding = nn.Embedding(num_actions + 1, hidden_size)
+        self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True)
+        self.head = nn.Linear(hidden_size, num_actions)
+
+    def forward(self, plans: Tensor) -> Tensor:
+        """Logits `[N, L, A]` of each action of `plans [N, L]`."""
+        before = nn.functional.pad(plans[:, :-1].long(), (1, 0), value=self.num_actions)
+        return self.head(self.gru(self.embedding(before))[0])
+
+    @torch.no_grad()
+    def sample(self, num_plans: int, length: int) -> Tensor:
+        """Plans `[N, L]`, by `torch.multinomial` a step."""
+        action, hidden = torch.full((num_plans, 1), self.num_actions), None
+        plans = torch.empty(num_plans, length, dtype=torch.uint8)
+        for t in range(length):
+            out, hidden = self.gru(self.embedding(action), hidden)
+            action = torch.multinomial(self.head(out[:, 0]).softmax(-1), 1)
+            plans[:, t] = action[:, 0]
+        return plans
+
+
+def plain_training(plans: Tensor, num_actions: int, steps: int, batch_size: int, learning_rate: float) -> PlainGRU:
+    """A GRU trained on `plans [N, L]` by the loop of every tutorial: DataLoader, Adam, cross entropy."""
+    torch.manual_seed(0)
+    model = PlainGRU(num_actions)
+    optimizer = torch.optim.Adam(model.parameters(), learning_rate)
+    loader = DataLoader(TensorDataset(plans), batch_size, shuffle=True)
+    step = 0
+    while step < steps:
+        for (batch,) in loader:
+            loss = nn.functional.cross_entropy(model(batch).flatten(0, 1), batch.flatten().long())
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            step += 1
+            if step == steps:
+                break
+    return model.eval()
+
+
+def numpy_table_1(size: int, starts: int, num_plans: int, length: int, depth: int, orders: tuple[int, ...]) -> Any:
+    """Hyvärinen's first simulation in numpy: mean reward by planner.
+
+    On a torus with independent rewards: the deterministic planner tries all plans of `depth` moves, chains of some
+    `orders` learn from what it chose at as many starts, and planners choose the best of plans drawn from them.
+    """
+    generator = np.random.default_rng(0)
+    row, column = np.divmod(np.arange(size * size), size)
+    moves = ((-1, 0), (0, 1), (1, 0), (0, -1))
+    next_state = np.stack([(row + down) % size * size + (column + right) % size for down, right in moves], 1)
+    reward = generator.random(size * size)
+    every = np.stack(np.meshgrid(*[np.arange(4)] * depth, indexing="ij"), -1).reshape(-1, depth)
+
+    def best(plans: Array, start: Array) -> tuple[Array, Array]:
+        cell = np.broadcast_to(start[:, None], plans.shape[:2])
+        for t in range(plans.shape[2]):
+            cell = next_state[cell, plans[:, :, t]]
+        score = reward[cell]
+        highest = score.max(1)
+        chosen = np.where(score == highest[:, None], generator.random(score.shape), -1.0).argmax(1)
+        return plans[np.arange(len(start)), chosen], highest
+
+    def deterministic(start: Array) -> tuple[Array, Array]:
+        return best(np.broadcast_to(every, (len(start), *every.shape)), start)
+
+    learned = deterministic(generator.integers(size * size, size=starts))[0]
+    start = generator.integers(size * size, size=starts)
+    found = {"deterministic": deterministic(start)[1].mean()}
+    random = generator.integers(4, size=(starts, num_plans, length), dtype=np.uint8)
+    found["random"] = best(random, start)[1].mean()
+    for order in orders:
+        found[f"markov-{order}"] = best(_chain(learned, order, starts * num_plans, length), start)[1].mean()
+    return found
+
+
+def _chain(learned: Array, order: int, number: int, length: int) -> Array:
+    """`[10,000 starts, plans, L]`: plans of a chain that counted `learned`, which open as those did."""
+    counts = numpy_counts(learned, 4, order) + 1e-3
+    probs = counts / counts.sum(1, keepdims=True)
+    generator = np.random.default_rng(order)
+    plans = np.empty((number, length), np.uint8)
+    plans[:, :order] = learned[generator.integers(len(learned), size=number), :order]
+    edges = probs.cumsum(1)[:, :-1]
+    for t in range(order, length):
+        code = np.zeros(number, np.int64)
+        for back in range(order):
+            code = code * 4 + plans[:, t - order + back]
+        plans[:, t] = (generator.random((number, 1)) > edges[code]).sum(1)
+    return plans.reshape(len(learned), -1, length)
