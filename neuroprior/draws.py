@@ -26,20 +26,22 @@ class Draw:
 
     def actions(self, logits: Tensor) -> Tensor:
         """One action a row of `logits [N, A]`: int64 `[N]`. Actions of probability 0 are never drawn."""
-        cumulative = self._probs(logits).cumsum(-1)
-        total = cumulative[:, -1:]
-        uniform = torch.rand(len(logits), 1, generator=self.generator, device=logits.device, dtype=cumulative.dtype)
-        action = (cumulative <= uniform * total).sum(-1)
+        # A row an action: with few actions and many rows each operation is several times as fast this way round.
+        cumulative = self._weights(logits.T.contiguous(), 0).cumsum(0)
+        total = cumulative[-1]
+        uniform = torch.rand(len(logits), generator=self.generator, device=logits.device, dtype=cumulative.dtype)
+        action = (cumulative <= uniform * total).sum(0)
         # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
-        return torch.minimum(action, (cumulative < total).sum(-1))
+        return torch.minimum(action, (cumulative < total).sum(0))
 
-    def _probs(self, logits: Tensor) -> Tensor:
+    def _weights(self, logits: Tensor, dim: int) -> Tensor:
+        """Probabilities but for a factor that is the same along `dim`."""
         # The largest is taken off first, so that no temperature makes it infinite.
-        return torch.softmax((logits - logits.amax(-1, keepdim=True)) / self.temperature, -1)
+        return ((logits - logits.amax(dim, keepdim=True)) / self.temperature).exp_()
 
     def split(self, counts: Tensor, logits: Tensor) -> Tensor:
         """Split `counts [M]` multinomially by the rows of `logits [M, A]`: `[M, A]`, a binomial draw an action."""
-        probs = self._probs(logits.double())
+        probs = self._weights(logits.double(), -1)
         # The share of an action among those not yet dealt out: exact 0 and 1 are kept by summing from the end.
         rest = probs.flip(-1).cumsum(-1).flip(-1)
         share = torch.where(rest > 0, probs / rest, 0).clamp_(0, 1)

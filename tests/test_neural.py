@@ -162,3 +162,29 @@ def test_refuses_a_width_that_the_heads_cannot_share(arguments):
 def test_refuses_settings(name):
     with refuses(name):
         small(GRUPrior).fit(torch.zeros(9, 4).long(), progress=False, **{name: 0})
+
+
+@pytest.mark.parametrize("lags", [1, 3])
+@pytest.mark.parametrize("num_layers", [1, 2])
+@pytest.mark.parametrize("sees", [{}, {"num_contexts": 3}, {"context_size": 2}])
+def test_single_steps_of_a_gru_are_those_of_torch(lags, num_layers, sees):
+    """Without gradients a step has a path of its own; with them it is `nn.GRU`'s."""
+    prior = GRUPrior(4, hidden_size=8, num_layers=num_layers, lags=lags, dropout=0.3, seed=1, **sees)
+    action = torch.randint(4, (6, 5), generator=seeded(0))
+    context = {"num_contexts": torch.tensor([0, 1, 2, 0, 1]), "context_size": torch.rand(5, 2, generator=seeded(1))}
+    seen = next((context[name] for name in sees), None)
+
+    def steps():
+        logits, state = prior.start(5, seen)
+        told = [logits]
+        for one in action:
+            logits, state = prior.step(one, state)
+            told.append(logits)
+        return torch.stack(told), state
+
+    with torch.no_grad():
+        fast = steps()
+    plain = steps()
+    assert plain[0].requires_grad
+    for one, other in zip(fast, plain, strict=True):
+        torch.testing.assert_close(one, other.detach(), atol=1e-6, rtol=1e-5)

@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from neuroprior.priors.neural import Embedding, NeuralPrior
 from neuroprior.worlds.world import check_sizes
@@ -55,12 +56,40 @@ class GRUPrior(NeuralPrior):
 
     def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
         hidden, recent, size = None, None, self.num_layers * self.hidden_size
+        step_alone = inputs.shape[1] == 1 and inputs.device.type == "cpu" and not self.training
         if memory is not None:
             hidden = memory[:, :size].view(-1, self.num_layers, self.hidden_size).transpose(0, 1).contiguous()
             recent = memory[:, size:]
-        vectors, recent = self.embedding(inputs, recent)
-        out, hidden = self.gru(self.drop(vectors), hidden)
+        if hidden is not None and recent is not None and step_alone and not torch.is_grad_enabled():
+            out, hidden, recent = self._one_step(inputs, hidden, recent)
+        else:
+            vectors, recent = self.embedding(inputs, recent)
+            out, hidden = self.gru(self.drop(vectors), hidden)
         return self.head(self.drop(out)), torch.cat([hidden.transpose(0, 1).flatten(1), recent], 1)
+
+    def _one_step(self, inputs: Tensor, hidden: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What `nn.GRU` gives for a single input, in half its time on a CPU, where it is made for long sequences.
+
+        Where there is nothing but an action to see, its input gates are looked up in a table of all actions.
+        """
+        size, below, after = self.hidden_size, None, []
+        if not self.embedding.action_alone:
+            vectors, recent = self.embedding(inputs, recent)
+            below = vectors[:, 0]
+        for layer, before in enumerate(hidden):
+            w_in, w_hidden, b_in, b_hidden = self.gru.all_weights[layer]
+            bias = torch.cat([b_in[: 2 * size] + b_hidden[: 2 * size], b_in[2 * size :]])
+            if below is None:
+                gates = functional.linear(self.embedding.action.weight, w_in, bias)[inputs[:, 0, 0].long()]
+            else:
+                gates = functional.linear(below, w_in, bias)
+            share = torch.addmm(gates[:, : 2 * size], before, w_hidden[: 2 * size].T).sigmoid_()
+            new = functional.linear(before, w_hidden[2 * size :], b_hidden[2 * size :])
+            new = torch.addcmul(gates[:, 2 * size :], share[:, :size], new).tanh_()
+            below = torch.lerp(new, before, share[:, size:])
+            after.append(below)
+        assert below is not None
+        return below[:, None], torch.stack(after), recent
 
     def memory_size(self, state_size: int) -> int:
         return self.num_layers * self.hidden_size + self.lags - 1
