@@ -21,6 +21,9 @@ ROWS = 2**15
 TEMPERATURES = (1.0, 1.5, 2.0)
 """At which priors may be sampled: one that is too sure of itself tries the same plans again and again."""
 
+DRAWN, AGAIN = 20, 9
+"""For each start that is wanted so many are drawn, and, where too few of them are of use, so many times again."""
+
 CLOSE = 1e-6
 """A score this near to the oracle's is as good."""
 
@@ -73,7 +76,7 @@ def starts_of(task: Task, world: World, number: int, length: int, generator: tor
     Raises:
         ValueError: there are hardly any.
     """
-    state = world.reset(20 * number, generator)
+    state = world.reset(DRAWN * number, generator)
     best = best_score(task, world, state, length)
     reference = 0.0
     if isinstance(world, TabularWorld) and float(world.reward.min()) < 0:
@@ -81,8 +84,15 @@ def starts_of(task: Task, world: World, number: int, length: int, generator: tor
         reference = float(_worth(task, world, state, plans).mean())
     else:
         state, best = state[best > 0], best[best > 0]
+        for _ in range(AGAIN):
+            if len(state) >= number:
+                break
+            more = world.reset(DRAWN * number, generator)
+            gain = best_score(task, world, more, length)
+            state, best = torch.cat([state, more[gain > 0]]), torch.cat([best, gain[gain > 0]])
     if len(state) < number:
-        raise ValueError(f"only {len(state)} of {20 * number} starts are such that a plan of {length} actions gains")
+        tried = (1 + AGAIN) * DRAWN * number
+        raise ValueError(f"only {len(state)} of {tried} starts are such that a plan of {length} actions gains")
     return Starts(task, world, state[:number], length, best[:number], reference)
 
 

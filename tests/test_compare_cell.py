@@ -105,7 +105,7 @@ def test_starts_are_such_that_something_can_be_had():
     assert starts.state.shape == (30,)
     assert float(starts.best.min()) > 0
     nothing = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.zeros(1, 1))
-    with refuses("only 0 of 600 starts"):
+    with refuses("only 0 of 6000 starts"):
         starts_of(task, nothing, 30, 4, seeded(0))
 
 
