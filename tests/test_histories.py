@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from neuroprior import ContextTreePrior, MarkovPrior, Plans
 from neuroprior.priors import histories
+from neuroprior.priors.grams import few_grams, grams
 from neuroprior.priors.histories import count_histories
 from tests.sources import refuses, seeded
 
@@ -60,11 +61,17 @@ def names(tree, depth):
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
-@given(problems(), st.sampled_from([1, 7, 2**18]))
-def test_the_tree_and_its_counts(problem, at_once):
+@given(problems(), st.sampled_from([1, 7, 2**18]), st.booleans())
+def test_the_tree_and_its_counts(problem, at_once, first):
+    """Also where short sequences are counted first, which by itself is done with many plans alone."""
     plans, contexts, depth = problem
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(histories, "ACTIONS_AT_ONCE", at_once)
+        patch.setattr(
+            histories,
+            "few_grams",
+            lambda plans, depth: first and 0 < depth < plans.max_length and plans.num_actions**depth < 1000,
+        )
         tree, counts = count_histories(plans, depth, contexts, True, torch.device("cpu"))
     truth = dictionary(plans, contexts, depth)
     name = names(tree, depth)
@@ -110,3 +117,16 @@ def test_rows_of_contexts_over_the_limit_are_refused(monkeypatch):
     MarkovPrior(10, 1).fit(plans)
     with refuses("histories"):
         MarkovPrior(10, 1, num_contexts=1_000).fit(plans)
+
+
+def test_many_plans_are_counted_by_their_short_sequences():
+    plans = Plans(torch.randint(4, (200, 30), dtype=torch.uint8, generator=seeded(0)), 4)
+    kept = plans.actions.clone()
+    assert few_grams(plans, 2)
+    assert not few_grams(plans, 30)
+    assert not few_grams(plans, 0)
+    assert not few_grams(plans[:2], 2)
+    sequences, times = grams(plans.actions, 3, 4, 7, torch.device("cpu"))
+    found = {tuple(one): number for one, number in zip(sequences.tolist(), times.tolist(), strict=True)}
+    assert found == Counter(tuple(plan[t : t + 3]) for plan in plans.actions.tolist() for t in range(28))
+    assert torch.equal(plans.actions, kept)

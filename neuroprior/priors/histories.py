@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans, sees_each_step
+from neuroprior.priors.grams import few_grams, grams
+from neuroprior.priors.tally import Tally, merge, number
 
 ACTIONS_AT_ONCE = 2**18
 """Actions that are counted together; small enough for a processor's cache."""
@@ -117,6 +119,11 @@ def count_histories(
     """
     histories = _Histories(plans.num_actions, depth, num_contexts or 1, device)
     size = max(ACTIONS_AT_ONCE // max(plans.max_length, 1), 1)
+    if num_contexts is None and plans.lengths is None and few_grams(plans, depth):
+        actions = plans.actions
+        histories.add(*grams(actions[:, :depth], depth, plans.num_actions, size, device))
+        histories.add(*grams(actions, depth + 1, plans.num_actions, size, device), openings=False)
+        return histories.finish(openings)
     for at in range(0, len(plans), size):
         part = plans[at : at + size]
         actions, here, context = part.actions.to(device).long(), None, None
@@ -126,31 +133,8 @@ def count_histories(
         if num_contexts is not None and part.context is not None:
             context = part.context.to(device).long()
             context = context[:, : actions.shape[1]] if sees_each_step(context) else context[:, None].expand_as(actions)
-        histories.add(actions, here, context)
+        histories.add(actions, None, here, context)
     return histories.finish(openings)
-
-
-class _Tally:
-    """How often each code was met."""
-
-    def __init__(self, device: torch.device) -> None:
-        none = torch.zeros(0, dtype=torch.long, device=device)
-        self.parts = [(none, none)]
-        self.size = self.merged = 0
-
-    def add(self, codes: Tensor, below: int) -> None:
-        """Count `codes [n]`, all of them under `below`."""
-        if below <= 4 * len(codes) + 2**16:
-            table = codes.bincount()
-            distinct = table.nonzero()[:, 0]
-            counts = table[distinct]
-        else:
-            distinct, counts = torch.unique(codes, return_counts=True)
-        self.parts.append((distinct, counts))
-        self.size += len(distinct)
-        if self.size > 2 * self.merged + 2**20:
-            distinct, counts, _ = _merge(self.parts)
-            self.parts, self.size, self.merged = [(distinct, counts)], len(distinct), len(distinct)
 
 
 class _Level:
@@ -159,7 +143,7 @@ class _Level:
     def __init__(self, num_actions: int, device: torch.device, size: int = 0) -> None:
         self.follow = torch.full((size, num_actions), -1, dtype=torch.int32, device=device)
         self.parent = torch.zeros(size, dtype=torch.long, device=device)
-        self.tally = _Tally(device)
+        self.tally = Tally(device)
 
     def __len__(self) -> int:
         return len(self.parent)
@@ -179,30 +163,48 @@ class _Histories:
         self.levels = [_Level(num_actions, device, int(t == 0)) for t in range(depth + 1)]
         self.openings = [_Level(num_actions, device, int(t == 0)) for t in range(depth)]
 
-    def add(self, actions: Tensor, here: Tensor | None, context: Tensor | None) -> None:
-        """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), seen with `context [n, L]`."""
+    def add(
+        self,
+        actions: Tensor,
+        times: Tensor | None,
+        here: Tensor | None = None,
+        context: Tensor | None = None,
+        openings: bool = True,
+    ) -> None:
+        """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), seen with `context [n, L]`.
+
+        Each row counts `times [n]` (None: once). Rows that do not begin a plan are no `openings`.
+        """
         length, depth = actions.shape[1], len(self.openings)
         node, opening = torch.zeros_like(actions), torch.zeros_like(actions[:, :1])
         for t in range(min(depth, length)):
-            self._count(self.openings[t], opening, actions, context, here, slice(t, t + 1))
+            if openings:
+                self._count(self.openings[t], opening, actions, context, here, slice(t, t + 1), times)
             if t + 1 == length:
                 return
             now, after = actions[:, t:-1], None if here is None else here[:, t + 1 :]
             node = self._go(self.levels, t, node[:, :-1], now, node[:, 1:], after)
-            if t + 1 < depth:
+            if openings and t + 1 < depth:
                 first = None if after is None else after[:, :1]
                 opening = self._go(self.openings, t, opening, now[:, :1], node[:, :1], first)
         if length > depth:
-            self._count(self.levels[depth], node, actions, context, here, slice(depth, None))
+            self._count(self.levels[depth], node, actions, context, here, slice(depth, None), times)
 
     def _count(
-        self, level: _Level, node: Tensor, actions: Tensor, context: Tensor | None, here: Tensor | None, steps: slice
+        self,
+        level: _Level,
+        node: Tensor,
+        actions: Tensor,
+        context: Tensor | None,
+        here: Tensor | None,
+        steps: slice,
+        times: Tensor | None,
     ) -> None:
         """Count the actions of some steps, which followed `node`."""
         row = node if context is None else node * self.contexts + context[:, steps]
         codes = row * self.num_actions + actions[:, steps]
         codes = codes.reshape(-1) if here is None else codes[here[:, steps]]
-        level.tally.add(codes, len(level) * self.contexts * self.num_actions)
+        level.tally.add(codes, len(level) * self.contexts * self.num_actions, times)
 
     def _go(
         self, levels: list[_Level], t: int, node: Tensor, actions: Tensor, parent: Tensor, here: Tensor | None
@@ -213,7 +215,7 @@ class _Histories:
         found = level.follow.view(-1)[codes]
         new = found < 0 if here is None else (found < 0) & here
         if bool(new.any()):
-            distinct, rank = _number(codes[new], level.follow.numel())
+            distinct, rank = number(codes[new], level.follow.numel())
             self._check_size(len(distinct))
             level.follow.view(-1)[distinct] = torch.arange(
                 len(below), len(below) + len(distinct), dtype=torch.int32, device=codes.device
@@ -260,13 +262,13 @@ class _Histories:
         def lift(level: _Level, codes: Tensor) -> Tensor:
             return level.parent[codes.div(below, rounding_mode="floor")] * below + codes % below
 
-        first = [_merge(level.tally.parts) for level in self.openings]
-        codes, count, _ = _merge(self.levels[-1].tally.parts)
+        first = [merge(level.tally.parts) for level in self.openings]
+        codes, count, _ = merge(self.levels[-1].tally.parts)
         out = [(codes, count, count)]
         for t in range(len(self.openings) - 1, -1, -1):
             longer = lift(self.levels[t + 1], out[0][0]), out[0][1]
             begun = lift(self.openings[t], first[t][0]), first[t][1]
-            out.insert(0, _merge([longer, begun]))
+            out.insert(0, merge([longer, begun]))
         return [*out, *((codes, count, count) for codes, count, _ in first)]
 
     def _tree(self, keep: list[_Level], bounds: list[int], openings: bool) -> Tree:
@@ -285,20 +287,3 @@ class _Histories:
             parents.append(parent)
         start = bounds[depth + 1] if openings and depth else 0
         return Tree(next_node, torch.cat(parents), start, bounds)
-
-
-def _number(codes: Tensor, below: int) -> tuple[Tensor, Tensor]:
-    """The distinct codes, all under `below`, in ascending order, and the rank among them of each code."""
-    if below > 4 * len(codes) + 2**16:
-        distinct, rank = torch.unique(codes, return_inverse=True)
-        return distinct, rank
-    present = torch.zeros(below, dtype=torch.bool, device=codes.device)
-    present[codes] = True
-    return present.nonzero()[:, 0], (present.cumsum(0) - 1)[codes]
-
-
-def _merge(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-    """The distinct codes of the parts in ascending order, the sum of their counts, and in how many places each was."""
-    codes, counts = (torch.cat(values) for values in zip(*parts, strict=True))
-    distinct, rank, places = torch.unique(codes, return_inverse=True, return_counts=True)
-    return distinct, torch.zeros_like(distinct).index_add_(0, rank, counts), places
