@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Rollout, TabularWorld, World, gridworld
-from neuroprior.worlds.pairs import pairs_pay
 from tests.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
 
 UP, RIGHT, DOWN, LEFT = range(4)
@@ -289,21 +288,3 @@ def test_rollout_names_the_wrong_dtype(state, plans, words):
 def test_state_refuses(cell, number, word):
     with refuses(word):
         random_world(0).state(torch.tensor([cell]), number)
-
-
-@pytest.mark.parametrize("per", ["state", "action"])
-@pytest.mark.parametrize(("maps", "num_actions"), [(1, 2), (3, 4), (2, 5)])
-def test_rollouts_in_pairs_are_those_of_single_steps(per, maps, num_actions):
-    """Where there are many plans, tables are looked up two steps at a time; rewards and states are the same."""
-    shape = (maps, 7) if per == "state" else (maps, 7, num_actions)
-    next_state = torch.randint(7, (7, num_actions), generator=seeded(0))
-    world = TabularWorld(next_state, torch.rand(shape, generator=seeded(1)))
-    state = world.reset(40, seeded(2))
-    plans = torch.randint(num_actions, (40, 600, 6), dtype=torch.uint8, generator=seeded(3))
-    assert pairs_pay(world.next_state, world.reward, plans)
-    for other in (plans[..., :5], plans.long(), plans[:2, :3]):
-        assert not pairs_pay(world.next_state, world.reward, other)
-    quick, plain = world.rollout(state, plans), world.rollout(state, plans, keep_states=True)
-    assert torch.equal(quick.final_state, plain.final_state)
-    assert torch.equal(quick.rewards, plain.rewards)
-    assert torch.equal(quick.final_state, plain.states[..., -1])

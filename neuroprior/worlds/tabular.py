@@ -7,7 +7,6 @@ from torch import Tensor
 
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.chance import Chance
-from neuroprior.worlds.pairs import pairs_pay, rollout_in_pairs
 from neuroprior.worlds.world import Rollout, World, check_plans, check_range, is_integer, join_states
 
 
@@ -140,13 +139,10 @@ class TabularWorld(World):
     ) -> Rollout:
         """See `World.rollout`. One gather a step for the transitions and one for the rewards, on int32 tables.
 
-        Where there are many more plans than states, two steps are looked up at once (see `rollout_in_pairs`). With
-        chance, `generator` gives one uniform number a start and step, however many plans there are.
+        With chance, `generator` gives one uniform number a start and step, however many plans there are.
         """
         self.check_state(state)
         check_plans(plans, state.shape[0], self.num_actions)
-        if self.chance is None and not keep_states and pairs_pay(self.next_state, self.reward, plans):
-            return Rollout(*rollout_in_pairs(self.next_state, self.reward, state, plans), None)
         batch, num_plans, length = plans.shape
         actions = self.num_actions
         table, flat_reward = self.next_state.int().view(-1), self.reward.view(-1)
