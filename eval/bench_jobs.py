@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from eval import bench_packages, bench_peers
+from eval.bench_packages import Run
 from eval.bench_training import TrainingRace
 from eval.first_simulation import Protocol, Size, simulate
 from neuroprior import (
@@ -21,8 +21,6 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-
-Run = Callable[[], Any]
 
 FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 
@@ -175,7 +173,9 @@ def table_1(scale: float) -> Job:
     """The paper's first table without its neural priors."""
     starts = _scaled(10_000, scale)
     size = Size(1, starts, starts, 20, 1.0, 4, 8, 256, 0)
-    script = partial(bench_peers.numpy_table_1, 20, starts, 256, 8, 4, (1, 2, 3))
+    world = gridworld(20, 20, "torus")
+    start = world.reset(starts, torch.Generator().manual_seed(0))
+    script = partial(bench_peers.numpy_table_1, world.reward[0].numpy(), start.numpy(), 256, 8, 4, (1, 2, 3))
     return Job(
         f"the paper's Table 1, Markov rows, {starts:,} starts",
         lambda: partial(simulate, Protocol("torus", "uniform", "all"), size, False, lambda what: None),
@@ -185,7 +185,7 @@ def table_1(scale: float) -> Job:
 
 def train(scale: float) -> Job:
     """A GRU trained until it is within 1 % of the entropy rate."""
-    race = TrainingRace(chain(), chain_plans(_scaled(100_000, scale), 16))
+    race = TrainingRace(source(), chain_plans(_scaled(100_000, scale), 16))
     return Job(
         f"train GRU-64 to 1 % of the entropy rate, {len(race.plans):,} plans of length 16",
         race.ours,
@@ -194,7 +194,7 @@ def train(scale: float) -> Job:
 
 
 def shoot(scale: float) -> Job:
-    """Random shooting in a Gymnasium environment."""
+    """Random shooting in a Gymnasium environment; its table is made before, which `setup_seconds` tells."""
     starts, few = _scaled(100, scale), _scaled(32, scale)
     uniform = UniformPrior(7)
     plans = uniform.sample(256, 16)
@@ -213,14 +213,12 @@ def shoot(scale: float) -> Job:
                 partial(bench_packages.deep_copies, FOUR_ROOMS, plans[:few]),
                 1000,
                 few / 256 / starts,
-                "minigrid",
             ),
             Peer(
                 "gymnasium vector environment",
                 partial(bench_packages.vector_env, FOUR_ROOMS, plans),
                 1000,
                 1 / starts,
-                "minigrid",
             ),
         ),
         "minigrid",
@@ -228,7 +226,7 @@ def shoot(scale: float) -> Job:
 
 
 def decide(scale: float) -> Job:
-    """One decision from many starts, against trees with as many model steps."""
+    """One decision from many starts, against trees with as many model steps, of which an eighth are timed."""
     starts, steps, simulations = _scaled(4096, scale), 256 * 8, 256
     world = gridworld(20, 20, "torus", num_worlds=10)
     state = world.reset(starts, torch.Generator().manual_seed(0))
@@ -239,7 +237,7 @@ def decide(scale: float) -> Job:
         lambda: partial(planner.plan, world, state),
         tuple(
             Peer(
-                f"mctx, {name}, an eighth of the steps",
+                f"mctx, {name}",
                 partial(bench_packages.mctx_search, *given, gumbel),
                 3,
                 simulations / steps,
@@ -270,16 +268,16 @@ JOBS: dict[str, Callable[[float], Job]] = {
 
 
 def chain_plans(number: int, length: int) -> Tensor:
-    """Plans `[N, L]` of a chain of order 2 that has learned the paper's moves: few reversals, many repeats."""
-    return chain().sample(number, length, generator=torch.Generator().manual_seed(1))
+    """Plans `[N, L]` of `source`."""
+    return source().sample(number, length, generator=torch.Generator().manual_seed(1))
 
 
-def chain() -> MarkovPrior:
-    """A chain of order 2 that has learned from the best plans of four moves on the paper's grid."""
+def source() -> MarkovPrior:
+    """A chain of order 2 that reverses its last move seldom."""
     moves = torch.cartesian_prod(*[torch.arange(4)] * 4)
     back = torch.tensor([2, 3, 0, 1])
-    straight = (moves[:, 1:] != back[moves[:, :-1]]).all(1)
-    return MarkovPrior(4, 2).fit(torch.cat([moves, moves[straight].repeat(5, 1)]))
+    onward = (moves[:, 1:] != back[moves[:, :-1]]).all(1)
+    return MarkovPrior(4, 2).fit(torch.cat([moves, moves[onward].repeat(5, 1)]))
 
 
 def _scaled(number: int, scale: float) -> int:

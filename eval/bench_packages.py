@@ -12,22 +12,25 @@ Run = Callable[[], Any]
 
 
 def transformers_generate(num_actions: int, length: int, batch_size: int, width: int = 64, layers: int = 2) -> Run:
-    """GPT-2 of the same size samples `batch_size` plans, with its key-value cache."""
+    """GPT-2, as wide and deep, samples `batch_size` plans with its key-value cache.
+
+    It begins with action 0, as it needs something to read.
+    """
     from transformers import GPT2Config, GPT2LMHeadModel
 
     torch.manual_seed(0)
     config = GPT2Config(
-        vocab_size=num_actions + 1,
+        vocab_size=num_actions,
         n_positions=length + 1,
         n_embd=width,
         n_layer=layers,
         n_head=4,
-        bos_token_id=num_actions,
+        bos_token_id=0,
         eos_token_id=None,
-        pad_token_id=num_actions,
+        pad_token_id=0,
     )
     model = GPT2LMHeadModel(config).eval()
-    begin = torch.full((batch_size, 1), num_actions)
+    begin = torch.zeros(batch_size, 1, dtype=torch.long)
     how = {"do_sample": True, "top_k": 0, "min_new_tokens": length, "max_new_tokens": length, "use_cache": True}
 
     def run() -> Tensor:
@@ -74,17 +77,18 @@ def numba_rollout(next_state: Tensor, reward: Tensor, state: Tensor, plans: Tens
         final = np.empty((starts, number), np.int64)
         rewards = np.empty((starts, number, length), np.float32)
         for start in numba.prange(starts):
-            first = state[start] % len(table)
-            map_ = state[start] // len(table)
+            first = np.uint32(state[start] % len(table))
+            gain = reward[state[start] // len(table)]
             for plan in range(number):
                 cell = first
                 for t in range(length):
                     cell = table[cell, plans[start, plan, t]]
-                    rewards[start, plan, t] = reward[map_, cell]
+                    rewards[start, plan, t] = gain[cell]
                 final[start, plan] = cell
         return final, rewards
 
-    arrays = next_state.int().numpy(), reward.numpy(), state.numpy(), plans.numpy()
+    # Numbers without a sign are quicker to index with.
+    arrays = next_state.numpy().astype(np.uint32), reward.numpy(), state.numpy(), plans.numpy()
     numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
     return lambda: loop(*arrays)
 
@@ -93,7 +97,12 @@ def vlmc_fit(actions: list[int], num_actions: int, depth: int) -> Run:
     """The best tree of Bayesian context trees, in Rust."""
     import vlmc
 
-    return lambda: vlmc.VLMC(num_actions, depth, "bct").fit([actions])
+    def run() -> Any:
+        tree = vlmc.VLMC(num_actions, depth, "bct")
+        tree.fit([actions])
+        return tree
+
+    return run
 
 
 def deep_copies(name: str, plans: Tensor) -> Run:

@@ -108,17 +108,26 @@ def plain_training(plans: Tensor, num_actions: int, steps: int, batch_size: int,
     return model.eval()
 
 
-def numpy_table_1(size: int, starts: int, num_plans: int, length: int, depth: int, orders: tuple[int, ...]) -> Any:
-    """Hyvärinen's first simulation in numpy: mean reward by planner.
+def numpy_table_1(
+    reward: Array, start: Array, num_plans: int, length: int, depth: int, orders: tuple[int, ...]
+) -> dict[str, Array]:
+    """Hyvärinen's first simulation in numpy, on a square torus: what each planner scores from each start.
 
-    On a torus with independent rewards: the deterministic planner tries all plans of `depth` moves, chains of some
-    `orders` learn from what it chose at as many starts, and planners choose the best of plans drawn from them.
+    The deterministic planner tries all plans of `depth` moves, chains of some `orders` learn from what it chose at as
+    many other starts, and planners choose the best of plans drawn from them.
+
+    Args:
+        reward: `[S]`, of the cells.
+        start: `[n]`, cells.
+        num_plans, length, depth, orders: see above.
+
+    Returns:
+        Scores `[n]` by planner.
     """
-    generator = np.random.default_rng(0)
-    row, column = np.divmod(np.arange(size * size), size)
+    generator, size = np.random.default_rng(0), round(len(reward) ** 0.5)
+    row, column = np.divmod(np.arange(len(reward)), size)
     moves = ((-1, 0), (0, 1), (1, 0), (0, -1))
     next_state = np.stack([(row + down) % size * size + (column + right) % size for down, right in moves], 1)
-    reward = generator.random(size * size)
     every = np.stack(np.meshgrid(*[np.arange(4)] * depth, indexing="ij"), -1).reshape(-1, depth)
 
     def best(plans: Array, start: Array) -> tuple[Array, Array]:
@@ -133,18 +142,17 @@ def numpy_table_1(size: int, starts: int, num_plans: int, length: int, depth: in
     def deterministic(start: Array) -> tuple[Array, Array]:
         return best(np.broadcast_to(every, (len(start), *every.shape)), start)
 
-    learned = deterministic(generator.integers(size * size, size=starts))[0]
-    start = generator.integers(size * size, size=starts)
-    found = {"deterministic": deterministic(start)[1].mean()}
-    random = generator.integers(4, size=(starts, num_plans, length), dtype=np.uint8)
-    found["random"] = best(random, start)[1].mean()
+    learned = deterministic(generator.integers(len(reward), size=len(start)))[0]
+    random = generator.integers(4, size=(len(start), num_plans, length), dtype=np.uint8)
+    found = {"deterministic": deterministic(start)[1], "random": best(random, start)[1]}
     for order in orders:
-        found[f"markov-{order}"] = best(_chain(learned, order, starts * num_plans, length), start)[1].mean()
+        plans = _chain(learned, order, len(start) * num_plans, length).reshape(random.shape)
+        found[f"markov-{order}"] = best(plans, start)[1]
     return found
 
 
 def _chain(learned: Array, order: int, number: int, length: int) -> Array:
-    """`[10,000 starts, plans, L]`: plans of a chain that counted `learned`, which open as those did."""
+    """`[number, L]`: plans of a chain that counted `learned`, which open as those did."""
     counts = numpy_counts(learned, 4, order) + 1e-3
     probs = counts / counts.sum(1, keepdims=True)
     generator = np.random.default_rng(order)
@@ -156,4 +164,4 @@ def _chain(learned: Array, order: int, number: int, length: int) -> Array:
         for back in range(order):
             code = code * 4 + plans[:, t - order + back]
         plans[:, t] = (generator.random((number, 1)) > edges[code]).sum(1)
-    return plans.reshape(len(learned), -1, length)
+    return plans

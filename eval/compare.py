@@ -54,8 +54,8 @@ def compare(
 
     Args:
         worlds: to compare priors in.
-        seeds: repeats in each world, each with training and held-out worlds and priors of its own; intervals are over
-            them.
+        seeds: repeats in each world, each with worlds (training, validation, held-out) and priors of its own; intervals
+            are over them.
         num_plans: numbers of candidate plans, powers of two.
         priors: model folders to compare, such as `python -m train` writes.
         kinds: of priors that are fitted: markov, gru, transformer; all by default, but none where there are saved ones.

@@ -226,13 +226,13 @@ class _Contest:
         entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
         entry |= {"temperature": heat}
         entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, heat))
-        told = self.settings.num_plans
-        timed = seconds_per_decision(starts, one.prior, told, TIMED_STARTS, self.generator, heat)
-        by_budget = dict(zip(told, timed, strict=True))
+        asked = self.settings.num_plans
+        timed = seconds_per_decision(starts, one.prior, asked, TIMED_STARTS, self.generator, heat)
+        by_budget = dict(zip(asked, timed, strict=True))
         seconds, steps = ([by_budget[b][k] if b in by_budget else None for b in self.settings.budgets] for k in (0, 1))
         entry |= {"seconds": seconds, "model_steps": steps}
-        held_out = score(one.label, one.prior, as_seen(self.told, one.sees))
-        return entry | {"bits": held_out.bits_per_action().mean, "actions": int(self.told.mask().sum())}
+        scored = score(one.label, one.prior, as_seen(self.told, one.sees))
+        return entry | {"bits": scored.bits_per_action().mean, "actions": int(self.told.mask().sum())}
 
     def growth(self, one: _Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""

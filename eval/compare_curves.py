@@ -30,11 +30,11 @@ CLOSE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """Where planners are compared: B starts of a world, with the best that can be had from each.
+    """Where priors are compared, or temperatures chosen: B starts of a world, with the best that can be had from each.
 
     Attributes:
         task: what is optimised.
-        world: the held-out world.
+        world: the held-out world, or the validation world.
         state: `[B, ...]`.
         length: number of actions in a plan.
         best: `[B]`: the oracle's scores.
@@ -161,8 +161,10 @@ def seconds_per_decision(
     """
     state, taken = starts.state[:number], []
     planners = [planner_of(starts, prior, budget, temperature) for budget in budgets]
-    # The first call is slower than those that follow.
-    planners[0].plan(starts.world, state, torch.Generator(generator.device).manual_seed(0))
+    # The first call is slower than those that follow, and the largest makes room for all.
+    max(planners, key=lambda planner: planner.num_plans).plan(
+        starts.world, state, torch.Generator(generator.device).manual_seed(0)
+    )
     for planner in planners:
         begin = perf_counter()
         decision = planner.plan(starts.world, state, generator)

@@ -36,7 +36,7 @@ class Task:
     Attributes:
         name: as in `TASKS`.
         action_names: of its actions, in the order of their numbers.
-        about: what it is, what differs between training and held-out worlds, and what is optimised.
+        about: what it is, what differs between the worlds of a seed, and what is optimised.
         worlds: makes the worlds of a seed.
         depth: of the exhaustive planner whose plans are learned from first.
         lengths: numbers of actions in the plans of the rounds of growth; the last is that of the comparison.

@@ -199,9 +199,8 @@ def _grow(
 ) -> Tensor:
     """`counts[r]` plans under `context[r]` for each root r: `[total, length]`, root by root, shuffled within."""
     total = int(counts.sum())
-    plans = torch.empty(total, length, dtype=draw.dtype, device=counts.device)
     if total == 0 or length == 0:
-        return plans
+        return torch.empty(total, length, dtype=draw.dtype, device=counts.device)
     per_step = sees_each_step(context)
     logits, state = prior.start(len(counts), context[:, 0] if context is not None and per_step else context)
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
@@ -220,6 +219,7 @@ def _grow(
     depth = prefix.shape[1]
     if depth == length:
         return prefix.index_select(0, row)
+    plans = torch.empty(total, length, dtype=draw.dtype, device=counts.device)
     plans[:, :depth] = prefix.index_select(0, row)
     for at in range(0, total, batch_size):
         some = row[at : at + batch_size]

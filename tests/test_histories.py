@@ -61,17 +61,11 @@ def names(tree, depth):
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
-@given(problems(), st.sampled_from([1, 7, 2**18]), st.booleans())
-def test_the_tree_and_its_counts(problem, at_once, first):
-    """Also where short sequences are counted first, which by itself is done with many plans alone."""
+@given(problems(), st.sampled_from([1, 7, 2**18]))
+def test_the_tree_and_its_counts(problem, at_once):
     plans, contexts, depth = problem
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(histories, "ACTIONS_AT_ONCE", at_once)
-        patch.setattr(
-            histories,
-            "few_grams",
-            lambda plans, depth: first and 0 < depth < plans.max_length and plans.num_actions**depth < 1000,
-        )
         tree, counts = count_histories(plans, depth, contexts, True, torch.device("cpu"))
     truth = dictionary(plans, contexts, depth)
     name = names(tree, depth)
@@ -130,3 +124,16 @@ def test_many_plans_are_counted_by_their_short_sequences():
     found = {tuple(one): number for one, number in zip(sequences.tolist(), times.tolist(), strict=True)}
     assert found == Counter(tuple(plan[t : t + 3]) for plan in plans.actions.tolist() for t in range(28))
     assert torch.equal(plans.actions, kept)
+
+
+@pytest.mark.parametrize("initial", ["joint", "lower"])
+@pytest.mark.parametrize(
+    ("num_actions", "depth", "length"), [(1, 1, 3), (2, 1, 2), (2, 3, 4), (3, 2, 9), (4, 2, 30), (5, 1, 3)]
+)
+def test_counted_first_or_not_the_prior_is_the_same(num_actions, depth, length, initial, monkeypatch):
+    plans = Plans(torch.randint(num_actions, (2000, length), generator=seeded(0)).square() % num_actions, num_actions)
+    assert few_grams(plans, depth)
+    test = torch.randint(num_actions, (50, length + 3), generator=seeded(1))
+    got = MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test)
+    monkeypatch.setattr(histories, "few_grams", lambda plans, depth: False)
+    torch.testing.assert_close(got, MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test))

@@ -164,18 +164,21 @@ def test_refuses_settings(name):
         small(GRUPrior).fit(torch.zeros(9, 4).long(), progress=False, **{name: 0})
 
 
+@pytest.mark.parametrize("batch", [3, 5])  # fewer than actions, and more
 @pytest.mark.parametrize("lags", [1, 3])
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("sees", [{}, {"num_contexts": 3}, {"context_size": 2}])
-def test_single_steps_of_a_gru_are_those_of_torch(lags, num_layers, sees):
+def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, sees, monkeypatch):
     """Without gradients a step has a path of its own; with them it is `nn.GRU`'s."""
     prior = GRUPrior(4, hidden_size=8, num_layers=num_layers, lags=lags, dropout=0.3, seed=1, **sees)
-    action = torch.randint(4, (6, 5), generator=seeded(0))
-    context = {"num_contexts": torch.tensor([0, 1, 2, 0, 1]), "context_size": torch.rand(5, 2, generator=seeded(1))}
+    action = torch.randint(4, (6, batch), generator=seeded(0))
+    context = {"num_contexts": torch.arange(batch) % 3, "context_size": torch.rand(batch, 2, generator=seeded(1))}
     seen = next((context[name] for name in sees), None)
+    one_step, calls = prior._one_step, []
+    monkeypatch.setattr(prior, "_one_step", lambda *given: calls.append(given) or one_step(*given))
 
     def steps():
-        logits, state = prior.start(5, seen)
+        logits, state = prior.start(batch, seen)
         told = [logits]
         for one in action:
             logits, state = prior.step(one, state)
@@ -184,7 +187,12 @@ def test_single_steps_of_a_gru_are_those_of_torch(lags, num_layers, sees):
 
     with torch.no_grad():
         fast = steps()
+    assert len(calls) == len(action)
     plain = steps()
     assert plain[0].requires_grad
-    for one, other in zip(fast, plain, strict=True):
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        rough = steps()
+    assert len(calls) == len(action)
+    for one, other, third in zip(fast, plain, rough, strict=True):
         torch.testing.assert_close(one, other.detach(), atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(third.float(), one, atol=0.05, rtol=0.05)

@@ -56,24 +56,35 @@ class GRUPrior(NeuralPrior):
 
     def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
         hidden, recent, size = None, None, self.num_layers * self.hidden_size
-        step_alone = inputs.shape[1] == 1 and inputs.device.type == "cpu" and not self.training
         if memory is not None:
             hidden = memory[:, :size].view(-1, self.num_layers, self.hidden_size).transpose(0, 1).contiguous()
             recent = memory[:, size:]
-        if hidden is not None and recent is not None and step_alone and not torch.is_grad_enabled():
+        if hidden is not None and recent is not None and self._may_step(inputs):
             out, hidden, recent = self._one_step(inputs, hidden, recent)
         else:
             vectors, recent = self.embedding(inputs, recent)
             out, hidden = self.gru(self.drop(vectors), hidden)
         return self.head(self.drop(out)), torch.cat([hidden.transpose(0, 1).flatten(1), recent], 1)
 
-    def _one_step(self, inputs: Tensor, hidden: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What `nn.GRU` gives for a single input, in half its time on a CPU, where it is made for long sequences.
+    def _may_step(self, inputs: Tensor) -> bool:
+        """Whether `_one_step` gives the same as `nn.GRU`, and sooner."""
+        plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"))
+        return plain and inputs.device.type == "cpu" and inputs.shape[1] == 1
 
-        Where there is nothing but an action to see, its input gates are looked up in a table of all actions.
+    def _one_step(self, inputs: Tensor, hidden: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What `nn.GRU`, which is made for long sequences, gives for a single input, in half the time.
+
+        Args:
+            inputs: `[N, 1, D]`.
+            hidden: `[layers, N, H]`.
+            recent: `[N, lags - 1]`: the actions before, see `Embedding`.
+
+        Returns:
+            The output `[N, 1, H]`, the new `hidden` and the new `recent`.
         """
         size, below, after = self.hidden_size, None, []
-        if not self.embedding.action_alone:
+        # Input gates that depend on an action alone are looked up, where plans are more than actions.
+        if self.takes_context or self.lags > 1 or len(inputs) <= self.num_actions:
             vectors, recent = self.embedding(inputs, recent)
             below = vectors[:, 0]
         for layer, before in enumerate(hidden):

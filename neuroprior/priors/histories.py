@@ -122,7 +122,7 @@ def count_histories(
     if num_contexts is None and plans.lengths is None and few_grams(plans, depth):
         actions = plans.actions
         histories.add(*grams(actions[:, :depth], depth, plans.num_actions, size, device))
-        histories.add(*grams(actions, depth + 1, plans.num_actions, size, device), openings=False)
+        histories.add(*grams(actions, depth + 1, plans.num_actions, size, device), begins=False)
         return histories.finish(openings)
     for at in range(0, len(plans), size):
         part = plans[at : at + size]
@@ -169,22 +169,23 @@ class _Histories:
         times: Tensor | None,
         here: Tensor | None = None,
         context: Tensor | None = None,
-        openings: bool = True,
+        begins: bool = True,
     ) -> None:
         """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), seen with `context [n, L]`.
 
-        Each row counts `times [n]` (None: once). Rows that do not begin a plan are no `openings`.
+        Each row counts `times [n]` (None: once), if it has at most `depth` + 1 actions, all of them there. `begins` says
+        whether rows are the beginnings of plans.
         """
         length, depth = actions.shape[1], len(self.openings)
         node, opening = torch.zeros_like(actions), torch.zeros_like(actions[:, :1])
         for t in range(min(depth, length)):
-            if openings:
+            if begins:
                 self._count(self.openings[t], opening, actions, context, here, slice(t, t + 1), times)
             if t + 1 == length:
                 return
             now, after = actions[:, t:-1], None if here is None else here[:, t + 1 :]
             node = self._go(self.levels, t, node[:, :-1], now, node[:, 1:], after)
-            if openings and t + 1 < depth:
+            if begins and t + 1 < depth:
                 first = None if after is None else after[:, :1]
                 opening = self._go(self.openings, t, opening, now[:, :1], node[:, :1], first)
         if length > depth:

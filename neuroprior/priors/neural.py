@@ -281,11 +281,6 @@ class Embedding(nn.Module):
         self.index = None if num_contexts is None else context_embedding(num_contexts, width)
         self.features = None if context_size is None else nn.Linear(context_size, width)
 
-    @property
-    def action_alone(self) -> bool:
-        """Whether vectors stand for the action before, and nothing else."""
-        return self.past is None and self.index is None and self.features is None
-
     def forward(self, inputs: Tensor, recent: Tensor | None) -> tuple[Tensor, Tensor]:
         """The vectors, and the last `lags` - 1 actions for inputs to come; `recent [N, lags - 1]`: those before."""
         now = inputs[..., 0]
