@@ -173,8 +173,8 @@ class _Histories:
     ) -> None:
         """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), seen with `context [n, L]`.
 
-        Each row counts `times [n]` (None: once), if it has at most `depth` + 1 actions, all of them there. `begins` says
-        whether rows are the beginnings of plans.
+        Each row counts `times [n]` (None: once), if it has at most `depth` + 1 actions, all of them there; `begins`
+        says whether rows are the beginnings of plans.
         """
         length, depth = actions.shape[1], len(self.openings)
         node, opening = torch.zeros_like(actions), torch.zeros_like(actions[:, :1])
