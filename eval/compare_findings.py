@@ -68,7 +68,7 @@ def lead(comparison: Comparison) -> str:
     for question in dict.fromkeys([PLAIN, *map(question_of, comparison.words)]):
         best = [row for row in comparison.words if (question_of(row), row["what"]) == (question, BEST)]
         if best:
-            said.append(_counted(best, question, shown_plans(comparison.num_plans)))
+            said.append(_counted(best, question, shown_plans(comparison.num_plans), again=bool(said)))
     factors: dict[str, list[float]] = {}
     for row in comparison.efficiency:
         if (row["sees"], row["rounds"] > 0) == PLAIN and row["prior"] != "uniform":
@@ -86,16 +86,18 @@ def lead(comparison: Comparison) -> str:
     return " ".join(said)
 
 
-def _counted(best: Rows, question: tuple[str, bool], number: int) -> str:
-    """In how many worlds which kind of prior is the better."""
+def _counted(best: Rows, question: tuple[str, bool], number: int, again: bool) -> str:
+    """In how many worlds which kind of prior is the better; briefly where the same was said of others before."""
     better = {side: sum(row["better"] == row[side] for row in best) for side in ("first", "second")}
-    count = {side: str(number or "none") for side, number in better.items()}
     rest = len(best) - sum(better.values())
     worlds = f"{len(best)} world{'s' * (len(best) > 1)}"
-    where = f"With {number:,} candidate plans, in" if question == PLAIN else f"Of {_priors(question)}, in"
+    if again:
+        return f"The same of {_priors(question)}: {better['first']}, {better['second']} and {rest} of {worlds}."
+    which = "" if question == PLAIN else f", of {_priors(question)},"
     return (
-        f"{where} {count['first']} of {worlds} the best neural prior is better than the best Markov chain, in"
-        f" {count['second']} the chain is better, and in {rest or 'none'} they cannot be told apart."
+        f"With {number:,} candidate plans{which} the best neural prior is better than the best Markov chain in"
+        f" {better['first']} of {worlds}, the chain is better in {better['second']}, and they cannot be told apart in"
+        f" {rest}."
     )
 
 

@@ -80,7 +80,8 @@ def test_page(everything):
     for row in results["words"]:
         assert f"<p>{row['words']}</p>" in page.replace("&#39;", "'")
     assert "python -m eval compare" in page
-    assert "With 256 candidate plans, in " in page
+    assert "With 256 candidate plans the best neural prior is better than the best Markov chain in " in page
+    assert "The same of priors that see the start: " in page
     assert page.count('<div class="beside">') == 6
 
 
