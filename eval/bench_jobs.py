@@ -63,36 +63,28 @@ class Job:
 
 def sample_short(scale: float) -> Job:
     """Many short plans, which share their beginnings."""
-    number = _scaled(2_560_000, scale)
-    peers = [
-        Peer(
-            f"transformers generate, {batch:,} at once",
-            partial(bench_packages.transformers_generate, 4, 8, batch),
-            500,
-            batch / number,
-            "transformers",
-        )
-        for batch in sorted({_scaled(size, scale) for size in (1024, 8192, 65_536)})
-    ]
-    about = f"sample {number:,} plans of length 8, transformer"
-    return Job(about, lambda: partial(TransformerPrior(4).sample, number, 8), tuple(peers))
+    return _against_generate(_scaled(2_560_000, scale), 8, [_scaled(size, scale) for size in (1024, 8192, 65_536)], 500)
 
 
 def sample_long(scale: float) -> Job:
     """Long plans, of which hardly two begin alike."""
-    number = _scaled(8192, scale)
+    return _against_generate(_scaled(8192, scale), 64, [_scaled(size, scale) for size in (512, 2048, 8192)], 10)
+
+
+def _against_generate(number: int, length: int, batches: list[int], goal: float) -> Job:
+    """A transformer samples, against one of another package in batches of several sizes."""
     peers = [
         Peer(
             f"transformers generate, {batch:,} at once",
-            partial(bench_packages.transformers_generate, 4, 64, batch),
-            10,
+            partial(bench_packages.transformers_generate, 4, length, batch),
+            goal,
             batch / number,
             "transformers",
         )
-        for batch in sorted({_scaled(size, scale) for size in (512, 2048, 8192)})
+        for batch in sorted(set(batches))
     ]
-    about = f"sample {number:,} plans of length 64, transformer"
-    return Job(about, lambda: partial(TransformerPrior(4).sample, number, 64), tuple(peers))
+    about = f"sample {number:,} plans of length {length}, transformer"
+    return Job(about, lambda: partial(TransformerPrior(4).sample, number, length), tuple(peers))
 
 
 def sample_gru(scale: float) -> Job:

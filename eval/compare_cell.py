@@ -228,8 +228,7 @@ class _Contest:
         entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, heat))
         asked = self.settings.num_plans
         timed = seconds_per_decision(starts, one.prior, asked, TIMED_STARTS, self.generator, heat)
-        by_budget = dict(zip(asked, timed, strict=True))
-        seconds, steps = ([by_budget[b][k] if b in by_budget else None for b in self.settings.budgets] for k in (0, 1))
+        seconds, steps = ([timed[b][k] if b in timed else None for b in self.settings.budgets] for k in (0, 1))
         entry |= {"seconds": seconds, "model_steps": steps}
         scored = score(one.label, one.prior, as_seen(self.told, one.sees))
         return entry | {"bits": scored.bits_per_action().mean, "actions": int(self.told.mask().sum())}

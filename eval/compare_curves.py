@@ -153,13 +153,13 @@ def curve(
 
 def seconds_per_decision(
     starts: Starts, prior: Prior, budgets: Sequence[int], number: int, generator: torch.Generator, temperature: float
-) -> list[tuple[float, int]]:
+) -> dict[int, tuple[float, int]]:
     """How long a sampling planner takes, planning from `number` starts together.
 
     Returns:
-        For each number of candidates: seconds, and model steps, for each start.
+        By number of candidates: seconds, and model steps, for each start.
     """
-    state, taken = starts.state[:number], []
+    state, taken = starts.state[:number], {}
     planners = [planner_of(starts, prior, budget, temperature) for budget in budgets]
     # The first call is slower than those that follow, and the largest makes room for all.
     max(planners, key=lambda planner: planner.num_plans).plan(
@@ -168,7 +168,7 @@ def seconds_per_decision(
     for planner in planners:
         begin = perf_counter()
         decision = planner.plan(starts.world, state, generator)
-        taken.append(((perf_counter() - begin) / len(state), decision.model_steps))
+        taken[planner.num_plans] = (perf_counter() - begin) / len(state), decision.model_steps
     return taken
 
 

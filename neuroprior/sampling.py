@@ -217,10 +217,11 @@ def _grow(
             logits = after_end(logits, action, draw.end)
     row = shuffled_rows(counts, root, draw.generator)
     depth = prefix.shape[1]
+    begun = prefix.index_select(0, row)
     if depth == length:
-        return prefix.index_select(0, row)
+        return begun
     plans = torch.empty(total, length, dtype=draw.dtype, device=counts.device)
-    plans[:, :depth] = prefix.index_select(0, row)
+    plans[:, :depth] = begun
     for at in range(0, total, batch_size):
         some = row[at : at + batch_size]
         now, memory = logits[some], state[some]

@@ -130,8 +130,8 @@ def test_a_decision_is_timed_at_some_of_the_starts():
     world = bandit(3)
     starts = starts_of(one_step(world), world, 6, 1, seeded(0))
     timed = seconds_per_decision(starts, UniformPrior(3), [2, 8], 2, seeded(0), 1.0)
-    assert [steps for _, steps in timed] == [2, 8]
-    assert all(0 < seconds < 5 for seconds, _ in timed)
+    assert [(budget, steps) for budget, (_, steps) in timed.items()] == [(2, 2), (8, 8)]
+    assert all(0 < seconds < 5 for seconds, _ in timed.values())
 
 
 @pytest.fixture(scope="module")

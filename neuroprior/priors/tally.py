@@ -15,8 +15,7 @@ class Tally:
     def add(self, codes: Tensor, below: int, times: Tensor | None = None) -> None:
         """Count `codes [n]`, all of them under `below` and each `times [n]`; None: once."""
         if times is not None:
-            distinct, rank = torch.unique(codes, return_inverse=True)
-            counts = torch.zeros_like(distinct).index_add_(0, rank, times)
+            distinct, counts, _ = merge([(codes, times)])
         elif below <= 4 * len(codes) + 2**16:
             table = codes.bincount()
             distinct = table.nonzero()[:, 0]
