@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Rollout, TabularWorld, World, gridworld
+from neuroprior.worlds import compiled
 from tests.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
 
 UP, RIGHT, DOWN, LEFT = range(4)
@@ -107,27 +108,59 @@ def test_step_by_hand(kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("layout", ["uint8", "int32", "int64", "strided", "permuted", "broadcast"])
 @pytest.mark.parametrize("size", [(4, 5, 6), (1, 1, 1), (4, 5, 0), (4, 0, 3), (0, 3, 2)])
-def test_rollout_is_stepping(kind, layout, size):
+@pytest.mark.parametrize("by", ["tensors", "loop"])
+def test_rollout_is_stepping(monkeypatch, kind, layout, size, by):
+    if by == "loop":
+        pytest.importorskip("numba")
+    monkeypatch.setattr(compiled, "MANY", 0 if by == "loop" else 2**60)
     world = random_world(1, kind)
     batch, num_plans, length = size
     state = world.reset(batch, seeded(0))
     plans = torch.randint(3, size, generator=seeded(1))
-    want = World.rollout(world, state, plans)
     if layout == "strided":
         plans = torch.randint(3, (batch, num_plans, 2 * length), generator=seeded(1))[:, :, ::2]
-        want = World.rollout(world, state, plans)
     elif layout == "permuted":
         plans = plans.permute(2, 1, 0).contiguous().permute(2, 1, 0)
     elif layout == "broadcast":
         plans = plans[:, :, :1].expand(size) if length else plans
-        want = World.rollout(world, state, plans)
     else:
         plans = plans.to(getattr(torch, layout))
+    for keep_states in (False, True):
+        want = World.rollout(world, state, plans.long(), keep_states=keep_states)
+        got = world.rollout(state, plans, keep_states=keep_states)
+        assert isinstance(got, Rollout)
+        assert got.rewards.shape == size
+        for one, other in zip(got, want, strict=True):
+            assert (one is None) == (other is None)
+            if one is not None:
+                assert one.dtype == other.dtype
+                assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_each_thread_follows_plans_of_its_own(monkeypatch, threads):
+    pytest.importorskip("numba")
+    world = random_world(1, "WS")
+    state, plans = world.reset(3, seeded(0)), torch.randint(3, (3, 7, 4), generator=seeded(1))
+    want = world.rollout(state, plans)
+    monkeypatch.setattr(compiled, "MANY", 0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     got = world.rollout(state, plans)
-    assert isinstance(got, Rollout)
-    assert got.rewards.shape == size
     assert torch.equal(got.final_state, want.final_state)
     assert torch.equal(got.rewards, want.rewards)
+
+
+def test_the_loop_is_for_what_it_can_do(monkeypatch):
+    pytest.importorskip("numba")
+    few, reward = torch.zeros(1, 1, 1, dtype=torch.uint8), torch.zeros(1, 1)
+    assert not compiled.worth_compiling(few, reward)
+    assert compiled.worth_compiling(few.expand(1, compiled.MANY, 1), reward)
+    monkeypatch.setattr(compiled, "MANY", 0)
+    assert compiled.worth_compiling(few, reward.double())
+    assert not compiled.worth_compiling(few, reward.half())
+    assert not compiled.worth_compiling(few, reward.requires_grad_())
+    monkeypatch.setattr(compiled, "_numba_is_there", lambda: False)
+    assert not compiled.worth_compiling(few, torch.zeros(1, 1))
 
 
 def test_rollout_takes_stored_actions():

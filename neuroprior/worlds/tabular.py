@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.randomness import generator_on
+from neuroprior.worlds import compiled
 from neuroprior.worlds.chance import Chance
 from neuroprior.worlds.world import Rollout, World, check_plans, check_range, is_integer, join_states
 
@@ -139,6 +140,8 @@ class TabularWorld(World):
     ) -> Rollout:
         """See `World.rollout`. One gather a step for the transitions and one for the rewards, on int32 tables.
 
+        Many plans without chance go through a compiled loop, where numba is installed; it gives the same.
+
         With chance, `generator` gives one uniform number a start and step, however many plans there are.
         """
         self.check_state(state)
@@ -147,6 +150,8 @@ class TabularWorld(World):
         actions = self.num_actions
         table, flat_reward = self.next_state.int().view(-1), self.reward.view(-1)
         cell = self.cell(state)
+        if self.chance is None and compiled.worth_compiling(plans, self.reward):
+            return Rollout(*compiled.rollout(table, self.reward, cell, state - cell, plans, keep_states))
         offset = (state - cell).int()[:, None]
         cell = cell.int()[:, None].expand(batch, num_plans)
         rewards = self.reward.new_empty(length, batch, num_plans)

@@ -1,0 +1,61 @@
+"""Rollouts in tables without chance by a compiled loop: `TabularWorld` takes it where numba is installed."""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+MANY = 2**20
+"""Steps of a rollout that are worth loading numba, and compiling the loop where it was not kept from before."""
+
+
+def worth_compiling(plans: Tensor, reward: Tensor) -> bool:
+    """Whether the loop is there for plans `[B, P, L]`, and quicker even when it has to be loaded first."""
+    plain = reward.dtype in (torch.float32, torch.float64) and not reward.requires_grad
+    return plans.numel() >= MANY and plain and plans.device.type == "cpu" and _numba_is_there()
+
+
+def rollout(
+    table: Tensor, reward: Tensor, cell: Tensor, offset: Tensor, plans: Tensor, keep_states: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Follow plans through a table, each by itself.
+
+    Args:
+        table: int32 `[S * A]`: the cell that each action leads to.
+        reward: `[W, S]` on arrival, or `[W, S, A]` on acting.
+        cell: `[B]`: where plans start.
+        offset: `[B]`: the reward map times S.
+        plans: integers `[B, P, L]`.
+        keep_states: also give the state after each step.
+
+    Returns:
+        The final states `[B, P]`, int64, the rewards `[B, P, L]`, and the states `[B, P, L]` or None.
+    """
+    loop: Any = import_module("neuroprior.worlds.compiled_loop").follow
+    (batch, num_plans, length), rows = plans.shape, plans.shape[:2].numel()
+    actions_of = (plans if plans.dtype == torch.uint8 else plans.long()).reshape(rows, length)
+    given = [x.contiguous().numpy() for x in (table, reward.flatten(), cell, offset, actions_of)]
+    # numpy asks the system for large pages, which torch does not: new memory is ready several times as soon.
+    last, gained = np.empty(rows, np.int64), np.empty((rows, length), given[1].dtype)
+    states = np.empty((rows, length if keep_states else 0), np.int64)
+    sizes = num_plans, len(table) // reward.shape[1], reward.dim() == 2
+
+    def part(begin: int, end: int) -> None:
+        loop(*given, *sizes, begin, end, last, gained, states)
+
+    threads = torch.get_num_threads()
+    edges = [rows * k // threads for k in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:  # the loop lets go of Python's lock
+        list(pool.map(part, edges[:-1], edges[1:]))
+    shaped = [torch.from_numpy(x).view(batch, num_plans, *x.shape[1:]) for x in (last, gained, states)]
+    return shaped[0], shaped[1], shaped[2] if keep_states else None
+
+
+@cache
+def _numba_is_there() -> bool:
+    return find_spec("numba") is not None
