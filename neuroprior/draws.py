@@ -61,11 +61,20 @@ def worth_splitting(children: int, total: int) -> bool:
 
 
 def shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> Tensor:
-    """The prefix of each plan: prefix m `counts[m]` times; root by root, in random order within a root."""
-    row = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+    """The prefix of each plan (int32 where that is enough): m `counts[m]` times; by root, in random order within."""
+    # The narrowest numbers that will do: to shuffle and to sort is to move memory.
+    row = torch.arange(len(counts), device=counts.device, dtype=_narrow(len(counts))).repeat_interleave(counts)
     if len(row) == 0 or len(counts) == int(root[-1]) + 1:
         return row  # one prefix a root
-    row = row[torch.randperm(len(row), generator=generator, device=row.device)]
-    if int(root[-1]) == 0:
+    order = torch.randperm(len(row), generator=generator, device=row.device, dtype=_narrow(len(row)))
+    row = row.index_select(0, order)
+    last = int(root[-1])
+    if last == 0:
         return row
-    return row[root[row].argsort(stable=True)]
+    root = root.to(torch.int16 if last < 2**15 else _narrow(last))
+    return row.index_select(0, root.index_select(0, row).argsort(stable=True))
+
+
+def _narrow(number: int) -> torch.dtype:
+    """The integers that can tell so many things apart and be indices."""
+    return torch.int32 if number < 2**31 else torch.int64
