@@ -8,52 +8,90 @@ from statistics import median
 from typing import Any
 
 import torch
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
+from eval import bench_limits, bench_sizes
+from eval.bench_figures import peers_figure, sizes_figure
 from eval.bench_jobs import JOBS, Job
-from eval.bench_packages import Run
+from eval.bench_tables import limits_table, peers_table, sizes_table
+from eval.bench_times import import_seconds, seconds
+from eval.figures import save
 from neuroprior.output import versions, write_csv, write_json
 
+PARTS = ("peers", "sizes", "limits", "imports")
+
 LISTS: dict[str, dict[str, Any]] = {
-    "jobs": {"default": list(JOBS), "choices": tuple(JOBS), "help": "what to measure; all jobs by default"}
+    "parts": {
+        "default": list(PARTS),
+        "choices": PARTS,
+        "help": "against peers; cost against size; how near the machine's limit; time to import; all by default",
+    },
+    "jobs": {"default": list(JOBS), "choices": tuple(JOBS), "help": "what to measure against peers; all by default"},
 }
 """Options that take several words."""
 
+GOAL = 1.1
+"""`import neuroprior` should take no more than so many times as long as `import torch`."""
+
+Rows = list[dict[str, Any]]
+
 
 def bench(
+    parts: list[str] = list(PARTS),  # noqa: B006
     jobs: list[str] = list(JOBS),  # noqa: B006
     repetitions: int = 5,
     scale: float = 1.0,
     out: str = "runs/bench",
 ) -> None:
-    """Measure the library against its peers; prints a table, writes CSV and results.json.
+    """Measure the library's speed; prints tables, draws figures, writes CSV and results.json.
 
     Args:
-        jobs: what to measure.
+        parts: peers: against what a user would take in place of it; sizes: seconds and memory against size; limits: how
+            near it comes to what the machine can do; imports: the time to import it.
+        jobs: what to measure against peers.
         repetitions: how often each job is timed, in turn with its peers.
-        scale: share of each job that is done; the goals are for 1.
+        scale: share of each job that is done, and of the largest size; the goals are for 1.
         out: folder to write to.
     """
     if repetitions < 1:
         raise ValueError(f"repetitions: at least 1 is expected, not {repetitions}")
     if not 0 < scale <= 1:
         raise ValueError(f"scale: a number above 0 and at most 1 is expected, not {scale}")
-    console, folder, rows = Console(), Path(out), []
+    console, folder = Console(), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     settings = {"repetitions": repetitions, "scale": scale, "threads": torch.get_num_threads()}
-    for name in jobs:
-        with console.status(name):
-            try:
-                rows += list(measured(name, JOBS[name](scale), repetitions, console))
-            except ValueError as error:
-                console.print(f"{name}: left out, {error}")
-        if rows:  # after each job: nothing that was measured is lost
-            write_csv(folder / "bench.csv", rows)
-        write_json(folder / "results.json", {"versions": versions(), "settings": settings, "rows": rows})
-    console.print(_table(rows, settings))
+    found: dict[str, Rows] = {}
+    with console.status("") as status:
+        for what, row in _all_rows(parts, jobs, settings, console, status.update):
+            found.setdefault(what, []).append(row)
+            # After each: nothing that was measured is lost.
+            write_csv(folder / f"{what}.csv", found[what])
+            parts_found = {"rows" if part == "peers" else part: rows for part, rows in found.items()}
+            write_json(folder / "results.json", {"versions": versions(), "settings": settings, **parts_found})
+    _show(found, settings, console, folder)
     console.print(f"written to {folder}")
+
+
+def _all_rows(
+    parts: list[str], jobs: list[str], settings: dict[str, Any], console: Console, says: Any
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Each row with the part that it belongs to."""
+    repetitions, scale = settings["repetitions"], settings["scale"]
+    for name in jobs if "peers" in parts else ():
+        says(name)
+        try:
+            yield from (("peers", row) for row in measured(name, JOBS[name](scale), repetitions, console))
+        except ValueError as error:
+            console.print(f"{name}: left out, {error}")
+    for name, sweep in bench_sizes.SWEEPS.items() if "sizes" in parts else ():
+        says(f"by {name}")
+        yield from (("sizes", row) for row in bench_sizes.measured(name, sweep, scale * sweep.sizes[-1]))
+    if "limits" in parts:
+        says("limits")
+        yield from (("limits", row) for row in bench_limits.measured(scale, repetitions))
+    if "imports" in parts:
+        says("imports")
+        yield "imports", _imports(repetitions)
 
 
 def measured(name: str, job: Job, repetitions: int, console: Console) -> Iterator[dict[str, Any]]:
@@ -72,7 +110,6 @@ def measured(name: str, job: Job, repetitions: int, console: Console) -> Iterato
         ours(), theirs()  # what is first is slow
         torch.set_num_threads(threads)  # packages change it when they are loaded
         times = [(seconds(ours), seconds(theirs) / peer.share) for _ in range(repetitions)]
-        ratios = sorted(theirs / ours for ours, theirs in times)
         yield {
             "job": name,
             "about": job.about,
@@ -81,9 +118,7 @@ def measured(name: str, job: Job, repetitions: int, console: Console) -> Iterato
             "peer": peer.name,
             "peer_seconds": median(theirs for _, theirs in times),
             "share": peer.share,
-            "ratio": median(ratios),
-            "low": ratios[0],
-            "high": ratios[-1],
+            **_ratios([theirs / ours for ours, theirs in times]),
             "goal": peer.goal,
         }
 
@@ -93,28 +128,32 @@ def missing(package: str | None) -> bool:
     return package is not None and find_spec(package) is None
 
 
-def seconds(run: Run) -> float:
-    """How long it takes."""
-    begin = time.perf_counter()
-    run()
-    return time.perf_counter() - begin
+def _imports(repetitions: int) -> dict[str, Any]:
+    """The row of the time to import the library, as a ratio to that of torch."""
+    pair = ("torch", "neuroprior")
+    times = [[import_seconds(package) for package in pair] for _ in range(repetitions + 1)][
+        1:
+    ]  # from the disk at first
+    ratios = _ratios([ours / torchs for torchs, ours in times])
+    return {"seconds": median(ours for _, ours in times), "torch_seconds": median(t for t, _ in times), **ratios} | {
+        "goal": GOAL
+    }
 
 
-def _table(rows: list[dict[str, Any]], settings: dict[str, Any]) -> Table:
-    table = Table(
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-        title=f"Speed with {settings['threads']} threads of torch (medians; ratio: peer's time / ours, min to max)",
-    )
-    for heading in ("job", "seconds", "peer", "ratio", "min", "max", "goal", "met"):
-        table.add_column(heading, justify="left" if heading in ("job", "peer") else "right", overflow="fold")
-    for row in rows:
-        figures = (_short(row[key]) for key in ("ratio", "low", "high", "goal"))
-        met = "" if settings["scale"] < 1 else "yes" if row["ratio"] >= row["goal"] else "no"
-        table.add_row(row["job"], f"{row['seconds']:.3g}", row["peer"], *figures, met)
-    return table
+def _ratios(ratios: list[float]) -> dict[str, float]:
+    return {"ratio": median(ratios), "low": min(ratios), "high": max(ratios)}
 
 
-def _short(number: float) -> str:
-    return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
+def _show(found: dict[str, Rows], settings: dict[str, Any], console: Console, folder: Path) -> None:
+    """Print the tables and draw the figures of all that was measured."""
+    if "peers" in found:
+        console.print(peers_table(found["peers"], settings))
+        save(peers_figure(found["peers"]), folder / "peers.png")
+    if "sizes" in found:
+        console.print(sizes_table(found["sizes"]))
+        save(sizes_figure(found["sizes"]), folder / "sizes.png")
+    if "limits" in found:
+        console.print(limits_table(found["limits"]))
+    for row in found.get("imports", ()):
+        told = f"{row['ratio']:.3f} times as long as torch ({row['low']:.3f} to {row['high']:.3f}; goal: {row['goal']})"
+        console.print(f"import neuroprior: {row['seconds']:.2f} s, {told}")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from eval import bench, bench_packages, bench_peers, bench_training
+from eval import bench, bench_limits, bench_packages, bench_peers, bench_sizes, bench_training
 from eval.__main__ import main
 from eval.bench_jobs import chain_plans, source
 from eval.bench_training import TrainingRace
@@ -145,19 +145,65 @@ def test_the_program(tmp_path, capsys):
     assert main(["bench", "--jobs", *jobs, "--repetitions", "2", "--scale", str(SMALL), "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "results.json").read_text())
     assert {row["job"] for row in results["rows"]} == set(jobs)
-    for row in results["rows"]:
+    for row in [*results["rows"], *results["imports"]]:
         assert 0 < row["low"] <= row["ratio"] <= row["high"]
         assert row["goal"] > 0
-    assert (tmp_path / "bench.csv").read_text().count("\n") == len(results["rows"]) + 1
+    assert {row["growing"] for row in results["sizes"]} == set(bench_sizes.SWEEPS) - {"length sampled"}
+    assert [row["work"] for row in results["limits"]][:2] == ["copy", "product"]
+    assert len(results["limits"]) == 6
+    for part in ("peers", "sizes", "limits", "imports"):
+        rows = results["rows" if part == "peers" else part]
+        assert (tmp_path / f"{part}.csv").read_text().count("\n") == len(rows) + 1
+    for name in ("peers", "sizes"):
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     shown = capsys.readouterr().out
     assert "…" not in shown
     assert "numpy bincount" in shown
+    assert "import neuroprior:" in shown
+
+
+def test_parts_by_themselves(tmp_path):
+    assert main(["bench", "--parts", "imports", "--repetitions", "1", "--out", str(tmp_path)]) == 0
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert "rows" not in results
+    assert len(results["imports"]) == 1
+
+
+def test_sizes_grow_and_memory_is_seen():
+    """A sweep whose result takes eight bytes for each of its size, and four times as many on the way."""
+
+    def make(size):
+        return lambda: torch.ones(4 * size, dtype=torch.float64)[:size].clone()
+
+    rows = list(bench_sizes.measured("x", bench_sizes.Sweep("", (10**3, 10**7, 10**8), make), 10**7))
+    assert [(row["size"], row["result_bytes"]) for row in rows] == [(10**3, 8 * 10**3), (10**7, 8 * 10**7)]
+    if rows[-1]["peak_bytes"] is not None:
+        assert 4.5 * 8 * 10**7 < rows[-1]["peak_bytes"] < 6 * 8 * 10**7
+
+
+def test_the_slope_is_that_of_the_last_decades():
+    rows = [{"size": 10**k, "seconds": 1.0 if k < 3 else 10.0 ** (1.5 * (k - 3))} for k in range(6)]
+    assert bench_sizes.slope(rows) == pytest.approx(1.5)
+    assert bench_sizes.slope(rows[:1]) is None
+
+
+def test_the_share_of_the_limit(monkeypatch):
+    """On a machine that copies in a second, and multiplies in two, work of half the bytes in four seconds."""
+    work = bench_limits.Work("half", lambda: None, bench_limits.COPIED, bench_limits.SIDE**3)
+    seconds = iter([1.0, 2.0, 4.0])
+    monkeypatch.setattr(bench_limits, "works", lambda scale: [lambda: work])
+    monkeypatch.setattr(bench_limits, "seconds_again", lambda run, repetitions: next(seconds))
+    *_, row = bench_limits.measured(1.0, 1)
+    assert row["bound"] == "arithmetic"
+    assert row["share"] == pytest.approx(0.25)
+    rates = {"memory": 1.0, "arithmetic": 1e30}
+    assert bench_limits._row(work, 2.0 * bench_limits.COPIED, rates)["share"] == pytest.approx(0.5)
 
 
 def test_what_is_not_installed_is_left_out(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bench, "missing", lambda package: package is not None)
-    jobs = ["evaluate", "shoot"]
-    assert main(["bench", "--jobs", *jobs, "--repetitions", "1", "--scale", str(SMALL), "--out", str(tmp_path)]) == 0
+    options = ["--jobs", "evaluate", "shoot", "--parts", "peers", "--repetitions", "1", "--scale", str(SMALL)]
+    assert main(["bench", *options, "--out", str(tmp_path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "numba, parallel left out, numba is not installed" in said
     assert "shoot: left out, minigrid is not installed" in said
