@@ -146,14 +146,16 @@ def sample_in_world(
             logits = logits.masked_fill(~world.legal(now), -torch.inf)
         if not alone and (world.stochastic or 2 * logits.numel() > batch * num_plans):
             alone, row = True, shuffled_rows(counts, root, generator)
-            logits, memory, now, tried = logits[row], memory[row], now[row], _rows(tried, row)
+            logits, memory, now = _taken(row, logits, memory, now)
+            tried = [_taken(row, *column) for column in tried]
         if alone:
             action = draw.actions(logits)
         else:
             children = draw.split(counts, logits)
             row, action = children.nonzero(as_tuple=True)
-            counts, root = children[row, action], root[row]
-            memory, now, tried = memory[row], now[row], _rows(tried, row)
+            counts = children[row, action]
+            root, memory, now = _taken(row, root, memory, now)
+            tried = [_taken(row, *column) for column in tried]
         now, reward = world.step(now, action, generator)
         for column, what in zip(tried, (action.to(draw.dtype), reward, now), strict=True):
             column.append(what)
@@ -163,7 +165,7 @@ def sample_in_world(
             logits, memory = prior.step(action, memory, world.observe(now) if prior.context_per == "step" else None)
     if not alone:
         row = shuffled_rows(counts, root, generator)
-        now, tried = now[row], _rows(tried, row)
+        (now,), tried = _taken(row, now), [_taken(row, *column) for column in tried]
     course = join_states(tried[2], state, (batch, num_plans, *state.shape[1:])) if keep_states else None
     # no step at all leaves nothing to stack
     none = (torch.zeros(len(now), 0, dtype=draw.dtype), torch.zeros(len(now), 0))
@@ -174,8 +176,9 @@ def sample_in_world(
     return plans.view(shape), Rollout(now.view(*shape[:2], *state.shape[1:]), gained.view(shape), course)
 
 
-def _rows(columns: list[list[Tensor]], row: Tensor) -> list[list[Tensor]]:
-    return [[step[row] for step in column] for column in columns]
+def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
+    """These rows of each; several times as quick as by brackets where rows are long."""
+    return [tensor.index_select(0, row) for tensor in tensors]
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
@@ -210,10 +213,10 @@ def _grow(
         children = draw.split(counts, logits)
         parent, action = children.nonzero(as_tuple=True)
         counts = children[parent, action]
-        prefix = torch.cat([prefix[parent], action[:, None].to(draw.dtype)], 1)
-        root = root[parent]
+        prefix, root = _taken(parent, prefix, root)
+        prefix = torch.cat([prefix, action[:, None].to(draw.dtype)], 1)
         if prefix.shape[1] < length:
-            logits, state = prior.step(action, state[parent])
+            logits, state = prior.step(action, state.index_select(0, parent))
             logits = after_end(logits, action, draw.end)
     row = shuffled_rows(counts, root, draw.generator)
     depth = prefix.shape[1]
@@ -224,7 +227,7 @@ def _grow(
     plans[:, :depth] = begun
     for at in range(0, total, batch_size):
         some = row[at : at + batch_size]
-        now, memory = logits[some], state[some]
+        now, memory = _taken(some, logits, state)
         for t in range(depth, length):
             action = draw.actions(now)
             plans[at : at + batch_size, t] = action

@@ -196,3 +196,46 @@ def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, sees,
     for one, other, third in zip(fast, plain, rough, strict=True):
         torch.testing.assert_close(one, other.detach(), atol=1e-6, rtol=1e-5)
         torch.testing.assert_close(third.float(), one, atol=0.05, rtol=0.05)
+
+
+@pytest.mark.parametrize("lags", [1, 3])
+@pytest.mark.parametrize("window", [None, 4, 9])
+@pytest.mark.parametrize("span", [None, 3])
+@pytest.mark.parametrize("sees", [{}, {"num_contexts": 3}, {"context_size": 2}])
+def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, span, sees, monkeypatch):
+    """Without gradients a step writes behind a copy of the cache; with them, and past a window or span, it does not."""
+    prior = TransformerPrior(4, width=8, num_heads=2, window=window, lags=lags, dropout=0.3, seed=1, **sees)
+    prior.span, batch = span, 3
+    action = torch.randint(4, (7, batch), generator=seeded(0))
+    context = {"num_contexts": torch.arange(batch), "context_size": torch.rand(batch, 2, generator=seeded(1))}
+    seen = next((context[name] for name in sees), None)
+    may, answers = prior._may_write, []
+    monkeypatch.setattr(prior, "_may_write", lambda state: answers.append(may(state)) or answers[-1])
+
+    def steps(state_grad):
+        with torch.set_grad_enabled(state_grad):
+            logits, state = prior.start(batch, seen)
+            told = [logits]
+            for one in action:
+                logits, state = prior.step(one, state)
+                told.append(logits)
+        return torch.stack(told), state
+
+    fast = steps(False)
+    # Of s + 1 inputs the first s are in the cache when the last is read.
+    assert answers == [s <= min(window or 99, (span or 99) - 1) for s in range(1, len(action) + 1)]
+    plain = steps(True)
+    assert not any(answers[len(action) :])
+    assert plain[0].requires_grad
+    for one, other in zip(fast, plain, strict=True):
+        torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
+
+
+def test_a_transformer_in_training_or_in_rough_numbers_does_not_write_in_place():
+    prior = TransformerPrior(4, width=8, num_heads=2)
+    with torch.no_grad():
+        _, state = prior.start(3)
+        assert prior._may_write(state)
+        with torch.autocast("cpu", torch.bfloat16):
+            assert not prior._may_write(state)
+        assert not prior.train()._may_write(state)

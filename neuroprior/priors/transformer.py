@@ -92,6 +92,41 @@ class TransformerPrior(NeuralPrior):
             caches.append(cache)
         return self.head(self.norm(x)), torch.cat([recent, torch.stack(caches, 2).flatten(1)], 1)
 
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        if not self._may_write(state):
+            return super().step(action, state, context)
+        memory, history = self._open(state)
+        new = self._inputs(action, context, history[:, -1])
+        kept = 0 if self.window is None else history[0].numel()
+        recent, past, cached = self.lags - 1, memory.shape[1], memory.shape[1] + self._cache_size
+        # The cache is most of what there is to move: it is copied once, and new keys and values are written behind it.
+        after = state.new_empty(len(state), cached + kept + self.input_size)
+        after[:, recent:past] = memory[:, recent:]
+        x, after[:, :recent] = self.embedding(new[:, None], memory[:, :recent])
+        places = after[:, recent:cached].unflatten(1, (-1, self.num_layers, 2 * self.width))
+        for layer, block in enumerate(self.blocks):
+            assert isinstance(block, _Block)
+            x = block.step(x, places[:, :, layer])
+        after[:, cached : cached + kept] = state[:, past : past + kept]
+        after[:, cached + kept :] = new
+        return self.head(self.norm(x))[:, 0], after
+
+    def _may_write(self, state: Tensor) -> bool:
+        """Whether `step` can write a state in place: nothing is learned, and nothing falls out of the window."""
+        if state.dim() == 3 or self.training or torch.is_grad_enabled():
+            return False
+        if torch.is_autocast_enabled(state.device.type):
+            return False
+        memory, history = self._open(state)
+        read = (memory.shape[1] - self.lags + 1) // self._cache_size
+        fits = self.window is None or history.shape[1] <= self.window
+        return fits and (self.span is None or read < self.span)
+
+    @property
+    def _cache_size(self) -> int:
+        """Numbers that are kept of an input."""
+        return self.num_layers * 2 * self.width
+
     def _encode_in_parts(self, inputs: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor]:
         """The same for a long sequence, part by part: attention costs the square of what is read at once."""
         logits = []
@@ -102,10 +137,9 @@ class TransformerPrior(NeuralPrior):
         return torch.cat(logits, 1), memory
 
     def memory_size(self, state_size: int) -> int:
-        cache = self.num_layers * 2 * self.width
         if self.window is None:
             return state_size - self.input_size
-        return (state_size - self.lags + 1) // (cache + self.input_size) * cache + self.lags - 1
+        return (state_size - self.lags + 1) // (self._cache_size + self.input_size) * self._cache_size + self.lags - 1
 
 
 class _Block(nn.Module):
@@ -128,19 +162,36 @@ class _Block(nn.Module):
         Each input attends to itself and those before it, at most `span` back. Positions count from the first of the
         past; where that moves, because only the last `span` are kept, the kept keys are turned back by as much.
         """
-        query, key, value = self.query_key_value(self.attention_norm(x)).chunk(3, -1)
         start = 0 if past is None else past.shape[1]
         place = torch.arange(start, start + x.shape[1], device=x.device)
-        query, key = self._rotate(query, place), self._rotate(key, place)
+        query, key, value = self._project(x, place)
         if past is not None:
             # under autocast new keys and values may be of another dtype than kept ones
             key, value = torch.cat([past.to(key.dtype), torch.cat([key, value], -1)], 1).chunk(2, -1)
-        mixed = self._attend(query, key, value, span)
-        x = x + self.drop(self.out(mixed))
+        x = self._add(x, self._attend(query, key, value, span))
         excess = 0 if span is None else max(key.shape[1] - span, 0)
         if excess:
             key, value = self._rotate(key[:, excess:], torch.full_like(place[:1], -excess)), value[:, excess:]
-        return x + self.drop(self.mlp(x)), torch.cat([key, value], -1)
+        return x, torch.cat([key, value], -1)
+
+    def step(self, x: Tensor, cache: Tensor) -> Tensor:
+        """The new `x [N, 1, width]`; keys and values are written to the last place of `cache [N, S, 2 * width]`."""
+        last = cache.shape[1] - 1
+        query, key, value = self._project(x, torch.arange(last, last + 1, device=x.device))
+        cache[:, last:] = torch.cat([key, value], -1)
+        key, value = cache.chunk(2, -1)
+        return self._add(x, self._attend(query, key, value, None))
+
+    def _project(self, x: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries, keys and values of `x [N, T, width]`, turned to their places `[T]`."""
+        query, key, value = self.query_key_value(self.attention_norm(x)).chunk(3, -1)
+        return self._rotate(query, place), self._rotate(key, place), value
+
+    def _add(self, x: Tensor, mixed: Tensor) -> Tensor:
+        """What attention found, and then the two-layer network, added to `x`."""
+        x = x + self.drop(self.out(mixed))
+        added: Tensor = self.drop(self.mlp(x))
+        return x + added
 
     def _attend(self, query: Tensor, key: Tensor, value: Tensor, span: int | None) -> Tensor:
         """`[N, T, width]`: for each query what it finds among keys and values `[N, S + T, width]`."""
