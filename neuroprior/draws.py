@@ -24,12 +24,15 @@ class Draw:
         self.num_actions, self.temperature, self.generator, self.end = num_actions, temperature, generator, end
         self.dtype = action_dtype(num_actions)
 
-    def actions(self, logits: Tensor) -> Tensor:
-        """One action a row of `logits [N, A]`: int64 `[N]`. Actions of probability 0 are never drawn."""
+    def uniform(self, shape: tuple[int, ...], logits: Tensor) -> Tensor:
+        """Numbers from 0 to below 1 to draw actions by, of the dtype of their `logits`."""
+        return torch.rand(shape, generator=self.generator, device=logits.device, dtype=logits.dtype)
+
+    def actions(self, logits: Tensor, uniform: Tensor) -> Tensor:
+        """One action a row of `logits [N, A]`, by `uniform [N]`: int64 `[N]`. None of probability 0 is ever drawn."""
         # A row an action: with few actions and many rows each operation is several times as fast this way round.
         cumulative = self._weights(logits.T.contiguous(), 0).cumsum(0)
         total = cumulative[-1]
-        uniform = torch.rand(len(logits), generator=self.generator, device=logits.device, dtype=cumulative.dtype)
         action = (cumulative <= uniform * total).sum(0)
         # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
         return torch.minimum(action, (cumulative < total).sum(0))

@@ -10,6 +10,9 @@ from neuroprior.plans import sees_each_step
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import Rollout, World, is_integer, join_states
 
+CACHED, FEWEST = 2**19, 256
+"""Numbers in the states of plans that are drawn together on a CPU; and the fewest plans: each step costs time, too."""
+
 
 class Steppable(Protocol):
     """What sampling knows of a prior."""
@@ -24,6 +27,10 @@ class Steppable(Protocol):
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]: ...
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]: ...
+
+    def advance(
+        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
+    ) -> tuple[Tensor, Tensor]: ...
 
     def check_context_of(self, plans: Tensor | None, num_plans: int = 0, length: int = 0) -> None: ...
 
@@ -149,7 +156,7 @@ def sample_in_world(
             logits, memory, now = _taken(row, logits, memory, now)
             tried = [_taken(row, *column) for column in tried]
         if alone:
-            action = draw.actions(logits)
+            action = draw.actions(logits, draw.uniform((len(logits),), logits))
         else:
             children = draw.split(counts, logits)
             row, action = children.nonzero(as_tuple=True)
@@ -227,12 +234,28 @@ def _grow(
     plans[:, :depth] = begun
     for at in range(0, total, batch_size):
         some = row[at : at + batch_size]
-        now, memory = _taken(some, logits, state)
-        for t in range(depth, length):
-            action = draw.actions(now)
-            plans[at : at + batch_size, t] = action
-            if t + 1 < length:
-                seen = context[some, t + 1] if context is not None and per_step else None
-                now, memory = prior.step(action, memory, seen)
-                now = after_end(now, action, draw.end)
+        seen = context if per_step else None
+        plans[at : at + batch_size, depth:] = _one_by_one(prior, some, logits, state, seen, range(depth, length), draw)
     return plans
+
+
+def _one_by_one(
+    prior: Steppable, row: Tensor, logits: Tensor, state: Tensor, context: Tensor | None, steps: range, draw: Draw
+) -> Tensor:
+    """The actions `[N, len(steps)]` of plans that go on by themselves, from what `row [N]` says of logits and state."""
+    actions = torch.empty(len(row), len(steps), dtype=draw.dtype, device=row.device)
+    uniform = draw.uniform((len(steps), len(row)), logits)
+    together = len(row)
+    if row.device.type == "cpu":  # states that fit a cache are several times as quick to read
+        together = max(CACHED // max(state[0].numel(), 1), FEWEST)
+    for at in range(0, len(row), together):
+        part = slice(at, at + together)
+        now, memory = _taken(row[part], logits, state)
+        for k, t in enumerate(steps):
+            action = draw.actions(now, uniform[k, part])
+            actions[part, k] = action
+            if k + 1 < len(steps):
+                seen = None if context is None else context[row[part], t + 1]
+                now, memory = prior.advance(action, memory, seen, len(steps) - k - 2)
+                now = after_end(now, action, draw.end)
+    return actions

@@ -227,8 +227,30 @@ def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, spa
     plain = steps(True)
     assert not any(answers[len(action) :])
     assert plain[0].requires_grad
-    for one, other in zip(fast, plain, strict=True):
+    monkeypatch.setattr(prior, "step", lambda one, state: prior.advance(one, state, None, len(action)))
+    written_over = steps(False)
+    for one, other, third in zip(fast, plain, written_over, strict=True):
         torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
+        assert torch.equal(one, third)
+
+
+def test_a_transformer_that_advances_takes_memory_once():
+    """A step leaves the state as it was; to advance takes room for all further steps, and then writes there."""
+    prior = TransformerPrior(4, width=8, num_heads=2, window=9)
+    with torch.no_grad():
+        _, state = prior.start(3)
+        whole = state.clone()
+        _, after = prior.step(torch.tensor([0, 1, 2]), state)
+        assert torch.equal(state, whole)
+        _, first = prior.advance(torch.tensor([0, 1, 2]), state, None, 2)
+        assert torch.equal(first, after)
+        places = {first.data_ptr()}
+        for _ in range(2):
+            _, first = prior.advance(torch.tensor([3, 1, 0]), first, None, 0)
+            places.add(first.data_ptr())
+        assert len(places) == 1
+        _, more = prior.advance(torch.tensor([3, 1, 0]), first, None, 0)
+        assert more.data_ptr() not in places
 
 
 def test_a_transformer_in_training_or_in_rough_numbers_does_not_write_in_place():

@@ -15,6 +15,7 @@ from neuroprior import (
     World,
     sample,
     sample_in_world,
+    sampling,
 )
 from tests.sources import (
     FALSE_ALARM,
@@ -108,7 +109,7 @@ def test_nor_at_the_ends_of_the_uniform_distribution(never, uniform, monkeypatch
     prior = TablePrior.random(A, 3, seed=4)
     for logits in prior.logits:
         logits[..., never] = -torch.inf
-    monkeypatch.setattr(torch, "rand", lambda *size, dtype=None, **_: torch.full(size, uniform, dtype=dtype))
+    monkeypatch.setattr(torch, "rand", lambda size, dtype=None, **_: torch.full(size, uniform, dtype=dtype))
     plans = sample(prior, 100, 3, generator=seeded(5), method="ancestral")
     assert not set(plans.unique().tolist()) & set(never)
 
@@ -197,6 +198,19 @@ def test_batches_bound_memory_and_change_nothing_else(method):
     plans = sample(prior, 20_000, 6, generator=seeded(0), method=method, batch_size=999)
     assert max(largest) <= (999 if method == "ancestral" else 20_000 // 8)
     assert fits(plans, distribution(TablePrior.random(A, 6), 6), A)
+
+
+@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
+def test_plans_drawn_together_in_parts_are_the_same(kind, monkeypatch):
+    prior = kind(3, lags=2)
+
+    def draws():
+        return sample(prior, 50, 6, generator=seeded(0), method="ancestral")
+
+    whole = draws()
+    monkeypatch.setattr(sampling, "CACHED", 1)
+    monkeypatch.setattr(sampling, "FEWEST", 7)
+    assert torch.equal(draws(), whole)
 
 
 def test_a_tree_evaluates_each_prefix_once():

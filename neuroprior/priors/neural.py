@@ -289,7 +289,11 @@ class Embedding(nn.Module):
             recent = now.new_full((len(now), self.lags - 1), self.nothing)
         line = torch.cat([recent.to(now), now], 1)
         if self.past is not None and self.mix is not None:
-            vectors = vectors + self.mix(self.past(line.long()).transpose(1, 2)).transpose(1, 2)
+            seen = self.past(line.long()).transpose(1, 2)
+            if now.shape[1] == 1:  # one output of a convolution is a product, which is quicker
+                vectors = vectors + nn.functional.linear(seen.flatten(1), self.mix.weight.flatten(1))[:, None]
+            else:
+                vectors = vectors + self.mix(seen).transpose(1, 2)
         if self.index is not None:
             vectors = vectors + self.index(inputs[..., 1].long())
         if self.features is not None:

@@ -130,6 +130,17 @@ class Prior(nn.Module, ABC):
             Logits `[N, A]` of the next action, and the next state.
         """
 
+    def advance(
+        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        """As `step`, for callers that need the old state no more: it may be written over.
+
+        Args:
+            action, state, context: see `step`.
+            room: so many further steps are to come, for which memory may be taken at once.
+        """
+        return self.step(action, state, context)
+
     @abstractmethod
     def fit(self, plans: Plans | Tensor) -> Self:
         """Learn from executed plans; returns self. A tensor `[N, L]` is taken as plans without context."""

@@ -95,19 +95,42 @@ class TransformerPrior(NeuralPrior):
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if not self._may_write(state):
             return super().step(action, state, context)
+        return self._write(action, state, context, 0)
+
+    def advance(
+        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        if not self._may_write(state):
+            return super().step(action, state, context)
+        return self._write(action, state, context, room + 1)
+
+    def _write(self, action: Tensor, state: Tensor, context: Tensor | None, room: int) -> tuple[Tensor, Tensor]:
+        """A step in which new keys and values are written behind the cache, which is most of what there is to move.
+
+        Args:
+            action, state, context: see `step`.
+            room: 0: the cache is copied once, and `state` stays as it is. Else, where there is room behind each of its
+                rows, it is written over; where there is none, it is copied to where so many steps have room.
+        """
         memory, history = self._open(state)
         new = self._inputs(action, context, history[:, -1])
         kept = 0 if self.window is None else history[0].numel()
         recent, past, cached = self.lags - 1, memory.shape[1], memory.shape[1] + self._cache_size
-        # The cache is most of what there is to move: it is copied once, and new keys and values are written behind it.
-        after = state.new_empty(len(state), cached + kept + self.input_size)
-        after[:, recent:past] = memory[:, recent:]
-        x, after[:, :recent] = self.embedding(new[:, None], memory[:, :recent])
+        before = state[:, past : past + kept].clone()  # where the cache will be
+        size = cached + kept + self.input_size
+        x, line = self.embedding(new[:, None], memory[:, :recent])
+        if room and state.stride(0) >= size:
+            after = state.as_strided((len(state), size), state.stride())
+        else:
+            most = size + max(room - 1, 0) * (self._cache_size + self.input_size)
+            after = state.new_empty(len(state), most)[:, :size]
+            after[:, recent:past] = memory[:, recent:]
+        after[:, :recent] = line
         places = after[:, recent:cached].unflatten(1, (-1, self.num_layers, 2 * self.width))
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, _Block)
             x = block.step(x, places[:, :, layer])
-        after[:, cached : cached + kept] = state[:, past : past + kept]
+        after[:, cached : cached + kept] = before
         after[:, cached + kept :] = new
         return self.head(self.norm(x))[:, 0], after
 
