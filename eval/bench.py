@@ -10,21 +10,21 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from eval import bench_limits, bench_sizes
+from eval import bench_gpu, bench_limits, bench_sizes
 from eval.bench_figures import peers_figure, sizes_figure
 from eval.bench_jobs import JOBS, Job
-from eval.bench_tables import limits_table, peers_table, sizes_table
+from eval.bench_tables import gpu_table, limits_table, peers_table, sizes_table
 from eval.bench_times import import_seconds, seconds
 from eval.figures import save
 from neuroprior.output import versions, write_csv, write_json
 
-PARTS = ("peers", "sizes", "limits", "imports")
+PARTS = ("peers", "sizes", "limits", "imports", "gpu")
 
 LISTS: dict[str, dict[str, Any]] = {
     "parts": {
         "default": list(PARTS),
         "choices": PARTS,
-        "help": "against peers; cost against size; how near the machine's limit; time to import; all by default",
+        "help": "against peers; cost against size; share of the machine's limit; time to import; a GPU; default: all",
     },
     "jobs": {"default": list(JOBS), "choices": tuple(JOBS), "help": "what to measure against peers; all by default"},
 }
@@ -47,7 +47,8 @@ def bench(
 
     Args:
         parts: peers: against what a user would take in place of it; sizes: seconds and memory against size; limits: how
-            near it comes to what the machine can do; imports: the time to import it.
+            near it comes to what the machine can do; imports: the time to import it; gpu: seconds of the same jobs on a
+            CUDA GPU, where one is there.
         jobs: what to measure against peers.
         repetitions: how often each job is timed, in turn with its peers.
         scale: share of each job that is done, and of the largest size; the goals are for 1.
@@ -92,6 +93,11 @@ def _all_rows(
     if "imports" in parts:
         says("imports")
         yield "imports", _imports(repetitions)
+    if "gpu" in parts and torch.cuda.is_available():
+        says("gpu")
+        yield from (("gpu", row) for row in bench_gpu.measured(torch.device("cuda"), scale, repetitions))
+    elif "gpu" in parts:
+        console.print("gpu: left out, there is no CUDA device")
 
 
 def measured(name: str, job: Job, repetitions: int, console: Console) -> Iterator[dict[str, Any]]:
@@ -100,7 +106,7 @@ def measured(name: str, job: Job, repetitions: int, console: Console) -> Iterato
         console.print(f"{name}: left out, {job.needs} is not installed")
         return
     threads, begin = torch.get_num_threads(), time.perf_counter()
-    ours = job.make()
+    ours = job.make(torch.device("cpu"))
     setup = time.perf_counter() - begin
     for peer in job.peers:
         if missing(peer.needs):
@@ -154,6 +160,8 @@ def _show(found: dict[str, Rows], settings: dict[str, Any], console: Console, fo
         save(sizes_figure(found["sizes"]), folder / "sizes.png")
     if "limits" in found:
         console.print(limits_table(found["limits"]))
+    if "gpu" in found:
+        console.print(gpu_table(found["gpu"]))
     for row in found.get("imports", ()):
         told = f"{row['ratio']:.3f} times as long as torch ({row['low']:.3f} to {row['high']:.3f}; goal: {row['goal']})"
         console.print(f"import neuroprior: {row['seconds']:.2f} s, {told}")

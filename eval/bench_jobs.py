@@ -50,25 +50,25 @@ class Job:
 
     Attributes:
         about: as in the tables.
-        make: prepares it; what it returns is timed.
-        peers: the rivals in the same run.
+        make: prepares it on a device; what it returns is timed.
+        peers: the rivals in the same run, which know the CPU alone.
         needs: the package without which it is left out; None: it is always there.
     """
 
     about: str
-    make: Callable[[], Run]
+    make: Callable[[torch.device], Run]
     peers: tuple[Peer, ...]
     needs: str | None = None
 
 
 def sample_short(scale: float) -> Job:
     """Many short plans, which share their beginnings."""
-    return _against_generate(_scaled(2_560_000, scale), 8, [_scaled(size, scale) for size in (1024, 8192, 65_536)], 500)
+    return _against_generate(scaled(2_560_000, scale), 8, [scaled(size, scale) for size in (1024, 8192, 65_536)], 500)
 
 
 def sample_long(scale: float) -> Job:
     """Long plans, of which hardly two begin alike."""
-    return _against_generate(_scaled(8192, scale), 64, [_scaled(size, scale) for size in (512, 2048, 8192)], 10)
+    return _against_generate(scaled(8192, scale), 64, [scaled(size, scale) for size in (512, 2048, 8192)], 10)
 
 
 def _against_generate(number: int, length: int, batches: list[int], goal: float) -> Job:
@@ -84,27 +84,29 @@ def _against_generate(number: int, length: int, batches: list[int], goal: float)
         for batch in sorted(set(batches))
     ]
     about = f"sample {number:,} plans of length {length}, transformer"
-    return Job(about, lambda: partial(TransformerPrior(4).sample, number, length), tuple(peers))
+    return Job(about, lambda device: partial(TransformerPrior(4).to(device).sample, number, length), tuple(peers))
 
 
 def sample_gru(scale: float) -> Job:
     """Long plans of a GRU."""
-    number = _scaled(8192, scale)
+    number = scaled(8192, scale)
     plain = Peer("plain PyTorch", lambda: partial(bench_peers.PlainGRU(4).eval().sample, number, 64), 3)
     return Job(
-        f"sample {number:,} plans of length 64, GRU", lambda: partial(GRUPrior(4, lags=1).sample, number, 64), (plain,)
+        f"sample {number:,} plans of length 64, GRU",
+        lambda device: partial(GRUPrior(4, lags=1).to(device).sample, number, 64),
+        (plain,),
     )
 
 
 def sample_markov(scale: float) -> Job:
     """Many short plans of a chain."""
-    number, plans = _scaled(2_560_000, scale), chain_plans(10_000, 16)
+    number, plans = scaled(2_560_000, scale), chain_plans(10_000, 16)
     prior = MarkovPrior(4, 2).fit(plans)
     tables = prior.log_probs.exp().double().numpy(), prior.next_node.numpy(), int(prior.start_node)
     few = min(10_000, number)
     return Job(
         f"sample {number:,} plans of length 8, Markov-2",
-        lambda: partial(prior.sample, number, 8),
+        lambda device: partial(prior.to(device).sample, number, 8),
         (
             Peer("numpy", lambda: partial(bench_peers.numpy_sample, *tables, number, 8), 20),
             Peer(
@@ -120,11 +122,11 @@ def sample_markov(scale: float) -> Job:
 
 def fit_markov(scale: float) -> Job:
     """Counts of many plans."""
-    plans = chain_plans(_scaled(1_000_000, scale), 32)
+    plans = chain_plans(scaled(1_000_000, scale), 32)
     array = plans.numpy()
     return Job(
         f"fit Markov-2 on {len(plans):,} plans of length 32",
-        lambda: lambda: MarkovPrior(4, 2).fit(plans),
+        lambda device: lambda: MarkovPrior(4, 2).fit(plans),
         (
             Peer("numpy bincount", lambda: partial(bench_peers.numpy_counts, array, 4, 2), 3),
             Peer("numpy add.at", lambda: partial(bench_peers.numpy_add_at, array, 4, 2), 3),
@@ -135,25 +137,25 @@ def fit_markov(scale: float) -> Job:
 
 def fit_tree(scale: float) -> Job:
     """Context trees of one long sequence."""
-    plan = chain_plans(1, _scaled(1_000_000, scale))
+    plan = chain_plans(1, scaled(1_000_000, scale))
     rust = Peer("vlmc (Rust)", partial(bench_packages.vlmc_fit, plan[0].tolist(), 4, 10), 1, needs="vlmc")
     return Job(
         f"fit context trees, depth 10, {plan.numel():,} actions",
-        lambda: lambda: ContextTreePrior(4, 10).fit(plan),
+        lambda device: lambda: ContextTreePrior(4, 10).fit(plan),
         (rust,),
     )
 
 
 def evaluate(scale: float) -> Job:
     """Candidate plans tried in a table."""
-    starts = _scaled(10_000, scale)
+    starts = scaled(10_000, scale)
     world, generator = gridworld(20, 20, "torus", num_worlds=10), torch.Generator().manual_seed(0)
     state = world.reset(starts, generator)
     plans = UniformPrior(4).sample(starts * 256, 8, generator=generator).view(starts, 256, 8)
     given = world.next_state, world.reward, state, plans
     return Job(
         f"evaluate {starts:,} starts x 256 plans x 8 steps",
-        lambda: partial(world.rollout, state, plans),
+        lambda device: partial(world.to(device).rollout, state.to(device), plans.to(device)),
         (
             Peer("plain torch indexing", lambda: partial(bench_peers.torch_rollout, *given), 5),
             Peer("numba, parallel", partial(bench_packages.numba_rollout, *given), 1, needs="numba"),
@@ -163,35 +165,35 @@ def evaluate(scale: float) -> Job:
 
 def table_1(scale: float) -> Job:
     """The paper's first table without its neural priors."""
-    starts = _scaled(10_000, scale)
+    starts = scaled(10_000, scale)
     size = Size(1, starts, starts, 20, 1.0, 4, 8, 256, 0)
     world = gridworld(20, 20, "torus")
     start = world.reset(starts, torch.Generator().manual_seed(0))
     script = partial(bench_peers.numpy_table_1, world.reward[0].numpy(), start.numpy(), 256, 8, 4, (1, 2, 3))
     return Job(
         f"the paper's Table 1, Markov rows, {starts:,} starts",
-        lambda: partial(simulate, Protocol("torus", "uniform", "all"), size, False, lambda what: None),
+        lambda device: partial(simulate, Protocol("torus", "uniform", "all"), size, False, lambda what: None),
         (Peer("numpy script", lambda: script, 20),),
     )
 
 
 def train(scale: float) -> Job:
     """A GRU trained until it is within 1 % of the entropy rate."""
-    race = TrainingRace(source(), chain_plans(_scaled(100_000, scale), 16))
+    race = TrainingRace(source(), chain_plans(scaled(100_000, scale), 16))
     return Job(
         f"train GRU-64 to 1 % of the entropy rate, {len(race.plans):,} plans of length 16",
-        race.ours,
+        lambda device: race.ours(),
         (Peer("plain PyTorch, DataLoader", race.theirs, 3),),
     )
 
 
 def shoot(scale: float) -> Job:
     """Random shooting in a Gymnasium environment; its table is made before, which `setup_seconds` tells."""
-    starts, few = _scaled(100, scale), _scaled(32, scale)
+    starts, few = scaled(100, scale), scaled(32, scale)
     uniform = UniformPrior(7)
     plans = uniform.sample(256, 16)
 
-    def make() -> Run:
+    def make(device: torch.device) -> Run:
         world = from_gymnasium(FOUR_ROOMS, seeds=[0], starts="any", progress=False)
         state = world.reset(starts, torch.Generator().manual_seed(0))
         return partial(SamplingPlanner(uniform, 16, 256, objective="return").plan, world, state)
@@ -219,14 +221,18 @@ def shoot(scale: float) -> Job:
 
 def decide(scale: float) -> Job:
     """One decision from many starts, against trees with as many model steps, of which an eighth are timed."""
-    starts, steps, simulations = _scaled(4096, scale), 256 * 8, 256
+    starts, steps, simulations = scaled(4096, scale), 256 * 8, 256
     world = gridworld(20, 20, "torus", num_worlds=10)
     state = world.reset(starts, torch.Generator().manual_seed(0))
-    planner = SamplingPlanner(MarkovPrior(4, 2).fit(chain_plans(10_000, 16)), 8, 256, objective="return")
     given = world.next_state, world.reward, state, simulations, 8
+
+    def make(device: torch.device) -> Run:
+        prior = MarkovPrior(4, 2).fit(chain_plans(10_000, 16)).to(device)
+        return partial(SamplingPlanner(prior, 8, 256, objective="return").plan, world.to(device), state.to(device))
+
     return Job(
         f"one decision with 256 candidates of 8 steps from {starts:,} starts",
-        lambda: partial(planner.plan, world, state),
+        make,
         tuple(
             Peer(
                 f"mctx, {name}",
@@ -258,6 +264,9 @@ JOBS: dict[str, Callable[[float], Job]] = {
 }
 """By name; each makes its job at a scale: 1 is the size of the goals."""
 
+ON_DEVICES = ("sample_short", "sample_long", "sample_gru", "sample_markov", "evaluate", "decide")
+"""Jobs that can be done on other devices than the CPU."""
+
 
 def chain_plans(number: int, length: int) -> Tensor:
     """Plans `[N, L]` of `source`."""
@@ -272,5 +281,6 @@ def source() -> MarkovPrior:
     return MarkovPrior(4, 2).fit(torch.cat([moves, moves[onward].repeat(5, 1)]))
 
 
-def _scaled(number: int, scale: float) -> int:
+def scaled(number: int, scale: float) -> int:
+    """A share of a number, at least 2."""
     return max(int(number * scale), 2)

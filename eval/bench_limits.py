@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from eval.bench_jobs import scaled
 from eval.bench_packages import Run
 from eval.bench_times import seconds_again
 from neuroprior import GRUPrior, MarkovPrior, TransformerPrior, UniformPrior, gridworld
@@ -37,10 +38,10 @@ class Work:
 
 def works(scale: float) -> Iterator[Callable[[], Work]]:
     """Trying plans, and sampling by prefix tree and plan by plan."""
-    yield partial(_evaluate, max(int(10_000 * scale), 2))
-    yield partial(_tree_markov, max(int(2_560_000 * scale), 2))
-    yield partial(_tree_transformer, max(int(2_560_000 * scale), 2))
-    yield partial(_plan_by_plan, max(int(8192 * scale), 2))
+    yield partial(_evaluate, scaled(10_000, scale))
+    yield partial(_tree_markov, scaled(2_560_000, scale))
+    yield partial(_tree_transformer, scaled(2_560_000, scale))
+    yield partial(_plan_by_plan, scaled(8192, scale))
 
 
 def measured(scale: float, repetitions: int) -> Iterator[dict[str, Any]]:

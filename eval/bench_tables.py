@@ -63,5 +63,16 @@ def limits_table(rows: Rows) -> Table:
     return table
 
 
+def gpu_table(rows: Rows) -> Table:
+    """Seconds on an accelerator."""
+    table = titled(f"On {rows[0]['device']}", 1)
+    columns(table, ("job", "seconds", "peak MiB"), 1)
+    for row in rows:
+        peak = "" if row["peak_bytes"] is None else f"{row['peak_bytes'] / MEBI:,.0f}"
+        table.add_row(row["about"], f"{row['seconds']:.3g}", peak)
+    table.columns[0].no_wrap = False
+    return table
+
+
 def _short(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"

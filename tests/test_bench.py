@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from eval import bench, bench_limits, bench_packages, bench_peers, bench_sizes, bench_training
+from eval import bench, bench_gpu, bench_limits, bench_packages, bench_peers, bench_sizes, bench_training
 from eval.__main__ import main
-from eval.bench_jobs import chain_plans, source
+from eval.bench_jobs import JOBS, ON_DEVICES, chain_plans, source
 from eval.bench_training import TrainingRace
 from eval.first_simulation import Protocol, Size, simulate
 from neuroprior import MarkovPrior, UniformPrior, gridworld
@@ -167,6 +167,22 @@ def test_parts_by_themselves(tmp_path):
     results = json.loads((tmp_path / "results.json").read_text())
     assert "rows" not in results
     assert len(results["imports"]) == 1
+
+
+def test_jobs_of_an_accelerator(tmp_path, capsys, monkeypatch):
+    """On a CPU in place of one."""
+    rows = list(bench_gpu.measured(torch.device("cpu"), SMALL, 1))
+    assert [(row["job"], row["about"]) for row in rows] == [(name, JOBS[name](SMALL).about) for name in ON_DEVICES]
+    assert all(row["seconds"] > 0 for row in rows)
+    options = ["--parts", "gpu", "--scale", str(SMALL), "--repetitions", "1", "--out", str(tmp_path)]
+    if not torch.cuda.is_available():
+        assert main(["bench", *options]) == 0
+        assert "there is no CUDA device" in capsys.readouterr().out
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+        monkeypatch.setattr(bench_gpu, "measured", lambda *how: iter(rows))
+    assert main(["bench", *options]) == 0
+    assert rows[0]["about"] in " ".join(capsys.readouterr().out.split())
+    assert len(json.loads((tmp_path / "results.json").read_text())["gpu"]) == len(rows)
 
 
 def test_sizes_grow_and_memory_is_seen():
