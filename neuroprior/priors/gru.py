@@ -57,13 +57,13 @@ class GRUPrior(NeuralPrior):
     def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
         hidden, recent, size = None, None, self.num_layers * self.hidden_size
         if memory is not None:
-            hidden = memory[:, :size].view(-1, self.num_layers, self.hidden_size).transpose(0, 1).contiguous()
+            hidden = memory[:, :size].unflatten(1, (self.num_layers, self.hidden_size)).transpose(0, 1)
             recent = memory[:, size:]
         if hidden is not None and recent is not None and self._may_step(inputs):
             out, hidden, recent = self._one_step(inputs, hidden, recent)
         else:
             vectors, recent = self.embedding(inputs, recent)
-            out, hidden = self.gru(self.drop(vectors), hidden)
+            out, hidden = self.gru(self.drop(vectors), None if hidden is None else hidden.contiguous())
         return self.head(self.drop(out)), torch.cat([hidden.transpose(0, 1).flatten(1), recent], 1)
 
     def _may_step(self, inputs: Tensor) -> bool:
@@ -91,12 +91,13 @@ class GRUPrior(NeuralPrior):
             w_in, w_hidden, b_in, b_hidden = self.gru.all_weights[layer]
             bias = torch.cat([b_in[: 2 * size] + b_hidden[: 2 * size], b_in[2 * size :]])
             if below is None:
-                gates = functional.linear(self.embedding.action.weight, w_in, bias)[inputs[:, 0, 0].long()]
+                table = functional.linear(self.embedding.action.weight, w_in, bias)
+                gates = table.index_select(0, inputs[:, 0, 0].int())
             else:
                 gates = functional.linear(below, w_in, bias)
-            share = torch.addmm(gates[:, : 2 * size], before, w_hidden[: 2 * size].T).sigmoid_()
-            new = functional.linear(before, w_hidden[2 * size :], b_hidden[2 * size :])
-            new = torch.addcmul(gates[:, 2 * size :], share[:, :size], new).tanh_()
+            share, new = gates[:, : 2 * size], gates[:, 2 * size :]
+            share.addmm_(before, w_hidden[: 2 * size].T).sigmoid_()
+            new.addcmul_(share[:, :size], functional.linear(before, w_hidden[2 * size :], b_hidden[2 * size :])).tanh_()
             below = torch.lerp(new, before, share[:, size:])
             after.append(below)
         assert below is not None
