@@ -76,23 +76,24 @@ def starts_of(task: Task, world: World, number: int, length: int, generator: tor
     Raises:
         ValueError: there are hardly any.
     """
-    state = world.reset(DRAWN * number, generator)
-    best = best_score(task, world, state, length)
-    reference = 0.0
-    if isinstance(world, TabularWorld) and float(world.reward.min()) < 0:
-        plans = torch.randint(world.num_actions, (len(state), 1, length), generator=generator)
-        reference = float(_worth(task, world, state, plans).mean())
-    else:
-        state, best = state[best > 0], best[best > 0]
-        for _ in range(AGAIN):
-            if len(state) >= number:
-                break
-            more = world.reset(DRAWN * number, generator)
-            gain = best_score(task, world, more, length)
-            state, best = torch.cat([state, more[gain > 0]]), torch.cat([best, gain[gain > 0]])
+    costs = isinstance(world, TabularWorld) and float(world.reward.min()) < 0
+    states, bests = [], []
+    for _ in range(1 + AGAIN):
+        drawn = world.reset(DRAWN * number, generator)
+        gain = best_score(task, world, drawn, length)
+        useful = (gain > 0) | costs
+        states.append(drawn[useful])
+        bests.append(gain[useful])
+        if sum(map(len, states)) >= number:
+            break
+    state, best = torch.cat(states), torch.cat(bests)
     if len(state) < number:
         tried = (1 + AGAIN) * DRAWN * number
         raise ValueError(f"only {len(state)} of {tried} starts are such that a plan of {length} actions gains")
+    reference = 0.0
+    if costs:
+        plans = torch.randint(world.num_actions, (len(state), 1, length), generator=generator)
+        reference = float(_worth(task, world, state, plans).mean())
     return Starts(task, world, state[:number], length, best[:number], reference)
 
 

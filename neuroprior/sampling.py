@@ -169,7 +169,8 @@ def sample_in_world(
         if not keep_states:
             tried[2].clear()
         if t + 1 < length:
-            logits, memory = prior.step(action, memory, world.observe(now) if prior.context_per == "step" else None)
+            seen = world.observe(now) if prior.context_per == "step" else None
+            logits, memory = prior.advance(action, memory, seen, length - t - 2 if alone else 0)
     if not alone:
         row = shuffled_rows(counts, root, generator)
         (now,), tried = _taken(row, now), [_taken(row, *column) for column in tried]
