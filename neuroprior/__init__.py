@@ -1,5 +1,6 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
 
+from neuroprior.distinct import Distinct, most_probable, sample_distinct, sample_distinct_in_world
 from neuroprior.planners import (
     Decision,
     ExhaustivePlanner,
@@ -47,6 +48,7 @@ __version__ = "0.1.0"
 __all__ = [
     "ContextTreePrior",
     "Decision",
+    "Distinct",
     "EpisodicWorld",
     "ExhaustivePlanner",
     "GRUPrior",
@@ -77,9 +79,12 @@ __all__ = [
     "labyrinth",
     "load",
     "maze",
+    "most_probable",
     "oracle",
     "read_plans",
     "sample",
+    "sample_distinct",
+    "sample_distinct_in_world",
     "sample_in_world",
     "save",
     "write_plans",

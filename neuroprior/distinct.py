@@ -1,0 +1,287 @@
+"""Distinct plans from any prior: samples without replacement, and the most probable plans."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroprior.draws import after_end
+from neuroprior.plans import action_dtype
+from neuroprior.randomness import generator_on
+from neuroprior.sampling import Steppable
+from neuroprior.worlds.world import Rollout, World, check_sizes, join_states
+
+MOST_PREFIXES = 2**22
+"""That `most_probable` follows together."""
+
+SLACK = 1e-9
+"""Log-probabilities that differ by less count as the same: sums in another order differ by rounding."""
+
+
+class Distinct(NamedTuple):
+    """P different plans of each of B distributions.
+
+    Attributes:
+        plans: `[B, P, L]`, uint8 (int64 where there are more than 256 actions).
+        log_prob: `[B, P]` float64: the logarithm of each plan's probability; -inf where there was no further plan: then
+            the plan is not one of the distribution's.
+        inclusion: `[B, P]` float64: the probability that a sample has this plan in it, given the threshold that the
+            sample had; 0 where there was no further plan. The mean of any f(plan) is estimated without bias by the sum
+            of f(plan) * exp(log_prob) / inclusion (Kool, van Hoof and Welling 2019, section 4.2).
+    """
+
+    plans: Tensor
+    log_prob: Tensor
+    inclusion: Tensor
+
+
+@torch.no_grad()
+def sample_distinct(
+    prior: Steppable,
+    num_plans: int,
+    length: int,
+    context: Tensor | None = None,
+    *,
+    batch_size: int = 1,
+    temperature: float = 1.0,
+    generator: torch.Generator | None = None,
+) -> Distinct:
+    """Plans drawn without replacement: one after another, each from what the ones before have left.
+
+    By stochastic beam search (Kool, van Hoof and Welling 2019, "Stochastic beams and where to find them"): beams grow
+    step by step, and those are kept whose log-probabilities, with Gumbel noise, are highest. Of each distribution the
+    first plan is a plain sample.
+
+    Args:
+        prior: any prior.
+        num_plans: P.
+        length: number of actions in a plan, L.
+        context: one a distribution, `[B]` indices or `[B, C]` features, for a prior that sees one.
+        batch_size: B, where there is no context.
+        temperature: divides the logits.
+        generator: the source of randomness.
+
+    Raises:
+        ValueError: an argument is out of range, or there are not so many plans.
+    """
+    _check(prior, num_plans, length, temperature)
+    logits, memory = _start(prior, context, batch_size)
+    search = _Search(prior, logits, memory, temperature, generator_on(generator, prior.device))
+    return search.run(num_plans, length)
+
+
+@torch.no_grad()
+def sample_distinct_in_world(
+    prior: Steppable,
+    world: World,
+    state: Tensor,
+    num_plans: int,
+    length: int,
+    *,
+    temperature: float = 1.0,
+    generator: torch.Generator | None = None,
+    keep_states: bool = False,
+) -> tuple[Distinct, Rollout]:
+    """The same for each of B starts, along with a world: see `sample_in_world`.
+
+    Beginnings that plans have in common are tried once. Where not every action exists, a start may have fewer than P
+    plans; those that are no plans are tried as if every action existed.
+
+    Args:
+        prior: any prior over the world's actions.
+        world: one without chance.
+        state: starts `[B, ...]`.
+        num_plans, length, temperature, generator: see `sample_distinct`.
+        keep_states: also return the state after each step, in the rollout.
+
+    Raises:
+        ValueError: an argument is out of range, prior and world differ in their number of actions, or chance has a part
+            in the world.
+    """
+    _check(prior, num_plans, length, temperature)
+    world.check_state(state)
+    if world.stochastic:
+        raise ValueError("world: one without chance is expected: plans that begin alike are tried together")
+    if prior.end is not None:
+        raise ValueError("prior: it samples an end symbol, which is no action of the world")
+    if prior.num_actions != world.num_actions:
+        raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
+    seen = world.observe(state) if prior.context_per is not None else None
+    prior.check_context_of(seen, len(state))
+    logits, memory = prior.start(len(state), seen)
+    search = _Search(prior, logits, memory, temperature, generator_on(generator, prior.device), world, state)
+    found = search.run(num_plans, length)
+    return found, search.rollout(state, keep_states)
+
+
+@torch.no_grad()
+def most_probable(
+    prior: Steppable, num_plans: int, length: int, context: Tensor | None = None, *, batch_size: int = 1
+) -> tuple[Tensor, Tensor]:
+    """The most probable plans, exactly, the most probable first.
+
+    A beam search finds plans of which the last is at most as probable as the last one that is sought; then every
+    beginning of a plan that is at least as probable as that is followed. A distribution that is nearly flat has very
+    many of them.
+
+    Args:
+        prior, length, context, batch_size: see `sample_distinct`.
+        num_plans: P.
+
+    Returns:
+        Plans `[B, P, L]` and the logarithms of their probabilities `[B, P]`, float64.
+
+    Raises:
+        ValueError: an argument is out of range, there are not so many plans, or more than `MOST_PREFIXES` beginnings
+            would have to be followed.
+    """
+    _check(prior, num_plans, length, 1.0)
+    logits, memory = _start(prior, context, batch_size)
+    batch = len(logits)
+    bound = _Search(prior, logits, memory, 1.0, None).run(num_plans, length).log_prob[:, -1] - SLACK
+    log_prob = torch.zeros(batch, dtype=torch.float64, device=logits.device)
+    owner, plans = torch.arange(batch, device=logits.device), _no_actions(prior, batch)
+    for t in range(length):
+        child = log_prob[:, None] + logits.double().log_softmax(-1)
+        row, action = ((child >= bound[owner, None]) & (child > -torch.inf)).nonzero(as_tuple=True)
+        if len(row) > MOST_PREFIXES:
+            raise ValueError(
+                f"num_plans: more than {MOST_PREFIXES} beginnings of {t + 1} actions are as probable as the least"
+                " probable of so many plans; ask for fewer"
+            )
+        log_prob, owner = child[row, action], owner[row]
+        plans = torch.cat([plans[row], action[:, None].to(plans.dtype)], 1)
+        if t + 1 < length:
+            logits, memory = prior.step(action, memory.index_select(0, row))
+            logits = after_end(logits, action, prior.end)
+    # By distribution, the most probable first.
+    order = log_prob.argsort(descending=True, stable=True)
+    order = order[owner[order].argsort(stable=True)]
+    counts = owner.bincount(minlength=batch)
+    if len(counts) and int(counts.min()) < num_plans:
+        raise ValueError(f"num_plans: only {int(counts.min())} plans have a probability above 0, not {num_plans}")
+    first = order[((counts.cumsum(0) - counts)[:, None] + torch.arange(num_plans, device=counts.device)).flatten()]
+    return plans[first].view(batch, num_plans, length), log_prob[first].view(batch, num_plans)
+
+
+class _Search:
+    """Beams of B distributions, K of each, which grow step by step.
+
+    Args:
+        prior: any prior.
+        logits, memory: as its `start` returned them, for B rows.
+        temperature: divides the logits.
+        generator: draws Gumbel noise; None: the most probable beams are kept.
+        world, state: where plans are tried on the way, and from where; None: nowhere.
+    """
+
+    def __init__(
+        self,
+        prior: Steppable,
+        logits: Tensor,
+        memory: Tensor,
+        temperature: float,
+        generator: torch.Generator | None,
+        world: World | None = None,
+        state: Tensor | None = None,
+    ) -> None:
+        self.prior, self.logits, self.memory, self.temperature = prior, logits, memory, temperature
+        self.generator, self.world, self.now = generator, world, state
+        self.batch, self.plans = len(logits), _no_actions(prior, len(logits))
+        self.tried: list[list[Tensor]] = [[], []]  # rewards and states of each step
+        self.log_prob = torch.zeros(self.batch, 1, dtype=torch.float64, device=logits.device)
+        self.height = torch.zeros_like(self.log_prob) if generator is None else self._gumbel(self.log_prob)
+
+    def run(self, num_plans: int, length: int) -> Distinct:
+        """Grow beams of `length` actions; one more than is asked for, whose height is the threshold."""
+        for t in range(length):
+            self._grow(num_plans + 1, last=t + 1 == length)
+        # Where there are no more plans than are asked for, all of them are in every sample.
+        threshold = self.height[:, num_plans:] if self.height.shape[1] > num_plans else -torch.inf
+        row = torch.arange(self.height.numel(), device=self.height.device).view_as(self.height)
+        self._keep(row[:, :num_plans].flatten())
+        self.log_prob = self.log_prob[:, :num_plans]
+        there = self.log_prob > -torch.inf
+        inclusion = torch.where(there, -torch.expm1(-torch.exp(self.log_prob - threshold)), 0.0)
+        return Distinct(self.plans.view(self.batch, num_plans, length), self.log_prob, inclusion)
+
+    def rollout(self, start: Tensor, keep_states: bool) -> Rollout:
+        """What came of the plans."""
+        assert self.now is not None
+        shape = (self.batch, len(self.now) // self.batch if self.batch else 0)
+        rewards = torch.stack(self.tried[0], 1).view(*shape, -1)
+        states = join_states(self.tried[1], start, (*shape, *start.shape[1:])) if keep_states else None
+        return Rollout(self.now.view(*shape, *start.shape[1:]), rewards, states)
+
+    def _grow(self, most: int, last: bool) -> None:
+        """One more action: of all beams' children those with the greatest heights are the new beams."""
+        logits, actions = self.logits, self.prior.num_actions
+        if self.world is not None and not self.world.all_legal:
+            assert self.now is not None
+            logits = logits.masked_fill(~self.world.legal(self.now), -torch.inf)
+        child = self.log_prob.view(-1, 1) + (logits.double() / self.temperature).log_softmax(-1)
+        height = child if self.generator is None else self._heights(child)
+        beams = self.log_prob.shape[1]
+        self.height, index = height.view(self.batch, -1).topk(min(most, beams * actions))
+        self.log_prob = child.view(self.batch, -1).gather(1, index)
+        action = (index % actions).flatten()
+        first = torch.arange(self.batch, device=index.device)[:, None] * beams
+        self._keep((first + index.div(actions, rounding_mode="floor")).flatten())
+        self.plans = torch.cat([self.plans, action[:, None].to(self.plans.dtype)], 1)
+        seen = None
+        if self.world is not None:
+            assert self.now is not None
+            self.now, reward = self.world.step(self.now, action, None)
+            self.tried[0].append(reward)
+            self.tried[1].append(self.now)
+            seen = self.world.observe(self.now) if self.prior.context_per == "step" and not last else None
+        if not last:
+            self.logits, self.memory = self.prior.advance(action, self.memory, seen, 0)
+            self.logits = after_end(self.logits, action, self.prior.end)
+
+    def _keep(self, row: Tensor) -> None:
+        """Go on with these beams."""
+        self.plans, self.memory = self.plans.index_select(0, row), self.memory.index_select(0, row)
+        if self.now is not None:
+            self.now = self.now.index_select(0, row)
+        self.tried = [[step.index_select(0, row) for step in column] for column in self.tried]
+
+    def _heights(self, child: Tensor) -> Tensor:
+        """Gumbel variables located at `child [M, A]`, given that the greatest of each row is its parent's height.
+
+        Kool, van Hoof and Welling 2019, appendix B.3.
+        """
+        free = self._gumbel(child)
+        parent = self.height.view(-1, 1)
+        below = parent - free + torch.log1p(-torch.exp(free - free.amax(-1, keepdim=True)))
+        height = parent - below.clamp(min=0) - torch.log1p(torch.exp(-below.abs()))
+        # What is impossible stays so; where a whole beam is, nothing above is a number.
+        return torch.where(child > -torch.inf, height, -torch.inf)
+
+    def _gumbel(self, location: Tensor) -> Tensor:
+        uniform = torch.rand(location.shape, generator=self.generator, device=location.device, dtype=location.dtype)
+        return location - torch.log(-torch.log(uniform.clamp(min=torch.finfo(location.dtype).tiny)))
+
+
+def _start(prior: Steppable, context: Tensor | None, batch_size: int) -> tuple[Tensor, Tensor]:
+    if context is None:
+        check_sizes(batch_size=batch_size)
+        prior.check_context_of(None)
+        return prior.start(batch_size)
+    context = torch.as_tensor(context, device=prior.device)
+    prior.check_context_of(context, len(context))
+    return prior.start(len(context), context)
+
+
+def _no_actions(prior: Steppable, number: int) -> Tensor:
+    return torch.empty(number, 0, dtype=action_dtype(prior.num_actions), device=prior.device)
+
+
+def _check(prior: Steppable, num_plans: int, length: int, temperature: float) -> None:
+    check_sizes(num_plans=num_plans, length=length)
+    if not 0 < temperature < float("inf"):
+        raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+    if prior.num_actions**length < num_plans:
+        raise ValueError(
+            f"num_plans: there are only {prior.num_actions**length} plans of {length} actions, not {num_plans}"
+        )
