@@ -67,12 +67,13 @@ def test_each_distribution_has_its_context():
         assert p_value(pair, one_after_another(probs, 2)) > FALSE_ALARM
 
 
-def test_inclusion_gives_means_without_bias():
+@pytest.mark.parametrize("num_plans", [1, 5])
+def test_inclusion_gives_means_without_bias(num_plans):
     """Six standard errors: a false alarm in five hundred million."""
     prior = TablePrior.random(3, 4)
     probs = distribution(prior, 4)
     value = torch.rand(81, generator=seeded(1), dtype=torch.double)
-    found = sample_distinct(prior, 5, 4, batch_size=MANY, generator=seeded(0))
+    found = sample_distinct(prior, num_plans, 4, batch_size=MANY, generator=seeded(0))
     told = (value[plan_number(found.plans, 3)] * found.log_prob.exp() / found.inclusion).sum(1)
     assert abs(float(told.mean() - (value * probs).sum())) < 6 * float(told.std()) / MANY**0.5
     assert float(told.std()) > 0
