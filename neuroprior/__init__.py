@@ -4,6 +4,7 @@ from neuroprior.distinct import Distinct, most_probable, sample_distinct, sample
 from neuroprior.planners import (
     Decision,
     ExhaustivePlanner,
+    FrontierPlanner,
     Growth,
     Planner,
     SamplingPlanner,
@@ -51,6 +52,7 @@ __all__ = [
     "Distinct",
     "EpisodicWorld",
     "ExhaustivePlanner",
+    "FrontierPlanner",
     "GRUPrior",
     "GridWorld",
     "Growth",

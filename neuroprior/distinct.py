@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuroprior.draws import after_end
 from neuroprior.plans import action_dtype
-from neuroprior.randomness import generator_on
+from neuroprior.randomness import generator_on, gumbel
 from neuroprior.sampling import Steppable
 from neuroprior.worlds.world import Rollout, World, check_sizes, join_states
 
@@ -190,7 +190,7 @@ class _Search:
         self.batch, self.plans = len(logits), _no_actions(prior, len(logits))
         self.tried: list[list[Tensor]] = [[], []]  # rewards and states of each step
         self.log_prob = torch.zeros(self.batch, 1, dtype=torch.float64, device=logits.device)
-        self.height = torch.zeros_like(self.log_prob) if generator is None else self._gumbel(self.log_prob)
+        self.height = self.log_prob if generator is None else gumbel(self.log_prob, generator)
 
     def run(self, num_plans: int, length: int) -> Distinct:
         """Grow beams of `length` actions; one more than is asked for, whose height is the threshold."""
@@ -220,7 +220,7 @@ class _Search:
             assert self.now is not None
             logits = logits.masked_fill(~self.world.legal(self.now), -torch.inf)
         child = self.log_prob.view(-1, 1) + (logits.double() / self.temperature).log_softmax(-1)
-        height = child if self.generator is None else self._heights(child)
+        height = child if self.generator is None else self._heights(child, self.generator)
         beams = self.log_prob.shape[1]
         self.height, index = height.view(self.batch, -1).topk(min(most, beams * actions))
         self.log_prob = child.view(self.batch, -1).gather(1, index)
@@ -246,21 +246,17 @@ class _Search:
             self.now = self.now.index_select(0, row)
         self.tried = [[step.index_select(0, row) for step in column] for column in self.tried]
 
-    def _heights(self, child: Tensor) -> Tensor:
+    def _heights(self, child: Tensor, generator: torch.Generator) -> Tensor:
         """Gumbel variables located at `child [M, A]`, given that the greatest of each row is its parent's height.
 
         Kool, van Hoof and Welling 2019, appendix B.3.
         """
-        free = self._gumbel(child)
+        free = gumbel(child, generator)
         parent = self.height.view(-1, 1)
         below = parent - free + torch.log1p(-torch.exp(free - free.amax(-1, keepdim=True)))
         height = parent - below.clamp(min=0) - torch.log1p(torch.exp(-below.abs()))
         # What is impossible stays so; where a whole beam is, nothing above is a number.
         return torch.where(child > -torch.inf, height, -torch.inf)
-
-    def _gumbel(self, location: Tensor) -> Tensor:
-        uniform = torch.rand(location.shape, generator=self.generator, device=location.device, dtype=location.dtype)
-        return location - torch.log(-torch.log(uniform.clamp(min=torch.finfo(location.dtype).tiny)))
 
 
 def _start(prior: Steppable, context: Tensor | None, batch_size: int) -> tuple[Tensor, Tensor]:

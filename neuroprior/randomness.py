@@ -1,6 +1,7 @@
 """Random generators: every random function draws from the one it is given, never from torch's global state."""
 
 import torch
+from torch import Tensor
 
 
 def generator_on(generator: torch.Generator | None, device: torch.device | str) -> torch.Generator:
@@ -27,3 +28,9 @@ def generator_on(generator: torch.Generator | None, device: torch.device | str) 
 def draw_seed(generator: torch.Generator) -> int:
     """An integer seed in [0, 2**62), drawn from `generator`, for code that takes seeds only."""
     return int(torch.randint(2**62, (), generator=generator, device=generator.device))
+
+
+def gumbel(location: Tensor, generator: torch.Generator) -> Tensor:
+    """Gumbel variables at these locations: of logarithms of probabilities, the greatest is at i with probability i."""
+    uniform = torch.rand(location.shape, generator=generator, device=location.device, dtype=location.dtype)
+    return location - torch.log(-torch.log(uniform.clamp(min=torch.finfo(location.dtype).tiny)))

@@ -3,6 +3,7 @@
 from neuroprior.planners.collect import collect
 from neuroprior.planners.exhaustive import ExhaustivePlanner
 from neuroprior.planners.expected import expected_score
+from neuroprior.planners.frontier import FrontierPlanner
 from neuroprior.planners.growth import Growth, grow
 from neuroprior.planners.oracle import oracle
 from neuroprior.planners.planner import Decision, Planner
@@ -11,6 +12,7 @@ from neuroprior.planners.sampling import SamplingPlanner
 __all__ = [
     "Decision",
     "ExhaustivePlanner",
+    "FrontierPlanner",
     "Growth",
     "Planner",
     "SamplingPlanner",
