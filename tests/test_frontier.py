@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import (
+    ExhaustivePlanner,
     FrontierPlanner,
     GRUPrior,
     MarkovPrior,
@@ -13,6 +14,7 @@ from neuroprior import (
     SamplingPlanner,
     TabularWorld,
     UniformPrior,
+    collect,
     cube,
     egocentric,
     gridworld,
@@ -139,15 +141,18 @@ def test_other_states_than_numbers():
 
 
 def test_egocentric_mazes_are_nearly_solved():
-    """256 plans of 16 steps in mazes of 15 x 15: less than 2 % from the oracle, blind; samples lose 10 % or more."""
-    world = egocentric(maze(15, 15, num_layouts=3, num_worlds=3, reward_power=8, seed=3))
-    state = world.reset(100, seeded(0))
+    """256 plans of 16 steps in mazes of 15 x 15: less than 2 % from the oracle, where samples lose 5 % or more."""
+    learn_in, world = (
+        egocentric(maze(15, 15, num_layouts=5, num_worlds=5, reward_power=8, seed=seed)) for seed in (1, 2)
+    )
+    prior = MarkovPrior(3, 3).fit(collect(ExhaustivePlanner(6), learn_in, 500, generator=seeded(0)))
+    state = world.reset(100, seeded(1))
     best = oracle(world, state, 16).double().mean()
-    prior = UniformPrior(3)
-    found = FrontierPlanner(prior, 16, 256).plan(world, state, seeded(1))
+    found = FrontierPlanner(prior, 16, 256).plan(world, state, seeded(2))
     assert found.model_steps <= 16 * 256
     assert found.score.double().mean() > 0.98 * best
-    assert SamplingPlanner(prior, 16, 256).plan(world, state, seeded(1)).score.double().mean() < 0.9 * best
+    sampled = SamplingPlanner(prior, 16, 256).plan(world, state, seeded(2))
+    assert sampled.score.double().mean() < 0.95 * best
 
 
 @pytest.mark.parametrize(
