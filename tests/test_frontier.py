@@ -145,8 +145,8 @@ def test_egocentric_mazes_are_nearly_solved():
     learn_in, world = (
         egocentric(maze(15, 15, num_layouts=5, num_worlds=5, reward_power=8, seed=seed)) for seed in (1, 2)
     )
-    prior = MarkovPrior(3, 3).fit(collect(ExhaustivePlanner(6), learn_in, 500, generator=seeded(0)))
-    state = world.reset(100, seeded(1))
+    prior = MarkovPrior(3, 3).fit(collect(ExhaustivePlanner(7), learn_in, 500, generator=seeded(0)))
+    state = world.reset(200, seeded(1))
     best = oracle(world, state, 16).double().mean()
     found = FrontierPlanner(prior, 16, 256).plan(world, state, seeded(2))
     assert found.model_steps <= 16 * 256

@@ -48,7 +48,7 @@ class FrontierPlanner(Planner):
         value: Callable[[Tensor], Tensor] | None = None,
         any_prefix: bool = False,
         temperature: float = 1.0,
-        noise: bool = False,
+        noise: bool = True,
     ) -> None:
         super().__init__(objective, discount, value, any_prefix)
         check_sizes(length=length, num_plans=num_plans)
