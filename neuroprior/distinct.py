@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from neuroprior.draws import after_end
-from neuroprior.plans import action_dtype
+from neuroprior.plans import action_dtype, sees_each_step
 from neuroprior.randomness import generator_on, gumbel
-from neuroprior.sampling import Steppable
+from neuroprior.sampling import Steppable, advance, start_in_world
 from neuroprior.worlds.world import Rollout, World, check_sizes, join_states
 
 MOST_PREFIXES = 2**22
@@ -42,7 +42,7 @@ def sample_distinct(
     length: int,
     context: Tensor | None = None,
     *,
-    batch_size: int = 1,
+    num_sets: int | None = None,
     temperature: float = 1.0,
     generator: torch.Generator | None = None,
 ) -> Distinct:
@@ -57,7 +57,7 @@ def sample_distinct(
         num_plans: P.
         length: number of actions in a plan, L.
         context: one a distribution, `[B]` indices or `[B, C]` features, for a prior that sees one.
-        batch_size: B, where there is no context.
+        num_sets: B, where there is no context; None: 1.
         temperature: divides the logits.
         generator: the source of randomness.
 
@@ -65,7 +65,7 @@ def sample_distinct(
         ValueError: an argument is out of range, or there are not so many plans.
     """
     _check(prior, num_plans, length, temperature)
-    logits, memory = _start(prior, context, batch_size)
+    logits, memory = _start(prior, context, num_sets)
     search = _Search(prior, logits, memory, temperature, generator_on(generator, prior.device))
     return search.run(num_plans, length)
 
@@ -99,16 +99,9 @@ def sample_distinct_in_world(
             in the world.
     """
     _check(prior, num_plans, length, temperature)
-    world.check_state(state)
     if world.stochastic:
         raise ValueError("world: one without chance is expected: plans that begin alike are tried together")
-    if prior.end is not None:
-        raise ValueError("prior: it samples an end symbol, which is no action of the world")
-    if prior.num_actions != world.num_actions:
-        raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
-    seen = world.observe(state) if prior.context_per is not None else None
-    prior.check_context_of(seen, len(state))
-    logits, memory = prior.start(len(state), seen)
+    logits, memory = start_in_world(prior, world, state)
     search = _Search(prior, logits, memory, temperature, generator_on(generator, prior.device), world, state)
     found = search.run(num_plans, length)
     return found, search.rollout(state, keep_states)
@@ -116,7 +109,7 @@ def sample_distinct_in_world(
 
 @torch.no_grad()
 def most_probable(
-    prior: Steppable, num_plans: int, length: int, context: Tensor | None = None, *, batch_size: int = 1
+    prior: Steppable, num_plans: int, length: int, context: Tensor | None = None, *, temperature: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     """The most probable plans, exactly, the most probable first.
 
@@ -125,29 +118,30 @@ def most_probable(
     many of them.
 
     Args:
-        prior, length, context, batch_size: see `sample_distinct`.
+        prior, length, temperature: see `sample_distinct`.
         num_plans: P.
+        context: one a distribution, as in `sample_distinct`; None: B is 1.
 
     Returns:
         Plans `[B, P, L]` and the logarithms of their probabilities `[B, P]`, float64.
 
     Raises:
         ValueError: an argument is out of range, there are not so many plans, or more than `MOST_PREFIXES` beginnings
-            would have to be followed.
+            of all distributions together would have to be followed.
     """
-    _check(prior, num_plans, length, 1.0)
-    logits, memory = _start(prior, context, batch_size)
+    _check(prior, num_plans, length, temperature)
+    logits, memory = _start(prior, context, None)
     batch = len(logits)
-    bound = _Search(prior, logits, memory, 1.0, None).run(num_plans, length).log_prob[:, -1] - SLACK
+    bound = _Search(prior, logits, memory, temperature, None).run(num_plans, length).log_prob[:, -1] - SLACK
     log_prob = torch.zeros(batch, dtype=torch.float64, device=logits.device)
     owner, plans = torch.arange(batch, device=logits.device), _no_actions(prior, batch)
     for t in range(length):
-        child = log_prob[:, None] + logits.double().log_softmax(-1)
+        child = children(log_prob[:, None], logits, temperature)
         row, action = ((child >= bound[owner, None]) & (child > -torch.inf)).nonzero(as_tuple=True)
         if len(row) > MOST_PREFIXES:
             raise ValueError(
                 f"num_plans: more than {MOST_PREFIXES} beginnings of {t + 1} actions are as probable as the least"
-                " probable of so many plans; ask for fewer"
+                f" probable of the {num_plans} plans that are sought; ask for fewer, or for fewer contexts at a time"
             )
         log_prob, owner = child[row, action], owner[row]
         plans = torch.cat([plans[row], action[:, None].to(plans.dtype)], 1)
@@ -208,8 +202,8 @@ class _Search:
     def rollout(self, start: Tensor, keep_states: bool) -> Rollout:
         """What came of the plans."""
         assert self.now is not None
-        shape = (self.batch, len(self.now) // self.batch if self.batch else 0)
-        rewards = torch.stack(self.tried[0], 1).view(*shape, -1)
+        shape = self.log_prob.shape
+        rewards = torch.stack(self.tried[0], 1).view(*shape, len(self.tried[0]))
         states = join_states(self.tried[1], start, (*shape, *start.shape[1:])) if keep_states else None
         return Rollout(self.now.view(*shape, *start.shape[1:]), rewards, states)
 
@@ -219,11 +213,11 @@ class _Search:
         if self.world is not None and not self.world.all_legal:
             assert self.now is not None
             logits = logits.masked_fill(~self.world.legal(self.now), -torch.inf)
-        child = self.log_prob.view(-1, 1) + (logits.double() / self.temperature).log_softmax(-1)
+        child = children(self.log_prob.view(-1, 1), logits, self.temperature)
         height = child if self.generator is None else self._heights(child, self.generator)
         beams = self.log_prob.shape[1]
-        self.height, index = height.view(self.batch, -1).topk(min(most, beams * actions))
-        self.log_prob = child.view(self.batch, -1).gather(1, index)
+        self.height, index = height.view(self.batch, beams * actions).topk(min(most, beams * actions))
+        self.log_prob = child.view(self.batch, beams * actions).gather(1, index)
         action = (index % actions).flatten()
         first = torch.arange(self.batch, device=index.device)[:, None] * beams
         self._keep((first + index.div(actions, rounding_mode="floor")).flatten())
@@ -236,7 +230,7 @@ class _Search:
             self.tried[1].append(self.now)
             seen = self.world.observe(self.now) if self.prior.context_per == "step" and not last else None
         if not last:
-            self.logits, self.memory = self.prior.advance(action, self.memory, seen, 0)
+            self.logits, self.memory = advance(self.prior, action, self.memory, seen)
             self.logits = after_end(self.logits, action, self.prior.end)
 
     def _keep(self, row: Tensor) -> None:
@@ -259,12 +253,24 @@ class _Search:
         return torch.where(child > -torch.inf, height, -torch.inf)
 
 
-def _start(prior: Steppable, context: Tensor | None, batch_size: int) -> tuple[Tensor, Tensor]:
+def children(log_prob: Tensor, logits: Tensor, temperature: float) -> Tensor:
+    """The log-probabilities `[M, A]` of plans of `log_prob [M, 1]` with one more action, by its `logits [M, A]`."""
+    child = log_prob + (logits.double() / temperature).log_softmax(-1)
+    # What a prior says after what cannot be may be no number.
+    return torch.where(log_prob > -torch.inf, child, -torch.inf)
+
+
+def _start(prior: Steppable, context: Tensor | None, num_sets: int | None) -> tuple[Tensor, Tensor]:
     if context is None:
-        check_sizes(batch_size=batch_size)
+        number = 1 if num_sets is None else num_sets
+        check_sizes(num_sets=number)
         prior.check_context_of(None)
-        return prior.start(batch_size)
+        return prior.start(number)
+    if num_sets is not None:
+        raise ValueError("num_sets: there is one for each context; leave it out")
     context = torch.as_tensor(context, device=prior.device)
+    if sees_each_step(context):
+        raise ValueError(f"context: one a plan is expected, [B] or [B, C], not {list(context.shape)}")
     prior.check_context_of(context, len(context))
     return prior.start(len(context), context)
 

@@ -28,11 +28,40 @@ class Steppable(Protocol):
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]: ...
 
-    def advance(
-        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
-    ) -> tuple[Tensor, Tensor]: ...
-
     def check_context_of(self, plans: Tensor | None, num_plans: int = 0, length: int = 0) -> None: ...
+
+
+def advance(
+    prior: Steppable, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
+) -> tuple[Tensor, Tensor]:
+    """`Prior.advance`, or a step where a prior has no such thing."""
+    own = getattr(prior, "advance", None)
+    return prior.step(action, state, context) if own is None else own(action, state, context, room)
+
+
+def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
+    """Raise ValueError unless a prior can act in a world from `state [B, ...]`."""
+    world.check_state(state)
+    if prior.end is not None:
+        raise ValueError(
+            "prior: it samples an end symbol, which is no action of the world; learn from plans without one"
+        )
+    if prior.num_actions != world.num_actions:
+        raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
+
+
+def start_in_world(prior: Steppable, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
+    """What `prior.start` gives where the prior sees `state [B, ...]`.
+
+    Raises:
+        ValueError: the prior cannot act there, or what is seen is not what it sees.
+    """
+    check_in_world(prior, world, state)
+    seen = world.observe(state) if prior.context_per is not None else None
+    if seen is not None and sees_each_step(seen):
+        raise ValueError(f"observe: indices [N] or features [N, C] are expected, not {seen.dtype} {list(seen.shape)}")
+    prior.check_context_of(seen, len(state))
+    return prior.start(len(state), seen)
 
 
 @torch.no_grad()
@@ -131,19 +160,9 @@ def sample_in_world(
         ValueError: an argument is out of range, or prior and world differ in their number of actions.
     """
     _check(num_plans, length, temperature, 1)
-    world.check_state(state)
-    if prior.end is not None:
-        raise ValueError("prior: it samples an end symbol, which is no action of the world")
-    if prior.num_actions != world.num_actions:
-        raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
-    generator = generator_on(generator, prior.device)
+    logits, memory = start_in_world(prior, world, state)
+    generator, batch = generator_on(generator, prior.device), len(state)
     draw = Draw(prior.num_actions, temperature, generator)
-    batch = len(state)
-    seen = world.observe(state) if prior.context_per is not None else None
-    if seen is not None and sees_each_step(seen):
-        raise ValueError(f"observe: indices [N] or features [N, C] are expected, not {seen.dtype} {list(seen.shape)}")
-    prior.check_context_of(seen, batch)
-    logits, memory = prior.start(batch, seen)
     now, root = state, torch.arange(batch, device=state.device)
     counts = torch.full((batch,), num_plans, device=state.device)
     tried: list[list[Tensor]] = [[], [], []]  # of each step: actions, rewards, states
@@ -170,7 +189,7 @@ def sample_in_world(
             tried[2].clear()
         if t + 1 < length:
             seen = world.observe(now) if prior.context_per == "step" else None
-            logits, memory = prior.advance(action, memory, seen, length - t - 2 if alone else 0)
+            logits, memory = advance(prior, action, memory, seen, length - t - 2 if alone else 0)
     if not alone:
         row = shuffled_rows(counts, root, generator)
         (now,), tried = _taken(row, now), [_taken(row, *column) for column in tried]
@@ -257,6 +276,6 @@ def _one_by_one(
             actions[part, k] = action
             if k + 1 < len(steps):
                 seen = None if context is None else context[row[part], t + 1]
-                now, memory = prior.advance(action, memory, seen, len(steps) - k - 2)
+                now, memory = advance(prior, action, memory, seen, len(steps) - k - 2)
                 now = after_end(now, action, draw.end)
     return actions

@@ -23,9 +23,10 @@ def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000
     """Raise AssertionError, with a message that says how, unless `prior` does what a prior must.
 
     With each kind of context that it takes: stepping equals `forward`, also past its window and after states were
-    reordered; `log_prob` sums to one over all plans of a length and fits what `sample` draws, by prefix tree and plan
-    by plan (chi-square tests, each with a false alarm of 1e-6); the same seed gives the same plans and torch's global
-    generator is left alone; saving and loading, and moving to a GPU where there is one, change nothing.
+    reordered, and `advance` equals stepping; `log_prob` sums to one over all plans of a length and fits what `sample`
+    draws, by prefix tree and plan by plan (chi-square tests, each with a false alarm of 1e-6); the same seed gives the
+    same plans and torch's global generator is left alone; saving and loading, and moving to a GPU where there is one,
+    change nothing.
 
     Args:
         prior: the prior to check, trained or not.
@@ -46,6 +47,7 @@ def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000
             plans = torch.randint(actions, (7, steps), generator=generator).to(prior.device)
             context = _random_context(prior, kind, 7, steps, generator)
             _check_stepping(prior, plans, context)
+            _check_advancing(prior, plans, context)
         _check_total(prior, _random_context(prior, kind, 1, length, generator), length)
         for method in ("tree", "ancestral"):
             context = _random_context(prior, kind, 1, length, generator)
@@ -161,6 +163,23 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
             logits, state = prior.step(plans[:, t], state, seen)
             gap = float((backwards[order] - logits).abs().nan_to_num(0).max())
             _require(gap < 1e-4, f"reordering the state changes the logits by {gap:.2g} ({where})")
+
+
+def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
+    """`advance` gives what `step` gives, whether there is room or not, for all plans and for some."""
+    num, length = plans.shape
+    with torch.no_grad():
+        for room in (0, length):
+            logits, state = prior.start(num, _at(context, 0))
+            _, other = prior.start(num, _at(context, 0))
+            for t in range(length - 1):
+                seen = _at(context, t + 1) if sees_each_step(context) else None
+                logits, state = prior.step(plans[:, t], state, seen)
+                again, other = prior.advance(plans[:, t], other, seen, room)
+                gap = float((again - logits).abs().nan_to_num(0).max())
+                _require(gap < 1e-4, f"advance differs from step by {gap:.2g} (action {t}, room {room})")
+                if t % 2:  # states that were picked out go on by themselves
+                    other = other[torch.arange(num, device=other.device)]
 
 
 def _at(context: Tensor | None, t: int) -> Tensor | None:

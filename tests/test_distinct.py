@@ -51,7 +51,7 @@ def test_plans_are_drawn_one_after_another(temperature):
     prior = TablePrior.random(2, 4)
     probs = distribution(prior, 4, temperature=temperature)
     # Three beams, of which some are dropped from the second step on.
-    found = sample_distinct(prior, 2, 4, batch_size=MANY, temperature=temperature, generator=seeded(0))
+    found = sample_distinct(prior, 2, 4, num_sets=MANY, temperature=temperature, generator=seeded(0))
     number = plan_number(found.plans, 2)
     assert p_value((number * torch.tensor([16, 1])).sum(-1), one_after_another(probs, 2)) > FALSE_ALARM
     assert torch.allclose(found.log_prob, probs[number].log())
@@ -73,7 +73,7 @@ def test_inclusion_gives_means_without_bias(num_plans):
     prior = TablePrior.random(3, 4)
     probs = distribution(prior, 4)
     value = torch.rand(81, generator=seeded(1), dtype=torch.double)
-    found = sample_distinct(prior, num_plans, 4, batch_size=MANY, generator=seeded(0))
+    found = sample_distinct(prior, num_plans, 4, num_sets=MANY, generator=seeded(0))
     told = (value[plan_number(found.plans, 3)] * found.log_prob.exp() / found.inclusion).sum(1)
     assert abs(float(told.mean() - (value * probs).sum())) < 6 * float(told.std()) / MANY**0.5
     assert float(told.std()) > 0
@@ -82,15 +82,15 @@ def test_inclusion_gives_means_without_bias(num_plans):
 @pytest.mark.parametrize("kind", [UniformPrior, MarkovPrior, GRUPrior, TransformerPrior])
 def test_all_plans_are_all_there_is(kind):
     prior = kind(3)
-    found = sample_distinct(prior, 27, 3, batch_size=4, generator=seeded(0))
+    found = sample_distinct(prior, 27, 3, num_sets=4, generator=seeded(0))
     assert found.plans.dtype == torch.uint8
     for plans in found.plans:
         assert plan_number(plans, 3).unique().tolist() == list(range(27))
     assert torch.allclose(found.log_prob.exp().sum(1), torch.ones(4, dtype=torch.double), atol=1e-5)
     assert (found.inclusion == 1).all()
-    few = sample_distinct(prior, 5, 3, batch_size=4, generator=seeded(0))
+    few = sample_distinct(prior, 5, 3, num_sets=4, generator=seeded(0))
     assert ((few.inclusion > 0) & (few.inclusion < 1)).all()
-    again = sample_distinct(prior, 5, 3, batch_size=4, generator=seeded(0))
+    again = sample_distinct(prior, 5, 3, num_sets=4, generator=seeded(0))
     assert all(torch.equal(one, other) for one, other in zip(few, again, strict=True))
 
 
@@ -99,7 +99,7 @@ def test_what_is_impossible_is_told():
     prior = TablePrior.random(3, 3)
     for logits in prior.logits:
         logits[..., 0] = -torch.inf
-    found = sample_distinct(prior, 10, 3, batch_size=50, generator=seeded(0))
+    found = sample_distinct(prior, 10, 3, num_sets=50, generator=seeded(0))
     there = found.log_prob > -torch.inf
     assert (there.sum(1) == 8).all()
     assert (there[:, :8]).all()
@@ -177,13 +177,43 @@ def test_flat_distributions_have_too_many_plans_of_one_probability(monkeypatch):
         ({"num_plans": 10, "length": 2}, "only 9"),
         ({"length": 0}, "length"),
         ({"temperature": 0.0}, "temperature"),
-        ({"batch_size": 0}, "batch_size"),
+        ({"num_sets": 0}, "num_sets"),
         ({"context": torch.zeros(2, dtype=torch.long)}, "context"),
     ],
 )
 def test_refuses(given, word):
     with refuses(word):
         sample_distinct(UniformPrior(3), **({"num_plans": 2, "length": 3} | given))
+
+
+def test_refuses_contexts_a_step_and_sets_beside_contexts():
+    prior = TablePrior.random(3, 2, num_contexts=2)
+    for call in (sample_distinct, most_probable):
+        with refuses("context", "one a plan"):
+            call(prior, 2, 2, torch.zeros(4, 2, dtype=torch.long))
+    with refuses("num_sets"):
+        sample_distinct(prior, 2, 2, torch.zeros(4, dtype=torch.long), num_sets=4)
+
+
+def test_no_distributions():
+    prior = TablePrior.random(3, 2, num_contexts=2)
+    none = torch.zeros(0, dtype=torch.long)
+    assert sample_distinct(prior, 4, 2, none).plans.shape == (0, 4, 2)
+    assert most_probable(prior, 4, 2, none)[0].shape == (0, 4, 2)
+    found, rollout = sample_distinct_in_world(UniformPrior(3), random_world(0), none, 4, 2, keep_states=True)
+    assert found.plans.shape == rollout.rewards.shape == rollout.states.shape == (0, 4, 2)
+
+
+def test_what_a_prior_says_after_the_impossible_does_not_count():
+    """No number: as of a distribution whose logits are all minus infinity."""
+    prior = TablePrior.random(3, 3)
+    for logits in prior.logits:
+        logits[..., 0] = -torch.inf
+    prior.logits[1][:, 0], prior.logits[2][:, :3] = torch.nan, torch.nan
+    found = sample_distinct(prior, 10, 3, num_sets=50, generator=seeded(0))
+    assert ((found.log_prob > -torch.inf).sum(1) == 8).all()
+    assert (found.log_prob[:, 8:] == -torch.inf).all()
+    assert len(most_probable(prior, 8, 3)[0][0].unique(dim=0)) == 8
 
 
 def test_refuses_in_worlds():

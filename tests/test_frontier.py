@@ -84,6 +84,37 @@ def test_it_finds_what_the_oracle_does_when_it_may_try_all(seed, how, kind, lega
     assert torch.equal(again.plan, decision.plan)
 
 
+@pytest.mark.parametrize("temperature", [1.0, 0.1, 0.01, 1e-4])
+@pytest.mark.parametrize("noise", [False, True])
+def test_nor_does_a_prior_that_is_sure_of_the_wrong_way_stop_it(temperature, noise):
+    """A line of 9 cells with a reward at its end, and a prior that goes the other way."""
+    cell = torch.arange(9)
+    world = TabularWorld(torch.stack([(cell - 1).clamp(min=0), (cell + 1).clamp(max=8)], 1), (cell == 8).float())
+    prior = MarkovPrior(2, 0).fit(torch.zeros(200, 8).long())
+    planner = FrontierPlanner(prior, 8, 50, temperature=temperature, noise=noise)
+    assert planner.plan(world, torch.zeros(3, dtype=torch.long), seeded(0)).score.tolist() == [1.0] * 3
+
+
+def test_plans_are_legal_even_where_nothing_is_worth_anything():
+    world = random_world(0, "WSA", legal=True)
+    world = TabularWorld(world.next_state, torch.full_like(world.reward, -torch.inf), world.legal_actions)
+    state = world.reset(200, seeded(0))
+    for how in ({}, {"any_prefix": True}):
+        decision = FrontierPlanner(UniformPrior(3), 4, 100, **how).plan(world, state, seeded(1))
+        now = state
+        for t in range(4):
+            taken = torch.ones(200, dtype=torch.bool) if decision.lengths is None else decision.lengths > t
+            action = decision.plan[:, t].long()
+            assert world.legal(now).gather(1, action[:, None])[taken].all()
+            now = world.step(now, action)[0]
+
+
+def test_no_starts():
+    world = random_world(0)
+    decision = FrontierPlanner(UniformPrior(3), 3, 5).plan(world, torch.zeros(0, dtype=torch.long), seeded(0))
+    assert decision.plan.shape == (0, 3)
+
+
 def test_steps_that_are_not_needed_at_first_are_for_later():
     planner = FrontierPlanner(UniformPrior(3), 4, 20)
     assert planner._widths(3) == [3, 9, 27, 41]

@@ -212,26 +212,38 @@ def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, spa
     may, answers = prior._may_write, []
     monkeypatch.setattr(prior, "_may_write", lambda state: answers.append(may(state)) or answers[-1])
 
-    def steps(state_grad):
-        with torch.set_grad_enabled(state_grad):
+    def steps(step, learning=False):
+        with torch.set_grad_enabled(learning):
             logits, state = prior.start(batch, seen)
             told = [logits]
             for one in action:
-                logits, state = prior.step(one, state)
+                logits, state = step(one, state)
                 told.append(logits)
         return torch.stack(told), state
 
-    fast = steps(False)
+    fast = steps(prior.step)
     # Of s + 1 inputs the first s are in the cache when the last is read.
-    assert answers == [s <= min(window or 99, (span or 99) - 1) for s in range(1, len(action) + 1)]
-    plain = steps(True)
-    assert not any(answers[len(action) :])
+    limits = [min(window or 99, (span or 99) - 1) - s for s in range(1, len(action) + 1)]
+    assert [answer is not None for answer in answers] == [limit >= 0 for limit in limits]
+    if window or span:
+        assert [answer for answer in answers if answer is not None] == [limit for limit in limits if limit >= 0]
+    answers.clear()
+    plain = steps(prior.step, learning=True)
+    assert answers == [None] * len(action)
     assert plain[0].requires_grad
-    monkeypatch.setattr(prior, "step", lambda one, state: prior.advance(one, state, None, len(action)))
-    written_over = steps(False)
+    written_over = steps(lambda one, state: prior.advance(one, state, None, len(action)))
     for one, other, third in zip(fast, plain, written_over, strict=True):
         torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
         assert torch.equal(one, third)
+
+
+def test_no_plans_at_all():
+    prior = TransformerPrior(4, width=8, num_heads=2, window=5)
+    with torch.no_grad():
+        _, state = prior.start(0)
+        for _ in range(3):
+            logits, state = prior.advance(torch.zeros(0, dtype=torch.long), state, None, 2)
+    assert logits.shape == (0, 4)
 
 
 def test_a_transformer_that_advances_takes_memory_once():
@@ -257,7 +269,63 @@ def test_a_transformer_in_training_or_in_rough_numbers_does_not_write_in_place()
     prior = TransformerPrior(4, width=8, num_heads=2)
     with torch.no_grad():
         _, state = prior.start(3)
-        assert prior._may_write(state)
+        assert prior._may_write(state) is not None
         with torch.autocast("cpu", torch.bfloat16):
-            assert not prior._may_write(state)
-        assert not prior.train()._may_write(state)
+            assert prior._may_write(state) is None
+        assert prior.train()._may_write(state) is None
+
+
+class NeverFirst(TransformerPrior):
+    """Without the first action, by steps of its own."""
+
+    def step(self, action, state, context=None):
+        logits, state = super().step(action, state, context)
+        return logits.index_fill(1, torch.tensor(0), -torch.inf), state
+
+
+class Loud(TransformerPrior):
+    """Reads in a way of its own."""
+
+    def encode(self, inputs, memory=None):
+        logits, memory = super().encode(inputs, memory)
+        return 2 * logits + 1, memory
+
+
+@pytest.mark.parametrize("kind", [NeverFirst, Loud])
+def test_subclasses_that_step_or_read_in_their_own_way_do(kind):
+    prior = kind(3, width=8, num_heads=2)
+    with torch.no_grad():
+        _, state = prior.start(4)
+        action = torch.tensor([0, 1, 2, 0])
+        want = kind.encode(prior, action[:, None, None].float(), state[:, :-1])[0][:, 0]
+        for logits, _ in (prior.step(action, state), prior.advance(action, state, None, 3)):
+            assert torch.allclose(logits[:, 1:], want[:, 1:], atol=1e-5)
+            assert (logits[:, 0] == -torch.inf).all() == (kind is NeverFirst)
+
+
+@pytest.mark.parametrize("part", [slice(None, None, 2), slice(1, None, 2), slice(0, 2), slice(3, None)])
+def test_a_state_that_is_part_of_another_tensor_is_not_written_over(part):
+    """Rows of a state that has room, and columns of a tensor that holds others."""
+    prior = TransformerPrior(4, width=8, num_heads=2)
+    with torch.no_grad():
+        _, state = prior.start(6)
+        action = torch.tensor([0, 1, 2, 3, 0, 1])
+        _, roomy = prior.advance(action, state, None, 5)
+        kept = roomy.clone()
+        want, _ = prior.step(action[part], roomy[part])
+        got, _ = prior.advance(action[part], roomy[part], None, 3)
+        assert torch.equal(got, want)
+        assert torch.equal(roomy, kept)
+        beside = torch.cat([kept, torch.ones(6, 500)], 1)
+        prior.advance(action, beside[:, : kept.shape[1]], None, 0)
+        assert (beside[:, kept.shape[1] :] == 1).all()
+
+
+@pytest.mark.parametrize(("window", "span"), [(5, None), (None, 6), (9, 4)])
+def test_no_more_room_is_taken_than_is_used(window, span):
+    prior = TransformerPrior(4, width=8, num_heads=2, window=window)
+    prior.span = span
+    with torch.no_grad():
+        _, state = prior.start(2)
+        _, state = prior.advance(torch.tensor([0, 1]), state, None, 10**6)
+    assert state.untyped_storage().nbytes() < 2 * 4 * 12 * (prior._cache_size + prior.lags + 1)

@@ -213,6 +213,27 @@ def test_plans_drawn_together_in_parts_are_the_same(kind, monkeypatch):
     assert torch.equal(draws(), whole)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_start_and_step_are_enough(method):
+    """Of a prior that is no `Prior`."""
+
+    class Plain:
+        num_actions, context_per, end, device = 3, None, None, torch.device("cpu")
+
+        def start(self, batch_size, context=None):
+            return torch.zeros(batch_size, 3), torch.zeros(batch_size, 1)
+
+        def step(self, action, state, context=None):
+            return torch.eye(3)[action].log(), state
+
+        def check_context_of(self, plans, num_plans=0, length=0):
+            pass
+
+    plans = sample(Plain(), 40, 4, generator=seeded(0), method=method)
+    assert (plans == plans[:, :1]).all()
+    assert len(plans[:, 0].unique()) == 3
+
+
 def test_a_tree_evaluates_each_prefix_once():
     prior, seen = UniformPrior(A), []
     step = prior.step

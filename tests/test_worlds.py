@@ -159,8 +159,21 @@ def test_the_loop_is_for_what_it_can_do(monkeypatch):
     assert compiled.worth_compiling(few, reward.double())
     assert not compiled.worth_compiling(few, reward.half())
     assert not compiled.worth_compiling(few, reward.requires_grad_())
-    monkeypatch.setattr(compiled, "_numba_is_there", lambda: False)
+    monkeypatch.setattr(compiled, "_loop", lambda: None)
     assert not compiled.worth_compiling(few, torch.zeros(1, 1))
+
+
+def test_a_numba_that_does_not_work_is_left_alone(monkeypatch):
+    monkeypatch.setattr(compiled, "find_spec", lambda name: object())
+    monkeypatch.setattr(compiled, "import_module", lambda name: {}["Numba needs another NumPy"])
+    monkeypatch.setattr(compiled, "MANY", 0)
+    compiled._loop.cache_clear()
+    world = random_world(1, "WS")
+    try:
+        assert not compiled.worth_compiling(torch.zeros(1, 1, 1, dtype=torch.uint8), torch.zeros(1, 1))
+        assert world.rollout(world.reset(2, seeded(0)), torch.zeros(2, 3, 4).long()).rewards.shape == (2, 3, 4)
+    finally:
+        compiled._loop.cache_clear()
 
 
 def test_rollout_takes_stored_actions():

@@ -6,10 +6,12 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from neuroprior.distinct import children
 from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
 from neuroprior.plans import action_dtype
 from neuroprior.priors.prior import Prior
 from neuroprior.randomness import generator_on, gumbel
+from neuroprior.sampling import advance, check_in_world, start_in_world
 from neuroprior.worlds.world import World, check_sizes
 
 
@@ -23,6 +25,7 @@ class FrontierPlanner(Planner):
     little to try, leave of them is for the later ones.
 
     Where it may try all actions in all states that can be reached, it finds what the oracle does, whatever the prior.
+    Where not every action exists and fewer can be tried than it may, others are tried as if they existed, for nothing.
 
     Args:
         prior: what proposes.
@@ -58,13 +61,9 @@ class FrontierPlanner(Planner):
         self.temperature, self.noise = temperature, noise
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        world.check_state(state)
         if world.stochastic:
             raise ValueError("world: one without chance is expected: plans that meet in a state are taken for one")
-        if self.prior.end is not None:
-            raise ValueError("prior: it samples an end symbol, which is no action of the world")
-        if self.prior.num_actions != world.num_actions:
-            raise ValueError(f"prior has {self.prior.num_actions} actions, the world {world.num_actions}")
+        check_in_world(self.prior, world, state)
         generator = generator_on(generator, state.device)
         steps = sum(self._widths(world.num_actions))
         return in_chunks(lambda some: self._plan(world, some, generator, steps), state, steps)
@@ -81,9 +80,7 @@ class FrontierPlanner(Planner):
     @torch.no_grad()
     def _plan(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
         batch = len(state)
-        seen = world.observe(state) if self.prior.context_per is not None else None
-        self.prior.check_context_of(seen, batch)
-        logits, memory = self.prior.start(batch, seen)
+        logits, memory = start_in_world(self.prior, world, state)
         front = _Front(
             torch.empty(batch, 1, 0, dtype=action_dtype(world.num_actions), device=state.device),
             torch.zeros(batch, 1, dtype=torch.float64, device=state.device),
@@ -93,15 +90,14 @@ class FrontierPlanner(Planner):
         ends = []
         for t, width in enumerate(self._widths(world.num_actions)):
             front, row, action = self._tried(world, front, logits, width, generator)
-            score = self.score(front.rewards, front.state.view(*front.rewards.shape[:2], *state.shape[1:]))
-            score = score.masked_fill(front.log_prob == -torch.inf, -torch.inf)
             if self.any_prefix or t + 1 == self.length:
+                score = self.score(front.rewards, front.state.view(*front.rewards.shape[:2], *state.shape[1:]))
                 ends.append(_best(front, score, generator, self.length))
             if t + 1 < self.length:
                 gained = front.rewards.double() @ self._weights(front.rewards).double()
                 front = front.merged(gained if self.objective == "return" else None)
                 seen = world.observe(front.state) if self.prior.context_per == "step" else None
-                logits, memory = self.prior.advance(action, memory.index_select(0, row), seen)
+                logits, memory = advance(self.prior, action, memory.index_select(0, row), seen)
         return self._decided(ends, generator, steps)
 
     def _tried(
@@ -110,8 +106,8 @@ class FrontierPlanner(Planner):
         """The continuations that are tried, and of each, in one line, which row it goes on from and by which action."""
         if not world.all_legal:
             logits = logits.masked_fill(~world.legal(front.state), -torch.inf)
-        log_prob = front.log_prob.view(-1, 1) + (logits.double() / self.temperature).log_softmax(-1)
-        log_prob = log_prob.view(len(front.log_prob), -1)
+        log_prob = children(front.log_prob.view(-1, 1), logits, self.temperature)
+        log_prob = log_prob.view(len(front.log_prob), front.log_prob.shape[1] * world.num_actions)
         height = gumbel(log_prob, generator) if self.noise else log_prob
         index = height.topk(width).indices
         action = (index % world.num_actions).flatten()
@@ -168,23 +164,24 @@ class _Front(NamedTuple):
         new = torch.ones_like(sorted_code, dtype=torch.bool)
         new[:, 1:] = sorted_code[:, 1:] != sorted_code[:, :-1]
         group = new.cumsum(1) - 1
-        # Sums of probabilities relative to the most probable plan of the start: nothing that matters underflows.
-        top = prob.amax(1, keepdim=True)
-        total = torch.zeros_like(prob).scatter_add_(1, group, (prob - top).exp()).log() + top
+        # Sums of probabilities relative to the greatest of each state, of which none underflows.
+        top = torch.full_like(prob, -torch.inf).scatter_reduce_(1, group, prob, "amax")
+        rest = (prob - top.gather(1, group)).nan_to_num(-torch.inf, neginf=-torch.inf).exp()
+        total = torch.zeros_like(prob).scatter_add_(1, group, rest).log() + top
         log_prob = torch.where(new, total.gather(1, group), -torch.inf)
         return self._replace(log_prob=torch.empty_like(log_prob).scatter_(1, order, log_prob))
 
 
 def _best(front: _Front, score: Tensor, generator: torch.Generator, length: int) -> Decision:
     """The best plan of each start, filled up with zeros."""
-    best = random_best(score, generator)
+    best = random_best(score, generator, front.log_prob > -torch.inf)
     row = torch.arange(len(best), device=best.device)
     plan = torch.nn.functional.pad(front.plans[row, best], (0, length - front.plans.shape[2]))
     return Decision(plan, score[row, best], front.state.view(*score.shape, *front.state.shape[1:])[row, best], 0)
 
 
 def _rows(values: Tensor, row: Tensor, shape: tuple[int, ...]) -> Tensor:
-    return values.flatten(0, 1).index_select(0, row).view(*shape[:2], -1)
+    return values.flatten(0, 1).index_select(0, row).view(*shape[:2], values.shape[2])
 
 
 def _codes(state: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from neuroprior.planners.chance import check_rollouts, mean_scores
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks
 from neuroprior.priors.prior import Prior
 from neuroprior.randomness import generator_on
-from neuroprior.sampling import sample_in_world
+from neuroprior.sampling import check_in_world, sample_in_world
 from neuroprior.worlds.world import Rollout, World
 
 
@@ -59,13 +59,7 @@ class SamplingPlanner(Planner):
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        world.check_state(state)
-        if self.prior.end is not None:
-            raise ValueError(
-                "prior: it samples an end symbol, which is no action of the world; learn from plans without one"
-            )
-        if self.prior.num_actions != world.num_actions:
-            raise ValueError(f"prior has {self.prior.num_actions} actions, the world {world.num_actions}")
+        check_in_world(self.prior, world, state)
         generator = generator_on(generator, state.device)
 
         def some(state: Tensor) -> Decision:

@@ -1,5 +1,6 @@
 """The transformer prior: attention over the actions so far, with a key-value cache for stepping."""
 
+import sys
 from typing import Any
 
 import torch
@@ -8,6 +9,9 @@ from torch.nn import functional
 
 from neuroprior.priors.neural import Embedding, NeuralPrior
 from neuroprior.worlds.world import check_sizes
+
+ROOM = "room_to_advance"
+"""The mark of memory that was taken for states which are written over."""
 
 
 class TransformerPrior(NeuralPrior):
@@ -93,40 +97,44 @@ class TransformerPrior(NeuralPrior):
         return self.head(self.norm(x)), torch.cat([recent, torch.stack(caches, 2).flatten(1)], 1)
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if not self._may_write(state):
+        if self._may_write(state) is None:
             return super().step(action, state, context)
-        return self._write(action, state, context, 0)
+        return self._write(action, state, context)
 
     def advance(
         self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
     ) -> tuple[Tensor, Tensor]:
-        if not self._may_write(state):
-            return super().step(action, state, context)
-        return self._write(action, state, context, room + 1)
+        most = self._may_write(state)
+        if most is None or type(self).step is not TransformerPrior.step:
+            return self.step(action, state, context)
+        return self._write(action, state, context, min(room, most))
 
-    def _write(self, action: Tensor, state: Tensor, context: Tensor | None, room: int) -> tuple[Tensor, Tensor]:
+    def _write(
+        self, action: Tensor, state: Tensor, context: Tensor | None, room: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """A step in which new keys and values are written behind the cache, which is most of what there is to move.
 
         Args:
             action, state, context: see `step`.
-            room: 0: the cache is copied once, and `state` stays as it is. Else, where there is room behind each of its
-                rows, it is written over; where there is none, it is copied to where so many steps have room.
+            room: None: the cache is copied once, and `state` stays as it is. Else a state for which room was made is
+                written over, and any other copied to where so many further steps have room.
         """
         memory, history = self._open(state)
         new = self._inputs(action, context, history[:, -1])
-        kept = 0 if self.window is None else history[0].numel()
+        kept = 0 if self.window is None else history.shape[1] * self.input_size
         recent, past, cached = self.lags - 1, memory.shape[1], memory.shape[1] + self._cache_size
         before = state[:, past : past + kept].clone()  # where the cache will be
         size = cached + kept + self.input_size
         x, line = self.embedding(new[:, None], memory[:, :recent])
-        if room and state.stride(0) >= size:
+        if room is not None and _has_room(state, size):
             after = state.as_strided((len(state), size), state.stride())
         else:
-            most = size + max(room - 1, 0) * (self._cache_size + self.input_size)
-            after = state.new_empty(len(state), most)[:, :size]
+            taken = state.new_empty(len(state), size + (room or 0) * (self._cache_size + self.input_size))
+            setattr(taken, ROOM, room is not None)
+            after = taken[:, :size]
             after[:, recent:past] = memory[:, recent:]
         after[:, :recent] = line
-        places = after[:, recent:cached].unflatten(1, (-1, self.num_layers, 2 * self.width))
+        places = after[:, recent:cached].unflatten(1, ((cached - recent) // self._cache_size, self.num_layers, -1))
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, _Block)
             x = block.step(x, places[:, :, layer])
@@ -134,16 +142,22 @@ class TransformerPrior(NeuralPrior):
         after[:, cached + kept :] = new
         return self.head(self.norm(x))[:, 0], after
 
-    def _may_write(self, state: Tensor) -> bool:
-        """Whether `step` can write a state in place: nothing is learned, and nothing falls out of the window."""
-        if state.dim() == 3 or self.training or torch.is_grad_enabled():
-            return False
-        if torch.is_autocast_enabled(state.device.type):
-            return False
+    def _may_write(self, state: Tensor) -> int | None:
+        """How many steps after the next can be written in place, too; None: not even that one.
+
+        Nothing may be learned, nothing fall out of the window or span, and no subclass read in a way of its own.
+        """
+        plain = type(self).encode is TransformerPrior.encode and not (self.training or torch.is_grad_enabled())
+        if not plain or state.dim() == 3 or torch.is_autocast_enabled(state.device.type):
+            return None
         memory, history = self._open(state)
         read = (memory.shape[1] - self.lags + 1) // self._cache_size
-        fits = self.window is None or history.shape[1] <= self.window
-        return fits and (self.span is None or read < self.span)
+        limits = [
+            *([] if self.window is None else [self.window - history.shape[1]]),
+            *([] if self.span is None else [self.span - read - 1]),
+        ]
+        most = min(limits, default=sys.maxsize)
+        return None if most < 0 else most
 
     @property
     def _cache_size(self) -> int:
@@ -163,6 +177,19 @@ class TransformerPrior(NeuralPrior):
         if self.window is None:
             return state_size - self.input_size
         return (state_size - self.lags + 1) // (self._cache_size + self.input_size) * self._cache_size + self.lags - 1
+
+
+def _has_room(state: Tensor, size: int) -> bool:
+    """Whether a state is all that is in use of memory that `advance` took, with room for `size` numbers in each row."""
+    base = state._base
+    return (
+        base is not None
+        and getattr(base, ROOM, False)
+        and state.storage_offset() == 0
+        and state.stride() == base.stride()
+        and len(state) == len(base)
+        and base.shape[1] >= size
+    )
 
 
 class _Block(nn.Module):

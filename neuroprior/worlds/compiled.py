@@ -17,7 +17,7 @@ MANY = 2**20
 def worth_compiling(plans: Tensor, reward: Tensor) -> bool:
     """Whether the loop is there for plans `[B, P, L]`, and quicker even when it has to be loaded first."""
     plain = reward.dtype in (torch.float32, torch.float64) and not reward.requires_grad
-    return plans.numel() >= MANY and plain and plans.device.type == "cpu" and _numba_is_there()
+    return plans.numel() >= MANY and plain and plans.device.type == "cpu" and _loop() is not None
 
 
 def rollout(
@@ -36,7 +36,8 @@ def rollout(
     Returns:
         The final states `[B, P]`, int64, the rewards `[B, P, L]`, and the states `[B, P, L]` or None.
     """
-    loop: Any = import_module("neuroprior.worlds.compiled_loop").follow
+    loop = _loop()
+    assert loop is not None
     (batch, num_plans, length), rows = plans.shape, plans.shape[:2].numel()
     actions_of = (plans if plans.dtype == torch.uint8 else plans.long()).reshape(rows, length)
     given = [x.contiguous().numpy() for x in (table, reward.flatten(), cell, offset, actions_of)]
@@ -57,5 +58,11 @@ def rollout(
 
 
 @cache
-def _numba_is_there() -> bool:
-    return find_spec("numba") is not None
+def _loop() -> Any:
+    """The loop; None where numba is not installed, or does not work here."""
+    if find_spec("numba") is None:
+        return None
+    try:
+        return import_module("neuroprior.worlds.compiled_loop").follow
+    except Exception:  # one that does not go with this numpy, or finds no place for what it compiles
+        return None
