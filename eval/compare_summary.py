@@ -64,7 +64,8 @@ def reasons(words: Rows, bits: Rows, paired: Rows, num_plans: Sequence[int]) -> 
             and one["p_holm"] < 0.05
         ]
         own["early"] = early[0] if early else None
-        found.append(own | {"words": _why(own, number, fewest)})
+        near = own["markov_share"] >= CEILING and row["better"] is None
+        found.append(own | {"words": _little_left(own, number) if near else _why(own, number, fewest)})
     return found
 
 
@@ -87,10 +88,13 @@ def reasons_section(found: Rows) -> Section | None:
     return Section("Where networks are not better, and why", [text, *reasons_in_words(found)])
 
 
+def _little_left(own: Mapping[str, Any], number: int) -> str:
+    share = 100 * own["markov_share"]
+    return f"little is left to find: with {number:,} plans the best chain reaches {share:.1f} % of the oracle"
+
+
 def _why(own: Mapping[str, Any], number: int, fewest: int) -> str:
-    share, neural, markov = own["markov_share"], own["neural_bits"], own["markov_bits"]
-    if share >= CEILING:
-        return f"little is left to find: with {number:,} plans the best chain reaches {100 * share:.1f} % of the oracle"
+    neural, markov = own["neural_bits"], own["markov_bits"]
     if neural is None or markov is None:
         return "no plans to tell bits of"
     told = f"{neural:.2f} bits an action against {markov:.2f}{', before growth' * bool(own['rounds'])}"
