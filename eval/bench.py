@@ -137,9 +137,8 @@ def missing(package: str | None) -> bool:
 def _imports(repetitions: int) -> dict[str, Any]:
     """The row of the time to import the library, as a ratio to that of torch."""
     pair = ("torch", "neuroprior")
-    times = [[import_seconds(package) for package in pair] for _ in range(repetitions + 1)][
-        1:
-    ]  # from the disk at first
+    times = [[import_seconds(package) for package in pair] for _ in range(repetitions + 1)]
+    del times[0]  # which read files from the disk
     ratios = _ratios([ours / torchs for torchs, ours in times])
     return {"seconds": median(ours for _, ours in times), "torch_seconds": median(t for t, _ in times), **ratios} | {
         "goal": GOAL
