@@ -1,16 +1,16 @@
 """How near work comes to what the machine can do, in `python -m eval bench`: bytes moved and operations done."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
 
-from eval.bench_jobs import scaled
+from eval.bench_jobs import JOBS, scaled
 from eval.bench_packages import Run
 from eval.bench_times import seconds_again
-from neuroprior import GRUPrior, MarkovPrior, TransformerPrior, UniformPrior, gridworld
+from neuroprior import GRUPrior, MarkovPrior, TransformerPrior
 
 COPIED, SIDE = 2**28, 2048
 """Bytes of a copy, and the side of the matrices, by which the machine is measured."""
@@ -36,12 +36,12 @@ class Work:
     operations: int = 0
 
 
-def works(scale: float) -> Iterator[Callable[[], Work]]:
-    """Trying plans, and sampling by prefix tree and plan by plan."""
-    yield partial(_evaluate, scaled(10_000, scale))
-    yield partial(_tree_markov, scaled(2_560_000, scale))
-    yield partial(_tree_transformer, scaled(2_560_000, scale))
-    yield partial(_plan_by_plan, scaled(8192, scale))
+def works(scale: float) -> Iterator[Work]:
+    """Trying plans, and sampling by prefix tree and plan by plan; each is made when its turn comes."""
+    yield _evaluate(scale)
+    yield _tree_markov(scaled(2_560_000, scale))
+    yield _tree_transformer(scaled(2_560_000, scale))
+    yield _plan_by_plan(scaled(8192, scale))
 
 
 def measured(scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
@@ -59,8 +59,7 @@ def measured(scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
     taken = [seconds_again(work.run, repetitions) for work in machine]
     rates = {"memory": machine[0].moved / taken[0], "arithmetic": machine[1].operations / taken[1]}
     yield from (_row(work, seconds, rates) for work, seconds in zip(machine, taken, strict=True))
-    for make in works(scale):
-        work = make()
+    for work in works(scale):
         yield _row(work, seconds_again(work.run, repetitions), rates)
 
 
@@ -71,13 +70,10 @@ def _row(work: Work, seconds: float, rates: dict[str, float]) -> dict[str, Any]:
     return row | {"share": least[bound] / seconds, "bound": bound}
 
 
-def _evaluate(starts: int) -> Work:
+def _evaluate(scale: float) -> Work:
     """Plans are read, rewards and final states written; the tables of a small world fit any cache."""
-    world, generator = gridworld(20, 20, "torus", num_worlds=10), torch.Generator().manual_seed(0)
-    state = world.reset(starts, generator)
-    plans = UniformPrior(4).sample(starts * 256, 8, generator=generator).view(starts, 256, 8)
-    moved = plans.numel() * (ACTION + FLOAT) + plans[..., 0].numel() * INTEGER
-    return Work(f"evaluate {starts:,} starts x 256 plans x 8 steps", partial(world.rollout, state, plans), moved)
+    job, plans = JOBS["evaluate"](scale), scaled(10_000, scale) * 256
+    return Work(job.about, job.make(torch.device("cpu")), plans * (8 * (ACTION + FLOAT) + INTEGER))
 
 
 def _tree_markov(number: int) -> Work:

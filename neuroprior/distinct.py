@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior.draws import after_end
+from neuroprior.draws import after_end, check_temperature
 from neuroprior.plans import action_dtype, sees_each_step
 from neuroprior.randomness import generator_on, gumbel
 from neuroprior.sampling import Steppable, advance, start_in_world
@@ -281,8 +281,7 @@ def _no_actions(prior: Steppable, number: int) -> Tensor:
 
 def _check(prior: Steppable, num_plans: int, length: int, temperature: float) -> None:
     check_sizes(num_plans=num_plans, length=length)
-    if not 0 < temperature < float("inf"):
-        raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+    check_temperature(temperature)
     if prior.num_actions**length < num_plans:
         raise ValueError(
             f"num_plans: there are only {prior.num_actions**length} plans of {length} actions, not {num_plans}"

@@ -6,6 +6,12 @@ from torch import Tensor
 from neuroprior.plans import action_dtype
 
 
+def check_temperature(temperature: float) -> None:
+    """Raise ValueError unless logits can be divided by it."""
+    if not 0 < temperature < float("inf"):
+        raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+
+
 def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:
     """`logits [..., A]`, but nothing else than the end symbol where the action `before [...]` was that symbol."""
     if end is None:

@@ -5,7 +5,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from neuroprior.draws import Draw, after_end, shuffled_rows, worth_splitting
+from neuroprior.draws import Draw, after_end, check_temperature, shuffled_rows, worth_splitting
 from neuroprior.plans import sees_each_step
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import Rollout, World, is_integer, join_states
@@ -214,8 +214,7 @@ def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> 
             "num_plans and length must not be negative and batch_size at least 1,"
             f" not {num_plans}, {length} and {batch_size}"
         )
-    if not 0 < temperature < float("inf"):
-        raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+    check_temperature(temperature)
 
 
 def _grow(

@@ -202,7 +202,7 @@ def test_the_share_of_the_limit(monkeypatch):
     """On a machine that copies in a second, and multiplies in two, work of half the bytes in four seconds."""
     work = bench_limits.Work("half", lambda: None, bench_limits.COPIED, bench_limits.SIDE**3)
     seconds = iter([1.0, 2.0, 4.0])
-    monkeypatch.setattr(bench_limits, "works", lambda scale: [lambda: work])
+    monkeypatch.setattr(bench_limits, "works", lambda scale: [work])
     monkeypatch.setattr(bench_limits, "seconds_again", lambda run, repetitions: next(seconds))
     *_, row = bench_limits.measured(1.0, 1)
     assert row["bound"] == "arithmetic"

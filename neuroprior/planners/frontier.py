@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.distinct import children
+from neuroprior.draws import check_temperature
 from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
 from neuroprior.plans import action_dtype
 from neuroprior.priors.prior import Prior
@@ -55,8 +56,7 @@ class FrontierPlanner(Planner):
     ) -> None:
         super().__init__(objective, discount, value, any_prefix)
         check_sizes(length=length, num_plans=num_plans)
-        if not 0 < temperature < float("inf"):
-            raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+        check_temperature(temperature)
         self.prior, self.length, self.num_plans = prior, length, num_plans
         self.temperature, self.noise = temperature, noise
 

@@ -6,6 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from neuroprior.draws import check_temperature
 from neuroprior.planners.chance import check_rollouts, mean_scores
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks
 from neuroprior.priors.prior import Prior
@@ -52,8 +53,7 @@ class SamplingPlanner(Planner):
         super().__init__(objective, discount, value, any_prefix)
         if length < 1 or num_plans < 1:
             raise ValueError(f"length and num_plans must be at least 1, not {length} and {num_plans}")
-        if not 0 < temperature < float("inf"):
-            raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+        check_temperature(temperature)
         check_rollouts(num_rollouts)
         self.num_rollouts = num_rollouts
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
