@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from neuroprior.memory import rows_of
 from neuroprior.plans import action_dtype
 
 
@@ -69,19 +70,27 @@ def worth_splitting(children: int, total: int) -> bool:
     return 8 * children <= total
 
 
+def levels_worth_splitting(prefixes: int, total: int, num_actions: int) -> int:
+    """How many levels of a tree are worth it beyond one with so many prefixes, if all of them branch."""
+    levels = 0
+    while num_actions > 1 and worth_splitting(prefixes * num_actions ** (levels + 1), total):
+        levels += 1
+    return levels
+
+
 def shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> Tensor:
     """The prefix of each plan (int32 where that is enough): m `counts[m]` times; by root, in random order within."""
     # The narrowest numbers that will do: to shuffle and to sort is to move memory.
-    row = torch.arange(len(counts), device=counts.device, dtype=_narrow(len(counts))).repeat_interleave(counts)
+    row = torch.repeat_interleave(counts.to(_narrow(int(counts.sum()))), output_size=int(counts.sum()))
     if len(row) == 0 or len(counts) == int(root[-1]) + 1:
         return row  # one prefix a root
     order = torch.randperm(len(row), generator=generator, device=row.device, dtype=_narrow(len(row)))
-    row = row.index_select(0, order)
+    row = rows_of(row, order)
     last = int(root[-1])
     if last == 0:
         return row
     root = root.to(torch.int16 if last < 2**15 else _narrow(last))
-    return row.index_select(0, root.index_select(0, row).argsort(stable=True))
+    return rows_of(row, rows_of(root, row).argsort(stable=True))
 
 
 def _narrow(number: int) -> torch.dtype:

@@ -5,7 +5,15 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from neuroprior.draws import Draw, after_end, check_temperature, shuffled_rows, worth_splitting
+from neuroprior.draws import (
+    Draw,
+    after_end,
+    check_temperature,
+    levels_worth_splitting,
+    shuffled_rows,
+    worth_splitting,
+)
+from neuroprior.memory import rows_of
 from neuroprior.plans import sees_each_step
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import Rollout, World, is_integer, join_states
@@ -204,8 +212,8 @@ def sample_in_world(
 
 
 def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
-    """These rows of each; several times as quick as by brackets where rows are long."""
-    return [tensor.index_select(0, row) for tensor in tensors]
+    """These rows of each."""
+    return [rows_of(tensor, row) for tensor in tensors]
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
@@ -242,11 +250,13 @@ def _grow(
         prefix, root = _taken(parent, prefix, root)
         prefix = torch.cat([prefix, action[:, None].to(draw.dtype)], 1)
         if prefix.shape[1] < length:
-            logits, state = prior.step(action, state.index_select(0, parent))
+            levels = levels_worth_splitting(len(counts), total, draw.num_actions)
+            room = min(length - prefix.shape[1] - 1, levels)
+            logits, state = advance(prior, action, rows_of(state, parent), None, room)
             logits = after_end(logits, action, draw.end)
     row = shuffled_rows(counts, root, draw.generator)
     depth = prefix.shape[1]
-    begun = prefix.index_select(0, row)
+    begun = rows_of(prefix, row)
     if depth == length:
         return begun
     plans = torch.empty(total, length, dtype=draw.dtype, device=counts.device)

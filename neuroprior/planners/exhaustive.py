@@ -62,24 +62,26 @@ class ExhaustivePlanner(Planner):
                 return self._plan_with_chance(world, state, generator, steps)
             return self._plan(world, state, generator, steps)
 
-        return in_chunks(some, state, steps)
+        return in_chunks(some, state, steps, cached=not world.stochastic)
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
         batch, actions = len(state), world.num_actions
         every = torch.arange(actions, device=state.device)
         now, rewards = state, torch.zeros(batch, 0, device=state.device)
         legal = torch.ones(batch, dtype=torch.bool, device=state.device)
-        found = []  # of each depth at which a plan may end: scores, states and legality, [B, A**depth]
+        found = []  # of each depth at which a plan may end: scores, states and, unless all are, legality, [B, A**depth]
         for depth in range(1, self.depth + 1):
-            legal = (legal[:, None] & world.legal(now)).flatten()
-            before = now.repeat_interleave(actions, 0)
-            now, reward = world.step(before, every.repeat(len(before) // actions), generator)
-            rewards = torch.cat([rewards.repeat_interleave(actions, 0), reward[:, None]], 1)
+            if not world.all_legal:
+                legal = (legal[:, None] & world.legal(now)).flatten()
+            now, reward = world.step(_for_each(actions, now), every.repeat(len(now)), generator)
+            # A terminal score looks at nothing before the last reward.
+            before = _for_each(actions, rewards if self.objective == "return" else rewards[:, :0])
+            rewards = torch.cat([before, reward[:, None]], 1)
             if self.any_prefix or depth == self.depth:
-                ends = (self.score(rewards, now), now, legal)
+                ends = (self.score(rewards, now), now) if world.all_legal else (self.score(rewards, now), now, legal)
                 found.append([values.view(batch, actions**depth, *values.shape[1:]) for values in ends])
-        score, final_state, legal = (torch.cat(values, 1) for values in zip(*found, strict=True))
-        best = random_best(score, generator, legal)
+        score, final_state, *allowed = (torch.cat(values, 1) for values in zip(*found, strict=True))
+        best = random_best(score, generator, *allowed)
         row = torch.arange(batch, device=state.device)
         depths = torch.arange(self.depth - len(found) + 1, self.depth + 1, device=state.device)
         past = (actions**depths).cumsum(0)
@@ -107,3 +109,8 @@ class ExhaustivePlanner(Planner):
         plans = plans.expand(len(state), -1, -1)
         score, ends = mean_scores(self, world, state, plans, self.num_rollouts, generator)
         return decide(plans, score, ends, steps, generator, ending)
+
+
+def _for_each(actions: int, values: Tensor) -> Tensor:
+    """`values [N, ...]`, each so many times in a row: `[N * actions, ...]`."""
+    return values[:, None].expand(-1, actions, *values.shape[1:]).flatten(0, 1)

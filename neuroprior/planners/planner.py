@@ -12,6 +12,9 @@ from neuroprior.worlds.world import World
 STEPS_AT_ONCE = 2**22
 """Simulator steps (starts x plans x length) that a planner takes together; bounds memory."""
 
+STEPS_CACHED = 2**19
+"""The same where the results of the steps should stay in a CPU's cache: new memory costs more than the steps do."""
+
 
 class Decision(NamedTuple):
     """What a planner decided for B starts.
@@ -122,11 +125,12 @@ def random_best(score: Tensor, generator: torch.Generator, legal: Tensor | None 
 
     Where `legal [B, P]` is given, only scores that it marks count; it marks at least one in each row.
     """
-    if score.isnan().any():
+    # Scores are often one column of many, which is slow to read more than once.
+    score = score.contiguous() if legal is None else score.masked_fill(~legal, -torch.inf)
+    highest = score.amax(1, keepdim=True)
+    if highest.isnan().any():
         raise ValueError("score: NaN; a reward of the world, or its value, is not a number")
-    if legal is not None:
-        score = score.masked_fill(~legal, -torch.inf)
-    best = score == score.amax(1, keepdim=True)
+    best = score == highest
     if legal is not None:
         best = best & legal
     draws = torch.rand(score.shape, generator=generator, device=score.device)
@@ -164,9 +168,15 @@ def decide(
     return Decision(plan, score[row, chosen], ends[row, best, last], model_steps, last + 1)
 
 
-def in_chunks(plan_some: Callable[[Tensor], Decision], state: Tensor, steps_per_start: int) -> Decision:
-    """`plan_some` applied to as many starts at a time as memory allows, put together again."""
-    size = max(STEPS_AT_ONCE // max(steps_per_start, 1), 1)
+def in_chunks(
+    plan_some: Callable[[Tensor], Decision], state: Tensor, steps_per_start: int, cached: bool = False
+) -> Decision:
+    """`plan_some` applied to as many starts at a time as memory allows, put together again.
+
+    Where steps need little but memory, only so many are `cached` together on a CPU that they find room in its cache.
+    """
+    at_once = min(STEPS_AT_ONCE, STEPS_CACHED) if cached and state.device.type == "cpu" else STEPS_AT_ONCE
+    size = max(at_once // max(steps_per_start, 1), 1)
     first = plan_some(state[:size])
     if len(state) <= size:
         return first

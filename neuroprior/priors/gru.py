@@ -64,7 +64,8 @@ class GRUPrior(NeuralPrior):
         else:
             vectors, recent = self.embedding(inputs, recent)
             out, hidden = self.gru(self.drop(vectors), None if hidden is None else hidden.contiguous())
-        return self.head(self.drop(out)), torch.cat([hidden.transpose(0, 1).flatten(1), recent], 1)
+        state = hidden.transpose(0, 1).flatten(1)
+        return self.head(self.drop(out)), state if recent.shape[1] == 0 else torch.cat([state, recent], 1)
 
     def _may_step(self, inputs: Tensor) -> bool:
         """Whether `_one_step` gives the same as `nn.GRU`, and sooner."""
@@ -101,7 +102,7 @@ class GRUPrior(NeuralPrior):
             below = torch.lerp(new, before, share[:, size:])
             after.append(below)
         assert below is not None
-        return below[:, None], torch.stack(after), recent
+        return below[:, None], after[0][None] if len(after) == 1 else torch.stack(after), recent
 
     def memory_size(self, state_size: int) -> int:
         return self.num_layers * self.hidden_size + self.lags - 1

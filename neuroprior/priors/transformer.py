@@ -7,11 +7,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from neuroprior.memory import grown, states_with_room
 from neuroprior.priors.neural import Embedding, NeuralPrior
 from neuroprior.worlds.world import check_sizes
-
-ROOM = "room_to_advance"
-"""The mark of memory that was taken for states which are written over."""
 
 
 class TransformerPrior(NeuralPrior):
@@ -126,12 +124,10 @@ class TransformerPrior(NeuralPrior):
         before = state[:, past : past + kept].clone()  # where the cache will be
         size = cached + kept + self.input_size
         x, line = self.embedding(new[:, None], memory[:, :recent])
-        if room is not None and _has_room(state, size):
-            after = state.as_strided((len(state), size), state.stride())
-        else:
-            taken = state.new_empty(len(state), size + (room or 0) * (self._cache_size + self.input_size))
-            setattr(taken, ROOM, room is not None)
-            after = taken[:, :size]
+        after = None if room is None else grown(state, size)
+        if after is None:
+            free = (room or 0) * (self._cache_size + self.input_size)
+            after = state.new_empty(len(state), size) if room is None else states_with_room(state, size, free)
             after[:, recent:past] = memory[:, recent:]
         after[:, :recent] = line
         places = after[:, recent:cached].unflatten(1, ((cached - recent) // self._cache_size, self.num_layers, -1))
@@ -177,19 +173,6 @@ class TransformerPrior(NeuralPrior):
         if self.window is None:
             return state_size - self.input_size
         return (state_size - self.lags + 1) // (self._cache_size + self.input_size) * self._cache_size + self.lags - 1
-
-
-def _has_room(state: Tensor, size: int) -> bool:
-    """Whether a state is all that is in use of memory that `advance` took, with room for `size` numbers in each row."""
-    base = state._base
-    return (
-        base is not None
-        and getattr(base, ROOM, False)
-        and state.storage_offset() == 0
-        and state.stride() == base.stride()
-        and len(state) == len(base)
-        and base.shape[1] >= size
-    )
 
 
 class _Block(nn.Module):

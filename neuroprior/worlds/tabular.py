@@ -102,7 +102,7 @@ class TabularWorld(World):
 
     def cell(self, state: Tensor) -> Tensor:
         """The cell of each state, between 0 and S - 1."""
-        return state % self.num_states
+        return state if self.num_maps == 1 else state % self.num_states
 
     def reward_map(self, state: Tensor) -> Tensor:
         """The reward map of each state, between 0 and W - 1."""
