@@ -2,10 +2,12 @@
 
 from neuroprior.distinct import Distinct, most_probable, sample_distinct, sample_distinct_in_world
 from neuroprior.planners import (
+    CrossEntropyPlanner,
     Decision,
     ExhaustivePlanner,
     FrontierPlanner,
     Growth,
+    MCTSPlanner,
     Planner,
     SamplingPlanner,
     collect,
@@ -48,6 +50,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ContextTreePrior",
+    "CrossEntropyPlanner",
     "Decision",
     "Distinct",
     "EpisodicWorld",
@@ -56,6 +59,7 @@ __all__ = [
     "GRUPrior",
     "GridWorld",
     "Growth",
+    "MCTSPlanner",
     "MarkovPrior",
     "MixturePrior",
     "Planner",

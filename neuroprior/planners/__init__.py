@@ -1,19 +1,23 @@
 """Planners: they choose, for each start, a plan with a high score."""
 
 from neuroprior.planners.collect import collect
+from neuroprior.planners.cross_entropy import CrossEntropyPlanner
 from neuroprior.planners.exhaustive import ExhaustivePlanner
 from neuroprior.planners.expected import expected_score
 from neuroprior.planners.frontier import FrontierPlanner
 from neuroprior.planners.growth import Growth, grow
+from neuroprior.planners.mcts import MCTSPlanner
 from neuroprior.planners.oracle import oracle
 from neuroprior.planners.planner import Decision, Planner
 from neuroprior.planners.sampling import SamplingPlanner
 
 __all__ = [
+    "CrossEntropyPlanner",
     "Decision",
     "ExhaustivePlanner",
     "FrontierPlanner",
     "Growth",
+    "MCTSPlanner",
     "Planner",
     "SamplingPlanner",
     "collect",

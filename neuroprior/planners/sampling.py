@@ -1,7 +1,7 @@
 """The sampling planner: candidate plans from a prior, the best of them wins."""
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -9,10 +9,20 @@ from torch import Tensor
 from neuroprior.draws import check_temperature
 from neuroprior.planners.chance import check_rollouts, mean_scores
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks
-from neuroprior.priors.prior import Prior
 from neuroprior.randomness import generator_on
-from neuroprior.sampling import check_in_world, sample_in_world
+from neuroprior.sampling import Steppable, check_in_world, sample_in_world
 from neuroprior.worlds.world import Rollout, World
+
+
+class Proposer(Steppable, Protocol):
+    """What a planner knows of a prior that it draws whole plans from."""
+
+    @property
+    def takes_context(self) -> bool: ...
+
+    def sample(
+        self, num_plans: int, length: int, *, temperature: float, generator: torch.Generator | None
+    ) -> Tensor: ...
 
 
 class SamplingPlanner(Planner):
@@ -39,7 +49,7 @@ class SamplingPlanner(Planner):
 
     def __init__(
         self,
-        prior: Prior,
+        prior: Proposer,
         length: int,
         num_plans: int,
         *,
@@ -75,16 +85,17 @@ class SamplingPlanner(Planner):
         return times * self.num_plans * self.length
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
+        return decide(*self.tried(world, state, generator), self._steps(world), generator)
+
+    def tried(self, world: World, state: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Candidate plans `[B, P, L]` for starts `[B, ...]`, and their scores and ends as `decide` takes them."""
         if world.stochastic:
             plans = self.proposals(world, state, generator)
-            score, ends = mean_scores(self, world, state, plans, self.num_rollouts, generator)
-        else:
-            plans, rollout = self.candidates(world, state, generator)
-            if rollout.states is None:
-                score, ends = self.score(rollout.rewards, rollout.final_state), rollout.final_state
-            else:
-                score, ends = self.prefix_scores(rollout.rewards, rollout.states), rollout.states
-        return decide(plans, score, ends, self._steps(world), generator)
+            return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
+        plans, rollout = self.candidates(world, state, generator)
+        if rollout.states is None:
+            return plans, self.score(rollout.rewards, rollout.final_state), rollout.final_state
+        return plans, self.prefix_scores(rollout.rewards, rollout.states), rollout.states
 
     def proposals(self, world: World, state: Tensor, generator: torch.Generator) -> Tensor:
         """Candidate plans `[B, P, L]` for starts `[B, ...]`, before they are scored."""

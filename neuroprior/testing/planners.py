@@ -1,0 +1,156 @@
+"""The conformance suite of planners."""
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from neuroprior.chi_square import chi_square
+from neuroprior.planners import Decision, Planner, oracle
+from neuroprior.priors import Prior, UniformPrior
+from neuroprior.testing.rules import FALSE_ALARM, raises, require
+from neuroprior.worlds import TabularWorld, World
+
+Make = Callable[[Prior, int, int], Planner]
+
+
+def check_planner(make: Make, enough: int = 512, seed: int = 0) -> None:
+    """Raise AssertionError, with a message that says how, unless a planner does what a planner must.
+
+    In small random tables, with and without actions that do not exist everywhere: a decision has the shapes that it
+    should have, its plan is legal, scores what is said and ends where is said; it never beats the oracle, and equals it
+    where the budget is large; it counts exactly the steps of the world that it takes; the same seed gives the same
+    decision, and torch's global generator is left alone; no starts are no trouble; of equally good plans each is chosen
+    equally often (a chi-square test with a false alarm of 1e-6); what does not fit is refused.
+
+    Args:
+        make: `make(prior, length, num_plans)` gives the planner. One that takes no prior, or no number of plans, leaves
+            it aside. All must optimise the same.
+        enough: a number of plans with which it must find the best of 16.
+        seed: draws worlds, starts and decisions.
+
+    Raises:
+        AssertionError: the planner breaks a rule.
+    """
+    for legal in (False, True):
+        world = _random_table(2, legal, seed)
+        state = world.reset(20, torch.Generator().manual_seed(seed))
+        for length, num_plans in ((1, 1), (3, 2), (4, enough)):
+            planner = make(UniformPrior(2), length, num_plans)
+            decision = planner.plan(world, state, torch.Generator().manual_seed(seed))
+            _check_decision(planner, world, state, decision, length)
+            _check_against_oracle(planner, world, state, decision, length, num_plans >= enough)
+            _check_seed(planner, world, state, decision, seed)
+            if not legal:
+                _check_steps(planner, world, state[:1], seed)
+    none = make(UniformPrior(2), 3, 4).plan(world, state[:0], torch.Generator().manual_seed(seed))
+    require(none.plan.shape == (0, 3), f"plan of no starts: plan {list(none.plan.shape)}, not [0, 3]")
+    _check_ties(make(UniformPrior(3), 2, 9), seed)
+    planner = make(UniformPrior(2), 3, 4)
+    for wrong, what in ((state + 10**6, "states that do not exist"), (state.double(), "states that are no integers")):
+        require(raises(partial(planner.plan, world, wrong)), f"plan must raise ValueError for {what}")
+
+
+def _random_table(actions: int, legal: bool, seed: int) -> TabularWorld:
+    """Twelve states with all different rewards."""
+    generator = torch.Generator().manual_seed(seed)
+    table = torch.randint(12, (12, actions), generator=generator)
+    allowed = torch.rand(12, actions, generator=generator) < 0.6
+    allowed[torch.arange(12), torch.randint(actions, (12,), generator=generator)] = True
+    return TabularWorld(table, torch.rand(12, generator=generator), allowed if legal else None)
+
+
+def _check_decision(planner: Planner, world: TabularWorld, state: Tensor, decision: Decision, length: int) -> None:
+    """Its shapes, and what becomes of its plan when it is tried step by step."""
+    shapes = (decision.plan.shape, decision.score.shape, decision.final_state.shape)
+    batch = len(state)
+    require(
+        shapes == ((batch, length), (batch,), state.shape),
+        f"plan from {batch} starts: plan, score and final_state of shapes {[list(shape) for shape in shapes]}",
+    )
+    require(decision.score.is_floating_point(), f"score: floating point is expected, not {decision.score.dtype}")
+    last = torch.full((batch,), length) if decision.lengths is None else decision.lengths
+    require(bool(((last >= 1) & (last <= length)).all()), f"lengths: from 1 to {length} are expected, not {last}")
+    now, rewards, states = state, [], []
+    for t in range(length):
+        action = decision.plan[:, t].long()
+        there = world.legal(now).gather(1, action[:, None])[:, 0] | (last <= t)
+        require(bool(there.all()), f"plan: its action {t} does not exist where it is taken")
+        now, reward = world.step(now, action)
+        rewards.append(reward)
+        states.append(now)
+    row, course = torch.arange(batch), torch.stack(states, 1)
+    prefixes = planner.prefix_scores(torch.stack(rewards, 1), course)
+    # The planner's own sums may be in another order.
+    near = torch.isclose(decision.score.double(), prefixes[row, last - 1].double(), rtol=1e-4, atol=1e-5)
+    require(bool(near.all()), "score: another than the plan has when it is tried")
+    require(course[row, last - 1].equal(decision.final_state), "final_state: another than the plan ends in")
+
+
+def _check_against_oracle(
+    planner: Planner, world: TabularWorld, state: Tensor, decision: Decision, length: int, must: bool
+) -> None:
+    best = oracle(
+        world,
+        state,
+        length,
+        objective=planner.objective,
+        discount=planner.discount,
+        value=planner.value,
+        any_prefix=planner.any_prefix,
+    )
+    gap = best.double() - decision.score.double()
+    require(bool((gap >= -1e-5).all()), f"score: {float(-gap.min())} above what the oracle says is possible")
+    require(not must or bool((gap <= 1e-5).all()), f"score: {float(gap.max())} below the best, with plans enough")
+
+
+def _check_seed(planner: Planner, world: TabularWorld, state: Tensor, decision: Decision, seed: int) -> None:
+    before = torch.get_rng_state()
+    again = planner.plan(world, state, torch.Generator().manual_seed(seed))
+    same = again.plan.equal(decision.plan) and again.score.equal(decision.score)
+    require(same and again.model_steps == decision.model_steps, "plan: the same seed gave another decision")
+    planner.plan(world, state)
+    require(torch.get_rng_state().equal(before), "plan: torch's global generator was used")
+
+
+def _check_steps(planner: Planner, world: TabularWorld, state: Tensor, seed: int) -> None:
+    """The steps that are counted are those that are taken, for a single start."""
+    counting = _Counting(world)
+    decision = planner.plan(counting, state, torch.Generator().manual_seed(seed))
+    require(
+        counting.steps == decision.model_steps,
+        f"model_steps: {decision.model_steps} were counted, but {counting.steps} steps of the world taken",
+    )
+
+
+def _check_ties(planner: Planner, seed: int) -> None:
+    """Nine plans of two actions, each to a cell of its own, which are all worth the same."""
+    if planner.value is not None:
+        return
+    world = TabularWorld(torch.arange(39).view(13, 3).add(1).clamp(max=12), torch.ones(13))
+    state = torch.zeros(9000, dtype=torch.long)
+    decision = planner.plan(world, state, torch.Generator().manual_seed(seed))
+    number, kinds = decision.plan[:, 0].long(), 3
+    if decision.lengths is None:
+        number, kinds = number * 3 + decision.plan[:, 1].long(), 9
+    counts = number.bincount(minlength=kinds)
+    p = chi_square(counts, torch.full((kinds,), len(state) / kinds))
+    require(p > FALSE_ALARM, f"plan: equally good plans were chosen {counts.tolist()} times (p = {p:.1g})")
+
+
+class _Counting(World):
+    """A table that counts its steps."""
+
+    def __init__(self, world: TabularWorld) -> None:
+        self.world, self.num_actions, self.steps = world, world.num_actions, 0
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        return self.world.reset(batch_size, generator)
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        self.steps += action.numel()
+        return self.world.step(state, action, generator)
+
+    def check_state(self, state: Tensor) -> None:
+        self.world.check_state(state)

@@ -1,0 +1,175 @@
+"""The conformance suite of priors."""
+
+import tempfile
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neuroprior.chi_square import chi_square
+from neuroprior.plans import all_plans, sees_each_step
+from neuroprior.priors import Prior, load, save
+from neuroprior.sampling import sample
+from neuroprior.testing.rules import FALSE_ALARM, require
+
+
+def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
+    """Raise AssertionError, with a message that says how, unless `prior` does what a prior must.
+
+    With each kind of context that it takes: stepping equals `forward`, also past its window and after states were
+    reordered, and `advance` equals stepping; `log_prob` sums to one over all plans of a length and fits what `sample`
+    draws, by prefix tree and plan by plan (chi-square tests, each with a false alarm of 1e-6); the same seed gives the
+    same plans and torch's global generator is left alone; saving and loading, and moving to a GPU where there is one,
+    change nothing.
+
+    Args:
+        prior: the prior to check, trained or not.
+        length: of the plans; None: the longest (at most 5) with at most 1,024 plans.
+        num_plans: samples of a chi-square test.
+        seed: draws plans and contexts.
+
+    Raises:
+        AssertionError: the prior breaks a rule.
+    """
+    actions = prior.num_actions
+    if length is None:
+        length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)
+    generator = torch.Generator().manual_seed(seed)
+    window = getattr(prior, "window", None) or 0
+    for kind in ("plan", "step") if prior.takes_context else (None,):
+        for steps in (1, length, window + 3):
+            plans = torch.randint(actions, (7, steps), generator=generator).to(prior.device)
+            context = _random_context(prior, kind, 7, steps, generator)
+            _check_stepping(prior, plans, context)
+            _check_advancing(prior, plans, context)
+        _check_total(prior, _random_context(prior, kind, 1, length, generator), length)
+        for method in ("tree", "ancestral"):
+            context = _random_context(prior, kind, 1, length, generator)
+            _check_samples(prior, context, length, num_plans, method, generator)
+        _check_seeds(prior, kind, length, generator)
+    _check_copies(prior, length, generator)
+
+
+def _random_context(prior: Prior, kind: str | None, num: int, length: int, generator: torch.Generator) -> Tensor | None:
+    """A random context of the kind that the prior takes, one a plan or one a step."""
+    shape = (num,) if kind == "plan" else (num, length)
+    if kind is None:
+        return None
+    if prior.num_contexts is not None:
+        return torch.randint(prior.num_contexts, shape, generator=generator).to(prior.device)
+    return torch.randn(*shape, prior.context_size or 0, generator=generator).to(prior.device)
+
+
+@torch.no_grad()
+def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
+    """`start` and `step` give what `forward` gives; reordering the state reorders the logits."""
+    num, length = plans.shape
+    whole = prior(plans, context)
+    shape = (num, length, prior.num_actions)
+    require(whole.shape == shape, f"forward: logits {list(whole.shape)}, not {list(shape)}")
+    require(not whole.isnan().any(), "forward: NaN in the logits")
+    whole = whole.log_softmax(-1)
+    seen = _at(context, 0)
+    logits, state = prior.start(num, seen)
+    order = torch.arange(num - 1, -1, -1, device=plans.device)
+    for t in range(length):
+        kind = "no context" if context is None else f"context {list(context.shape)}"
+        where = f"plans of length {length}, action {t}, {kind}"
+        require(isinstance(state, Tensor) and len(state) == num, f"state must be one tensor of {num} rows ({where})")
+        require(logits.shape == (num, prior.num_actions), f"logits {list(logits.shape)} ({where})")
+        gap = float((logits.log_softmax(-1) - whole[:, t]).abs().nan_to_num(0).max())
+        require(gap < 1e-4, f"stepping differs from forward by {gap:.2g} nats ({where})")
+        if t + 1 < length:
+            seen = _at(context, t + 1) if sees_each_step(context) else None
+            backwards, _ = prior.step(plans[order, t], state[order], None if seen is None else seen[order])
+            logits, state = prior.step(plans[:, t], state, seen)
+            gap = float((backwards[order] - logits).abs().nan_to_num(0).max())
+            require(gap < 1e-4, f"reordering the state changes the logits by {gap:.2g} ({where})")
+
+
+def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
+    """`advance` gives what `step` gives, whether there is room or not, for all plans and for some."""
+    num, length = plans.shape
+    with torch.no_grad():
+        for room in (0, length):
+            logits, state = prior.start(num, _at(context, 0))
+            _, other = prior.start(num, _at(context, 0))
+            for t in range(length - 1):
+                seen = _at(context, t + 1) if sees_each_step(context) else None
+                logits, state = prior.step(plans[:, t], state, seen)
+                again, other = prior.advance(plans[:, t], other, seen, room)
+                gap = float((again - logits).abs().nan_to_num(0).max())
+                require(gap < 1e-4, f"advance differs from step by {gap:.2g} (action {t}, room {room})")
+                if t % 2:  # states that were picked out go on by themselves
+                    other = other[torch.arange(num, device=other.device)]
+
+
+def _at(context: Tensor | None, t: int) -> Tensor | None:
+    return context[:, t] if context is not None and sees_each_step(context) else context
+
+
+def _all_log_probs(prior: Prior, length: int, context: Tensor | None) -> Tensor:
+    plans = all_plans(prior.num_actions, length).to(prior.device)
+    return prior.log_prob(plans, None if context is None else context.expand(len(plans), *context.shape[1:])).detach()
+
+
+def _check_total(prior: Prior, context: Tensor | None, length: int) -> None:
+    """Probabilities of all plans sum to one; a context a plan is the same context at each step."""
+    log_probs = _all_log_probs(prior, length, context)
+    total = float(log_probs.double().exp().sum())
+    require(abs(total - 1) < 1e-4, f"the probabilities of all plans of length {length} sum to {total:.6f}, not 1")
+    if context is not None and not sees_each_step(context):
+        repeated = _all_log_probs(prior, length, context[:, None].repeat(1, length, *[1] * (context.dim() - 1)))
+        gap = float((repeated - log_probs).abs().max())
+        require(gap < 1e-3, f"a context a plan differs by {gap:.2g} nats from the same context at each step")
+
+
+def _check_samples(
+    prior: Prior,
+    context: Tensor | None,
+    length: int,
+    num_plans: int,
+    method: Literal["tree", "ancestral"],
+    generator: torch.Generator,
+) -> None:
+    """A chi-square test of samples against `log_prob`."""
+    expected = _all_log_probs(prior, length, context).double().exp().cpu() * num_plans
+    given = None if context is None else context.expand(num_plans, *context.shape[1:])
+    plans = sample(prior, num_plans, length, given, generator=generator, method=method).cpu().long()
+    require(plans.shape == (num_plans, length), f"sample: {list(plans.shape)}, not {[num_plans, length]}")
+    base = prior.num_actions ** torch.arange(length - 1, -1, -1)
+    counts = (plans * base).sum(1).bincount(minlength=len(expected)).double()
+    impossible = int(counts[expected < 1e-9 * num_plans].sum())
+    require(impossible == 0, f"{method} samples: {impossible} plans whose log_prob says they cannot occur")
+    p = chi_square(counts, expected)
+    require(p > FALSE_ALARM, f"{method} samples do not fit log_prob: chi-square p = {p:.2g}, {num_plans} plans")
+
+
+def _check_seeds(prior: Prior, kind: str | None, length: int, generator: torch.Generator) -> None:
+    """The same seed gives the same plans; torch's global generator is not used."""
+    context = _random_context(prior, kind, 64, length, generator)
+    before = torch.get_rng_state()
+    first, second = (prior.sample(64, length, context, generator=torch.Generator().manual_seed(1)) for _ in range(2))
+    require(first.equal(second), "sample: the same seed gave other plans")
+    require(torch.get_rng_state().equal(before), "sample used torch's global generator")
+
+
+@torch.no_grad()
+def _check_copies(prior: Prior, length: int, generator: torch.Generator) -> None:
+    """A saved and loaded copy, and one on the GPU where there is one, say the same."""
+    context = _random_context(prior, "plan" if prior.takes_context else None, 64, length, generator)
+    plans = torch.randint(prior.num_actions, (64, length), generator=generator).to(prior.device)
+    want = prior.log_prob(plans, context).cpu()
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            copy = load(save(prior, folder))
+        except ValueError as error:
+            raise AssertionError(f"the prior cannot be saved and loaded: {error}") from error
+    devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+    for device in devices:
+        copy.to(device)
+        got = copy.log_prob(plans.to(device), None if context is None else context.to(device))
+        require(got.device.type == device, f"log_prob on {device} came back on {got.device}")
+        # what is impossible for both is no difference
+        gap = float((got.cpu() - want).abs().masked_fill(got.cpu() == want, 0).max())
+        require(gap < 1e-3, f"saved, loaded and moved to {device}, the prior differs by {gap:.2g} nats")

@@ -1,0 +1,139 @@
+"""The conformance suite of worlds."""
+
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from neuroprior.chi_square import alike
+from neuroprior.testing.rules import FALSE_ALARM, raises, require, same
+from neuroprior.worlds import TabularWorld, World
+from neuroprior.worlds.world import is_integer
+
+
+def check_world(world: World, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
+    """Raise AssertionError, with a message that says how, unless `world` does what a world must.
+
+    `reset`, `step`, `observe` and `legal` return what the interface says; `step` leaves its arguments alone and treats
+    each state of a batch by itself; the same seed gives the same course; `rollout` equals stepping and refuses plans of
+    a wrong shape, dtype or range. A world with chance says so (`stochastic`), and its rollouts have the distribution of
+    its steps (chi-square tests, together with a false alarm of 1e-6); those of a table let all plans of a start meet
+    the same chance.
+
+    Args:
+        world: the world to check.
+        num_states: how many random states.
+        length: of the plans.
+        seed: draws states and plans.
+
+    Raises:
+        AssertionError: the world breaks a rule.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    state = world.reset(num_states, torch.Generator().manual_seed(seed))
+    again = world.reset(num_states, torch.Generator().manual_seed(seed))
+    require(len(state) == num_states, f"reset({num_states}) gave {len(state)} states")
+    require(state.equal(again), "reset: the same seed gave other states")
+    actions = world.num_actions
+    plans = torch.randint(actions, (num_states, 3, length), generator=generator).to(state.device)
+    _check_step(world, state, plans[:, 0, 0], seed)
+    _check_views(world, state)
+    by_steps, rewards, chance = _step_through(world, state, plans, seed)
+    rollout = world.rollout(state, plans, torch.Generator().manual_seed(seed))
+    require(
+        rollout.rewards.shape == plans.shape, f"rollout: rewards {list(rollout.rewards.shape)}, not {list(plans.shape)}"
+    )
+    shape = (num_states, 3, *state.shape[1:])
+    require(rollout.final_state.shape == shape, f"rollout: final_state {list(rollout.final_state.shape)}, not {shape}")
+    if not chance:
+        require(same(rollout.final_state, by_steps), "rollout ends in other states than stepping")
+        require(same(rollout.rewards, rewards), "rollout gives other rewards than stepping")
+    else:
+        require(world.stochastic, "step: chance was seen, but the world's `stochastic` is False")
+        _check_chance(world, state, plans[:, 0], seed)
+    none = world.rollout(state, plans[:, :, :0])
+    require(none.final_state[:, 0].equal(state), "rollout of plans of length 0 must end where it starts")
+    for wrong, what in (
+        (plans[:, 0], "plans of shape [B, L]"),
+        (plans[1:], "plans for too few starts"),
+        (plans.float(), "plans of floating point numbers"),
+        (plans + actions, "actions past the last"),
+        (plans - actions, "negative actions"),
+    ):
+        require(raises(partial(world.rollout, state, wrong)), f"rollout must raise ValueError for {what}")
+
+
+def _check_step(world: World, state: Tensor, action: Tensor, seed: int) -> None:
+    """`step`: shapes, dtypes, seeds, and no change to what it was given."""
+    kept = state.clone()
+    after, reward = world.step(state, action, torch.Generator().manual_seed(seed))
+    require(state.equal(kept), "step changed the state that it was given")
+    require(after.shape == state.shape, f"step: state {list(after.shape)}, not {list(state.shape)}")
+    require(after.dtype == state.dtype, f"step: state of {after.dtype}, not {state.dtype}")
+    require(reward.shape == action.shape, f"step: reward {list(reward.shape)}, not {list(action.shape)}")
+    require(reward.is_floating_point(), f"step: reward of {reward.dtype}, not floating point")
+    require(not reward.isnan().any(), "step: NaN in the reward")
+    again, _ = world.step(state, action, torch.Generator().manual_seed(seed))
+    require(after.equal(again), "step: the same seed gave other states")
+
+
+def _check_views(world: World, state: Tensor) -> None:
+    """`observe` and `legal`."""
+    seen = world.observe(state)
+    index = is_integer(seen) and seen.dim() == 1
+    require(
+        len(seen) == len(state) and (index or (seen.is_floating_point() and seen.dim() == 2)),
+        f"observe must give indices [N] or floating point features [N, C], not {seen.dtype} {list(seen.shape)}",
+    )
+    over = world.is_over(state)
+    require(over.dtype == torch.bool and over.shape == state.shape[:1], f"is_over must be bool [{len(state)}]")
+    legal = world.legal(state)
+    shape = [len(state), world.num_actions]
+    require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal must be bool {shape}")
+    require(bool(legal.any(1).all()), "legal: a state without any legal action")
+    if world.all_legal:
+        require(bool(legal.all()), "all_legal is True, but legal leaves actions out")
+
+
+def _step_through(world: World, state: Tensor, plans: Tensor, seed: int) -> tuple[Tensor, Tensor, bool]:
+    """Final states `[B, P]` and rewards `[B, P, L]` of single steps, each start alone; and whether chance was seen."""
+    batch, num_plans, length = plans.shape
+    finals, rewards = [], []
+    chance = False
+    for p in range(num_plans):
+        now, row = state, []
+        for t in range(length):
+            after, reward = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed))
+            other, _ = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed + 1))
+            chance = chance or not other.equal(after)
+            if not chance:
+                half, _ = world.step(now[batch // 2 :], plans[batch // 2 :, p, t])
+                require(same(half, after[batch // 2 :]), "step: what happens in a state depends on its batch")
+            now = after
+            row.append(reward)
+        finals.append(now)
+        rewards.append(torch.stack(row, -1))
+    return torch.stack(finals, 1), torch.stack(rewards, 1), chance
+
+
+def _check_chance(world: World, state: Tensor, plans: Tensor, seed: int, times: int = 200) -> None:
+    """Rollouts in a world with chance against steps, `times` from each start `[N, ...]` by its plan `[N, L]`."""
+    generator = torch.Generator().manual_seed(seed)
+    group = torch.arange(len(state)).repeat_interleave(times)
+    now, plans = state.repeat_interleave(times, 0), plans.repeat_interleave(times, 0)
+    rollout = world.rollout(now, plans[:, None], generator)
+    again = world.rollout(now, plans[:, None], torch.Generator().manual_seed(seed))
+    require(same(rollout.final_state, again.final_state), "rollout: the same seed gave other states")
+    rewards = []
+    for t in range(plans.shape[1]):
+        now, reward = world.step(now, plans[:, t], generator)
+        rewards.append(reward)
+    seen = torch.cat([rollout.final_state.reshape(len(now), -1).double(), rollout.rewards[:, 0].double()], 1)
+    due = torch.cat([now.reshape(len(now), -1).double(), torch.stack(rewards, 1).double()], 1)
+    for column in range(seen.shape[1]):
+        p = alike(seen[:, column].cpu(), due[:, column].cpu(), group)
+        what = "rewards" if column >= seen.shape[1] - plans.shape[1] else "final states"
+        require(p > FALSE_ALARM / seen.shape[1], f"{what} of rollout do not fit those of steps: p = {p:.2g}")
+    if isinstance(world, TabularWorld):
+        twice = world.rollout(state, plans[::times, None].expand(-1, 2, -1), generator)
+        require(twice.rewards[:, 0].equal(twice.rewards[:, 1]), "rollout: the same plan twice met different chance")
