@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from eval import compare_cell, compare_settings
-from eval.compare_jobs import Study, cells_of, run_cells
+from eval import compare_cell, compare_settings, planner_report
+from eval.compare_jobs import Cell, Study, cells_of, run_cells
+from eval.compare_planners import PLANNERS, PlannerSettings, check_planners, run_planners
 from eval.compare_priors import NEURAL
 from eval.compare_report import write_report
 from eval.compare_settings import Settings
@@ -26,6 +27,7 @@ LISTS: dict[str, dict[str, Any]] = {
     "num_plans": {"type": int, "default": [16, 64, 256, 1024, 4096], "help": "candidate plans, powers of two"},
     "priors": {"help": "model folders to compare, such as `python -m train` writes; nothing is fitted without --kinds"},
     "kinds": {"choices": KINDS, "help": "kinds of priors that are fitted; all of them by default"},
+    "planners": {"help": f"compare planners with the same priors instead: {', '.join(PLANNERS)}"},
     "sees": {"choices": SEES, "help": "what priors see: nothing but the plan so far, or more; as suits each world"},
 }
 """Options that take several words."""
@@ -37,6 +39,7 @@ def compare(
     num_plans: Sequence[int] = (16, 64, 256, 1024, 4096),
     priors: list[str] | None = None,
     kinds: list[str] | None = None,
+    planners: list[str] | None = None,
     sees: list[str] | None = None,
     rounds: int = 4,
     steps: int = 600,
@@ -59,8 +62,10 @@ def compare(
         num_plans: numbers of candidate plans, powers of two.
         priors: model folders to compare, such as `python -m train` writes.
         kinds: of priors that are fitted: markov, gru, transformer; all by default, but none where there are saved ones.
+        planners: some of sampling, frontier, mcts and cross-entropy: instead of priors these are compared, at as many
+            model steps, with uniform plans, a Markov chain of order 3 and the networks of --kinds, after growth.
         sees: what priors see: nothing but the plan so far, the start as well, or each step; by default nothing and, in
-            worlds where it could help, one or both of the others.
+            worlds where it could help, one or both of the others (with --planners the last of them alone).
         rounds: of horizon growth, at most (worlds have two or three): a prior learns from plans found with it,
             each time longer ones; 0: none.
         steps: of training of each neural prior, at most.
@@ -83,11 +88,28 @@ def compare(
     check(worlds, seeds, processes, settings)
     check_saved(saved, worlds)
     folder = Path(out)
+    if planners is not None:
+        compare_planners(planners, settings, cells_of(worlds, seeds), processes, folder)
+        return
     study = Study.prepare(folder, settings, compare_cell.run_cell)
     cells = run_cells(study, cells_of(worlds, seeds), processes)
     if cells is not None:
         told = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
         write_report(cells, num_plans, settings=told, command=command("compare"), folder=folder, console=Console())
+
+
+def compare_planners(
+    planners: Sequence[str], settings: Settings, cells: Sequence[Cell], processes: int | None, folder: Path
+) -> None:
+    """The comparison of planners; see `compare`."""
+    check_planners(planners)
+    of_planners = PlannerSettings(**vars(settings), planners=tuple(planners))
+    study = Study.prepare(folder, of_planners, run_planners)
+    done = run_cells(study, cells, processes)
+    if done is not None:
+        worlds = dict.fromkeys(cell.world for cell in cells)
+        told = {"worlds": list(worlds), "seeds": len(cells) // len(worlds)} | asdict(of_planners)
+        planner_report.write_report(done, told, folder, Console(), command("compare"))
 
 
 def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Settings) -> None:

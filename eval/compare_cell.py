@@ -1,7 +1,7 @@
 """One cell of `python -m eval compare`: everything about one world and one seed."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, fields, replace
 from functools import cached_property, partial
 from time import perf_counter
@@ -89,7 +89,7 @@ def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
         ValueError: too few plans or starts lead anywhere, or a saved prior does not fit the world.
     """
     begin = perf_counter()
-    contest = _Contest(task, seed, settings)
+    contest = Contest(task, seed, settings)
     entries, growth, last = [], [], {}
     if (tried_all := contest.exhaustive()) is not None:
         entries.append(tried_all)
@@ -115,7 +115,7 @@ def run_growth(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
     Args, raises: see `run_cell`.
     """
     begin = perf_counter()
-    contest = _Contest(task, seed, settings)
+    contest = Contest(task, seed, settings)
     growth = [
         contest.growth(one, length)
         for one in contest.contestants()
@@ -132,7 +132,7 @@ def as_seen(plans: Plans, sees: str) -> Plans:
     return replace(plans, context=seen)
 
 
-class _Contestant(NamedTuple):
+class Contestant(NamedTuple):
     """A prior as it is after some rounds of growth, the plans of the last of which had `length` actions."""
 
     label: str
@@ -142,11 +142,11 @@ class _Contestant(NamedTuple):
     length: int | None
 
 
-class _Contest:
+class Contest:
     """The worlds of a seed, what is learned from there, and where priors are compared."""
 
-    def __init__(self, task: Task, seed: int, settings: Settings) -> None:
-        self.task, self.settings = task, settings
+    def __init__(self, task: Task, seed: int, settings: Settings, orders: Sequence[int] = ORDERS) -> None:
+        self.task, self.settings, self.orders = task, settings, orders
         self.generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
         self.worlds = task.worlds(settings.seed * 10_000 + seed)
         self.longer = (settings.lengths or task.lengths)[: settings.rounds]
@@ -165,21 +165,21 @@ class _Contest:
         self.starts = self.starts_at[task.length]
         self._heats: dict[tuple[str, str, int, int], float] = {}
 
-    def contestants(self) -> Iterator[_Contestant]:
+    def contestants(self) -> Iterator[Contestant]:
         """All priors, each after every round of its growth; the object is the same, and goes on learning."""
-        yield _Contestant("uniform", "nothing", UniformPrior(self.worlds.training.num_actions), 0, None)
+        yield Contestant("uniform", "nothing", UniformPrior(self.worlds.training.num_actions), 0, None)
         for folder in self.settings.priors:
             prior = load_for(folder, self.task.name, self.task.num_actions, self.task.action_names)
             sees = next(name for name, per in SEES.items() if per == prior.context_per)
-            yield _Contestant(folder, sees, prior, 0, None)
+            yield Contestant(folder, sees, prior, 0, None)
         for sees in self.settings.sees or self.task.sights:
             if self.task.shows(sees):
                 yield from self._learners(sees)
 
-    def _learners(self, sees: str) -> Iterator[_Contestant]:
+    def _learners(self, sees: str) -> Iterator[Contestant]:
         first = as_seen(self.first, sees)
         if "markov" in self.settings.kinds:
-            for order in ORDERS:
+            for order in self.orders:
                 prior = chain(order, self.worlds.training, first, self.task.near)
                 yield from self._grown(f"markov-{order}", sees, prior, first, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
@@ -188,7 +188,7 @@ class _Contest:
 
     def _grown(
         self, label: str, sees: str, prior: Prior, first: Plans, training: dict[str, Any]
-    ) -> Iterator[_Contestant]:
+    ) -> Iterator[Contestant]:
         growth = grow(
             prior,
             first,
@@ -204,7 +204,7 @@ class _Contest:
             **training,
         )
         for rounds, _ in enumerate(growth):
-            yield _Contestant(label, sees, prior, rounds, (self.task.depth, *self.longer)[rounds])
+            yield Contestant(label, sees, prior, rounds, (self.task.depth, *self.longer)[rounds])
 
     @cached_property
     def first(self) -> Plans:
@@ -220,7 +220,7 @@ class _Contest:
         planner = ExhaustivePlanner(self.task.depth, num_rollouts=ROLLOUTS, **self.task.scoring)
         return collect(planner, world, number, context="step", above=self.task.above, generator=self.generator)
 
-    def entry(self, one: _Contestant) -> dict[str, Any]:
+    def entry(self, one: Contestant) -> dict[str, Any]:
         """What a prior's plans reach in the held-out worlds, and how well it tells those that were chosen there."""
         starts, heat = self.starts, self._heat(one, self.task.length)
         entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
@@ -233,7 +233,7 @@ class _Contest:
         scored = score(one.label, one.prior, as_seen(self.told, one.sees))
         return entry | {"bits": scored.bits_per_action().mean, "actions": int(self.told.mask().sum())}
 
-    def growth(self, one: _Contestant, length: int) -> dict[str, Any]:
+    def growth(self, one: Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""
         budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else JUDGED_WITH
         heat = self._heat(one, length)
@@ -241,7 +241,7 @@ class _Contest:
         named = {"prior": one.label, "sees": one.sees, "round": one.rounds}
         return named | {"length": length, "num_plans": budget, "share": share}
 
-    def _heat(self, one: _Contestant, length: int) -> float:
+    def _heat(self, one: Contestant, length: int) -> float:
         """The temperature to sample plans of `length` actions at, chosen once; uniform plans are the same at all."""
         if one.label == "uniform":
             return 1.0

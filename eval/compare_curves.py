@@ -93,7 +93,7 @@ def starts_of(task: Task, world: World, number: int, length: int, generator: tor
     reference = 0.0
     if costs:
         plans = torch.randint(world.num_actions, (len(state), 1, length), generator=generator)
-        reference = float(_worth(task, world, state, plans).mean())
+        reference = float(worth(task, world, state, plans).mean())
     return Starts(task, world, state[:number], length, best[:number], reference)
 
 
@@ -114,7 +114,7 @@ def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.
         if starts.world.stochastic:
             plans = planner.proposals(starts.world, state, generator)
             told.append(mean_scores(planner, starts.world, state, plans, ROLLOUTS, generator)[0])
-            true.append(_worth(starts.task, starts.world, state, plans))
+            true.append(worth(starts.task, starts.world, state, plans))
             continue
         _, rollout = planner.candidates(starts.world, state, generator)
         if rollout.states is None:
@@ -173,7 +173,7 @@ def seconds_per_decision(
     return taken
 
 
-def _worth(task: Task, world: World, state: Tensor, plans: Tensor) -> Tensor:
+def worth(task: Task, world: World, state: Tensor, plans: Tensor) -> Tensor:
     """The exact mean scores `[B, P]` of plans in a table."""
     assert isinstance(world, TabularWorld)
     how: dict[str, Any] = {"objective": task.objective, "discount": task.discount}

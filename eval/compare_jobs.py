@@ -56,10 +56,10 @@ class Study:
 
     folder: Path
     settings: Settings
-    run: Callable[[Task, int, Settings], dict[str, Any]]
+    run: Callable[[Task, int, Any], dict[str, Any]]
 
     @classmethod
-    def prepare(cls, out: Path, settings: Settings, run: Callable[[Task, int, Settings], dict[str, Any]]) -> "Study":
+    def prepare(cls, out: Path, settings: Settings, run: Callable[[Task, int, Any], dict[str, Any]]) -> "Study":
         """Find the folder of these settings, and of no others, in `out`; make it where there is none yet.
 
         Raises:

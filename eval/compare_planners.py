@@ -1,0 +1,109 @@
+"""One cell of `python -m eval compare --planners`: several planners with the same priors and as many model steps."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from eval.compare_cell import Contest, Contestant
+from eval.compare_curves import ROLLOUTS, TEMPERATURES, Starts, worth
+from eval.compare_settings import Settings
+from eval.suite import Task
+from neuroprior import CrossEntropyPlanner, FrontierPlanner, MCTSPlanner, Planner, Prior, SamplingPlanner
+
+ORDERS = (3,)
+"""Of the Markov priors that planners are compared with."""
+
+CHANCE = {"sampling", "cross-entropy"}
+"""Planners for worlds with chance."""
+
+
+@dataclass(frozen=True)
+class PlannerSettings(Settings):
+    """All that decides the results of a cell, beside its world and seed; `sees`: one, or none for the last of a world.
+
+    Attributes:
+        planners: some of `PLANNERS`.
+    """
+
+    planners: tuple[str, ...] = ()
+
+
+def cross_entropy(prior: Prior, length: int, num_plans: int, **how: Any) -> CrossEntropyPlanner:
+    """The cross-entropy planner, with fewer rounds where there are few plans."""
+    return CrossEntropyPlanner(prior, length, num_plans, rounds=min(4, num_plans), **how)
+
+
+PLANNERS: dict[str, Callable[..., Planner]] = {
+    "sampling": SamplingPlanner,
+    "frontier": FrontierPlanner,
+    "mcts": MCTSPlanner,
+    "cross-entropy": cross_entropy,
+}
+"""By their names in tables."""
+
+
+def run_planners(task: Task, seed: int, settings: PlannerSettings) -> dict[str, Any]:
+    """Collect, fit, grow, and plan with each planner and prior in the worlds of one seed.
+
+    Args, raises: see `eval.compare_cell.run_cell`.
+
+    Returns:
+        `entries`, each of a planner and prior: by number of plans the `share` of the oracle, the `model_steps` that
+        were taken, and the `seconds` of a decision.
+    """
+    begin = perf_counter()
+    contest = Contest(task, seed, replace(settings, sees=settings.sees or task.sights[-1:]), ORDERS)
+    entries = []
+    for one in contest.contestants():
+        if one.label == "uniform" or one.rounds == (0 if one.length is None else contest.rounds):
+            for name in settings.planners:
+                if name in CHANCE or not contest.worlds.held_out.stochastic:
+                    entries.append(_entry(contest, one, name))
+    cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "num_plans": settings.num_plans}
+    return cell | {"entries": entries, "seconds": perf_counter() - begin}
+
+
+def _entry(contest: Contest, one: Contestant, name: str) -> dict[str, Any]:
+    """What a planner with a prior reaches; the temperature is chosen for both, in the validation worlds."""
+    length, generator = contest.task.length, contest.generator
+    heat = 1.0
+    if one.label != "uniform":
+        chosen_at, most = contest.chosen_at[length], max(contest.settings.num_plans)
+        shares = {t: _planned(chosen_at, name, one.prior, most, t, generator)["share"] for t in TEMPERATURES}
+        heat = max(shares, key=lambda t: shares[t])
+    found = [
+        _planned(contest.starts, name, one.prior, number, heat, generator) for number in contest.settings.num_plans
+    ]
+    entry = {"planner": name, "prior": one.label, "sees": one.sees, "rounds": one.rounds, "temperature": heat}
+    return entry | {what: [some[what] for some in found] for what in ("share", "model_steps", "seconds")}
+
+
+def _planned(
+    starts: Starts, name: str, prior: Prior, num_plans: int, temperature: float, generator: torch.Generator
+) -> dict[str, Any]:
+    """The share of the oracle that a planner's decisions reach, their model steps and seconds, for each start."""
+    how: dict[str, Any] = starts.task.scoring | {"temperature": temperature}
+    if starts.world.stochastic:
+        how["num_rollouts"] = ROLLOUTS
+    planner = PLANNERS[name](prior, starts.length, num_plans, **how)
+    begin = perf_counter()
+    decision = planner.plan(starts.world, starts.state, generator)
+    seconds = (perf_counter() - begin) / len(starts.state)
+    score: Tensor = decision.score
+    if starts.world.stochastic:
+        score = worth(starts.task, starts.world, starts.state, decision.plan[:, None].long())[:, 0]
+    return {"share": starts.share(score), "model_steps": decision.model_steps, "seconds": seconds}
+
+
+def check_planners(planners: Sequence[str]) -> None:
+    """Raise ValueError, naming the option, where there is no planner, or one is not known or given twice."""
+    if not planners:
+        raise ValueError("planners: at least one is expected")
+    if unknown := [name for name in planners if name not in PLANNERS]:
+        raise ValueError(f"planners: {unknown[0]!r} is not known; there are {', '.join(PLANNERS)}")
+    if len(set(planners)) < len(planners):
+        raise ValueError(f"planners: each may be given once, not {' '.join(planners)}")
