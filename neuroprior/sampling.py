@@ -18,7 +18,7 @@ from neuroprior.plans import sees_each_step
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import Rollout, World, is_integer, join_states
 
-CACHED, FEWEST = 2**19, 256
+CACHED, FEWEST = 2**19, 1024
 """Numbers in the states of plans that are drawn together on a CPU; and the fewest plans: each step costs time, too."""
 
 
