@@ -1,26 +1,13 @@
-"""Large pieces of memory: ready sooner than torch's own, and with room behind the states of priors that grow."""
+"""Moving little memory: rows that are taken as whole numbers, and room behind the states of priors that grow."""
 
-import numpy as np
 import torch
 from torch import Tensor
-
-LARGE = 2**22
-"""Bytes from which new memory costs more than what is done with it, unless it comes in large pages."""
 
 WIDE = {2: torch.int16, 4: torch.int32, 8: torch.int64}
 """Whole numbers by their bytes."""
 
 MARK = "room_to_advance"
 """Of memory that was taken for states which are written over."""
-
-
-def empty(shape: tuple[int, ...], like: Tensor) -> Tensor:
-    """Memory that is not written yet, for numbers as in `like` and where they are."""
-    numbers = torch.Size(shape).numel()
-    if like.device.type != "cpu" or numbers * like.element_size() < LARGE or like.dtype == torch.bfloat16:
-        return like.new_empty(shape)
-    # numpy asks the system for large pages, which torch does not: such memory is ready several times as soon.
-    return torch.from_numpy(np.empty(shape, dtype=like.new_empty(0).detach().numpy().dtype))
 
 
 def rows_of(values: Tensor, row: Tensor) -> Tensor:
@@ -37,19 +24,17 @@ def rows_of(values: Tensor, row: Tensor) -> Tensor:
 
 
 def _selected(values: Tensor, row: Tensor) -> Tensor:
-    if values.requires_grad and torch.is_grad_enabled():
-        return values.index_select(0, row)
     if values.dim() == 2 and values.is_contiguous() and values.storage_offset() == 0:
         # A row that is as long as a number is moved as one.
         whole = WIDE.get(values.shape[1] * values.element_size())
         if whole is not None and values.shape[1] > 1:
             return _selected(values.view(whole).view(-1), row).view(values.dtype).view(-1, values.shape[1])
-    return torch.index_select(values, 0, row, out=empty((len(row), *values.shape[1:]), values))
+    return values.index_select(0, row)
 
 
 def states_with_room(like: Tensor, size: int, room: int) -> Tensor:
     """States `[N, size]` to be written, as many and as precise as `like [N, ...]`; a row has room for `room` more."""
-    taken = empty((len(like), size + room), like)
+    taken = like.new_empty(len(like), size + room)
     setattr(taken, MARK, True)
     return taken[:, :size]
 

@@ -19,7 +19,7 @@ from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import Rollout, World, is_integer, join_states
 
 CACHED, FEWEST = 2**19, 1024
-"""Numbers in the states of plans that are drawn together on a CPU; and the fewest plans: each step costs time, too."""
+"""Numbers in states, or logits, of plans that are drawn together on a CPU; and the fewest plans."""
 
 
 class Steppable(Protocol):
@@ -276,7 +276,7 @@ def _one_by_one(
     uniform = draw.uniform((len(steps), len(row)), logits)
     together = len(row)
     if row.device.type == "cpu":  # states that fit a cache are several times as quick to read
-        together = max(CACHED // max(state[0].numel(), 1), FEWEST)
+        together = max(CACHED // max(state[0].numel(), logits.shape[1], 1), FEWEST)
     for at in range(0, len(row), together):
         part = slice(at, at + together)
         now, memory = _taken(row[part], logits, state)

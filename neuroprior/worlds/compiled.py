@@ -6,7 +6,6 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,20 +39,23 @@ def rollout(
     assert loop is not None
     (batch, num_plans, length), rows = plans.shape, plans.shape[:2].numel()
     actions_of = (plans if plans.dtype == torch.uint8 else plans.long()).reshape(rows, length)
+    threads = torch.get_num_threads()
+    if batch < threads and num_plans % threads == 0:  # the threads share the plans of each start
+        cell, offset = cell.repeat_interleave(threads), offset.repeat_interleave(threads)
+        batch, num_plans = batch * threads, num_plans // threads
     given = [x.contiguous().numpy() for x in (table, reward.flatten(), cell, offset, actions_of)]
-    # numpy asks the system for large pages, which torch does not: new memory is ready several times as soon.
-    last, gained = np.empty(rows, np.int64), np.empty((rows, length), given[1].dtype)
-    states = np.empty((rows, length if keep_states else 0), np.int64)
+    last, gained = torch.empty(rows, dtype=torch.int64), torch.empty(rows, length, dtype=reward.dtype)
+    states = torch.empty(rows, length if keep_states else 0, dtype=torch.int64)
+    written = [x.numpy() for x in (last, gained, states)]
     sizes = num_plans, len(table) // reward.shape[1], reward.dim() == 2
 
     def part(begin: int, end: int) -> None:
-        loop(*given, *sizes, begin, end, last, gained, states)
+        loop(*given, *sizes, begin, end, *written)
 
-    threads = torch.get_num_threads()
-    edges = [rows * k // threads for k in range(threads + 1)]
+    edges = [batch * k // threads for k in range(threads + 1)]
     with ThreadPoolExecutor(threads) as pool:  # the loop lets go of Python's lock
         list(pool.map(part, edges[:-1], edges[1:]))
-    shaped = [torch.from_numpy(x).view(batch, num_plans, *x.shape[1:]) for x in (last, gained, states)]
+    shaped = [x.view(*plans.shape[:2], *x.shape[1:]) for x in (last, gained, states)]
     return shaped[0], shaped[1], shaped[2] if keep_states else None
 
 

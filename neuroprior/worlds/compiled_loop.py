@@ -24,19 +24,21 @@ def follow(
     gained: Array,
     states: Array,
 ) -> None:
-    """Follow the plans from `begin` to `end`, of which each start has `num_plans`; see `compiled.rollout`.
+    """Follow the plans of the starts from `begin` to `end`, of which each has `num_plans`; see `compiled.rollout`.
 
     Writes to `last [N]`, `gained [N, L]` and, unless it is empty, `states [N, L]`.
     """
     keep = states.shape[1] > 0
-    for row in range(begin, end):
-        start = row // num_plans
+    each = np.uintp(actions)
+    for start in range(begin, end):
         # Numbers without a sign are quicker to index with.
-        now, more, each = np.uintp(cell[start]), np.uintp(offset[start]), np.uintp(actions)
-        for t in range(plans.shape[1]):
-            taken = now * each + np.uintp(plans[row, t])
-            now = np.uintp(table[taken])
-            gained[row, t] = reward[now + more] if on_arrival else reward[taken + more * each]
-            if keep:
-                states[row, t] = now + more
-        last[row] = now + more
+        first, more = np.uintp(cell[start]), np.uintp(offset[start])
+        for row in range(start * num_plans, (start + 1) * num_plans):
+            now = first
+            for t in range(plans.shape[1]):
+                taken = now * each + np.uintp(plans[row, t])
+                now = np.uintp(table[taken])
+                gained[row, t] = reward[now + more] if on_arrival else reward[taken + more * each]
+                if keep:
+                    states[row, t] = now + more
+            last[row] = now + more

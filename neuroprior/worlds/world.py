@@ -145,11 +145,20 @@ def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
         return
     # torch cannot compare the wider unsigned types.
     values = values.long() if values.dtype in (torch.uint16, torch.uint32, torch.uint64) else values
-    low, high = (int(v) for v in torch.aminmax(values))
+    low, high = _extremes(values)
     if low < 0 or high >= stop:
         where = ((values < 0) | (values.long() >= stop)).nonzero()[0].tolist()
         value = int(values[tuple(where)])
         raise ValueError(f"{name}{where}: {value} is out of range: there are {stop} {what}, 0 to {stop - 1}")
+
+
+def _extremes(values: Tensor) -> tuple[int, int]:
+    """The least and the greatest of some integers."""
+    if values.dtype == torch.uint8 and values.device.type == "cpu":
+        # On one thread: those of torch, once awake, would be in the way of the threads of a compiled loop.
+        return 0, int(values.numpy().max())
+    low, high = torch.aminmax(values)
+    return int(low), int(high)
 
 
 def check_sizes(**sizes: object) -> None:
