@@ -12,7 +12,15 @@ from eval.compare_cell import Contest, Contestant
 from eval.compare_curves import ROLLOUTS, TEMPERATURES, Starts, worth
 from eval.compare_settings import Settings
 from eval.suite import Task
-from neuroprior import CrossEntropyPlanner, FrontierPlanner, MCTSPlanner, Planner, Prior, SamplingPlanner
+from neuroprior import (
+    CrossEntropyPlanner,
+    DistinctPlanner,
+    FrontierPlanner,
+    MCTSPlanner,
+    Planner,
+    Prior,
+    SamplingPlanner,
+)
 
 ORDERS = (3,)
 """Of the Markov priors that planners are compared with."""
@@ -39,6 +47,7 @@ def cross_entropy(prior: Prior, length: int, num_plans: int, **how: Any) -> Cros
 
 PLANNERS: dict[str, Callable[..., Planner]] = {
     "sampling": SamplingPlanner,
+    "distinct": DistinctPlanner,
     "frontier": FrontierPlanner,
     "mcts": MCTSPlanner,
     "cross-entropy": cross_entropy,

@@ -5,11 +5,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neuroprior.beams import Beams, children, no_actions
 from neuroprior.draws import after_end, check_temperature
-from neuroprior.plans import action_dtype, sees_each_step
-from neuroprior.randomness import generator_on, gumbel
-from neuroprior.sampling import Steppable, advance, start_in_world
-from neuroprior.worlds.world import Rollout, World, check_sizes, join_states
+from neuroprior.plans import sees_each_step
+from neuroprior.randomness import generator_on
+from neuroprior.sampling import Steppable, start_in_world
+from neuroprior.worlds.world import Rollout, World, check_sizes
 
 MOST_PREFIXES = 2**22
 """That `most_probable` follows together."""
@@ -66,8 +67,8 @@ def sample_distinct(
     """
     _check(prior, num_plans, length, temperature)
     logits, memory = _start(prior, context, num_sets)
-    search = _Search(prior, logits, memory, temperature, generator_on(generator, prior.device))
-    return search.run(num_plans, length)
+    search = Beams(prior, logits, memory, temperature, generator_on(generator, prior.device))
+    return _without_replacement(search, num_plans, length)
 
 
 @torch.no_grad()
@@ -99,12 +100,41 @@ def sample_distinct_in_world(
             in the world.
     """
     _check(prior, num_plans, length, temperature)
+    search = _search_in_world(prior, world, state, temperature, generator)
+    found = _without_replacement(search, num_plans, length)
+    return found, search.rollout(state, keep_states)
+
+
+@torch.no_grad()
+def try_distinct(
+    prior: Steppable,
+    world: World,
+    state: Tensor,
+    num_plans: int,
+    length: int,
+    *,
+    temperature: float = 1.0,
+    generator: torch.Generator | None = None,
+    keep_states: bool = False,
+) -> tuple[Tensor, Tensor, Rollout]:
+    """As `sample_distinct_in_world`, for planners: without inclusion probabilities, which take one plan more.
+
+    Returns:
+        Plans `[B, P, L]`, the logarithms of their probabilities `[B, P]` (-inf: it is no plan), and their rollout; P is
+        smaller where there are not so many plans.
+    """
+    search = _search_in_world(prior, world, state, temperature, generator)
+    search.grow(num_plans, length)
+    return search.plans.view(*search.log_prob.shape, length), search.log_prob, search.rollout(state, keep_states)
+
+
+def _search_in_world(
+    prior: Steppable, world: World, state: Tensor, temperature: float, generator: torch.Generator | None
+) -> Beams:
     if world.stochastic:
         raise ValueError("world: one without chance is expected: plans that begin alike are tried together")
     logits, memory = start_in_world(prior, world, state)
-    search = _Search(prior, logits, memory, temperature, generator_on(generator, prior.device), world, state)
-    found = search.run(num_plans, length)
-    return found, search.rollout(state, keep_states)
+    return Beams(prior, logits, memory, temperature, generator_on(generator, prior.device), world, state)
 
 
 @torch.no_grad()
@@ -132,9 +162,11 @@ def most_probable(
     _check(prior, num_plans, length, temperature)
     logits, memory = _start(prior, context, None)
     batch = len(logits)
-    bound = _Search(prior, logits, memory, temperature, None).run(num_plans, length).log_prob[:, -1] - SLACK
+    search = Beams(prior, logits, memory, temperature, None)
+    search.grow(num_plans, length)
+    bound = search.log_prob[:, num_plans - 1] - SLACK
     log_prob = torch.zeros(batch, dtype=torch.float64, device=logits.device)
-    owner, plans = torch.arange(batch, device=logits.device), _no_actions(prior, batch)
+    owner, plans = torch.arange(batch, device=logits.device), no_actions(prior, batch)
     for t in range(length):
         child = children(log_prob[:, None], logits, temperature)
         row, action = ((child >= bound[owner, None]) & (child > -torch.inf)).nonzero(as_tuple=True)
@@ -158,106 +190,17 @@ def most_probable(
     return plans[first].view(batch, num_plans, length), log_prob[first].view(batch, num_plans)
 
 
-class _Search:
-    """Beams of B distributions, K of each, which grow step by step.
-
-    Args:
-        prior: any prior.
-        logits, memory: as its `start` returned them, for B rows.
-        temperature: divides the logits.
-        generator: draws Gumbel noise; None: the most probable beams are kept.
-        world, state: where plans are tried on the way, and from where; None: nowhere.
-    """
-
-    def __init__(
-        self,
-        prior: Steppable,
-        logits: Tensor,
-        memory: Tensor,
-        temperature: float,
-        generator: torch.Generator | None,
-        world: World | None = None,
-        state: Tensor | None = None,
-    ) -> None:
-        self.prior, self.logits, self.memory, self.temperature = prior, logits, memory, temperature
-        self.generator, self.world, self.now = generator, world, state
-        self.batch, self.plans = len(logits), _no_actions(prior, len(logits))
-        self.tried: list[list[Tensor]] = [[], []]  # rewards and states of each step
-        self.log_prob = torch.zeros(self.batch, 1, dtype=torch.float64, device=logits.device)
-        self.height = self.log_prob if generator is None else gumbel(self.log_prob, generator)
-
-    def run(self, num_plans: int, length: int) -> Distinct:
-        """Grow beams of `length` actions; one more than is asked for, whose height is the threshold."""
-        for t in range(length):
-            self._grow(num_plans + 1, last=t + 1 == length)
-        # Where there are no more plans than are asked for, all of them are in every sample.
-        threshold = self.height[:, num_plans:] if self.height.shape[1] > num_plans else -torch.inf
-        row = torch.arange(self.height.numel(), device=self.height.device).view_as(self.height)
-        self._keep(row[:, :num_plans].flatten())
-        self.log_prob = self.log_prob[:, :num_plans]
-        there = self.log_prob > -torch.inf
-        inclusion = torch.where(there, -torch.expm1(-torch.exp(self.log_prob - threshold)), 0.0)
-        return Distinct(self.plans.view(self.batch, num_plans, length), self.log_prob, inclusion)
-
-    def rollout(self, start: Tensor, keep_states: bool) -> Rollout:
-        """What came of the plans."""
-        assert self.now is not None
-        shape = self.log_prob.shape
-        rewards = torch.stack(self.tried[0], 1).view(*shape, len(self.tried[0]))
-        states = join_states(self.tried[1], start, (*shape, *start.shape[1:])) if keep_states else None
-        return Rollout(self.now.view(*shape, *start.shape[1:]), rewards, states)
-
-    def _grow(self, most: int, last: bool) -> None:
-        """One more action: of all beams' children those with the greatest heights are the new beams."""
-        logits, actions = self.logits, self.prior.num_actions
-        if self.world is not None and not self.world.all_legal:
-            assert self.now is not None
-            logits = logits.masked_fill(~self.world.legal(self.now), -torch.inf)
-        child = children(self.log_prob.view(-1, 1), logits, self.temperature)
-        height = child if self.generator is None else self._heights(child, self.generator)
-        beams = self.log_prob.shape[1]
-        self.height, index = height.view(self.batch, beams * actions).topk(min(most, beams * actions))
-        self.log_prob = child.view(self.batch, beams * actions).gather(1, index)
-        action = (index % actions).flatten()
-        first = torch.arange(self.batch, device=index.device)[:, None] * beams
-        self._keep((first + index.div(actions, rounding_mode="floor")).flatten())
-        self.plans = torch.cat([self.plans, action[:, None].to(self.plans.dtype)], 1)
-        seen = None
-        if self.world is not None:
-            assert self.now is not None
-            self.now, reward = self.world.step(self.now, action, None)
-            self.tried[0].append(reward)
-            self.tried[1].append(self.now)
-            seen = self.world.observe(self.now) if self.prior.context_per == "step" and not last else None
-        if not last:
-            self.logits, self.memory = advance(self.prior, action, self.memory, seen)
-            self.logits = after_end(self.logits, action, self.prior.end)
-
-    def _keep(self, row: Tensor) -> None:
-        """Go on with these beams."""
-        self.plans, self.memory = self.plans.index_select(0, row), self.memory.index_select(0, row)
-        if self.now is not None:
-            self.now = self.now.index_select(0, row)
-        self.tried = [[step.index_select(0, row) for step in column] for column in self.tried]
-
-    def _heights(self, child: Tensor, generator: torch.Generator) -> Tensor:
-        """Gumbel variables located at `child [M, A]`, given that the greatest of each row is its parent's height.
-
-        Kool, van Hoof and Welling 2019, appendix B.3.
-        """
-        free = gumbel(child, generator)
-        parent = self.height.view(-1, 1)
-        below = parent - free + torch.log1p(-torch.exp(free - free.amax(-1, keepdim=True)))
-        height = parent - below.clamp(min=0) - torch.log1p(torch.exp(-below.abs()))
-        # What is impossible stays so; where a whole beam is, nothing above is a number.
-        return torch.where(child > -torch.inf, height, -torch.inf)
-
-
-def children(log_prob: Tensor, logits: Tensor, temperature: float) -> Tensor:
-    """The log-probabilities `[M, A]` of plans of `log_prob [M, 1]` with one more action, by its `logits [M, A]`."""
-    child = log_prob + (logits.double() / temperature).log_softmax(-1)
-    # What a prior says after what cannot be may be no number.
-    return torch.where(log_prob > -torch.inf, child, -torch.inf)
+def _without_replacement(search: Beams, num_plans: int, length: int) -> Distinct:
+    """Grow beams of `length` actions; one more than is asked for, whose height is the threshold."""
+    search.grow(num_plans + 1, length)
+    # Where there are no more plans than are asked for, all of them are in every sample.
+    threshold = search.height[:, num_plans:] if search.height.shape[1] > num_plans else -torch.inf
+    row = torch.arange(search.height.numel(), device=search.height.device).view_as(search.height)
+    search.keep(row[:, :num_plans].flatten())
+    search.log_prob = search.log_prob[:, :num_plans]
+    there = search.log_prob > -torch.inf
+    inclusion = torch.where(there, -torch.expm1(-torch.exp(search.log_prob - threshold)), 0.0)
+    return Distinct(search.plans.view(search.batch, num_plans, length), search.log_prob, inclusion)
 
 
 def _start(prior: Steppable, context: Tensor | None, num_sets: int | None) -> tuple[Tensor, Tensor]:
@@ -273,10 +216,6 @@ def _start(prior: Steppable, context: Tensor | None, num_sets: int | None) -> tu
         raise ValueError(f"context: one a plan is expected, [B] or [B, C], not {list(context.shape)}")
     prior.check_context_of(context, len(context))
     return prior.start(len(context), context)
-
-
-def _no_actions(prior: Steppable, number: int) -> Tensor:
-    return torch.empty(number, 0, dtype=action_dtype(prior.num_actions), device=prior.device)
 
 
 def _check(prior: Steppable, num_plans: int, length: int, temperature: float) -> None:

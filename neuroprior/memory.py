@@ -24,7 +24,7 @@ def rows_of(values: Tensor, row: Tensor) -> Tensor:
 
 
 def _selected(values: Tensor, row: Tensor) -> Tensor:
-    if values.dim() == 2 and values.is_contiguous() and values.storage_offset() == 0:
+    if values.dim() == 2 and values.is_contiguous() and values.storage_offset() == 0 and not values.requires_grad:
         # A row that is as long as a number is moved as one.
         whole = WIDE.get(values.shape[1] * values.element_size())
         if whole is not None and values.shape[1] > 1:

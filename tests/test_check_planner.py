@@ -6,6 +6,7 @@ import torch
 from neuroprior import (
     CrossEntropyPlanner,
     Decision,
+    DistinctPlanner,
     ExhaustivePlanner,
     FrontierPlanner,
     MCTSPlanner,
@@ -22,6 +23,7 @@ HOW = {
 }
 PLANNERS = {
     "sampling": SamplingPlanner,
+    "distinct": DistinctPlanner,
     "frontier": FrontierPlanner,
     "cross-entropy": lambda prior, length, number, **how: CrossEntropyPlanner(
         prior, length, number, rounds=min(3, number), **how

@@ -12,7 +12,19 @@ from neuroprior.statistics import paired_difference
 from tests.reports import FROM_ELSEWHERE
 
 SMALL = [
-    *("compare", "--planners", "sampling", "frontier", "mcts", "cross-entropy", "--kinds", "markov", "--rounds", "1"),
+    *(
+        "compare",
+        "--planners",
+        "sampling",
+        "distinct",
+        "frontier",
+        "mcts",
+        "cross-entropy",
+        "--kinds",
+        "markov",
+        "--rounds",
+        "1",
+    ),
     *("--worlds", "grid", "slippery", "--seeds", "2", "--starts", "4", "--training-starts", "60"),
     *("--num-plans", "4", "16", "--processes", "1"),
 ]
@@ -33,10 +45,10 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     for row in rows:
         length = {"grid": 8, "slippery": 14 * 16}[row["world"]]
         assert 0 < row["model_steps"] <= row["num_plans"] * length
-        assert row["planner"] in ("frontier", "mcts") or row["model_steps"] == row["num_plans"] * length
+        assert row["planner"] in ("distinct", "frontier", "mcts") or row["model_steps"] == row["num_plans"] * length
         assert row["oracle_share"] <= 1 + 1e-6 or row["world"] == "slippery"
     with (out / "paired.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(results["paired"]) == 2 * (3 * 2) + 2 * 2
+        assert len(list(csv.DictReader(file))) == len(results["paired"]) == 2 * (4 * 2) + 2 * 2
     page = (out / "report.html").read_text()
     assert not re.search(FROM_ELSEWHERE, page)
     assert "cross-entropy" in page

@@ -2,6 +2,8 @@
 
 from neuroprior.planners.collect import collect
 from neuroprior.planners.cross_entropy import CrossEntropyPlanner
+from neuroprior.planners.distinct import DistinctPlanner
+from neuroprior.planners.execution import Execution, execute
 from neuroprior.planners.exhaustive import ExhaustivePlanner
 from neuroprior.planners.expected import expected_score
 from neuroprior.planners.frontier import FrontierPlanner
@@ -14,6 +16,8 @@ from neuroprior.planners.sampling import SamplingPlanner
 __all__ = [
     "CrossEntropyPlanner",
     "Decision",
+    "DistinctPlanner",
+    "Execution",
     "ExhaustivePlanner",
     "FrontierPlanner",
     "Growth",
@@ -21,6 +25,7 @@ __all__ = [
     "Planner",
     "SamplingPlanner",
     "collect",
+    "execute",
     "expected_score",
     "grow",
     "oracle",

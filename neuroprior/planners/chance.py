@@ -1,5 +1,8 @@
 """Scoring plans in a world with chance: means over rollouts in which all plans of a start meet the same chance."""
 
+from collections.abc import Iterator
+from math import ceil, log2
+
 import torch
 from torch import Tensor
 
@@ -57,3 +60,39 @@ def mean_scores(
         scores.append(mean.to(score.dtype))
         ends.append(end[::num_rollouts])
     return torch.cat(scores, 1), torch.cat(ends, 1)
+
+
+def halved_scores(
+    planner: Planner, world: World, state: Tensor, plans: Tensor, num_rollouts: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The better ones of some plans by successive halving: the longer a plan stays, the more often it is tried.
+
+    As many rollouts as `num_rollouts` for each plan are shared out equally over rounds. In each round all plans that
+    are left are tried equally often, and the half with the lower means so far is left out (Karnin et al. 2013).
+
+    Args, raises: see `mean_scores`.
+
+    Returns:
+        The plans `[B, K, L]` that were left in the last round, and their scores and ends.
+    """
+    total, tried, row = torch.zeros((), dtype=torch.float64), 0, torch.arange(len(plans), device=plans.device)[:, None]
+    for kept, times in halving(plans.shape[1], num_rollouts):
+        if kept < plans.shape[1]:
+            worth = total.flatten(2).amax(2) if total.dim() > 2 else total
+            # Equally good plans in random order.
+            mixed = torch.rand(worth.shape, generator=generator, device=worth.device).argsort(1)
+            order = worth.gather(1, mixed).argsort(dim=1, descending=True, stable=True)[:, :kept]
+            best = mixed.gather(1, order)
+            plans, total = plans[row, best], total[row, best]
+        score, ends = mean_scores(planner, world, state, plans, times, generator)
+        total, tried = total + times * score.double(), tried + times
+    return plans, (total / tried).to(score.dtype), ends
+
+
+def halving(num_plans: int, num_rollouts: int) -> Iterator[tuple[int, int]]:
+    """How many plans are left in each round of halving, and how often each is tried in it."""
+    rounds = max(min(ceil(log2(num_plans)), num_rollouts), 1)
+    kept = num_plans
+    for _ in range(rounds):
+        yield kept, num_plans * num_rollouts // rounds // kept
+        kept = -(-kept // 2)

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior.distinct import children
+from neuroprior.beams import children
 from neuroprior.draws import check_temperature
 from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
 from neuroprior.plans import action_dtype

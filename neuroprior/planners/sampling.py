@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.draws import check_temperature
-from neuroprior.planners.chance import check_rollouts, mean_scores
+from neuroprior.planners.chance import check_rollouts, halved_scores, halving, mean_scores
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks
 from neuroprior.randomness import generator_on
 from neuroprior.sampling import Steppable, check_in_world, sample_in_world
@@ -42,6 +42,8 @@ class SamplingPlanner(Planner):
         temperature: of sampling.
         num_rollouts: a plan's score is its mean over so many rollouts, all plans of a start meeting the same chance
             where the world can (see `World.rollout`). Without chance (`World.stochastic`) one is all that is taken.
+        halving: share as many rollouts out unequally: after each of several rounds the worse half of the plans is left
+            out, so that the better ones are tried more often (see `planners.chance.halved_scores`).
 
     Raises:
         ValueError: an argument is out of range. `plan` raises it for a prior that samples an end symbol, too.
@@ -59,13 +61,14 @@ class SamplingPlanner(Planner):
         any_prefix: bool = False,
         temperature: float = 1.0,
         num_rollouts: int = 1,
+        halving: bool = False,
     ) -> None:
         super().__init__(objective, discount, value, any_prefix)
         if length < 1 or num_plans < 1:
             raise ValueError(f"length and num_plans must be at least 1, not {length} and {num_plans}")
         check_temperature(temperature)
         check_rollouts(num_rollouts)
-        self.num_rollouts = num_rollouts
+        self.num_rollouts, self.halving = num_rollouts, halving
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
@@ -79,10 +82,12 @@ class SamplingPlanner(Planner):
 
     def _steps(self, world: World) -> int:
         """Simulator steps for each start."""
-        times = 1
-        if world.stochastic:
-            times = self.num_rollouts + (1 if self.prior.takes_context else 0)
-        return times * self.num_plans * self.length
+        if not world.stochastic:
+            return self.num_plans * self.length
+        tried = self.num_plans * self.num_rollouts
+        if self.halving:
+            tried = sum(kept * times for kept, times in halving(self.num_plans, self.num_rollouts))
+        return (tried + (self.num_plans if self.prior.takes_context else 0)) * self.length
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
         return decide(*self.tried(world, state, generator), self._steps(world), generator)
@@ -91,6 +96,8 @@ class SamplingPlanner(Planner):
         """Candidate plans `[B, P, L]` for starts `[B, ...]`, and their scores and ends as `decide` takes them."""
         if world.stochastic:
             plans = self.proposals(world, state, generator)
+            if self.halving:
+                return halved_scores(self, world, state, plans, self.num_rollouts, generator)
             return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
         plans, rollout = self.candidates(world, state, generator)
         if rollout.states is None:
