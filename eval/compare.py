@@ -62,8 +62,8 @@ def compare(
         num_plans: numbers of candidate plans, powers of two.
         priors: model folders to compare, such as `python -m train` writes.
         kinds: of priors that are fitted: markov, gru, transformer; all by default, but none where there are saved ones.
-        planners: some of sampling, distinct, frontier, mcts and cross-entropy: these are compared instead of priors, at
-            as many model steps, with uniform plans, a chain of order 3 and the networks of --kinds, after growth.
+        planners: some of sampling, distinct, frontier, mcts, cross-entropy and halving: they are compared, not priors,
+            at as many model steps, with uniform plans, a chain of order 3 and the networks of --kinds, after growth.
         sees: what priors see: nothing but the plan so far, the start as well, or each step; by default nothing and, in
             worlds where it could help, one or both of the others (with --planners the last of them alone).
         rounds: of horizon growth, at most (worlds have two or three): a prior learns from plans found with it,

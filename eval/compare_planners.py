@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -25,8 +26,8 @@ from neuroprior import (
 ORDERS = (3,)
 """Of the Markov priors that planners are compared with."""
 
-CHANCE = {"sampling", "cross-entropy"}
-"""Planners for worlds with chance."""
+CHANCE, ONLY_CHANCE = {"sampling", "cross-entropy", "halving"}, {"halving"}
+"""Planners for worlds with chance, and those that are nothing new in worlds without."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
     "frontier": FrontierPlanner,
     "mcts": MCTSPlanner,
     "cross-entropy": cross_entropy,
+    "halving": partial(SamplingPlanner, halving=True),
 }
 """By their names in tables."""
 
@@ -70,7 +72,7 @@ def run_planners(task: Task, seed: int, settings: PlannerSettings) -> dict[str, 
     for one in contest.contestants():
         if one.label == "uniform" or one.rounds == (0 if one.length is None else contest.rounds):
             for name in settings.planners:
-                if name in CHANCE or not contest.worlds.held_out.stochastic:
+                if name in CHANCE if contest.worlds.held_out.stochastic else name not in ONLY_CHANCE:
                     entries.append(_entry(contest, one, name))
     cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "num_plans": settings.num_plans}
     return cell | {"entries": entries, "seconds": perf_counter() - begin}

@@ -86,7 +86,7 @@ def _shares(own: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> Arr
 def table(rows: Rows, gaps: Rows, world: str) -> Table:
     """Shares of the oracle in one world, a row a prior and planner; stars where it cannot be chance."""
     own = [row for row in rows if row["world"] == world]
-    numbers = sorted({row["num_plans"] for row in own})
+    numbers = _numbers(own)
     sure = {_key(row) for row in gaps if row["world"] == world and row["p_holm"] < 0.05}
     at = {_key(row): row for row in own}
     names = dict.fromkeys((row["prior"], row["sees"], row["planner"]) for row in own)
@@ -126,6 +126,11 @@ def words(rows: Rows, gaps: Rows, world: str) -> str:
     return f"{told} {'; '.join(parts)}."
 
 
+def _numbers(rows: Rows) -> list[int]:
+    """The numbers of plans."""
+    return sorted({row["num_plans"] for row in rows})
+
+
 def _prior(row: Mapping[str, Any]) -> str:
     return str(row["prior"]) + ("" if row["sees"] == "nothing" else f", sees {row['sees']}")
 
@@ -151,6 +156,8 @@ def planner_figure(rows: Rows) -> Figure:
     expect_some("rows", rows)
     priors = list(dict.fromkeys(_prior(row) for row in rows))
     planners = list(dict.fromkeys(row["planner"] for row in rows))
+    # Most planners spend all steps that they may.
+    places = sorted({max(int(row["model_steps"]) for row in rows if row["num_plans"] == n) for n in _numbers(rows)})
     figure, axes = panels(1, len(priors), (WIDTH, 3.2), sharey=True)
     for panel, prior in zip(axes, priors, strict=True):
         for planner, (color, line) in zip(planners, lines(planners), strict=True):
@@ -159,6 +166,7 @@ def planner_figure(rows: Rows) -> Figure:
                 points = [(row["model_steps"], row["oracle_share"], row["low"], row["high"]) for row in own]
                 band(panel, sorted(points), color, planner, line)
         panel.set_xscale("log", base=2)
+        panel.set_xticks(places, [f"{place:,}" for place in places])
         panel.set_title(prior)
         panel.set_xlabel("model steps a decision")
         panel.grid(axis="y")
