@@ -13,6 +13,7 @@ from torch import Tensor
 from eval import behaviour_sections as behaviour
 from eval import plan_sections as sections
 from eval.held_out import Model
+from eval.macro_section import macro_section
 from eval.page import Page, Section, Table, write_page
 from eval.plan_statistics import describe
 from eval.tables import columns, titled
@@ -67,6 +68,7 @@ PARTS: list[tuple[str, Callable[[Any], Any]]] = [
     ("calibration", sections.calibration_section),
     ("transitions", behaviour.transition_section),
     ("over-represented sequences", behaviour.motif_section),
+    ("macro-actions", macro_section),
     ("generated sequences", behaviour.likeness_section),
     ("drift", behaviour.drift_section),
 ]
