@@ -102,7 +102,7 @@ def compare_planners(
     planners: Sequence[str], settings: Settings, cells: Sequence[Cell], processes: int | None, folder: Path
 ) -> None:
     """The comparison of planners; see `compare`."""
-    check_planners(planners)
+    check_planners(planners, list(dict.fromkeys(cell.world for cell in cells)))
     of_planners = PlannerSettings(**vars(settings), planners=tuple(planners))
     study = Study.prepare(folder, of_planners, run_planners)
     done = run_cells(study, cells, processes)

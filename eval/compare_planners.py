@@ -12,7 +12,7 @@ from torch import Tensor
 from eval.compare_cell import Contest, Contestant
 from eval.compare_curves import ROLLOUTS, TEMPERATURES, Starts, worth
 from eval.compare_settings import Settings
-from eval.suite import Task
+from eval.suite import TASKS, Task
 from neuroprior import (
     CrossEntropyPlanner,
     DistinctPlanner,
@@ -21,6 +21,7 @@ from neuroprior import (
     Planner,
     Prior,
     SamplingPlanner,
+    World,
 )
 
 ORDERS = (3,)
@@ -41,17 +42,12 @@ class PlannerSettings(Settings):
     planners: tuple[str, ...] = ()
 
 
-def cross_entropy(prior: Prior, length: int, num_plans: int, **how: Any) -> CrossEntropyPlanner:
-    """The cross-entropy planner, with fewer rounds where there are few plans."""
-    return CrossEntropyPlanner(prior, length, num_plans, rounds=min(4, num_plans), **how)
-
-
 PLANNERS: dict[str, Callable[..., Planner]] = {
     "sampling": SamplingPlanner,
     "distinct": DistinctPlanner,
     "frontier": FrontierPlanner,
     "mcts": MCTSPlanner,
-    "cross-entropy": cross_entropy,
+    "cross-entropy": CrossEntropyPlanner,
     "halving": partial(SamplingPlanner, halving=True),
 }
 """By their names in tables."""
@@ -72,7 +68,7 @@ def run_planners(task: Task, seed: int, settings: PlannerSettings) -> dict[str, 
     for one in contest.contestants():
         if one.label == "uniform" or one.rounds == (0 if one.length is None else contest.rounds):
             for name in settings.planners:
-                if name in CHANCE if contest.worlds.held_out.stochastic else name not in ONLY_CHANCE:
+                if suits(name, contest.worlds.held_out):
                     entries.append(_entry(contest, one, name))
     cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "num_plans": settings.num_plans}
     return cell | {"entries": entries, "seconds": perf_counter() - begin}
@@ -110,11 +106,21 @@ def _planned(
     return {"share": starts.share(score), "model_steps": decision.model_steps, "seconds": seconds}
 
 
-def check_planners(planners: Sequence[str]) -> None:
-    """Raise ValueError, naming the option, where there is no planner, or one is not known or given twice."""
+def check_planners(planners: Sequence[str], worlds: Sequence[str]) -> None:
+    """Raise ValueError, naming the option, where a planner is not known or given twice, or a world is left without."""
     if not planners:
         raise ValueError("planners: at least one is expected")
     if unknown := [name for name in planners if name not in PLANNERS]:
         raise ValueError(f"planners: {unknown[0]!r} is not known; there are {', '.join(PLANNERS)}")
     if len(set(planners)) < len(planners):
         raise ValueError(f"planners: each may be given once, not {' '.join(planners)}")
+    for world in worlds:
+        if set(planners) & CHANCE and set(planners) - ONLY_CHANCE:
+            continue  # something for worlds with chance, and for those without: some worlds take long to make
+        if not any(suits(name, TASKS[world].worlds(0).held_out) for name in planners):
+            raise ValueError(f"planners: none of {' '.join(planners)} is for {world}; leave it out, or add sampling")
+
+
+def suits(name: str, world: World) -> bool:
+    """Whether a planner can plan in a world, and is not there what another one is, too."""
+    return name in CHANCE if world.stochastic else name not in ONLY_CHANCE

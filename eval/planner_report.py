@@ -189,6 +189,8 @@ def write_report(cells: Cells, settings: Mapping[str, Any], folder: Path, consol
     for name, some in (("rows", rows), ("paired", gaps)):
         if some:
             write_csv(folder / f"{name}.csv", some)
+        else:
+            (folder / f"{name}.csv").unlink(missing_ok=True)  # of an earlier run
     results = {"rows": rows, "paired": gaps, "words": said, "settings": dict(settings), "versions": versions()}
     write_json(folder / "results.json", results)
     sections = [

@@ -66,7 +66,13 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("given", "says"), [(["best"], "planners: 'best' is not known"), (["mcts", "mcts"], "planners: each may be given")]
+    ("given", "says"),
+    [
+        (["best"], "planners: 'best' is not known"),
+        (["mcts", "mcts"], "planners: each may be given"),
+        (["mcts", "--worlds", "grid", "slippery"], "planners: none of mcts is for slippery"),
+        (["halving", "--worlds", "grid"], "planners: none of halving is for grid"),
+    ],
 )
 def test_bad_planners_are_one_line(given, says, tmp_path, capsys):
     assert main(["compare", "--planners", *given, "--out", str(tmp_path / "out")]) == 2

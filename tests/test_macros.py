@@ -15,6 +15,7 @@ from neuroprior import (
     MarkovPrior,
     Plans,
     SamplingPlanner,
+    TransformerPrior,
     UniformPrior,
     learn_macros,
     load,
@@ -160,6 +161,38 @@ def test_it_is_a_prior(inner):
     check_prior(fitted(INNER[inner](), **quick), length=4, num_plans=5000)
 
 
+@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
+def test_networks_inside_tell_plans_longer_than_their_window(kind):
+    """Recoded plans are short, and so is the window that is learned; past it a network's state has another shape."""
+    words = torch.tensor([[0, 1, 2, 3], [3, 2, 2, 0], [1, 1, 0, 3]])
+    plans = words[torch.randint(3, (200, 4), generator=seeded(0))].flatten(1)
+    prior = MacroPrior(4, kind(12)).fit(plans, max_steps=3, progress=False)
+    long = torch.randint(4, (3, 20), generator=seeded(1))
+    with torch.no_grad():
+        told = prior.log_prob(long)
+        assert told.isfinite().all()
+        assert torch.allclose(prior.log_prob(long.to(torch.uint8)), told)
+    assert prior.sample(5, 18, generator=seeded(2)).shape == (5, 18)
+
+
+def test_of_too_many_ways_the_most_probable_are_kept(monkeypatch):
+    prior, plans = fitted(MarkovPrior(7, 2)), every_plan(3, 6)
+    exact = prior.log_prob(plans)
+    monkeypatch.setattr(MacroPrior, "MOST", 6)
+    near = prior.log_prob(plans)
+    assert not torch.equal(near, exact)
+    assert (near - exact).abs().mean() < 0.1
+    assert float(near.double().exp().sum()) == pytest.approx(1, abs=1e-4)
+
+
+def test_actions_of_any_integer_dtype():
+    prior = fitted(MarkovPrior(7, 1))
+    _, state = prior.start(4)
+    action = torch.tensor([0, 1, 2, 1])
+    for dtype in (torch.uint8, torch.int32):
+        assert torch.equal(prior.step(action.to(dtype), state)[0], prior.step(action, state)[0])
+
+
 def test_before_it_learned_it_has_no_macros():
     check_prior(MacroPrior(3, MarkovPrior(5, 1)), length=3, num_plans=2000)
 
@@ -205,6 +238,12 @@ def test_refuses():
         MacroPrior(3, MarkovPrior(4, 1, num_contexts=2))
     with refuses("end symbol"):
         learn_macros(Plans(plans, 2, end=1), 1)
+    prior = MacroPrior(2, MarkovPrior(3))
+    with refuses("end symbol"):
+        prior.fit(Plans(plans, 2, end=1))
+    assert prior.end is None
+    with refuses("without macros"):
+        MacroPrior(2, MacroPrior(3, MarkovPrior(4)))
 
 
 def test_nothing_to_find():

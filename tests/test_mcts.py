@@ -78,11 +78,39 @@ def test_other_states_than_numbers_and_priors_that_see():
     assert decision.score.mean() > 0.8
 
 
-def test_impossible_rewards_are_no_trouble():
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_impossible_rewards_are_no_trouble(share):
+    """Where some, or all, scores are infinite, plans are legal, end where is said, and the best is found."""
+    world = random_world(0, "WS", legal=True)
+    reward = world.reward.masked_fill(torch.rand(world.reward.shape, generator=seeded(1)) < share, -torch.inf)
+    world = TabularWorld(world.next_state, reward, world.legal_actions)
+    state = world.reset(60, seeded(0))
+    decision = MCTSPlanner(UniformPrior(3), 3, 60).plan(world, state, seeded(0))
+    assert torch.equal(decision.score, oracle(world, state, 3))
+    now = state
+    for t in range(3):
+        action = decision.plan[:, t].long()
+        assert world.legal(now).gather(1, action[:, None]).all()
+        now = world.step(now, action)[0]
+    assert torch.equal(now, decision.final_state)
+
+
+def test_rewards_are_as_precise_as_the_worlds():
     world = random_world(0)
-    world = TabularWorld(world.next_state, torch.full_like(world.reward, -torch.inf))
-    decision = MCTSPlanner(UniformPrior(3), 2, 6).plan(world, world.reset(4, seeded(0)), seeded(0))
-    assert decision.score.tolist() == [-torch.inf] * 4
+    world = TabularWorld(world.next_state, world.reward.double() + 2**25)
+    state = world.reset(20, seeded(0))
+    decision = MCTSPlanner(UniformPrior(3), 3, 60, objective="return").plan(world, state, seeded(0))
+    assert torch.allclose(decision.score, oracle(world, state, 3, objective="return"), rtol=0, atol=1e-6)
+
+
+def test_the_start_that_took_most_steps_tells_how_many(monkeypatch):
+    """A start where little can be tried before others, in chunks of one."""
+    world = TabularWorld(torch.tensor([[0, 0], [2, 3], [4, 5], [6, 1], [1, 2], [3, 4], [5, 6]]), torch.rand(7))
+    state = torch.tensor([0, 1, 0])
+    planner = MCTSPlanner(UniformPrior(2), 4, 6)
+    together = planner.plan(world, state, seeded(0)).model_steps
+    monkeypatch.setattr("neuroprior.planners.planner.STEPS_AT_ONCE", 1)
+    assert planner.plan(world, state, seeded(0)).model_steps == together == 24
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.planners.planner import Decision, decide
+from neuroprior.planners.planner import Decision, decide, in_chunks
 from neuroprior.planners.sampling import Proposer, SamplingPlanner
 from neuroprior.priors.packing import pack, unpack
 from neuroprior.priors.prior import Prior
 from neuroprior.sampling import sample
 from neuroprior.worlds.world import World, check_sizes
 
-MOST_COUNTS = 2**28
-"""Numbers in the counts of all starts that are planned from together."""
+MOST_COUNTS = 2**22
+"""Numbers in the counts of a start."""
 
 
 class CrossEntropyPlanner(SamplingPlanner):
@@ -29,7 +29,7 @@ class CrossEntropyPlanner(SamplingPlanner):
         prior: what proposes.
         length: number of actions in a plan, at least 1.
         num_plans: candidates for each start in all rounds together.
-        rounds: of about as many candidates each; at most `num_plans`.
+        rounds: of about as many candidates each; no more are taken than there are candidates.
         elites: the share of the candidates so far that is refitted to, above 0 and at most 1; at least one plan.
         order: None: the elites' actions are counted step by step; k >= 1: after each k actions, wherever in a plan.
         strength: s > 0: so many observations is the prior worth.
@@ -70,20 +70,27 @@ class CrossEntropyPlanner(SamplingPlanner):
             num_rollouts=num_rollouts,
         )
         check_sizes(rounds=rounds, **({} if order is None else {"order": order}))
-        if rounds > num_plans:
-            raise ValueError(f"rounds: at most num_plans = {num_plans} are expected, not {rounds}")
         if not 0 < elites <= 1:
             raise ValueError(f"elites: a share above 0 and at most 1 is expected, not {elites}")
         if not 0 < strength < float("inf"):
             raise ValueError(f"strength: a positive finite number is expected, not {strength}")
-        self.rounds, self.elites, self.order, self.strength = rounds, elites, order, strength
+        self.rounds, self.elites, self.order, self.strength = min(rounds, num_plans), elites, order, strength
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
         histories = self.length if self.order is None else (world.num_actions + 1) ** self.order
-        if histories * world.num_actions * len(state) > MOST_COUNTS:
+        if histories * world.num_actions > MOST_COUNTS:
+            what = "length" if self.order is None else "order"
             raise ValueError(
-                f"order: {self.order} is too high to count in {len(state)} starts' plans; give a lower one"
+                f"{what}: {histories:,} places with {world.num_actions} actions each are too many to count in;"
+                " give a smaller one"
             )
+
+        def some(state: Tensor) -> Decision:
+            return self._plan_some(world, state, histories, generator)
+
+        return in_chunks(some, state, histories * world.num_actions)
+
+    def _plan_some(self, world: World, state: Tensor, histories: int, generator: torch.Generator) -> Decision:
         counts = torch.zeros(len(state), histories, world.num_actions, device=state.device)
         found: list[tuple[Tensor, ...]] = []
         for k in range(self.rounds):
@@ -133,7 +140,8 @@ class _Refitted:
 
     def sample(self, num_plans: int, length: int, *, temperature: float, generator: torch.Generator | None) -> Tensor:
         """Plans of one start after another, `[num_plans, length]`; the number of the start stands in for a context."""
-        start = torch.arange(len(self.counts), device=self.device).repeat_interleave(num_plans // len(self.counts))
+        starts = len(self.counts)
+        start = torch.arange(starts, device=self.device).repeat_interleave(num_plans // max(starts, 1))
         return sample(self, num_plans, length, start, temperature=temperature, generator=generator)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:

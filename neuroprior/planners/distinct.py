@@ -70,6 +70,6 @@ class DistinctPlanner(Planner):
             if rollout.states is not None:
                 score, ends = self.prefix_scores(rollout.rewards, rollout.states), rollout.states
                 there = there[..., None]
-            return decide(plans, score.masked_fill(~there, -torch.inf), ends, steps, generator)
+            return decide(plans, score, ends, steps, generator, there)
 
         return in_chunks(some, state, steps)

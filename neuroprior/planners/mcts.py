@@ -74,8 +74,10 @@ class MCTSPlanner(Planner):
         found = [search.simulate(search.unfinished())]
         while len(rows := search.unfinished()):
             found.append(search.simulate(rows))
-        plans, score, ends = (torch.stack(parts, 1) for parts in zip(*found, strict=True))
-        return decide(plans, score, ends, search.most_steps(), generator)
+        plans, score, ends, there = (torch.stack(parts, 1) for parts in zip(*found, strict=True))
+        return decide(
+            plans, score, ends, search.most_steps(), generator, there[..., None] if self.any_prefix else there
+        )
 
 
 class _Search:
@@ -113,8 +115,8 @@ class _Search:
         """The steps that were taken for the start that took most."""
         return int((self.steps - self.left).max()) if len(self.left) else 0
 
-    def simulate(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One more plan of the starts `rows [K]`: for all B plan, score (-inf where there is none) and end."""
+    def simulate(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """One more plan of the starts `rows [K]`: for all B plan, score and end, and where there is one."""
         length, prior = self.planner.length, self.planner.prior
         self._make_room()
         logits, memory = (part.index_select(0, rows) for part in self.first)
@@ -145,13 +147,12 @@ class _Search:
         plan, gained, course = (torch.stack(column, 1) for column in columns)
         score, ends = self._scored(gained, course)
         self._learn(rows[alive], torch.stack(path, 1)[alive], plan[alive], score[alive])
-        score = torch.where(alive if score.dim() == 1 else alive[:, None], score, -torch.inf)
+        found = (plan.to(self.draw.dtype), score, ends, alive)
         batch = len(self.size)
-        return (
-            plan.new_zeros(batch, length, dtype=self.draw.dtype).index_copy_(0, rows, plan.to(self.draw.dtype)),
-            score.new_full((batch, *score.shape[1:]), -torch.inf).index_copy_(0, rows, score),
-            ends.new_zeros(batch, *ends.shape[1:]).index_copy_(0, rows, ends),
+        first, second, third, fourth = (
+            part.new_zeros(batch, *part.shape[1:]).index_copy_(0, rows, part) for part in found
         )
+        return first, second, third, fourth
 
     def _selected(self, rows: Tensor, node: Tensor, logits: Tensor) -> Tensor:
         """The actions that PUCT takes at nodes `[K]` where the prior gives `logits [K, A]`."""
@@ -175,13 +176,15 @@ class _Search:
         after, node = now.clone(), torch.where(known, self.child[rows, node, action], node)
         reward = torch.where(known, self.reward[rows, node], 0)
         after[known] = self.state[rows[known], node[known]]
-        stepped, gained = self.world.step(now[go], action[go], self.generator)
-        after[go], reward = stepped, reward.to(gained.dtype).masked_scatter(go, gained)
-        self.left[rows[go]] -= 1
+        if go.any():
+            after[go], gained = self.world.step(now[go], action[go], self.generator)
+            self.reward = self.reward.to(gained.dtype)
+            reward = reward.to(gained.dtype).masked_scatter(go, gained)
+            self.left[rows[go]] -= 1
         at, old = rows[fresh], node[fresh]
         new = self.size[at]
         self.child[at, old, action[fresh]] = new
-        self.state[at, new], self.reward[at, new] = after[fresh], reward[fresh].to(self.reward.dtype)
+        self.state[at, new], self.reward[at, new] = after[fresh], reward[fresh]
         self.size[at] += 1
         return after, reward, node.masked_scatter(fresh, new)
 
@@ -194,8 +197,12 @@ class _Search:
     def _learn(self, rows: Tensor, path: Tensor, plan: Tensor, score: Tensor) -> None:
         """Count plans `[K, L]` and their scores at the nodes `path [K, L]` (-1: outside of the tree) they went by."""
         score = (score if score.dim() == 1 else score.amax(1)).double()
-        self.low[rows] = torch.minimum(self.low[rows], score)
-        self.high[rows] = torch.maximum(self.high[rows], score)
+        finite = score.isfinite()
+        self.low[rows[finite]] = torch.minimum(self.low[rows[finite]], score[finite])
+        self.high[rows[finite]] = torch.maximum(self.high[rows[finite]], score[finite])
+        # An infinite score counts as the worst, or best, of all others so far.
+        extreme = torch.where(score > 0, self.high[rows], self.low[rows])
+        score = torch.where(finite, score, extreme.nan_to_num(0, 0, 0))
         finished = torch.ones_like(rows, dtype=torch.bool)
         for t in reversed(range(plan.shape[1])):
             inside = path[:, t] >= 0

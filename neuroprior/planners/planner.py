@@ -153,15 +153,17 @@ def decide(
         ends: where they end, or their prefixes: as `score`, and the state's own dimensions.
         model_steps: what that took for each start.
         generator: breaks ties.
-        allowed: `[P, L]` bool: the prefixes that may win; None: all.
+        allowed: bool, of a shape that `score` has or can be spread to: what may win; None: all. Something may.
     """
     row = torch.arange(len(plans), device=plans.device)
+    if allowed is not None:
+        allowed = allowed.expand(score.shape).flatten(1)
     if score.dim() == 2:
-        best = random_best(score, generator)
+        best = random_best(score, generator, allowed)
         return Decision(plans[row, best], score[row, best], ends[row, best], model_steps)
     length = plans.shape[2]
     score = score.flatten(1)
-    chosen = random_best(score, generator, None if allowed is None else allowed.flatten().expand(score.shape))
+    chosen = random_best(score, generator, allowed)
     best, last = chosen.div(length, rounding_mode="floor"), chosen % length
     beyond = torch.arange(length, device=plans.device) > last[:, None]
     plan = plans[row, best].masked_fill(beyond, 0)
@@ -189,10 +191,12 @@ def in_chunks(
         first.model_steps,
         None if first.lengths is None else first.lengths.new_empty(len(state)),
     )
+    steps = first.model_steps
     for at in range(0, len(state), size):
         part = plan_some(state[at : at + size]) if at else first
+        steps = max(steps, part.model_steps)
         for result, some in ((whole.plan, part.plan), (whole.score, part.score), (whole.final_state, part.final_state)):
             result[at : at + size] = some
         if whole.lengths is not None and part.lengths is not None:
             whole.lengths[at : at + size] = part.lengths
-    return whole
+    return whole._replace(model_steps=steps)

@@ -20,7 +20,8 @@ class MacroPrior(Prior):
     may come about in several ways, with macros and without, and its probability is the sum over all of them (a plan
     that is cut off within a macro counts, too). After each action the ways that fit it are known with their
     probabilities; ways that `inner` cannot tell apart from there on are one. So all is exact, as long as a prefix has
-    no more than `MOST` ways with as many symbols; of more, the least probable are left out.
+    no more than `MOST` ways; of more, the least probable are left out. A chain forgets, and so has few ways; a network
+    has all of them, hundreds after a dozen actions, and takes time and memory in proportion.
 
     Args:
         num_actions: A.
@@ -35,7 +36,9 @@ class MacroPrior(Prior):
         ValueError: an argument is out of range, or the inner prior does not fit.
     """
 
-    MOST = 256
+    MOST = 128
+
+    actions_at_once = 2**14
 
     ahead: Tensor
     """`[A + M, longest]`: the actions of each symbol; -1 beyond."""
@@ -53,6 +56,8 @@ class MacroPrior(Prior):
                 f"inner: a prior over more than {num_actions} actions is expected, one for each macro;"
                 f" it has {made.num_actions}"
             )
+        if isinstance(made, MacroPrior):
+            raise ValueError("inner: a prior without macros is expected; give this one more of them")
         if made.takes_context:
             raise ValueError("inner: a prior without context is expected: a macro is one step of many sights")
         super().__init__(num_actions)
@@ -93,27 +98,33 @@ class MacroPrior(Prior):
         Raises:
             ValueError: the plans do not fit this prior, or have an end symbol.
         """
+        if isinstance(plans, Plans) and plans.end is not None:
+            raise ValueError("plans: an end symbol cannot be part of a macro; learn from plans without one")
         macros, recoded = learn_macros(self.training_plans(plans), self.num_macros, self.by)
         self._inner().fit(recoded, **settings)
         self._take(macros)
         return self
 
+    @torch.no_grad()  # what is learned is learned by `fit`
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         logits, memory = self._inner().start(batch_size)
         row = torch.arange(batch_size, device=logits.device)
         return self._joined([self._ways(row, logits.new_zeros(batch_size), logits, memory)], batch_size)
 
+    @torch.no_grad()
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if len(state) == 0:  # of which nothing can be unpacked
             return torch.zeros(0, self.num_actions, device=self.device), state
-        groups = self._open(state)
-        within = [ways.within(action, self.ahead) for ways in groups]
-        begun = [self._begun(ways, action) for ways in groups]
-        # A way to which a symbol was added goes on among those with one symbol more.
-        after = [[one] for one in within] + [[]]
-        for place, one in enumerate(begun):
-            after[place + 1].append(one)
-        return self._joined([_merged(some) for some in after], len(state))
+        action, groups = action.long(), self._open(state)
+        after = [[ways.within(action, self.ahead)] for ways in groups]
+        for place, ways in enumerate(groups):
+            begun = self._begun(ways, action)
+            # A way to which a symbol was added goes on among those with one more, whose states may be of another size.
+            further = place + (begun.memory.dim() > 1)
+            if further == len(after):
+                after.append([])
+            after[further].append(begun)
+        return self._joined(_likeliest([_merged(some) for some in after], len(state), self.MOST), len(state))
 
     def _begun(self, ways: "_Ways", action: Tensor) -> "_Ways":
         """The ways that add a symbol which begins with `action [N]`."""
@@ -136,8 +147,6 @@ class MacroPrior(Prior):
 
     def _ways(self, row: Tensor, weight: Tensor, logits: Tensor, memory: Tensor) -> "_Ways":
         """Ways at whose end the inner prior gives `logits`; macros that were not learned are never taken."""
-        if memory.dim() == 2 and memory.shape[1] == 0:  # which cannot be packed
-            memory = memory.new_zeros(len(memory))
         unknown = torch.arange(logits.shape[1], device=logits.device) >= self.num_actions + len(self.macros)
         told = logits.masked_fill(unknown, -torch.inf).log_softmax(-1)
         return _Ways(row, weight, torch.zeros_like(row), told, memory)
@@ -152,7 +161,7 @@ class MacroPrior(Prior):
         for ways in groups:
             weight = (ways.weight.double() - total[ways.row]).exp()
             probs.index_add_(0, ways.row, weight[:, None] * self._next(ways))
-            parts += ways._replace(weight=weight.log()).padded(batch, self.MOST)
+            parts += ways._replace(weight=weight.log()).padded(batch)
         logits = probs.log().float()
         groups_of = torch.full((batch, 1), float(len(groups)), device=self.device)
         return logits, torch.cat([groups_of, pack(parts)], 1)
@@ -224,22 +233,18 @@ class _Ways(NamedTuple):
         more = (turn < size) & (ahead[symbol, turn.clamp(max=size - 1)] >= 0)
         return left._replace(place=torch.where(more, left.place + 1, 0))
 
-    def padded(self, batch: int, most: int) -> list[Tensor]:
+    def padded(self, batch: int) -> list[Tensor]:
         """Weight, place, told and memory as `[batch, K, ...]`; beyond a plan's ways the weight is -inf."""
-        order = (-self.weight).argsort(stable=True)
-        order = order[self.row[order].argsort(stable=True)]
-        ways = self.taken(order)
+        ways = self.taken(self.row.argsort(stable=True))
         count = ways.row.bincount(minlength=batch)
         turn = torch.arange(len(ways.row), device=ways.row.device) - (count.cumsum(0) - count)[ways.row]
-        kept = turn < most
-        ways, turn = ways.taken(kept), turn[kept]
-        wide = min(max(int(count.max()) if batch else 0, 1), most)
+        wide = max(int(count.max()) if batch else 0, 1)
         parts = []
         for part, nothing in ((ways.weight.float(), -torch.inf), (ways.place, 0), (ways.told, 0), (ways.memory, 0)):
-            room = part.new_full((batch, wide, *(part.shape[1:] or (1,))), nothing)
-            room[ways.row, turn] = part.view(len(part), *(part.shape[1:] or (1,)))
+            room = part.new_full((batch, wide, *part.shape[1:]), nothing)
+            room[ways.row, turn] = part
             parts.append(room)
-        return [parts[0][..., 0], parts[1][..., 0], parts[2], parts[3] if self.memory.dim() > 1 else parts[3][..., 0]]
+        return parts
 
     @classmethod
     def unpadded(cls, weight: Tensor, place: Tensor, told: Tensor, memory: Tensor) -> "_Ways":
@@ -262,6 +267,24 @@ def _merged(some: Sequence[_Ways]) -> _Ways:
     first = torch.full((groups,), len(group), device=group.device)
     first.scatter_reduce_(0, group, torch.arange(len(group), device=group.device), "amin")
     return ways.taken(first)._replace(weight=_log_sums(ways.weight, group, groups).to(ways.weight))
+
+
+def _likeliest(groups: Sequence[_Ways], batch: int, most: int) -> list[_Ways]:
+    """Of each of `batch` plans the most probable ways, at most so many in all groups together."""
+    row, weight, place = (torch.cat([getattr(ways, part) for ways in groups]) for part in ("row", "weight", "place"))
+    if len(row) <= most or int(row.bincount(minlength=batch).max()) <= most:
+        return list(groups)
+    # One at the end of a symbol is always among them: from there every action can be taken.
+    free = weight.masked_fill(place > 0, -torch.inf)
+    best = torch.full((batch,), -torch.inf, device=row.device, dtype=weight.dtype).scatter_reduce(0, row, free, "amax")
+    weight = weight.masked_fill((place == 0) & (free == best[row]), torch.inf)
+    order = (-weight).argsort(stable=True)
+    order = order[row[order].argsort(stable=True)]
+    count = row.bincount(minlength=batch)
+    turn = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count)[row[order]]
+    kept = torch.zeros_like(row, dtype=torch.bool)
+    kept[order[turn < most]] = True
+    return [ways.taken(some) for ways, some in zip(groups, kept.split([len(w.row) for w in groups]), strict=True)]
 
 
 def _log_sums(values: Tensor, group: Tensor, groups: int) -> Tensor:

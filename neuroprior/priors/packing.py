@@ -8,26 +8,34 @@ from torch import Tensor
 DIGITS = 2**24
 """Up to here float32 holds every integer: larger ones, up to its square, are kept as two numbers."""
 
-HEADER = 3
-"""Numbers that tell what each part is: 1 for integers, and its second and third dimension (0: there is none)."""
+MOST_DIMENSIONS = 4
+"""Of a part, beside the batch."""
+
+HEADER = 2 + MOST_DIMENSIONS
+"""Numbers that tell what each part is: 1 for integers, 2 for bool; how many dimensions; and these."""
 
 
 def pack(parts: list[Tensor]) -> Tensor:
-    """States `[N]`, `[N, M]` or `[N, M, D]` as one tensor `[N, K]`, float32.
+    """States `[N, ...]` as one tensor `[N, K]`, float32.
 
     Args:
-        parts: floating point, or integers from 0 to 2**48 - 1; sizes may differ, and change from step to step.
+        parts: floating point, bool, or integers from 0 to 2**48 - 1; sizes may differ, and change from step to step.
+
+    Raises:
+        ValueError: a part has more than `MOST_DIMENSIONS` dimensions beside the batch.
     """
     heads, bodies = [], []
     for part in parts:
-        whole = not part.is_floating_point()
-        sizes = [*part.shape[1:], 0, 0][:2]
-        heads += [float(whole), *map(float, sizes)]
-        flat = part.reshape(len(part), -1) if part.numel() else part.new_zeros(len(part), 0)
+        sizes = part.shape[1:]
+        if len(sizes) > MOST_DIMENSIONS:
+            raise ValueError(f"state: at most {MOST_DIMENSIONS} dimensions beside the batch are kept, not {len(sizes)}")
+        kind = 2 if part.dtype == torch.bool else int(not part.is_floating_point())
+        heads += [kind, len(sizes), *sizes, *[0] * (MOST_DIMENSIONS - len(sizes))]
+        flat = part.reshape(len(part), prod(sizes))
         bodies += (
-            [flat.div(DIGITS, rounding_mode="floor").float(), (flat % DIGITS).float()] if whole else [flat.float()]
+            [flat.div(DIGITS, rounding_mode="floor").float(), (flat % DIGITS).float()] if kind == 1 else [flat.float()]
         )
-    head = torch.tensor(heads, device=parts[0].device).expand(len(parts[0]), len(heads))
+    head = torch.tensor(heads, device=parts[0].device).float().expand(len(parts[0]), len(heads))
     return torch.cat([head, *bodies], 1)
 
 
@@ -40,14 +48,16 @@ def unpack(packed: Tensor, number: int) -> list[Tensor]:
     """
     if len(packed) == 0:
         return [packed[:, :0]] * number
-    heads = packed[0, : HEADER * number].long().tolist()
+    heads = packed[0, : HEADER * number].long().view(number, HEADER).tolist()
     at, parts = HEADER * number, []
-    for kind, *sizes in zip(heads[::3], heads[1::3], heads[2::3], strict=True):
-        shape = [size for size in sizes if size] or ([] if kind else [0])
+    for kind, dimensions, *sizes in heads:
+        shape = sizes[:dimensions]
         size = prod(shape)
-        body = packed[:, at : at + size * (1 + kind)]
-        at += size * (1 + kind)
-        if kind:
+        body = packed[:, at : at + size * (1 + (kind == 1))]
+        at += body.shape[1]
+        if kind == 1:
             body = body[:, :size].long() * DIGITS + body[:, size:].long()
+        elif kind == 2:
+            body = body.bool()
         parts.append(body.reshape(len(packed), *shape))
     return parts

@@ -44,8 +44,8 @@ def check_planner(make: Make, enough: int = 512, seed: int = 0) -> None:
             _check_seed(planner, world, state, decision, seed)
             if not legal:
                 _check_steps(planner, world, state[:1], seed)
-    none = make(UniformPrior(2), 3, 4).plan(world, state[:0], torch.Generator().manual_seed(seed))
-    require(none.plan.shape == (0, 3), f"plan of no starts: plan {list(none.plan.shape)}, not [0, 3]")
+        none = make(UniformPrior(2), 3, 4).plan(world, state[:0], torch.Generator().manual_seed(seed))
+        require(none.plan.shape == (0, 3), f"plan of no starts: plan {list(none.plan.shape)}, not [0, 3]")
     _check_ties(make(UniformPrior(3), 2, 9), seed)
     planner = make(UniformPrior(2), 3, 4)
     for wrong, what in ((state + 10**6, "states that do not exist"), (state.double(), "states that are no integers")):
