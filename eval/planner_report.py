@@ -90,18 +90,21 @@ def table(rows: Rows, gaps: Rows, world: str) -> Table:
     sure = {_key(row) for row in gaps if row["world"] == world and row["p_holm"] < 0.05}
     at = {_key(row): row for row in own}
     names = dict.fromkeys((row["prior"], row["sees"], row["planner"]) for row in own)
+    sights = {row["sees"] for row in own if row["prior"] != "uniform"}
+    seen = f" Learned priors see {next(iter(sights))}." if len(sights) == 1 else ""
     cells = []
     for name in names:
         found = [at[(*name, number)] for number in numbers]
         told = [_told(row) + "*" * (_key(row) in sure) for row in found]
-        cells.append([_prior(found[0]), name[2], *told, f"{1000 * found[-1]['seconds_per_decision']:.2g}"])
+        prior = _prior(found[0]) if len(sights) > 1 else name[0]
+        cells.append([prior, name[2], *told, _milliseconds(found[-1])])
     seeds = max(row["seeds"] for row in own)
     over = f" ±: the wider half of 95 % bootstrap intervals over {seeds} seeds." if seeds > 1 else " A single seed."
     star = " *: p < 0.05 against sampling from the same prior, corrected for all of this table." if sure else ""
     length = round(max(row["model_steps"] / row["num_plans"] for row in own))
     caption = (
         f"{world}: share of the oracle, %, with so many plans of {length} model steps each, or as many steps otherwise"
-        f" spent; and how long a decision takes with the most.{over}{star}"
+        f" spent; and how long a decision takes with the most.{seen}{over}{star}"
     )
     headings = ("prior", "planner", *(f"{number:,} plans" for number in numbers), "ms")
     return Table(headings, cells, caption, "ll" + "r" * (len(numbers) + 1))
@@ -133,6 +136,11 @@ def _numbers(rows: Rows) -> list[int]:
 
 def _prior(row: Mapping[str, Any]) -> str:
     return str(row["prior"]) + ("" if row["sees"] == "nothing" else f", sees {row['sees']}")
+
+
+def _milliseconds(row: Mapping[str, Any]) -> str:
+    value = 1000 * row["seconds_per_decision"]
+    return f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def _key(row: Mapping[str, Any]) -> tuple[str, str, str, int]:

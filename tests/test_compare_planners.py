@@ -112,7 +112,8 @@ def test_what_is_told():
     made = list(cells(0.2))
     rows, gaps = planner_report.planner_rows(made), planner_report.paired_rows(made)
     table = planner_report.table(rows, gaps, "maze")
-    assert [row[:2] for row in table.rows] == [["gru, sees start", "sampling"], ["gru, sees start", "mcts"]]
+    assert [row[:2] for row in table.rows] == [["gru", "sampling"], ["gru", "mcts"]]
+    assert "Learned priors see start." in table.caption
     assert table.rows[1][2].startswith("81.5 ±")
     assert table.rows[1][2].endswith("*") == (gaps[0]["p_holm"] < 0.05)
     said = planner_report.words(rows, gaps, "maze")
