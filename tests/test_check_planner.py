@@ -12,8 +12,10 @@ from neuroprior import (
     MCTSPlanner,
     Planner,
     SamplingPlanner,
+    TabularWorld,
 )
 from neuroprior.testing import check_planner
+from tests.sources import TablePrior, refuses, seeded
 
 HOW = {
     "terminal": {},
@@ -37,6 +39,16 @@ PLANNERS = {
 @pytest.mark.parametrize("make", PLANNERS.values(), ids=PLANNERS)
 def test_planners_conform(make, how):
     check_planner(lambda prior, length, number: make(prior, length, number, **how))
+
+
+@pytest.mark.parametrize("make", [MCTSPlanner, DistinctPlanner])
+def test_priors_that_hold_all_that_exists_impossible_are_named(make):
+    """Where action 0 alone exists, a prior that never takes it."""
+    world = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.ones(1), torch.tensor([[True, False]]))
+    never = torch.tensor([-torch.inf, 0.0])
+    prior = TablePrior([never.expand(1, 1, 2), never.expand(1, 2, 2)])
+    with refuses("prior"):
+        make(prior, 2, 3).plan(world, torch.zeros(2, dtype=torch.long), seeded(0))
 
 
 class Broken(Planner):

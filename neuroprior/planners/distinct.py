@@ -67,6 +67,8 @@ class DistinctPlanner(Planner):
             )
             score, ends = self.score(rollout.rewards, rollout.final_state), rollout.final_state
             there = log_prob > -torch.inf
+            if not there.any(1).all():
+                raise ValueError("prior: it gives no plan that exists from some start a probability above 0")
             if rollout.states is not None:
                 score, ends = self.prefix_scores(rollout.rewards, rollout.states), rollout.states
                 there = there[..., None]

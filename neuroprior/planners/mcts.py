@@ -128,6 +128,8 @@ class _Search:
             if not self.world.all_legal:
                 legal = self.world.legal(now)
                 logits = logits.masked_fill(~legal, -torch.inf)
+                if (logits == -torch.inf).all(1).any():
+                    raise ValueError("prior: it gives none of the actions that exist somewhere a probability above 0")
                 self.closed[rows[inside], node[inside]] |= ~legal[inside]
             action = self.draw.actions(logits, self.draw.uniform((len(rows),), logits))
             chosen = self._selected(rows[inside], node[inside], logits[inside])
