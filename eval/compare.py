@@ -19,7 +19,7 @@ from eval.compare_settings import Settings
 from eval.suite import TASKS
 from eval.world_priors import load_for
 
-KINDS = ("markov", *NEURAL)
+KINDS = ("markov", "macro", *NEURAL)
 SEES = tuple(compare_settings.SEES)
 MOST_PLANS = 2**20
 LISTS: dict[str, dict[str, Any]] = {
@@ -61,7 +61,8 @@ def compare(
             are over them.
         num_plans: numbers of candidate plans, powers of two.
         priors: model folders to compare, such as `python -m train` writes.
-        kinds: of priors that are fitted: markov, gru, transformer; all by default, but none where there are saved ones.
+        kinds: of priors that are fitted: markov, macro (a chain of order 2 over actions and 16 macro-actions, which
+            sees nothing), gru, transformer; all by default, but none where there are saved ones.
         planners: some of sampling, distinct, frontier, mcts, cross-entropy and halving: they are compared, not priors,
             at as many model steps, with uniform plans, a chain of order 3 and the networks of --kinds, after growth.
         sees: what priors see: nothing but the plan so far, the start as well, or each step; by default nothing and, in

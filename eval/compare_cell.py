@@ -19,7 +19,7 @@ from eval.compare_curves import (
     starts_of,
 )
 from eval.compare_pictures import drawn_plans, transitions
-from eval.compare_priors import MANY, NEURAL, ORDERS, RECIPE, TRAINING, WIDE, chain, network
+from eval.compare_priors import MANY, NEURAL, ORDERS, RECIPE, TRAINING, WIDE, chain, macro, network
 from eval.compare_settings import SEES, Settings
 from eval.suite import Task
 from eval.suite_worlds import LAYOUTS, MAPS, SCRAMBLE
@@ -185,6 +185,9 @@ class Contest:
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
             prior = network(kind, self.worlds.training, first, draw_seed(self.generator))
             yield from self._grown(kind, sees, prior, first, TRAINING | {"max_steps": self.settings.steps})
+
+        if "macro" in self.settings.kinds and sees == "nothing":
+            yield from self._grown("macro", sees, macro(first), first, {})
 
     def _grown(
         self, label: str, sees: str, prior: Prior, first: Plans, training: dict[str, Any]

@@ -41,7 +41,7 @@ def efficiency(cells: Cells) -> Rows:
     found: Rows = []
     for world, results in by_world(cells).items():
         random = results.entries.get(UNIFORM, {})
-        for key in results.priors("uniform", "markov", "neural", "saved") if random else []:
+        for key in results.priors("uniform", "markov", "neural", "other") if random else []:
             seeds = [seed for seed in results.entries[key] if seed in random]
             if not seeds:
                 continue

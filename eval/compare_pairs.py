@@ -23,10 +23,10 @@ class Pair(NamedTuple):
 def paired(cells: Cells, num_plans: Sequence[int]) -> Rows:
     """Differences in the share of the oracle between priors with as many plans, over the seeds that have both.
 
-    What is compared: the best neural with the best Markov prior; each neural with each Markov prior; each saved prior
-    with every other; grown with not grown; seeing with not seeing. All else is equal. The best are chosen on half of
-    the seeds and compared on the other half, for both halves, so that the choice favours none; their intervals and
-    p-values hold whichever are the best: see `best_difference`.
+    What is compared: the best neural with the best Markov prior; each neural with each Markov prior; each saved or
+    macro prior with every other; grown with not grown; seeing with not seeing. All else is equal. The best are chosen
+    on half of the seeds and compared on the other half, for both halves, so that the choice favours none; their
+    intervals and p-values hold whichever are the best: see `best_difference`.
 
     Returns:
         A row a world, pair and number of plans: the shares of the two (`first_share`, `second_share`; of the best, as
@@ -48,7 +48,7 @@ def paired(cells: Cells, num_plans: Sequence[int]) -> Rows:
 
 
 def _pairs(results: Results) -> Iterator[Pair]:
-    keys = results.priors("neural", "markov", "saved")
+    keys = results.priors("neural", "markov", "other")
     for like in dict.fromkeys(key[2:] for key in keys):
         neural, markov = ([k for k in keys if (k.kind, k[2:]) == (kind, like)] for kind in ("neural", "markov"))
         if neural and markov:
@@ -57,8 +57,8 @@ def _pairs(results: Results) -> Iterator[Pair]:
     for place, key in enumerate(keys):
         for later, other in enumerate(keys):
             alike = other != key and other[2:] == key[2:]
-            if key.kind == "saved" and alike and (other.kind != "saved" or place < later):
-                yield Pair("saved minus other", [key], [other])
+            if key.kind == "other" and alike and (other.kind != "other" or place < later):
+                yield Pair("other minus any", [key], [other])
     for key in keys:
         if key.rounds and key._replace(rounds=0) in keys:
             yield Pair("grown minus not", [key], [key._replace(rounds=0)])
@@ -137,7 +137,7 @@ def words(cells: Cells, num_plans: Sequence[int]) -> Rows:
     """
     number, found = shown_plans(num_plans), []
     for world, results in by_world(cells).items():
-        keys = results.priors("neural", "markov", "saved")
+        keys = results.priors("neural", "markov", "other")
         for like in dict.fromkeys(key[2:] for key in keys):
             told = ((pair, difference(results, pair, number)) for pair in _headlines(results, like))
             # The first pair that can be compared.
@@ -161,7 +161,7 @@ def question_of(row: Mapping[str, Any]) -> tuple[str, bool]:
 
 def _headlines(results: Results, like: tuple[str, int]) -> Iterator[Pair]:
     """The pairs to tell of, among priors that see and have grown alike."""
-    keys = [key for key in results.priors("neural", "markov", "saved") if key[2:] == like]
+    keys = [key for key in results.priors("neural", "markov", "other") if key[2:] == like]
     neural, markov = ([key for key in keys if key.kind == kind] for kind in ("neural", "markov"))
     if neural and markov:
         yield Pair(BEST, neural, markov)

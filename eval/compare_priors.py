@@ -6,10 +6,14 @@ from typing import Any
 from torch import Tensor
 
 from eval.compare_sight import SeeingMarkov
-from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World
+from neuroprior import GRUPrior, MacroPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World
 
 ORDERS = range(5)
 """Of the Markov priors."""
+
+
+MACROS, MACRO_ORDER = 16, 2
+"""Macro-actions, and the order of the chain over actions and these; `VERSION` counts up with a change of them."""
 
 
 class UnlimitedGRU(GRUPrior):
@@ -45,6 +49,11 @@ def chain(order: int, world: World, plans: Plans, near: Sequence[tuple[int, ...]
     if sizes:
         return SeeingMarkov(plans.num_actions, order, near, **sizes)
     return MarkovPrior(plans.num_actions, order)
+
+
+def macro(plans: Plans) -> MacroPrior:
+    """A chain over actions and macro-actions."""
+    return MacroPrior(plans.num_actions, MarkovPrior(plans.num_actions + MACROS, MACRO_ORDER))
 
 
 def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:

@@ -33,12 +33,12 @@ class Key(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """One of uniform, markov, neural, and saved: a folder, whose name tells nothing. Empty without a prior."""
+        """One of uniform, markov, neural, and other: macro, or a folder of any name. Empty without a prior."""
         if self.prior is None or self.prior == "uniform":
             return self.prior or ""
         if self.prior in NEURAL:
             return "neural"
-        return "markov" if self.prior.removeprefix("markov-").isdecimal() else "saved"
+        return "markov" if self.prior.removeprefix("markov-").isdecimal() else "other"
 
     @property
     def label(self) -> str:
