@@ -62,9 +62,8 @@ class Beams:
         beams = self.log_prob.shape[1]
         self.height, index = height.view(self.batch, beams * actions).topk(min(most, beams * actions))
         self.log_prob = child.view(self.batch, beams * actions).gather(1, index)
-        action = (index % actions).flatten()
-        first = torch.arange(self.batch, device=index.device)[:, None] * beams
-        self.keep((first + index.div(actions, rounding_mode="floor")).flatten())
+        row, action = origins(index, beams, actions)
+        self.keep(row)
         self.plans = torch.cat([self.plans, action[:, None].to(self.plans.dtype)], 1)
         seen = None
         if self.world is not None:
@@ -102,6 +101,16 @@ def children(log_prob: Tensor, logits: Tensor, temperature: float) -> Tensor:
     child = log_prob + (logits.double() / temperature).log_softmax(-1)
     # What a prior says after what cannot be may be no number.
     return torch.where(log_prob > -torch.inf, child, -torch.inf)
+
+
+def origins(index: Tensor, beams: int, actions: int) -> tuple[Tensor, Tensor]:
+    """Where children come from, by number: `index [B, K]` of the children of each of B times `beams`, A of each beam.
+
+    Returns:
+        The rows `[B * K]` of their beams among all, and their actions.
+    """
+    first = torch.arange(len(index), device=index.device)[:, None] * beams
+    return (first + index.div(actions, rounding_mode="floor")).flatten(), (index % actions).flatten()
 
 
 def no_actions(prior: Steppable, number: int) -> Tensor:

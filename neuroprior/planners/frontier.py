@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior.beams import children
+from neuroprior.beams import children, origins
 from neuroprior.draws import check_temperature
 from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
 from neuroprior.plans import action_dtype
@@ -110,10 +110,7 @@ class FrontierPlanner(Planner):
         log_prob = log_prob.view(len(front.log_prob), front.log_prob.shape[1] * world.num_actions)
         height = gumbel(log_prob, generator) if self.noise else log_prob
         index = height.topk(width).indices
-        action = (index % world.num_actions).flatten()
-        before = index.div(world.num_actions, rounding_mode="floor")
-        row = before + torch.arange(len(index), device=index.device)[:, None] * front.log_prob.shape[1]
-        row = row.flatten()
+        row, action = origins(index, front.log_prob.shape[1], world.num_actions)
         state, reward = world.step(front.state.index_select(0, row), action, generator)
         return front.gone_on(row, action, log_prob.gather(1, index), state, reward), row, action
 
