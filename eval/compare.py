@@ -86,11 +86,13 @@ def compare(
     settings = Settings(
         tuple(num_plans), tuple(kinds), tuple(sees or ()), rounds, steps, starts, training_starts, seed, saved
     )
+    if planners is not None:
+        settings = PlannerSettings(**vars(settings), planners=tuple(planners))
     check(worlds, seeds, processes, settings)
     check_saved(saved, worlds)
     folder = Path(out)
-    if planners is not None:
-        compare_planners(planners, settings, cells_of(worlds, seeds), processes, folder)
+    if isinstance(settings, PlannerSettings):
+        compare_planners(settings, cells_of(worlds, seeds), processes, folder)
         return
     study = Study.prepare(folder, settings, compare_cell.run_cell)
     cells = run_cells(study, cells_of(worlds, seeds), processes)
@@ -99,23 +101,22 @@ def compare(
         write_report(cells, num_plans, settings=told, command=command("compare"), folder=folder, console=Console())
 
 
-def compare_planners(
-    planners: Sequence[str], settings: Settings, cells: Sequence[Cell], processes: int | None, folder: Path
-) -> None:
+def compare_planners(settings: PlannerSettings, cells: Sequence[Cell], processes: int | None, folder: Path) -> None:
     """The comparison of planners; see `compare`."""
-    check_planners(planners, list(dict.fromkeys(cell.world for cell in cells)))
-    of_planners = PlannerSettings(**vars(settings), planners=tuple(planners))
-    study = Study.prepare(folder, of_planners, run_planners)
+    worlds = list(dict.fromkeys(cell.world for cell in cells))
+    check_planners(settings.planners, worlds)
+    study = Study.prepare(folder, settings, run_planners)
     done = run_cells(study, cells, processes)
     if done is not None:
-        worlds = dict.fromkeys(cell.world for cell in cells)
-        told = {"worlds": list(worlds), "seeds": len(cells) // len(worlds)} | asdict(of_planners)
+        told = {"worlds": worlds, "seeds": len(cells) // len(worlds)} | asdict(settings)
         planner_report.write_report(done, told, folder, Console(), command("compare"))
 
 
 def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Settings) -> None:
     """Raise ValueError, naming the option, where one is out of range, not known or given twice."""
+    planners = settings.planners if isinstance(settings, PlannerSettings) else ()
     words = {"worlds": (worlds, TASKS), "kinds": (settings.kinds, KINDS), "sees": (settings.sees, SEES)}
+    words["planners"] = planners, PLANNERS
     for name, (given, known) in words.items():
         if unknown := [word for word in given if word not in known]:
             raise ValueError(f"{name}: {unknown[0]!r} is not known; there are {', '.join(known)}")
@@ -123,7 +124,7 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
     for name, some in lists.items():
         if not some:
             raise ValueError(f"{name}: at least one is expected")
-    more = {name: getattr(settings, name) for name in ("sees", "kinds", "priors", "lengths")}
+    more = {name: getattr(settings, name) for name in ("sees", "kinds", "priors", "lengths")} | {"planners": planners}
     for name, some in (lists | more).items():
         if len(set(some)) < len(some):
             raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, some))}")

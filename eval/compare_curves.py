@@ -117,10 +117,9 @@ def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.
             true.append(worth(starts.task, starts.world, state, plans))
             continue
         _, rollout = planner.candidates(starts.world, state, generator)
-        if rollout.states is None:
-            score = planner.score(rollout.rewards, rollout.final_state)
-        else:
-            score = planner.prefix_scores(rollout.rewards, rollout.states).amax(-1)
+        score = planner.scored(rollout)[0]
+        if planner.any_prefix:
+            score = score.amax(-1)
         told.append(score)
         true.append(score)
     return torch.cat(told), torch.cat(true)

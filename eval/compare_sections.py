@@ -163,7 +163,7 @@ def bits_section(comparison: Comparison) -> Section | None:
 def _bits_table(comparison: Comparison, world: str) -> Iterator[Table]:
     rows = [row for row in comparison.bits if row["world"] == world and not row["rounds"]]
     if rows:
-        cells = [[key_of(row).label, _plus_minus(row, "bits_per_action", 1, 3), _more(row)] for row in rows]
+        cells = [[key_of(row).label, plus_minus(row, "bits_per_action", 1, 3), _more(row)] for row in rows]
         caption = f"{world}: bits per held-out action; more: than the best Markov chain that sees as much, paired."
         yield Table(("prior", "bits per action", "more"), cells, caption)
 
@@ -175,7 +175,7 @@ def _more(row: Mapping[str, Any]) -> str:
     return f"{row['more']:+.3f} ±{half:.3f}"
 
 
-def _plus_minus(row: Mapping[str, Any], name: str, factor: float, digits: int) -> str:
+def plus_minus(row: Mapping[str, Any], name: str, factor: float, digits: int) -> str:
     """A mean with the longer side of its interval."""
     if row["low"] is None:
         return f"{factor * row[name]:.{digits}f}"
@@ -233,12 +233,10 @@ def _share_table(comparison: Comparison, world: str) -> Iterator[Table]:
     caption = f"{world}: share of the oracle, %, by candidate plans. ±: the longer side of the 95 % interval."
     for row in comparison.rows:
         if row["world"] == world and row["num_plans"] is None:
-            share = _plus_minus(row, "oracle_share", 100, 1)
+            share = plus_minus(row, "oracle_share", 100, 1)
             caption += f" {row['planner'].capitalize()}, {row['model_steps']:,} model steps: {share}."
     own = _by_prior(comparison, world)
-    cells = [
-        [name, *(_plus_minus(some[n], "oracle_share", 100, 1) for n in sorted(some))] for name, some in own.items()
-    ]
+    cells = [[name, *(plus_minus(some[n], "oracle_share", 100, 1) for n in sorted(some))] for name, some in own.items()]
     yield Table(("prior", *(f"{number:,}" for number in comparison.num_plans)), cells, caption)
 
 

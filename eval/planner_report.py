@@ -10,6 +10,7 @@ from matplotlib.ticker import PercentFormatter
 from rich.console import Console
 
 from eval.compare_rows import Array, Cells, Rows, estimated
+from eval.compare_sections import plus_minus
 from eval.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
 from eval.page import FigureBox, Page, Section, Table, svg, write_page
 from eval.plan_report import printed
@@ -95,7 +96,7 @@ def table(rows: Rows, gaps: Rows, world: str) -> Table:
     cells = []
     for name in names:
         found = [at[(*name, number)] for number in numbers]
-        told = [_told(row) + "*" * (_key(row) in sure) for row in found]
+        told = [plus_minus(row, "oracle_share", 100, 1) + "*" * (_key(row) in sure) for row in found]
         prior = _prior(found[0]) if len(sights) > 1 else name[0]
         cells.append([prior, name[2], *told, _milliseconds(found[-1])])
     seeds = max(row["seeds"] for row in own)
@@ -145,13 +146,6 @@ def _milliseconds(row: Mapping[str, Any]) -> str:
 
 def _key(row: Mapping[str, Any]) -> tuple[str, str, str, int]:
     return row["prior"], row["sees"], row["planner"], row["num_plans"]
-
-
-def _told(row: Mapping[str, Any]) -> str:
-    share = f"{100 * row['oracle_share']:.1f}"
-    if row["low"] is None:
-        return share
-    return f"{share} ±{100 * max(row['high'] - row['oracle_share'], row['oracle_share'] - row['low']):.1f}"
 
 
 @drawn

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from eval import compare_planners, planner_report
+from eval import compare, compare_planners, planner_report
 from eval.__main__ import main
 from neuroprior.statistics import paired_difference
 from tests.reports import FROM_ELSEWHERE
@@ -56,7 +56,7 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     page = (out / "report.html").read_text()
     assert not re.search(FROM_ELSEWHERE, page)
     assert "cross-entropy" in page
-    monkeypatch.setattr(compare_planners, "PLANNERS", {})  # nothing is planned again
+    monkeypatch.setattr(compare, "PLANNERS", {})  # none is known
     assert main([*SMALL, "--out", str(out)]) == 2
     assert "planners" in capsys.readouterr().err
     monkeypatch.undo()

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.planners import planner as limits
-from neuroprior.planners.planner import Planner
+from neuroprior.planners.planner import Planner, random_top
 from neuroprior.randomness import draw_seed
 from neuroprior.worlds.world import World
 
@@ -51,10 +51,7 @@ def mean_scores(
         # The same seed each time: plans that are tried later meet the same chance, too.
         again = torch.Generator(generator.device).manual_seed(seed)
         rollout = world.rollout(repeated, many, again, planner.any_prefix)
-        if rollout.states is None:
-            score, end = planner.score(rollout.rewards, rollout.final_state), rollout.final_state
-        else:
-            score, end = planner.prefix_scores(rollout.rewards, rollout.states), rollout.states
+        score, end = planner.scored(rollout)
         # In float64, and rounded at the end: plans that fare alike must tie, in whichever order they were added up.
         mean = score.view(batch, num_rollouts, *score.shape[1:]).mean(1, dtype=torch.float64)
         scores.append(mean.to(score.dtype))
@@ -79,10 +76,7 @@ def halved_scores(
     for kept, times in halving(plans.shape[1], num_rollouts):
         if kept < plans.shape[1]:
             worth = total.flatten(2).amax(2) if total.dim() > 2 else total
-            # Equally good plans in random order.
-            mixed = torch.rand(worth.shape, generator=generator, device=worth.device).argsort(1)
-            order = worth.gather(1, mixed).argsort(dim=1, descending=True, stable=True)[:, :kept]
-            best = mixed.gather(1, order)
+            best = random_top(worth, kept, generator)
             plans, total = plans[row, best], total[row, best]
         score, ends = mean_scores(planner, world, state, plans, times, generator)
         total, tried = total + times * score.double(), tried + times

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.planners.planner import Decision, decide, in_chunks
+from neuroprior.planners.planner import Decision, decide, in_chunks, random_top
 from neuroprior.planners.sampling import Proposer, SamplingPlanner
 from neuroprior.priors.packing import pack, unpack
 from neuroprior.priors.prior import Prior
@@ -115,9 +115,7 @@ class CrossEntropyPlanner(SamplingPlanner):
         """How often the elites among `plans [B, P, L]` took each action where, as `counts [B, H, A]`."""
         score = score if score.dim() == 2 else score.amax(2)
         number = max(round(self.elites * plans.shape[1]), 1)
-        # Equally good plans in random order.
-        mixed = torch.rand(score.shape, generator=generator, device=score.device).argsort(1)
-        best = mixed.gather(1, score.gather(1, mixed).argsort(dim=1, descending=True, stable=True))[:, :number]
+        best = random_top(score, number, generator)
         actions = plans.gather(1, best[:, :, None].expand(-1, -1, self.length)).long()
         where = _places(actions.flatten(0, 1), counts.shape[2], self.order).view_as(actions)
         row = torch.arange(len(plans), device=plans.device)[:, None, None]

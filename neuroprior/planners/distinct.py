@@ -65,13 +65,10 @@ class DistinctPlanner(Planner):
                 generator=generator,
                 keep_states=self.any_prefix,
             )
-            score, ends = self.score(rollout.rewards, rollout.final_state), rollout.final_state
+            score, ends = self.scored(rollout)
             there = log_prob > -torch.inf
             if not there.any(1).all():
                 raise ValueError("prior: it gives no plan that exists from some start a probability above 0")
-            if rollout.states is not None:
-                score, ends = self.prefix_scores(rollout.rewards, rollout.states), rollout.states
-                there = there[..., None]
-            return decide(plans, score, ends, steps, generator, there)
+            return decide(plans, score, ends, steps, generator, there[..., None] if self.any_prefix else there)
 
         return in_chunks(some, state, steps)

@@ -11,7 +11,7 @@ from neuroprior.planners.planner import Decision, Planner, decide, in_chunks, ra
 from neuroprior.priors.prior import Prior
 from neuroprior.randomness import generator_on
 from neuroprior.sampling import advance, check_in_world, start_in_world
-from neuroprior.worlds.world import World, check_sizes
+from neuroprior.worlds.world import Rollout, World, check_sizes
 
 
 class MCTSPlanner(Planner):
@@ -115,7 +115,7 @@ class _Search:
         """The steps that were taken for the start that took most."""
         return int((self.steps - self.left).max()) if len(self.left) else 0
 
-    def simulate(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def simulate(self, rows: Tensor) -> tuple[Tensor, ...]:
         """One more plan of the starts `rows [K]`: for all B plan, score and end, and where there is one."""
         length, prior = self.planner.length, self.planner.prior
         self._make_room()
@@ -147,14 +147,11 @@ class _Search:
                 logits, memory = advance(prior, action, memory, seen, length - t - 2)
         self.left[rows[~alive]] = 0
         plan, gained, course = (torch.stack(column, 1) for column in columns)
-        score, ends = self._scored(gained, course)
+        score, ends = self.planner.scored(Rollout(course[:, -1], gained, course if self.planner.any_prefix else None))
         self._learn(rows[alive], torch.stack(path, 1)[alive], plan[alive], score[alive])
         found = (plan.to(self.draw.dtype), score, ends, alive)
         batch = len(self.size)
-        first, second, third, fourth = (
-            part.new_zeros(batch, *part.shape[1:]).index_copy_(0, rows, part) for part in found
-        )
-        return first, second, third, fourth
+        return tuple(part.new_zeros(batch, *part.shape[1:]).index_copy_(0, rows, part) for part in found)
 
     def _selected(self, rows: Tensor, node: Tensor, logits: Tensor) -> Tensor:
         """The actions that PUCT takes at nodes `[K]` where the prior gives `logits [K, A]`."""
@@ -189,12 +186,6 @@ class _Search:
         self.state[at, new], self.reward[at, new] = after[fresh], reward[fresh]
         self.size[at] += 1
         return after, reward, node.masked_scatter(fresh, new)
-
-    def _scored(self, rewards: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
-        """Scores and ends of plans with `rewards [K, L]` that lead to `states [K, L, ...]`, as `decide` takes them."""
-        if self.planner.any_prefix:
-            return self.planner.prefix_scores(rewards, states), states
-        return self.planner.score(rewards, states[:, -1]), states[:, -1]
 
     def _learn(self, rows: Tensor, path: Tensor, plan: Tensor, score: Tensor) -> None:
         """Count plans `[K, L]` and their scores at the nodes `path [K, L]` (-1: outside of the tree) they went by."""

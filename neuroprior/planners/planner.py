@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import Rollout, World
 
 STEPS_AT_ONCE = 2**22
 """Simulator steps (starts x plans x length) that a planner takes together; bounds memory."""
@@ -89,6 +89,12 @@ class Planner(ABC):
         weights = self._weights(rewards)
         return self._add_value((rewards * weights).cumsum(-1), states, self.discount * weights)
 
+    def scored(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
+        """Scores and ends as `decide` takes them: of all prefixes where the rollout kept its states, else of plans."""
+        if rollout.states is None:
+            return self.score(rollout.rewards, rollout.final_state), rollout.final_state
+        return self.prefix_scores(rollout.rewards, rollout.states), rollout.states
+
     def _weights(self, rewards: Tensor) -> Tensor:
         return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=rewards.dtype)
 
@@ -135,6 +141,13 @@ def random_best(score: Tensor, generator: torch.Generator, legal: Tensor | None 
         best = best & legal
     draws = torch.rand(score.shape, generator=generator, device=score.device)
     return torch.where(best, draws, -1.0).argmax(1)
+
+
+def random_top(score: Tensor, number: int, generator: torch.Generator) -> Tensor:
+    """The indices `[B, number]` of the highest scores in each row of `score [B, P]`; of equals a random choice."""
+    mixed = torch.rand(score.shape, generator=generator, device=score.device).argsort(1)
+    order = score.gather(1, mixed).argsort(dim=1, descending=True, stable=True)
+    return mixed.gather(1, order[:, :number])
 
 
 def decide(

@@ -100,9 +100,7 @@ class SamplingPlanner(Planner):
                 return halved_scores(self, world, state, plans, self.num_rollouts, generator)
             return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
         plans, rollout = self.candidates(world, state, generator)
-        if rollout.states is None:
-            return plans, self.score(rollout.rewards, rollout.final_state), rollout.final_state
-        return plans, self.prefix_scores(rollout.rewards, rollout.states), rollout.states
+        return plans, *self.scored(rollout)
 
     def proposals(self, world: World, state: Tensor, generator: torch.Generator) -> Tensor:
         """Candidate plans `[B, P, L]` for starts `[B, ...]`, before they are scored."""

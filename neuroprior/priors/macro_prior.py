@@ -98,9 +98,9 @@ class MacroPrior(Prior):
         Raises:
             ValueError: the plans do not fit this prior, or have an end symbol.
         """
-        if isinstance(plans, Plans) and plans.end is not None:
-            raise ValueError("plans: an end symbol cannot be part of a macro; learn from plans without one")
-        macros, recoded = learn_macros(self.training_plans(plans), self.num_macros, self.by)
+        given = plans if isinstance(plans, Plans) else Plans(torch.as_tensor(plans), self.num_actions)
+        macros, recoded = learn_macros(given, self.num_macros, self.by)  # which refuses before anything is noted
+        self.training_plans(given)
         self._inner().fit(recoded, **settings)
         self._take(macros)
         return self
