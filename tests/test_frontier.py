@@ -134,16 +134,6 @@ def test_plans_that_meet_add_up_and_the_best_goes_on():
     assert torch.allclose(gained, torch.tensor([[0.5, 0.5, 0.0], [0.0, 0.0, 0.5]], dtype=torch.double))
 
 
-@pytest.mark.parametrize("states", [torch.int64, torch.uint8, torch.float32, torch.float64])
-def test_states_are_told_apart(states):
-    state = torch.randint(3, (500, 2, 6), generator=seeded(0)).to(states)
-    code = frontier._codes(state)
-    _, number = state.flatten(1).unique(dim=0, return_inverse=True)
-    assert torch.equal(code[:, None] == code, number[:, None] == number)
-    row = torch.arange(5)
-    assert torch.equal(frontier._codes(row), row)
-
-
 def test_a_seeing_prior_sees_where_each_plan_is():
     """It knows the way: in each cell of a table one action is right, and one plan alone is tried."""
     table, right = torch.randint(30, (30, 4), generator=seeded(1)), torch.randint(4, (30,), generator=seeded(2))

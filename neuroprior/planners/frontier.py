@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.beams import children, origins
+from neuroprior.codes import row_codes
 from neuroprior.draws import check_temperature
 from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
 from neuroprior.plans import action_dtype
@@ -150,7 +151,7 @@ class _Front(NamedTuple):
 
     def merged(self, gained: Tensor | None) -> "_Front":
         """Of plans in one state that which has `gained [B, K]` most, else the most probable, stands for all of them."""
-        code = _codes(self.state).view_as(self.log_prob)
+        code = row_codes(self.state).view_as(self.log_prob)
         # By state, then by what was gained, then by probability: the first of each state stands for it.
         order = self.log_prob.argsort(dim=1, descending=True, stable=True)
         if gained is not None:
@@ -179,16 +180,3 @@ def _best(front: _Front, score: Tensor, generator: torch.Generator, length: int)
 
 def _rows(values: Tensor, row: Tensor, shape: tuple[int, ...]) -> Tensor:
     return values.flatten(0, 1).index_select(0, row).view(*shape[:2], values.shape[2])
-
-
-def _codes(state: Tensor) -> Tensor:
-    """A number for each of `state [M, ...]`: the same for the same state, and hardly ever for another."""
-    if state.dim() == 1 and not state.is_floating_point():
-        return state.long()
-    # Numbers are told apart by their bits; a sum with random odd weights tells rows apart but once in 2**63 times.
-    flat = state.reshape(len(state), -1)
-    bits = flat.double().view(torch.int64) if flat.is_floating_point() else flat.long()
-    weight = torch.Generator().manual_seed(0)
-    factors = torch.randint(-(2**62), 2**62, (bits.shape[1],), generator=weight).to(bits.device) * 2 + 1
-    mixed = (bits ^ (bits >> 29)) * factors
-    return (mixed ^ (mixed >> 32)).sum(1)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
+from neuroprior.codes import row_codes
 from neuroprior.plans import Plans
 from neuroprior.priors.macros import CRITERIA, Criterion, Macro, learn_macros
 from neuroprior.priors.packing import pack, unpack
@@ -262,11 +263,13 @@ def _merged(some: Sequence[_Ways]) -> _Ways:
         return ways
     memory = ways.memory.reshape(len(ways.row), -1)
     alike = torch.cat([ways.row[:, None].double(), ways.place[:, None].double(), memory.double()], 1)
-    _, group = alike.unique(dim=0, return_inverse=True)
+    _, group = row_codes(alike).unique(return_inverse=True)
     groups = int(group.max()) + 1
     first = torch.full((groups,), len(group), device=group.device)
     first.scatter_reduce_(0, group, torch.arange(len(group), device=group.device), "amin")
-    return ways.taken(first)._replace(weight=_log_sums(ways.weight, group, groups).to(ways.weight))
+    # In the order in which they were met: of equally probable ways the same must be left out in equal plans.
+    first, order = first.sort()
+    return ways.taken(first)._replace(weight=_log_sums(ways.weight, group, groups)[order].to(ways.weight))
 
 
 def _likeliest(groups: Sequence[_Ways], batch: int, most: int) -> list[_Ways]:
