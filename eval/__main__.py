@@ -22,6 +22,8 @@ def _run(arguments: Sequence[str]) -> None:
     from eval.compare import compare
     from eval.grow import LISTS as GROW_LISTS
     from eval.grow import grow
+    from eval.live import LISTS as LIVE_LISTS
+    from eval.live import live
     from eval.mice import LISTS as MICE_LISTS
     from eval.mice import mice
     from eval.paper import paper
@@ -33,11 +35,11 @@ def _run(arguments: Sequence[str]) -> None:
     parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False, allow_abbrev=True)
     commands = parser.add_subcommands()
     by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality, "mice": mice}
-    by_name |= {"compare": compare, "grow": grow}
+    by_name |= {"compare": compare, "grow": grow, "live": live}
     # Lists are given as words, `--priors a b`, which functions cannot say.
     numbers = {key: {"type": int, "default": [*some], "help": what} for key, (some, what) in MICE_LISTS.items()}
     lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
-    lists |= {"compare": COMPARE_LISTS, "grow": GROW_LISTS, "bench": BENCH_LISTS}
+    lists |= {"compare": COMPARE_LISTS, "grow": GROW_LISTS, "bench": BENCH_LISTS, "live": LIVE_LISTS}
     for name, command in by_name.items():
         sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False, allow_abbrev=True)
         own = lists.get(name, {})

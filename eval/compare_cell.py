@@ -21,6 +21,7 @@ from eval.compare_curves import (
 from eval.compare_pictures import drawn_plans, transitions
 from eval.compare_priors import MANY, NEURAL, ORDERS, RECIPE, TRAINING, WIDE, chain, macro, network
 from eval.compare_settings import SEES, Settings
+from eval.homes import Home
 from eval.suite import Task
 from eval.suite_worlds import LAYOUTS, MAPS, SCRAMBLE
 from eval.world_priors import load_for
@@ -61,9 +62,9 @@ def recipe() -> str:
     return repr((priors, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, CHOSEN_AT, TIMED_STARTS, VERSION))
 
 
-def digest(task: Task) -> str:
+def digest(task: Task | Home) -> str:
     """Eight letters for all that is said of a world but in words; after a change, its finished cells do not count."""
-    said = [_said(getattr(task, field.name)) for field in fields(Task) if field.name != "about"]
+    said = [_said(getattr(task, field.name)) for field in fields(task) if field.name != "about"]
     return hashlib.sha256(repr((said, MAPS, LAYOUTS, SCRAMBLE)).encode()).hexdigest()[:8]
 
 

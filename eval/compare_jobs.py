@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 from eval import compare_cell
-from eval.compare_settings import Settings
+from eval.compare_settings import LiveSettings, Settings
+from eval.homes import HOMES
 from eval.processes import do_each, progress_bar
-from eval.suite import TASKS, Task
+from eval.suite import TASKS
 from neuroprior.output import versions, write_json, write_whole
 from neuroprior.threads import one_thread
 
@@ -32,6 +33,10 @@ LONGEST_WAIT = timedelta(days=365)
 """How long a process that torchrun started waits for the others to finish their cells."""
 
 
+WORLDS: dict[str, Any] = {**TASKS, **HOMES}
+"""All that cells are of, by name."""
+
+
 class Cell(NamedTuple):
     """A world, and the number of a seed."""
 
@@ -41,7 +46,7 @@ class Cell(NamedTuple):
     @property
     def file(self) -> str:
         """The name of its file, by what the world is, too: another world of that name has other cells."""
-        return f"{self.world}-{self.seed}-{compare_cell.digest(TASKS[self.world])}.json"
+        return f"{self.world}-{self.seed}-{compare_cell.digest(WORLDS[self.world])}.json"
 
 
 @dataclass(frozen=True)
@@ -51,22 +56,33 @@ class Study:
     Attributes:
         folder: of the cells; another for other settings.
         settings: of every cell.
-        run: does a cell: `(task, seed, settings)` gives JSON values.
+        run: does a cell: `(world, seed, settings)` gives JSON values, where the world is one of `WORLDS`.
     """
 
     folder: Path
-    settings: Settings
-    run: Callable[[Task, int, Any], dict[str, Any]]
+    settings: Settings | LiveSettings
+    run: Callable[[Any, int, Any], dict[str, Any]]
 
     @classmethod
-    def prepare(cls, out: Path, settings: Settings, run: Callable[[Task, int, Any], dict[str, Any]]) -> "Study":
+    def prepare(
+        cls,
+        out: Path,
+        settings: Settings | LiveSettings,
+        run: Callable[[Any, int, Any], dict[str, Any]],
+        recipe: str = "",
+    ) -> "Study":
         """Find the folder of these settings, and of no others, in `out`; make it where there is none yet.
+
+        Args:
+            out: the folder of the report.
+            settings, run: see `Study`.
+            recipe: what else decides a cell; that of `compare_cell` by default.
 
         Raises:
             OSError: a folder of a saved prior cannot be read, or `out` not be written.
         """
         # Other versions and recipes give other results: cells that were finished with them do not count.
-        decides = {"settings": asdict(settings), "recipe": compare_cell.recipe(), "what": run.__qualname__}
+        decides = {"settings": asdict(settings), "recipe": recipe or compare_cell.recipe(), "what": run.__qualname__}
         decides |= versions(*DRAWN_BY)
         digest = hashlib.sha256(json.dumps(decides, sort_keys=True).encode())
         for prior in settings.priors:
@@ -205,7 +221,7 @@ def do(study: Study, cell: Cell) -> None:
     where = f"{cell.world}, seed {cell.seed}"
     try:
         with one_thread():
-            found = study.run(TASKS[cell.world], cell.seed, study.settings)
+            found = study.run(WORLDS[cell.world], cell.seed, study.settings)
     except (ValueError, OSError, ImportError, OverflowError) as error:
         raise ValueError(f"{where}: {error}") from error
     except Exception as error:

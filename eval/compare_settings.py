@@ -1,4 +1,4 @@
-"""The settings of `python -m eval compare` and `eval grow`: all that decides what is found, beside world and seed."""
+"""The settings of `eval compare`, `grow` and `live`: all that decides what is found, beside world and seed."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -39,3 +39,30 @@ class Settings:
     def budgets(self) -> list[int]:
         """All powers of two up to the most candidates."""
         return [2**k for k in range(max(self.num_plans).bit_length())]
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """All that decides the results of a cell, beside its world and seed.
+
+    Attributes:
+        kinds: of priors that learn: "markov", "gru".
+        period: steps in a season.
+        seasons: that the agents live through.
+        agents: that live in each world, and share one prior.
+        items: of food.
+        num_plans: candidates of each decision.
+        length: actions in a plan.
+        seed: of everything random.
+        priors: folders of saved priors: none.
+    """
+
+    kinds: tuple[str, ...]
+    period: int
+    seasons: int
+    agents: int
+    items: int
+    num_plans: int
+    length: int
+    seed: int
+    priors: tuple[str, ...] = ()

@@ -1,5 +1,7 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
 
+from neuroprior.agent import Agent
+from neuroprior.checkpoints import restore_agent, save_agent
 from neuroprior.distinct import Distinct, most_probable, sample_distinct, sample_distinct_in_world
 from neuroprior.planners import (
     CrossEntropyPlanner,
@@ -7,6 +9,7 @@ from neuroprior.planners import (
     DistinctPlanner,
     Execution,
     ExhaustivePlanner,
+    ForagingOracle,
     FrontierPlanner,
     Growth,
     MCTSPlanner,
@@ -37,6 +40,7 @@ from neuroprior.priors import (
 from neuroprior.sampling import sample, sample_in_world
 from neuroprior.worlds import (
     EpisodicWorld,
+    ForagingWorld,
     GridWorld,
     PocketCube,
     Rollout,
@@ -50,11 +54,13 @@ from neuroprior.worlds import (
     gridworld,
     labyrinth,
     maze,
+    patches,
 )
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Agent",
     "ContextTreePrior",
     "CrossEntropyPlanner",
     "Decision",
@@ -63,6 +69,8 @@ __all__ = [
     "EpisodicWorld",
     "Execution",
     "ExhaustivePlanner",
+    "ForagingOracle",
+    "ForagingWorld",
     "FrontierPlanner",
     "GRUPrior",
     "GridWorld",
@@ -99,11 +107,14 @@ __all__ = [
     "maze",
     "most_probable",
     "oracle",
+    "patches",
     "read_plans",
+    "restore_agent",
     "sample",
     "sample_distinct",
     "sample_distinct_in_world",
     "sample_in_world",
     "save",
+    "save_agent",
     "write_plans",
 ]

@@ -6,6 +6,7 @@ from neuroprior.planners.distinct import DistinctPlanner
 from neuroprior.planners.execution import Execution, execute
 from neuroprior.planners.exhaustive import ExhaustivePlanner
 from neuroprior.planners.expected import expected_score
+from neuroprior.planners.foraging import ForagingOracle
 from neuroprior.planners.frontier import FrontierPlanner
 from neuroprior.planners.growth import Growth, grow
 from neuroprior.planners.mcts import MCTSPlanner
@@ -19,6 +20,7 @@ __all__ = [
     "DistinctPlanner",
     "Execution",
     "ExhaustivePlanner",
+    "ForagingOracle",
     "FrontierPlanner",
     "Growth",
     "MCTSPlanner",

@@ -1,13 +1,17 @@
 """Executing plans: open loop, or planning anew after every few steps, which is what chance calls for."""
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from neuroprior.planners.planner import Planner
+from neuroprior.planners.planner import Decision, Planner
 from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import World, check_sizes
+
+Change = Callable[[Tensor, torch.Generator | None], Tensor]
+"""What happens to states `[B, ...]` beside the agent's own steps."""
 
 
 class Execution(NamedTuple):
@@ -33,6 +37,7 @@ def execute(
     num_steps: int,
     every: int = 1,
     generator: torch.Generator | None = None,
+    change: Change | None = None,
 ) -> Execution:
     """Plan, execute the first actions, and plan anew from where they led, again and again.
 
@@ -43,24 +48,48 @@ def execute(
         num_steps: T, at least 1.
         every: after so many actions it is planned anew: 1 is a closed loop, the length of the plans an open one.
         generator: draws what the planner draws, and what is random in the world.
+        change: what happens after each step besides, unforeseen by the planner (such as `ForagingWorld.grow`).
 
     Raises:
         ValueError: an argument is out of range, or a plan is too short.
     """
     check_sizes(num_steps=num_steps, every=every)
     generator = generator_on(generator, state.device)
-    columns: tuple[list[Tensor], ...] = ([], [], [])  # actions, rewards and states
-    steps = 0
+    parts = []
     for at in range(0, num_steps, every):
         decision = planner.plan(world, state, generator)
-        steps += decision.model_steps
-        wanted = min(every, num_steps - at)
-        if decision.plan.shape[1] < wanted or (decision.lengths is not None and (decision.lengths < wanted).any()):
-            raise ValueError(f"every: {wanted} actions are to be executed, but a plan has fewer; plan anew sooner")
-        for t in range(wanted):
-            action = decision.plan[:, t].long()
-            state, reward = world.step(state, action, generator)
-            for column, what in zip(columns, (action, reward, state), strict=True):
-                column.append(what)
+        done = follow(decision, world, state, min(every, num_steps - at), generator, change)
+        state = done.states[:, -1]
+        parts.append(done)
+    return joined(parts)
+
+
+def follow(
+    decision: Decision,
+    world: World,
+    state: Tensor,
+    num_steps: int,
+    generator: torch.Generator | None = None,
+    change: Change | None = None,
+) -> Execution:
+    """Execute the first `num_steps` actions of what was decided for `state [B, ...]`; see `execute`."""
+    plan, lengths = decision.plan, decision.lengths
+    if plan.shape[1] < num_steps or (lengths is not None and (lengths < num_steps).any()):
+        raise ValueError(f"every: {num_steps} actions are to be executed, but a plan has fewer; plan anew sooner")
+    columns: tuple[list[Tensor], ...] = ([], [], [])  # actions, rewards and states
+    for t in range(num_steps):
+        action = plan[:, t].long()
+        state, reward = world.step(state, action, generator)
+        state = state if change is None else change(state, generator)
+        for column, what in zip(columns, (action, reward, state), strict=True):
+            column.append(what)
     actions, rewards, states = (torch.stack(column, 1) for column in columns)
-    return Execution(actions, rewards, states, steps)
+    return Execution(actions, rewards, states, decision.model_steps)
+
+
+def joined(parts: Sequence[Execution]) -> Execution:
+    """What was done one after another, as one."""
+    actions, rewards, states = (
+        torch.cat([getattr(part, name) for part in parts], 1) for name in ("actions", "rewards", "states")
+    )
+    return Execution(actions, rewards, states, sum(part.model_steps for part in parts))

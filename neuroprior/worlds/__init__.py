@@ -2,6 +2,7 @@
 
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
+from neuroprior.worlds.foraging import ForagingWorld, patches
 from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridworld, local_view
 from neuroprior.worlds.gymnasium_stepping import SteppedWorld
 from neuroprior.worlds.gymnasium_worlds import from_gymnasium
@@ -12,6 +13,7 @@ from neuroprior.worlds.world import Rollout, World
 
 __all__ = [
     "EpisodicWorld",
+    "ForagingWorld",
     "GridWorld",
     "PocketCube",
     "Rollout",
@@ -27,4 +29,5 @@ __all__ = [
     "labyrinth",
     "local_view",
     "maze",
+    "patches",
 ]

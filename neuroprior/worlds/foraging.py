@@ -1,0 +1,138 @@
+"""Foraging: food that is eaten where the agent arrives, and grows again elsewhere, in patches that move."""
+
+import torch
+from torch import Tensor
+
+from neuroprior.randomness import generator_on
+from neuroprior.worlds.grid import GridWorld
+from neuroprior.worlds.tabular import TabularWorld
+from neuroprior.worlds.world import World, check_range, check_sizes
+
+
+class ForagingWorld(World):
+    """Items of food in a table: arriving where some lie eats them, each for a reward of 1.
+
+    A state is int64 `[N, 2 + K]`: the cell, the time (steps since the beginning), and the places of the K items; an
+    item that is eaten is at place `num_places`, which is nowhere. What comes next hangs on the state alone, so that
+    every planner can plan here.
+
+    Planners know where food lies, but not where it will grow: for them what is eaten is gone. It comes back by `grow`,
+    which is for what happens beside the agent's own steps (`execute`, `Agent`): what was eaten grows again elsewhere,
+    at random places of the season, and where a new season begins all items are at new places.
+
+    Args:
+        table: where the agent moves, of one layout; its rewards count for nothing.
+        growth: floating point `[E, places]`: how probable each place is to grow food in each of E seasons, which come
+            one after another and then again; need not sum to one.
+        period: steps in a season.
+        num_items: K.
+
+    Attributes:
+        num_places: number of places in which food can be: the squares of a grid (`GridWorld.square`), of another table
+            its cells.
+        table, growth, period, num_items: as they came.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(self, table: TabularWorld, growth: Tensor, period: int, num_items: int = 4) -> None:
+        check_sizes(period=period, num_items=num_items)
+        if table.num_layouts > 1:
+            raise ValueError(f"table: one layout is expected, not {table.num_layouts}, of which one has all the food")
+        self.place = places(table)
+        self.num_places = int(self.place.max()) + 1
+        growth = torch.as_tensor(growth, device=table.device)
+        if growth.dim() != 2 or growth.shape[1] != self.num_places or not growth.is_floating_point() or not len(growth):
+            raise ValueError(
+                f"growth: floating point of shape [E, {self.num_places}] is expected,"
+                f" not {str(growth.dtype).removeprefix('torch.')} of shape {list(growth.shape)}"
+            )
+        if not growth.isfinite().all() or (growth < 0).any() or (growth.sum(1) <= 0).any():
+            raise ValueError("growth: finite numbers of at least 0 are expected, in each season one above it")
+        self.table, self.growth, self.period, self.num_items = table, growth, period, num_items
+        self.num_actions, self.action_names = table.num_actions, table.action_names
+        self.all_legal, self.stochastic = table.all_legal, table.stochastic
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        """States `[batch_size, 2 + K]` at time 0: in any cell, with food as the first season grows it."""
+        generator = generator_on(generator, self.table.device)
+        cell = self.table.cell(self.table.reset(batch_size, generator))
+        nowhere = cell.new_full((batch_size, self.num_items), self.num_places)
+        return self.grow(torch.cat([torch.stack([cell, torch.zeros_like(cell)], 1), nowhere], 1), generator)
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        cell, _ = self.table.step(state[:, 0], action, generator)
+        items = state[:, 2:]
+        eaten = items == self.place[cell][:, None]
+        left = items.masked_fill(eaten, self.num_places)
+        return torch.cat([cell[:, None], state[:, 1:2] + 1, left], 1), eaten.sum(1).float()
+
+    def grow(self, state: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """What planners do not foresee: the same `state [N, 2 + K]`, with food grown again."""
+        generator = generator_on(generator, self.table.device)
+        time, items = state[:, 1], state[:, 2:]
+        season = self.season(state)
+        up_to = self.growth.double().cumsum(1)
+        height = torch.rand(items.shape, generator=generator, device=state.device, dtype=torch.float64)
+        # Places of probability 0 are never drawn: above a height comes the next place that has some.
+        grown = torch.searchsorted(up_to[season], height * up_to[season, -1:], right=True)
+        new = (items == self.num_places) | (time % self.period == 0)[:, None]
+        return torch.cat([state[:, :2], torch.where(new, grown.clamp(max=self.num_places - 1), items)], 1)
+
+    def season(self, state: Tensor) -> Tensor:
+        """The season, from 0, in each of `state [N, 2 + K]`: `[N]`."""
+        return state[:, 1].div(self.period, rounding_mode="floor") % len(self.growth)
+
+    def observe(self, state: Tensor) -> Tensor:
+        """What the table shows in the cell: not where food lies."""
+        return self.table.observe(state[:, 0])
+
+    def legal(self, state: Tensor) -> Tensor:
+        return self.table.legal(state[:, 0])
+
+    def check_state(self, state: Tensor) -> None:
+        if state.dim() != 2 or state.shape[1] != 2 + self.num_items:
+            raise ValueError(f"state: shape [B, {2 + self.num_items}] is expected, not {list(state.shape)}")
+        check_range("state[:, 0]", state[:, 0], self.table.num_states, "cells")
+        check_range("state[:, 2:]", state[:, 2:], self.num_places + 1, "places, nowhere among them")
+        if (state[:, 1] < 0).any():
+            raise ValueError("state[:, 1]: a time of at least 0 is expected")
+
+
+def places(table: TabularWorld) -> Tensor:
+    """The place of each cell of a table, `[S]`: its square in a grid, else the cell itself."""
+    cell = torch.arange(table.num_states, device=table.device)
+    return table.square(cell) if isinstance(table, GridWorld) else cell
+
+
+def patches(table: TabularWorld, num_seasons: int, radius: int, generator: torch.Generator | None = None) -> Tensor:
+    """Growth for `ForagingWorld`: in each season food grows in one patch, all around a random cell.
+
+    Args:
+        table: without chance.
+        num_seasons: E.
+        radius: a patch is all places that can be reached from its middle with so many actions.
+        generator: draws the middles, as `table.reset` draws starts.
+
+    Returns:
+        `[E, places]` float32: 1 in the patch, 0 elsewhere.
+
+    Raises:
+        ValueError: an argument is out of range, or the table has chance.
+    """
+    check_sizes(num_seasons=num_seasons, radius=radius)
+    if table.stochastic:
+        raise ValueError("table: one without chance is expected")
+    generator = generator_on(generator, table.device)
+    reached = torch.zeros(num_seasons, table.num_states, device=table.device)
+    reached.scatter_(1, table.cell(table.reset(num_seasons, generator))[:, None], 1.0)
+    for _ in range(radius):
+        further = reached[:, :, None].expand(-1, -1, table.num_actions).flatten(1)
+        if table.legal_actions is not None:
+            further = further * table.legal_actions.flatten()
+        to = table.next_state.flatten().expand_as(further)
+        reached = reached.scatter_reduce(1, to, further, "amax")
+    place = places(table)
+    growth = torch.zeros(num_seasons, int(place.max()) + 1, device=table.device)
+    return growth.scatter_reduce(1, place.expand_as(reached), reached, "amax")
