@@ -111,13 +111,13 @@ def table(rows: Rows, gaps: Rows, world: str) -> Table:
         cells.append([row["prior"], row["sees"], learns, told, share, *seasons, _number(1e6 * row["seconds"], 0)])
     seeds = max(row["seeds"] for row in own)
     over = f" ±: the wider half of 95 % bootstrap intervals over {seeds} seeds." if seeds > 1 else " A single seed."
-    star = " *: p < 0.05 against random with a warm start, corrected for all tests in this world."
+    star = " *: p < 0.05 against random with a warm start, corrected for all tests in this world." if gaps else ""
     caption = (
         f"{world}: food eaten in 100 steps; in % of the oracle's; in the first and the last quarter of the"
-        f" seasons after the first; and microseconds a step and agent. Cold: without a warm start.{over}{star if gaps else ''}"
+        f" seasons after the first; and microseconds a step and agent. Cold: without a warm start.{over}"
     )
     headings = ("prior", "sees", "learns", "eaten", "%", "first", "last", "µs")
-    return Table(headings, cells, caption, "lllrrrrr")
+    return Table(headings, cells, caption + star, "lllrrrrr")
 
 
 def words(gaps: Rows, world: str) -> str:
