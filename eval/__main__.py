@@ -20,6 +20,8 @@ def _run(arguments: Sequence[str]) -> None:
     from eval.bench import bench
     from eval.compare import LISTS as COMPARE_LISTS
     from eval.compare import compare
+    from eval.depth import LISTS as DEPTH_LISTS
+    from eval.depth import depth
     from eval.grow import LISTS as GROW_LISTS
     from eval.grow import grow
     from eval.live import LISTS as LIVE_LISTS
@@ -35,11 +37,17 @@ def _run(arguments: Sequence[str]) -> None:
     parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False, allow_abbrev=True)
     commands = parser.add_subcommands()
     by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality, "mice": mice}
-    by_name |= {"compare": compare, "grow": grow, "live": live}
+    by_name |= {"compare": compare, "grow": grow, "live": live, "depth": depth}
     # Lists are given as words, `--priors a b`, which functions cannot say.
     numbers = {key: {"type": int, "default": [*some], "help": what} for key, (some, what) in MICE_LISTS.items()}
     lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
-    lists |= {"compare": COMPARE_LISTS, "grow": GROW_LISTS, "bench": BENCH_LISTS, "live": LIVE_LISTS}
+    lists |= {
+        "compare": COMPARE_LISTS,
+        "grow": GROW_LISTS,
+        "bench": BENCH_LISTS,
+        "live": LIVE_LISTS,
+        "depth": DEPTH_LISTS,
+    }
     for name, command in by_name.items():
         sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False, allow_abbrev=True)
         own = lists.get(name, {})

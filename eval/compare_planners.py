@@ -92,11 +92,15 @@ def _entry(contest: Contest, one: Contestant, name: str) -> dict[str, Any]:
 def _planned(
     starts: Starts, name: str, prior: Prior, num_plans: int, temperature: float, generator: torch.Generator
 ) -> dict[str, Any]:
-    """The share of the oracle that a planner's decisions reach, their model steps and seconds, for each start."""
+    """What a planner of this name reaches, see `planned`."""
     how: dict[str, Any] = starts.task.scoring | {"temperature": temperature}
     if starts.world.stochastic:
         how["num_rollouts"] = ROLLOUTS
-    planner = PLANNERS[name](prior, starts.length, num_plans, **how)
+    return planned(starts, PLANNERS[name](prior, starts.length, num_plans, **how), generator)
+
+
+def planned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:
+    """The share of the oracle that a planner's decisions reach, their model steps and seconds, for each start."""
     begin = perf_counter()
     decision = planner.plan(starts.world, starts.state, generator)
     seconds = (perf_counter() - begin) / len(starts.state)

@@ -20,6 +20,11 @@ from neuroprior.statistics import holm, paired_difference
 PLAIN = "sampling"
 """The planner that the others are compared with."""
 
+ABOUT = (
+    "Planners compared",
+    "The same priors, the same number of steps in a model of the world: what do other planners make of them?",
+)
+
 Place = tuple[str, str, str, str, int]
 """World, planner, prior, what it sees, number of plans."""
 
@@ -42,19 +47,19 @@ def planner_rows(cells: Cells) -> Rows:
     ]
 
 
-def paired_rows(cells: Cells) -> Rows:
-    """How much further than samples from the same prior each planner comes, with as many model steps.
+def paired_rows(cells: Cells, plain: str = PLAIN) -> Rows:
+    """How much further than `plain`, samples from the same prior, each planner comes, with as many model steps.
 
     A row a world, planner, prior and number of plans: the `difference` in the share of the oracle, paired over seeds,
     with Student's interval (`low`, `high`), `p_value` of the two-sided t-test, and `p_holm`, corrected for all rows of
-    the world. Nothing where there is a single seed, or no `sampling`.
+    the world. Nothing where there is a single seed, or no `plain`.
     """
     found, rows = _found(cells), []
     for place, own in found.items():
-        plain = found.get((place[0], PLAIN, *place[2:]))
-        if place[1] == PLAIN or plain is None or len(common := [seed for seed in own if seed in plain]) < 2:
+        rival = found.get((place[0], plain, *place[2:]))
+        if place[1] == plain or rival is None or len(common := [seed for seed in own if seed in rival]) < 2:
             continue
-        first, second = (_shares(side, common) for side in (own, plain))
+        first, second = (_shares(side, common) for side in (own, rival))
         gap = paired_difference(first, second)
         rows.append(_named(place) | {"difference": gap.mean, "low": gap.low, "high": gap.high, "p_value": gap.p_value})
     for world in dict.fromkeys(row["world"] for row in rows):
@@ -84,7 +89,7 @@ def _shares(own: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> Arr
     return np.array([own[seed]["share"] for seed in seeds], dtype=np.float64)
 
 
-def table(rows: Rows, gaps: Rows, world: str) -> Table:
+def table(rows: Rows, gaps: Rows, world: str, plain: str = PLAIN) -> Table:
     """Shares of the oracle in one world, a row a prior and planner; stars where it cannot be chance."""
     own = [row for row in rows if row["world"] == world]
     numbers = _numbers(own)
@@ -101,7 +106,7 @@ def table(rows: Rows, gaps: Rows, world: str) -> Table:
         cells.append([prior, name[2], *told, _milliseconds(found[-1])])
     seeds = max(row["seeds"] for row in own)
     over = f" ±: the wider half of 95 % bootstrap intervals over {seeds} seeds." if seeds > 1 else " A single seed."
-    star = " *: p < 0.05 against sampling from the same prior, corrected for all of this table." if sure else ""
+    star = f" *: p < 0.05 against {plain} with the same prior, corrected for all of this table." if sure else ""
     length = round(max(row["model_steps"] / row["num_plans"] for row in own))
     caption = (
         f"{world}: share of the oracle, %, with so many plans of {length} model steps each, or as many steps otherwise"
@@ -111,7 +116,7 @@ def table(rows: Rows, gaps: Rows, world: str) -> Table:
     return Table(headings, cells, caption, "ll" + "r" * (len(numbers) + 1))
 
 
-def words(rows: Rows, gaps: Rows, world: str) -> str:
+def words(rows: Rows, gaps: Rows, world: str, plain: str = PLAIN) -> str:
     """A line of plain words: what each planner adds to the best prior's samples, with the most plans."""
     own = [row for row in rows if row["world"] == world]
     most = max(row["num_plans"] for row in own)
@@ -123,10 +128,10 @@ def words(rows: Rows, gaps: Rows, world: str) -> str:
             interval = f"({100 * row['low']:+.1f} to {100 * row['high']:+.1f})"
             (clear if row["p_holm"] < 0.05 else unclear).append(f"{gap} {interval}")
     if not clear and not unclear:
-        return f"{told} differences need several seeds, {PLAIN}, and another planner."
-    parts = [f"{', '.join(clear)} points of the oracle against samples from the same prior"] if clear else []
+        return f"{told} differences need several seeds, {plain}, and another planner."
+    parts = [f"{', '.join(clear)} points of the oracle against {plain} with the same prior"] if clear else []
     if unclear:
-        parts.append(f"cannot be told apart from samples: {', '.join(unclear)}")
+        parts.append(f"cannot be told apart from {plain}: {', '.join(unclear)}")
     return f"{told} {'; '.join(parts)}."
 
 
@@ -178,14 +183,31 @@ def planner_figure(rows: Rows) -> Figure:
     return figure
 
 
-def write_report(cells: Cells, settings: Mapping[str, Any], folder: Path, console: Console, command: str) -> None:
-    """Print the tables, and write `report.html`, `results.json`, `rows.csv` and `paired.csv`."""
-    rows, gaps = planner_rows(cells), paired_rows(cells)
+def write_report(
+    cells: Cells,
+    settings: Mapping[str, Any],
+    folder: Path,
+    console: Console,
+    command: str,
+    plain: str = PLAIN,
+    about: tuple[str, str] = ABOUT,
+) -> None:
+    """Print the tables, and write `report.html`, `results.json`, `rows.csv` and `paired.csv`.
+
+    Args:
+        cells: what was found.
+        settings, command: to tell on the page.
+        folder: for the files.
+        console: for the tables.
+        plain: the planner that the others are compared with.
+        about: the title of the page, and a line below it.
+    """
+    rows, gaps = planner_rows(cells), paired_rows(cells, plain)
     worlds = list(dict.fromkeys(row["world"] for row in rows))
-    made = [table(rows, gaps, world) for world in worlds]
+    made = [table(rows, gaps, world, plain) for world in worlds]
     for world, one in zip(worlds, made, strict=True):
         console.print(printed(world, one))
-    said = [words(rows, gaps, world) for world in worlds]
+    said = [words(rows, gaps, world, plain) for world in worlds]
     console.print("\n".join(said), highlight=False, markup=False)
     folder.mkdir(parents=True, exist_ok=True)
     for name, some in (("rows", rows), ("paired", gaps)):
@@ -201,8 +223,7 @@ def write_report(cells: Cells, settings: Mapping[str, Any], folder: Path, consol
         Section("Tables", [], tables=made),
     ]
     shown = dict(settings) | {f"version: {name}": number for name, number in versions().items()}
-    lead = "The same priors, the same number of steps in a model of the world: what do other planners make of them?"
-    write_page(folder / "report.html", Page("Planners compared", lead, command, shown, sections))
+    write_page(folder / "report.html", Page(*about, command, shown, sections))
     console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
 
 

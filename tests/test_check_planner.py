@@ -9,6 +9,7 @@ from neuroprior import (
     DistinctPlanner,
     ExhaustivePlanner,
     FrontierPlanner,
+    HorizonPlanner,
     MCTSPlanner,
     Planner,
     SamplingPlanner,
@@ -31,6 +32,7 @@ PLANNERS = {
         prior, length, number, rounds=min(3, number), **how
     ),
     "mcts": MCTSPlanner,
+    "horizon": lambda prior, length, number, any_prefix=True, **how: HorizonPlanner(prior, length, number, **how),
     "exhaustive": lambda prior, length, number, **how: ExhaustivePlanner(length, **how),
 }
 

@@ -9,6 +9,7 @@ from neuroprior.planners.expected import expected_score
 from neuroprior.planners.foraging import ForagingOracle
 from neuroprior.planners.frontier import FrontierPlanner
 from neuroprior.planners.growth import Growth, grow
+from neuroprior.planners.horizon import HorizonPlanner
 from neuroprior.planners.mcts import MCTSPlanner
 from neuroprior.planners.oracle import oracle
 from neuroprior.planners.planner import Decision, Planner
@@ -23,6 +24,7 @@ __all__ = [
     "ForagingOracle",
     "FrontierPlanner",
     "Growth",
+    "HorizonPlanner",
     "MCTSPlanner",
     "Planner",
     "SamplingPlanner",
