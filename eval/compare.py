@@ -63,8 +63,9 @@ def compare(
         priors: model folders to compare, such as `python -m train` writes.
         kinds: of priors that are fitted: markov, macro (a chain of order 2 over actions and 16 macro-actions, which
             sees nothing), gru, transformer; all by default, but none where there are saved ones.
-        planners: some of sampling, distinct, frontier, mcts, cross-entropy and halving: they are compared, not priors,
-            at as many model steps, with uniform plans, a chain of order 3 and the networks of --kinds, after growth.
+        planners: some of sampling, distinct, frontier, mcts, cross-entropy, halving and replanning (these two in worlds
+            with chance): they are compared, not priors, at as many model steps, with uniform plans, a chain of order 3
+            and the networks of --kinds, after growth.
         sees: what priors see: nothing but the plan so far, the start as well, or each step; by default nothing and, in
             worlds where it could help, one or both of the others (with --planners the last of them alone).
         rounds: of horizon growth, at most (worlds have two or three): a prior learns from plans found with it,

@@ -22,13 +22,17 @@ from neuroprior import (
     Prior,
     SamplingPlanner,
     World,
+    execute,
 )
 
 ORDERS = (3,)
 """Of the Markov priors that planners are compared with."""
 
-CHANCE, ONLY_CHANCE = {"sampling", "cross-entropy", "halving"}, {"halving"}
+CHANCE, ONLY_CHANCE = {"sampling", "cross-entropy", "halving", "replanning"}, {"halving", "replanning"}
 """Planners for worlds with chance, and those that are nothing new in worlds without."""
+
+COURSES = 8
+"""From each start, in which a closed loop is followed: what it is worth cannot be computed."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,9 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
     "mcts": MCTSPlanner,
     "cross-entropy": CrossEntropyPlanner,
     "halving": partial(SamplingPlanner, halving=True),
+    "replanning": partial(SamplingPlanner, halving=True),
 }
-"""By their names in tables."""
+"""By their names in tables; "replanning" is halving in a closed loop, planning anew after each action."""
 
 
 def run_planners(task: Task, seed: int, settings: PlannerSettings) -> dict[str, Any]:
@@ -96,7 +101,21 @@ def _planned(
     how: dict[str, Any] = starts.task.scoring | {"temperature": temperature}
     if starts.world.stochastic:
         how["num_rollouts"] = ROLLOUTS
+    if name == "replanning":
+        # All decisions together take no more steps than one of the others, but for at least one plan each.
+        number = max(num_plans // starts.length, 1)
+        return replanned(starts, PLANNERS[name](prior, starts.length, number, **how), generator)
     return planned(starts, PLANNERS[name](prior, starts.length, num_plans, **how), generator)
+
+
+def replanned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:
+    """What `planned` tells, of as many actions as a plan has, each the first of a new plan; the mean of `COURSES`."""
+    begin = perf_counter()
+    state = starts.state.repeat_interleave(COURSES, 0)
+    done = execute(planner, starts.world, state, starts.length, 1, generator)
+    seconds = (perf_counter() - begin) / len(state)
+    score = planner.score(done.rewards.double(), done.states[:, -1]).view(-1, COURSES).mean(1)
+    return {"share": starts.share(score), "model_steps": done.model_steps, "seconds": seconds}
 
 
 def planned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:

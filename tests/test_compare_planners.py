@@ -21,6 +21,7 @@ SMALL = [
         "mcts",
         "cross-entropy",
         "halving",
+        "replanning",
         "--kinds",
         "markov",
         "--rounds",
@@ -41,18 +42,21 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     names = {"world", "planner", "prior", "num_plans", "model_steps", "oracle_share", "low", "high"}
     assert names | {"seconds_per_decision"} <= set(rows[0])
     by_world = {world: {row["planner"] for row in rows if row["world"] == world} for world in ("grid", "slippery")}
-    assert by_world == {"grid": set(compare_planners.PLANNERS) - {"halving"}, "slippery": compare_planners.CHANCE}
+    assert by_world == {
+        "grid": set(compare_planners.PLANNERS) - compare_planners.ONLY_CHANCE,
+        "slippery": compare_planners.CHANCE,
+    }
     assert {row["prior"] for row in rows} == {"uniform", "markov-3"}
     for row in rows:
         length = {"grid": 8, "slippery": 14 * 16}[row["world"]]
-        assert 0 < row["model_steps"] <= row["num_plans"] * length
+        assert 0 < row["model_steps"] <= max(row["num_plans"], 14 * (row["world"] == "slippery")) * length
         assert (
-            row["planner"] in ("distinct", "frontier", "mcts", "halving")
+            row["planner"] in ("distinct", "frontier", "mcts", "halving", "replanning")
             or row["model_steps"] == row["num_plans"] * length
         )
         assert row["oracle_share"] <= 1 + 1e-6 or row["world"] == "slippery"
     with (out / "paired.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(results["paired"]) == 2 * (4 * 2) + 2 * (2 * 2)
+        assert len(list(csv.DictReader(file))) == len(results["paired"]) == 2 * (4 * 2) + 2 * (3 * 2)
     page = (out / "report.html").read_text()
     assert not re.search(FROM_ELSEWHERE, page)
     assert "cross-entropy" in page
