@@ -11,6 +11,7 @@ from rich.console import Console
 from eval.compare_rows import Array, Cells, Rows, estimated
 from eval.compare_sections import plus_minus
 from eval.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
+from eval.figures import save
 from eval.live_cell import PARTS
 from eval.page import FigureBox, Page, Section, Table, svg, write_page
 from eval.plan_report import printed
@@ -111,7 +112,8 @@ def table(rows: Rows, gaps: Rows, world: str) -> Table:
         cells.append([row["prior"], row["sees"], learns, told, share, *seasons, _number(1e6 * row["seconds"], 0)])
     seeds = max(row["seeds"] for row in own)
     over = f" ±: the wider half of 95 % bootstrap intervals over {seeds} seeds." if seeds > 1 else " A single seed."
-    star = " *: p < 0.05 against random with a warm start, corrected for all tests in this world." if gaps else ""
+    star = " *: p < 0.05 against random with a warm start, corrected for all tests in this world."
+    star *= any(row[3].endswith("*") for row in cells)
     caption = (
         f"{world}: food eaten in 100 steps; in % of the oracle's; in the first and the last quarter of the"
         f" seasons after the first; and microseconds a step and agent. Cold: without a warm start.{over}"
@@ -187,7 +189,7 @@ def _points(rewards: Array, period: int) -> list[tuple[float, float, float | Non
 
 
 def write_report(cells: Cells, settings: Mapping[str, Any], folder: Path, console: Console, command: str) -> None:
-    """Print the tables, and write `report.html`, `results.json`, `rows.csv` and `paired.csv`."""
+    """Print the tables; write `report.html`, `results.json`, `rows.csv`, `paired.csv` and a picture of each world."""
     rows, gaps = live_rows(cells), paired_rows(cells)
     about = {cell["world"]: cell for cell in cells}
     made = [table(rows, gaps, world) for world in about]
@@ -203,6 +205,8 @@ def write_report(cells: Cells, settings: Mapping[str, Any], folder: Path, consol
             (folder / f"{name}.csv").unlink(missing_ok=True)  # of an earlier run
     results = {"rows": rows, "paired": gaps, "words": said, "settings": dict(settings), "versions": versions()}
     write_json(folder / "results.json", results)
+    for world in about:
+        save(live_figure(cells, world), folder / f"{world}.png")
     sections = [
         Section("In plain words", said),
         Section("Food eaten against time", [], figures=[_box(cells, cell) for cell in about.values()]),

@@ -21,7 +21,7 @@ def test_example(number: int, tmp_path: Path) -> None:
 
 
 def test_there_are_examples() -> None:
-    assert len(EXAMPLES) == 3
+    assert len(EXAMPLES) == 4
 
 
 def test_import_leaves_lightning_for_training() -> None:
