@@ -34,7 +34,7 @@ ABOUT = (
 CHOSEN = "chosen"
 """The planner that chooses its horizon, in tables."""
 
-VERSION = 1
+VERSION = 2
 """Of the way in which a cell is done; counts up with each change of it."""
 
 

@@ -46,7 +46,7 @@ TRAINING = {"markov": {}, "gru": {"max_steps": 40, "weight_decay": 0.3, "progres
 HALF_LIFE = 96
 """Steps after which half of what was executed is forgotten."""
 
-VERSION = 1
+VERSION = 2
 """Of the way in which a cell is done; counts up with each change of it."""
 
 
@@ -93,7 +93,8 @@ def run_live(home: Home, seed: int, settings: LiveSettings) -> dict[str, Any]:
     begin = perf_counter()
     generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
     table = home.table(settings.seed * 10_000 + seed)
-    growth = patches(table, settings.seasons, home.radius, generator)
+    # One season more than is lived through: that in which priors learn that learn before.
+    growth = patches(table, settings.seasons + 1, home.radius, generator)
     world = ForagingWorld(table, growth, settings.period, settings.items)
     state, own = world.reset(settings.agents, generator), draw_seed(generator)
     entries = []
@@ -102,7 +103,8 @@ def run_live(home: Home, seed: int, settings: LiveSettings) -> dict[str, Any]:
         prior = _prior(life, table, own)
         if life.learns == "before":
             before = world.reset(settings.agents, drawn)
-            _agent(life, world, prior, before, settings, drawn).live(settings.period)
+            before[:, 1] = settings.period * settings.seasons
+            _agent(life, world, prior, world.grow(before, drawn), settings, drawn).live(settings.period)
         start = perf_counter()
         agent = _agent(life, world, prior, state, settings, drawn, life.learns == "online")
         done = agent.live(settings.period * settings.seasons)
@@ -142,7 +144,9 @@ def _agent(
 ) -> Agent:
     planner: Planner = ForagingOracle(FORESIGHT * settings.length, DISCOUNT)
     if life.prior != "oracle":
-        planner = SamplingPlanner(prior, settings.length, settings.num_plans, objective="return", discount=DISCOUNT)
+        # The rest of the last plan is one more candidate: without it there is one more plan.
+        number = settings.num_plans + (not life.warm)
+        planner = SamplingPlanner(prior, settings.length, number, objective="return", discount=DISCOUNT)
     often = LEARN_EVERY.get(life.prior)
     return Agent(
         world,

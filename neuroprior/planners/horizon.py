@@ -124,7 +124,7 @@ class HorizonPlanner(SamplingPlanner):
         spread = (squares / number - mean**2).clamp(min=0).sqrt()
         depth = torch.arange(1, self.length + 1, device=mean.device)
         # Of few actions there are few plans.
-        tries = (left // depth).minimum((self.prior.num_actions ** depth.double().clamp(max=40)).long())
+        tries = (left // depth).double().minimum(self.prior.num_actions ** depth.double())
         share = (torch.arange(QUANTILES, device=mean.device, dtype=torch.float64) + 0.5) / QUANTILES
         # The best of n scores is below its quantile q with probability q, so each of them with probability q ** (1/n).
         above = -torch.expm1(share.log() / tries[:, None])
