@@ -50,4 +50,4 @@ HOMES = {
         Home("forage_labyrinth", "the labyrinth of the mice, 127 nodes of a binary tree", _labyrinth, 3),
     )
 }
-"""By their names in tables. Patches cover about a tenth of each."""
+"""By their names in tables. A patch covers from a thirtieth (grid) to a twelfth (labyrinth) of each."""

@@ -40,7 +40,7 @@ EVERY = 4
 LEARN_EVERY = {"markov": 16, "gru": 64}
 """Steps after which a prior learns; a network takes its time."""
 
-TRAINING = {"markov": {}, "gru": {"max_steps": 40, "weight_decay": 0.3, "progress": False}}
+TRAINING = {"markov": None, "gru": {"max_steps": 40, "weight_decay": 0.3, "progress": False}}
 """Passed on to `fit`."""
 
 HALF_LIFE = 96

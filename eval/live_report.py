@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from eval.compare_rows import Array, Cells, Rows, estimated
+from eval.compare_rows import Array, Cells, Rows, estimated, number_or_none
 from eval.compare_sections import plus_minus
 from eval.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
 from eval.figures import save
-from eval.live_cell import PARTS
+from eval.live_cell import FORESIGHT, PARTS
 from eval.page import FigureBox, Page, Section, Table, svg, write_page
 from eval.plan_report import printed
 from neuroprior.output import versions, write_csv, write_json
@@ -40,7 +40,7 @@ def live_rows(cells: Cells) -> Rows:
         best = found[(place[0], "oracle", "everything", "never", True)]
         row = dict(zip(("world", "prior", "sees", "learns", "warm_start"), place, strict=True))
         row |= {"reward": share["mean"], "low": share["low"], "high": share["high"], "seeds": share["seeds"]}
-        row |= {what: _whole(own, what) for what in ("after", "late")}
+        row |= {what: number_or_none(_whole(own, what)) for what in ("after", "late")}
         row |= {"oracle_share": _whole(own, "rewards") / max(_whole(best, "rewards"), 1e-12)}
         row |= {name: float(np.mean([entry[name] for entry in own.values()])) for name in ("model_steps", "seconds")}
         rows.append(row)
@@ -50,9 +50,9 @@ def live_rows(cells: Cells) -> Rows:
 def paired_rows(cells: Cells) -> Rows:
     """What each life is rewarded more, in 100 steps, than the same with one thing less; paired over seeds.
 
-    Learning online against having learned before, and against not at all; each with its `difference`, Student's
-    interval, `p_value`, and `p_holm`, corrected for all rows of the world; and a warm start against none. Nothing where
-    there is a single seed.
+    What has learned, before or online, against random plans; learning online against having learned before; and a warm
+    start against none. Each with its `difference`, Student's interval, `p_value`, and `p_holm`, corrected for all rows
+    of the world. Nothing where there is a single seed.
     """
     found, rows = _found(cells), []
     for place, own in found.items():
@@ -60,6 +60,7 @@ def paired_rows(cells: Cells) -> Rows:
         others: list[tuple[str, Place]] = []
         if learns == "online" and warm:
             others += [("learned before", (world, prior, sees, "before", True))]
+        if learns != "never" and warm:
             others += [("random", (world, "uniform", "nothing", "never", True))]
         if warm:
             others += [("no warm start", (world, prior, sees, learns, False))]
@@ -106,17 +107,19 @@ def table(rows: Rows, gaps: Rows, world: str) -> Table:
         told = plus_minus(row, "reward", 1, 1)
         if any(_sure(gap) for gap in gaps if gap["against"] == "random" and _same(gap, row) and row["warm_start"]):
             told += "*"
-        seasons = [_number(row[what], 1) for what in ("after", "late")]
+        seasons = ["" if row[what] is None else _number(row[what], 1) for what in ("after", "late")]
         learns = row["learns"] + ("" if row["warm_start"] else ", cold")
         share = _number(100 * row["oracle_share"], 0)
         cells.append([row["prior"], row["sees"], learns, told, share, *seasons, _number(1e6 * row["seconds"], 0)])
     seeds = max(row["seeds"] for row in own)
     over = f" ±: the wider half of 95 % bootstrap intervals over {seeds} seeds." if seeds > 1 else " A single seed."
-    star = " *: p < 0.05 against random with a warm start, corrected for all tests in this world."
+    star = " *: p < 0.05 against random (tested: what learned, with a warm start), corrected for all tests here."
     star *= any(row[3].endswith("*") for row in cells)
     caption = (
         f"{world}: food eaten in 100 steps; in % of the oracle's; in the first and the last quarter of the"
-        f" seasons after the first; and microseconds a step and agent. Cold: without a warm start.{over}"
+        f" seasons after the first; and microseconds a step and agent. Cold: without a warm start, but with one plan"
+        f" more. The oracle knows all food that lies, and plans {FORESIGHT} times as far; what will grow it does not"
+        f" know.{over}"
     )
     headings = ("prior", "sees", "learns", "eaten", "%", "first", "last", "µs")
     return Table(headings, cells, caption + star, "lllrrrrr")
@@ -130,7 +133,7 @@ def words(gaps: Rows, world: str) -> str:
     clear = [_told(row) for row in own if _sure(row)]
     unclear = [_told(row) for row in own if not _sure(row)]
     parts = [f"{'; '.join(clear)}: food in 100 steps"] if clear else []
-    parts += [f"cannot be told apart: {'; '.join(unclear)}"] if unclear else []
+    parts += [f"in so many tests cannot be told apart: {'; '.join(unclear)}"] if unclear else []
     return f"{world}: {'. '.join(parts)}."
 
 
@@ -149,7 +152,7 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _number(value: float, digits: int) -> str:
-    return "" if np.isnan(value) else f"{value:,.{digits}f}"
+    return f"{value:,.{digits}f}"
 
 
 @drawn

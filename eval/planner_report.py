@@ -48,7 +48,7 @@ def planner_rows(cells: Cells) -> Rows:
 
 
 def paired_rows(cells: Cells, plain: str = PLAIN) -> Rows:
-    """How much further than `plain`, samples from the same prior, each planner comes, with as many model steps.
+    """How much further than `plain` each planner comes with the same prior and as many model steps.
 
     A row a world, planner, prior and number of plans: the `difference` in the share of the oracle, paired over seeds,
     with Student's interval (`low`, `high`), `p_value` of the two-sided t-test, and `p_holm`, corrected for all rows of
@@ -131,7 +131,7 @@ def words(rows: Rows, gaps: Rows, world: str, plain: str = PLAIN) -> str:
         return f"{told} differences need several seeds, {plain}, and another planner."
     parts = [f"{', '.join(clear)} points of the oracle against {plain} with the same prior"] if clear else []
     if unclear:
-        parts.append(f"cannot be told apart from {plain}: {', '.join(unclear)}")
+        parts.append(f"cannot be told apart from {plain} in so many tests: {', '.join(unclear)}")
     return f"{told} {'; '.join(parts)}."
 
 

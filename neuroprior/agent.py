@@ -10,7 +10,9 @@ from neuroprior.planners import Decision, Execution, Planner
 from neuroprior.planners.execution import Change, follow, joined
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
-from neuroprior.priors import Prior
+from neuroprior.priors import Prior, UniformPrior
+from neuroprior.priors.history_prior import HistoryPrior
+from neuroprior.priors.neural import NeuralPrior
 from neuroprior.randomness import generator_on
 from neuroprior.replay import Replay
 from neuroprior.worlds.world import World, check_sizes
@@ -40,7 +42,8 @@ class Agent:
         keep: what is remembered is kept with this probability at each learning, see `Replay`.
         above: only plans whose rewards sum to more than this are remembered; None: all are.
         generator: draws everything that is random.
-        training: passed on to the prior's `fit`, such as `{"max_steps": 50}` for neural priors.
+        training: passed on to the prior's `fit`, together with the generator, such as `{"max_steps": 50}`; None for
+            priors that count.
 
     Attributes:
         world, planner, prior, state: as given; the state is the present one.
@@ -69,10 +72,13 @@ class Agent:
         generator: torch.Generator | None = None,
         training: Mapping[str, Any] | None = None,
     ) -> None:
-        check_sizes(every=every, plan_length=plan_length, num_rollouts=num_rollouts)
+        learns = {} if learn_every is None else {"learn_every": learn_every}
+        check_sizes(every=every, plan_length=plan_length, num_rollouts=num_rollouts, **learns)
+        if not isinstance(prior, Prior):
+            raise ValueError(f"prior: a Prior is expected, not a {type(prior).__name__}")
         if plan_length % every:
             raise ValueError(f"plan_length: a multiple of every = {every} is expected, not {plan_length}")
-        if learn_every is not None and (learn_every < 1 or learn_every % plan_length):
+        if learn_every is not None and learn_every % plan_length:
             raise ValueError(f"learn_every: a multiple of plan_length = {plan_length} is expected, not {learn_every}")
         if prior.num_actions != world.num_actions:
             raise ValueError(f"prior: it has {prior.num_actions} actions, the world {world.num_actions}")
@@ -82,7 +88,9 @@ class Agent:
         self.world, self.planner, self.prior, self.replay = world, planner, prior, Replay(keep)
         self.every, self.change, self.warm_start, self.num_rollouts = every, change, warm_start, num_rollouts
         self.learn_every, self.plan_length, self.above = learn_every, plan_length, above
-        self.training = dict(training or {})
+        if training is not None and isinstance(prior, HistoryPrior | UniformPrior):
+            raise ValueError(f"training: a {type(prior).__name__} counts, and is not trained; leave it out")
+        self.training = dict(training or {}) if training is not None or isinstance(prior, NeuralPrior) else None
         self.time = 0
         self.last: Decision | None = None  # what is left of the last plan
         self.recent: list[Execution] = []  # since a plan was remembered last
@@ -146,7 +154,7 @@ class Agent:
         if self.time % self.learn_every == 0:
             self.replay.forget(self.generator)
             if self.replay.plans is not None and len(self.replay) > 1:
-                settings = self.training | {"generator": self.generator} if self.training else {}
+                settings = {} if self.training is None else self.training | {"generator": self.generator}
                 self.prior.fit(self.replay.plans, **settings)
 
     def _remember(self, done: Execution) -> None:

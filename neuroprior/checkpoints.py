@@ -29,28 +29,35 @@ PARTS = ("actions", "rewards", "states")
 def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
     """Save an agent to a folder, made if need be: where it is, what it remembers, its prior and its random numbers.
 
-    `agent.json` names the files that belong to it and is written last, so that the folder holds the last whole
-    checkpoint at all times; files of earlier ones are then removed. World and planner are not saved.
+    Files are named after what is in them, and `agent.json`, which names those that belong to it, is written last: the
+    folder holds the last whole checkpoint at all times. What the one before named is then removed, and nothing else.
+    World and planner are not saved.
 
     Raises:
         OSError: the folder cannot be written.
+        ValueError: the `agent.json` that is there is of something else.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    prior, weights = f"prior-{agent.time}", f"agent-{agent.time}.safetensors"
-    folders.save(agent.prior, folder / prior)
+    before = _read(folder / "agent.json") if (folder / "agent.json").exists() else {}
+    partial = folders.save(agent.prior, folder / f".prior.{os.getpid()}.partial")
+    prior = f"prior-{_digest(partial)[:16]}"
+    if (folder / prior).exists():  # the same, saved before
+        shutil.rmtree(partial)
+    else:
+        partial.rename(folder / prior)
     data = write_tensors({name: value.detach().cpu().contiguous().clone() for name, value in _tensors(agent).items()})
+    digest = hashlib.sha256(data).hexdigest()
+    weights = f"agent-{digest[:16]}.safetensors"
     write_whole(folder / weights, data)
-    told = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent), "prior": prior}
-    told |= {"weights": weights, "sha256": hashlib.sha256(data).hexdigest()}
+    told = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent)}
+    told |= {"prior": prior, "prior_sha256": _digest(folder / prior), "weights": weights, "sha256": digest}
     told |= {"recent": [done.model_steps for done in agent.recent]}
     write_whole(folder / "agent.json", (json.dumps(told, indent=2) + "\n").encode())
-    for path in folder.glob("agent-*.safetensors"):
-        if path.name != weights:
-            path.unlink()
-    for path in folder.glob("prior-*"):
-        if path.name != prior:
-            shutil.rmtree(path)
+    if before and before["weights"] != weights:
+        (folder / before["weights"]).unlink(missing_ok=True)
+    if before and before["prior"] != prior:
+        shutil.rmtree(folder / before["prior"], ignore_errors=True)
     return folder
 
 
@@ -59,12 +66,12 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
 
     Args:
         agent: made anew with the same world, planner, kind of prior and arguments; its prior takes over what was
-            learned, in place.
+            learned, in place. Of world and planner no more can be checked than that states and class fit.
         folder: where `save_agent` saved.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
-        ValueError: a file is damaged, or the agent was made in another way.
+        ValueError: a file is damaged, or the agent was made in another way. The agent is as it was before.
     """
     folder = Path(folder)
     told = _read(folder / "agent.json")
@@ -73,18 +80,26 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
         raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; make this one in the same way")
     path = folder / told["weights"]
     data = path.read_bytes()
-    if hashlib.sha256(data).hexdigest() != told["sha256"]:
-        raise ValueError(f"{path}: truncated, changed, or of another checkpoint than agent.json")
+    if hashlib.sha256(data).hexdigest() != told["sha256"] or _digest(folder / told["prior"]) != told["prior_sha256"]:
+        raise ValueError(f"{folder}: {path.name} or {told['prior']} is truncated, changed, or of another checkpoint")
     try:
         tensors = read_tensors(data)
     except SafetensorError as error:
         raise ValueError(f"{path}: not a file of tensors ({error})") from error
+    if sum(name.startswith("recent.") for name in tensors) != len(PARTS) * len(told["recent"]):
+        raise ValueError(f"{folder / 'agent.json'}: 'recent' does not fit {path.name}")
     prior = folders.load(folder / told["prior"], agent.prior.device)
+    agent.world.check_state(tensors["state"].to(agent.state.device))
     agent.prior.restore(prior.learned)
     agent.prior.load_state_dict(prior.state_dict())
     agent.time = told["time"]
     _take(agent, tensors, told["recent"])
     return agent
+
+
+def _digest(prior: Path) -> str:
+    """Of both files of a saved prior."""
+    return hashlib.sha256(b"".join((prior / name).read_bytes() for name in folders.FILES)).hexdigest()
 
 
 def _settings(agent: Agent) -> dict[str, Any]:
@@ -93,7 +108,7 @@ def _settings(agent: Agent) -> dict[str, Any]:
     told |= {name: getattr(agent, name) for name in ("plan_length", "above", "training")}
     told |= {"keep": agent.replay.keep, "agents": list(agent.state.shape), "planner": type(agent.planner).__name__}
     told |= {"prior": type(agent.prior).__name__, "config": agent.prior.config}
-    settings = json.loads(json.dumps(told))
+    settings = json.loads(json.dumps(told, default=str))
     assert isinstance(settings, dict)
     return settings
 
@@ -137,6 +152,18 @@ def _read(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: not JSON ({error})") from error
     if not isinstance(told, dict) or told.get("format") != FORMAT or told.get("version") != VERSION:
         raise ValueError(f'{path}: not a checkpoint of an agent ("format": "{FORMAT}", "version": {VERSION})')
-    if missing := [key for key in ("time", "agent", "prior", "weights", "sha256", "recent") if key not in told]:
-        raise ValueError(f"{path}: {missing[0]!r} is missing")
+    kinds = {
+        "time": int,
+        "agent": dict,
+        "prior": str,
+        "prior_sha256": str,
+        "weights": str,
+        "sha256": str,
+        "recent": list,
+    }
+    for key, kind in kinds.items():
+        if not isinstance(told.get(key), kind):
+            raise ValueError(f"{path}: {key!r} is missing or of another kind than it was saved")
+    if not all(isinstance(steps, int) for steps in told["recent"]):
+        raise ValueError(f"{path}: 'recent': whole numbers are expected")
     return told

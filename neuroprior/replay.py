@@ -40,22 +40,31 @@ class Replay:
             self.plans = self.plans[(draws < self.keep).to(self.plans.actions.device)]
 
     def add(self, plans: Plans) -> None:
-        """Remember more plans, of as many actions and with the same kind of context as those before."""
+        """Remember more plans.
+
+        Raises:
+            ValueError: they have not as many actions as those before, or contexts of another kind.
+        """
         if self.plans is None:
             self.plans = plans
             return
         before = self.plans
-
-        def both(one: Tensor | None, other: Tensor | None) -> Tensor | None:
-            return None if one is None or other is None else torch.cat([one, other])
-
-        self.plans = Plans(
-            torch.cat([before.actions, plans.actions]),
-            plans.num_actions,
-            both(before.lengths, plans.lengths),
-            plans.action_names,
-            both(before.context, plans.context),
-        )
+        if (before.num_actions, before.max_length) != (plans.num_actions, plans.max_length):
+            raise ValueError(
+                f"plans: {before.max_length} of {before.num_actions} actions are remembered,"
+                f" {plans.max_length} of {plans.num_actions} cannot be added"
+            )
+        kinds = [None if one.context is None else (one.context.dtype, one.context.shape[1:]) for one in (before, plans)]
+        if kinds[0] != kinds[1]:
+            raise ValueError("plans: their context is of another kind than that of the plans that are remembered")
+        lengths = None
+        if before.lengths is not None or plans.lengths is not None:
+            lengths = torch.cat([before.mask().sum(1), plans.mask().sum(1)])
+        context = None
+        if before.context is not None and plans.context is not None:
+            context = torch.cat([before.context, plans.context])
+        actions = torch.cat([before.actions, plans.actions])
+        self.plans = Plans(actions, plans.num_actions, lengths, plans.action_names, context)
 
     def tensors(self) -> dict[str, Tensor]:
         """What is remembered, by name; for files."""

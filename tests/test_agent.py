@@ -1,6 +1,7 @@
 """Agents: they do what their planner says, learn from what they did and from nothing else, and go on after a pause."""
 
 import json
+import re
 
 import pytest
 import torch
@@ -13,10 +14,13 @@ from neuroprior import (
     Plans,
     SamplingPlanner,
     UniformPrior,
+    checkpoints,
     execute,
     gridworld,
+    load,
     patches,
     restore_agent,
+    save,
     save_agent,
 )
 from tests.sources import corridor, every_plan, refuses, seeded
@@ -149,12 +153,61 @@ def test_a_pause_changes_nothing(kind, at, tmp_path):
     assert len(again.replay) == len(through.replay)
 
 
+def test_networks_are_trained_from_its_generator():
+    """Whatever torch's own generator is at."""
+    lives = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        one = agent(GRUPrior(4, hidden_size=4), training={"max_steps": 2, "progress": False})
+        lives.append((one.live(24).actions, one.prior.log_prob(every_plan(4, 2))))
+    for first, second in zip(*lives, strict=True):
+        assert torch.equal(first, second)
+    assert agent(GRUPrior(4, hidden_size=4)).training == {}
+
+
 def test_a_folder_holds_one_checkpoint(tmp_path):
     one = agent()
     for _ in range(3):
         one.live(6)
         save_agent(one, tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent-18.safetensors", "agent.json", "prior-18"]
+        save_agent(one, tmp_path)  # again at the same time
+    assert [re.sub("-.*", "", path.name) for path in sorted(tmp_path.iterdir())] == ["agent", "agent.json", "prior"]
+
+
+def test_what_others_put_there_stays(tmp_path):
+    save(MarkovPrior(4, 1), tmp_path / "prior-mine")
+    (tmp_path / "agent-notes.safetensors").write_text("mine")
+    (tmp_path / "prior-notes.txt").write_text("mine")
+    one = agent()
+    for _ in range(2):
+        one.live(12)
+        save_agent(one, tmp_path)
+    assert restore_agent(agent(), tmp_path).time == 24
+    assert len(list(tmp_path.iterdir())) == 6
+    load(tmp_path / "prior-mine")
+
+
+def test_another_life_that_is_cut_off_leaves_the_last(tmp_path, monkeypatch):
+    """Two agents at the same time of their lives, one of which is not saved whole."""
+    one, other = agent(seed=1), agent(seed=2)
+    for some in (one, other):
+        some.live(12)
+    save_agent(one, tmp_path)
+    write = checkpoints.write_whole
+    for last in ("agent.json", "safetensors"):
+
+        def cut_off(path, content, last=last):
+            if last in path.name:
+                raise KeyboardInterrupt
+            write(path, content)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(checkpoints, "write_whole", cut_off)
+            with pytest.raises(KeyboardInterrupt):
+                save_agent(other, tmp_path)
+        again = restore_agent(agent(), tmp_path)
+        assert torch.equal(again.state, one.state)
+        assert torch.equal(again.prior.log_prob(every_plan(4, 3)), one.prior.log_prob(every_plan(4, 3)))
 
 
 def test_a_save_that_is_cut_off_leaves_the_last(tmp_path, monkeypatch):
@@ -189,6 +242,11 @@ def test_damaged_checkpoints(tmp_path):
         ("[]", "not a checkpoint"),
         (json.dumps(told | {"version": 9}), "not a checkpoint"),
         (json.dumps({k: v for k, v in told.items() if k != "weights"}), "weights"),
+        (json.dumps(told | {"agent": []}), "agent"),
+        (json.dumps(told | {"prior": 3}), "prior"),
+        (json.dumps(told | {"time": "x"}), "time"),
+        (json.dumps(told | {"recent": [1, "x"]}), "recent"),
+        (json.dumps(told | {"recent": [1] * 9}), "recent"),
         (json.dumps(told | {"sha256": "0"}), "truncated"),
     ):
         path.write_text(content)
@@ -209,6 +267,8 @@ def test_damaged_checkpoints(tmp_path):
         ({"learn_every": 8}, "learn_every: a multiple of plan_length = 6"),
         ({"num_rollouts": 0}, "num_rollouts"),
         ({"keep": 0.0}, "keep"),
+        ({"learn_every": "12"}, "learn_every"),
+        ({"training": {"max_steps": 5}}, "training: a MarkovPrior counts"),
         ({"prior": MarkovPrior(3, 1)}, "3 actions, the world 4"),
     ],
 )

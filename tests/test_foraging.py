@@ -110,7 +110,7 @@ def test_bad_worlds():
         "cells": torch.tensor([[4, 0, 0, 0]]),
         "places": torch.tensor([[0, 0, 5, 0]]),
         "time": torch.tensor([[0, -1, 0, 0]]),
-        "integers": torch.zeros(3, 4),
+        "int64": torch.zeros(3, 4),
     }.items():
         with refuses(word):
             world.rollout(state, torch.zeros(len(state), 1, 1, dtype=torch.long))

@@ -16,7 +16,8 @@ class ForagingOracle(Planner):
     """Finds the plan of so many actions that eats most in a `ForagingWorld`; what is yet to grow it does not know.
 
     Finite-horizon dynamic programming over the cell and which of the K items are left: `L * 2**K * S * A` operations
-    for each start, which are counted as model steps. No planner whose plans are as long scores more.
+    for each start, which are counted as model steps. No planner whose plans are as long scores more. At each step
+    it takes a random one of the best actions.
 
     Args:
         length: number of actions in a plan, at least 1.

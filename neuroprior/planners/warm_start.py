@@ -68,9 +68,11 @@ def with_rest(
     num_rollouts: int,
     generator: torch.Generator | None = None,
 ) -> Decision:
-    """What was decided, or the rest of the last plan, whichever scores more; of equals a random one.
+    """What was decided, or the rest of the last plan, whichever scores more; of these two, if equal, a random one.
 
-    In a world with chance both are tried anew, meeting the same chance: the score of a winner among many flatters it.
+    The rest stands against the best of the planner's plans, not against each of them: where all are equally good, an
+    agent keeps to its course every other time, however many plans there are. In a world with chance both are tried
+    anew, meeting the same chance: the score of a winner among many flatters it.
 
     Args:
         planner: whose decision it was.
@@ -89,7 +91,10 @@ def with_rest(
     if world.stochastic:
         both = torch.cat([decision.plan[:, None].to(plans.dtype), plans], 1)
         score, ends = mean_scores(planner, world, state, both, num_rollouts, generator)
-        return decide(both, score, ends, steps + 2 * num_rollouts * length, generator)
+        allowed = torch.ones_like(score, dtype=torch.bool)
+        if decision.lengths is not None:  # beyond them there are no actions
+            allowed[:, 0] = torch.arange(length, device=state.device) < decision.lengths[:, None]
+        return decide(both, score, ends, steps + 2 * num_rollouts * length, generator, allowed)
     score, ends = planner.scored(rollout if planner.any_prefix else rollout._replace(states=None))
     other = decide(plans, score, ends, steps, generator)
     chosen = random_best(torch.stack([decision.score, other.score.to(decision.score)], 1), generator) == 1

@@ -13,6 +13,8 @@ from safetensors.torch import save as write_tensors
 
 from neuroprior.priors.prior import Prior
 
+FILES = ("model.safetensors", "config.json")
+
 FORMAT = "neuroprior model"
 VERSION = 1
 

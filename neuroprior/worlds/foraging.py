@@ -38,6 +38,8 @@ class ForagingWorld(World):
 
     def __init__(self, table: TabularWorld, growth: Tensor, period: int, num_items: int = 4) -> None:
         check_sizes(period=period, num_items=num_items)
+        if not isinstance(table, TabularWorld):
+            raise ValueError(f"table: a TabularWorld is expected, not a {type(table).__name__}")
         if table.num_layouts > 1:
             raise ValueError(f"table: one layout is expected, not {table.num_layouts}, of which one has all the food")
         self.place = places(table)
@@ -94,6 +96,8 @@ class ForagingWorld(World):
     def check_state(self, state: Tensor) -> None:
         if state.dim() != 2 or state.shape[1] != 2 + self.num_items:
             raise ValueError(f"state: shape [B, {2 + self.num_items}] is expected, not {list(state.shape)}")
+        if state.dtype != torch.int64:
+            raise ValueError(f"state: int64 is expected, not {str(state.dtype).removeprefix('torch.')}")
         check_range("state[:, 0]", state[:, 0], self.table.num_states, "cells")
         check_range("state[:, 2:]", state[:, 2:], self.num_places + 1, "places, nowhere among them")
         if (state[:, 1] < 0).any():
