@@ -7,6 +7,8 @@ from neuroprior import (
     ExhaustivePlanner,
     ForagingOracle,
     ForagingWorld,
+    FrontierPlanner,
+    HorizonPlanner,
     MarkovPrior,
     SamplingPlanner,
     UniformPrior,
@@ -152,6 +154,13 @@ def test_many_starts_are_planned_for_in_parts(monkeypatch):
     parts = ForagingOracle(6).plan(world, state, seeded(0))
     assert torch.equal(whole.score, parts.score)
     assert whole.model_steps == parts.model_steps == 6 * 2**3 * 16 * 4
+
+
+def test_no_starts_are_no_trouble():
+    world = forage(gridworld(4, 4))
+    none = world.reset(3, seeded(0))[:0]
+    for planner in (ForagingOracle(5), FrontierPlanner(UniformPrior(4), 5, 8), HorizonPlanner(UniformPrior(4), 5, 8)):
+        assert planner.plan(world, none, seeded(0)).plan.shape == (0, 5)
 
 
 def test_where_the_oracle_cannot_be_asked():

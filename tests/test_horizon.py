@@ -58,6 +58,20 @@ def test_of_few_actions_there_are_few_plans():
     assert HorizonPlanner(UniformPrior(2), 3, 60)._horizon(gathered(scores), 60).tolist() == [3]
 
 
+def test_deep_horizons_count():
+    """Only the last of 64 actions tells; so many plans of four actions there are that their number overflows."""
+    scores = torch.zeros(1, 8, 64, dtype=torch.float64)
+    scores[0, :, -1] = torch.arange(8) / 8
+    found = gathered(scores.tolist())
+    found = found._replace(decision=found.decision._replace(score=torch.tensor([0.5])))
+    for actions in (2, 4, 300):
+        planner = HorizonPlanner(UniformPrior(actions), 64, 16)
+        assert planner._horizon(found, 640).tolist() == [64]
+    scores[0, :, 40:] = scores[0, :, -1:]
+    found = gathered(scores.tolist())
+    assert HorizonPlanner(UniformPrior(4), 64, 16)._horizon(found, 640).tolist() == [42]  # 15 plans, as of 41
+
+
 def test_what_others_found_counts_for_a_little():
     """A start that found nothing goes by the others; alone it would plan as deep as it may."""
     planner = HorizonPlanner(UniformPrior(100), 3, 60)

@@ -42,3 +42,23 @@ def test_nothing_is_forgotten_where_all_is_kept():
 def test_bad_keep(keep):
     with refuses("keep"):
         Replay(keep)
+
+
+def test_what_does_not_fit_is_refused():
+    replay = Replay(1.0)
+    replay.add(numbered(0, 3, context=True))
+    for wrong in (
+        numbered(0, 3),
+        Plans(torch.zeros(1, 3, dtype=torch.long), 100_000),
+        Plans(torch.zeros(1, 2, dtype=torch.long), 5),
+    ):
+        with refuses("plans"):
+            replay.add(wrong)
+    assert len(replay) == 3
+
+
+def test_lengths_are_kept():
+    replay = Replay(1.0)
+    replay.add(numbered(0, 2))
+    replay.add(Plans(torch.zeros(1, 2, dtype=torch.long), 100_000, torch.tensor([1])))
+    assert replay.plans.lengths.tolist() == [2, 2, 1]

@@ -3,7 +3,16 @@
 import pytest
 import torch
 
-from neuroprior import Decision, MarkovPrior, SamplingPlanner, UniformPrior, expected_score, gridworld, labyrinth
+from neuroprior import (
+    Decision,
+    MarkovPrior,
+    SamplingPlanner,
+    TabularWorld,
+    UniformPrior,
+    expected_score,
+    gridworld,
+    labyrinth,
+)
 from neuroprior.planners.warm_start import continued, with_rest
 from tests.sources import (
     FALSE_ALARM,
@@ -102,3 +111,16 @@ def test_seeing_priors_see_where_the_rest_leads():
     prior = MarkovPrior(4, 1, num_contexts=16)
     plans, _ = continued(prior, world, state, torch.zeros(50, 2, dtype=torch.long), torch.full((50,), 2), 4, seeded(0))
     assert (plans[:, 0, :2] == 0).all()
+
+
+def test_with_chance_nothing_beyond_the_end_of_a_plan_wins():
+    """Every step of one action is rewarded: what comes after the end of what was decided would score more."""
+    table = torch.zeros(1, 2, 1, dtype=torch.long)
+    world = TabularWorld(table, torch.tensor([[[1.0], [0.0]]]), probability=torch.ones(1, 2, 1, dtype=torch.float64))
+    state = torch.zeros(40, dtype=torch.long)
+    planner = SamplingPlanner(UniformPrior(2), 5, 1, objective="return", any_prefix=True)
+    own = Decision(torch.zeros(40, 5, dtype=torch.uint8), torch.ones(40), state, 5, torch.full((40,), 2))
+    rest = torch.ones(40, 5, dtype=torch.long)
+    chosen = with_rest(planner, UniformPrior(2), world, state, own, rest, torch.full((40,), 5), 1, seeded(0))
+    assert (chosen.lengths == 2).all()
+    assert (chosen.score == 2).all()
