@@ -14,6 +14,7 @@ from scipy import stats
 
 from eval.compare_best import best_difference
 from eval.compare_priors import NEURAL
+from neuroprior.statistics import holm
 
 Array = NDArray[np.float64]
 Cells = Sequence[Mapping[str, Any]]
@@ -136,6 +137,15 @@ def estimated(values: Iterable[Array]) -> list[dict[str, Any]]:
             mean = float(given[place].mean())
             found[place] = {"mean": mean, "low": number_or_none(low), "high": number_or_none(high), "seeds": number}
     return found
+
+
+def corrected(rows: Rows) -> Rows:
+    """The same rows with `p_holm`: their `p_value`, corrected for all rows of the same world."""
+    for world in dict.fromkeys(row["world"] for row in rows):
+        tested = [row for row in rows if row["world"] == world]
+        for row, p_value in zip(tested, holm([row["p_value"] for row in tested]), strict=True):
+            row["p_holm"] = float(p_value)
+    return rows
 
 
 def number_or_none(value: float) -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from eval.compare_rows import Array, Cells, Rows, estimated, number_or_none
+from eval.compare_rows import Array, Cells, Rows, corrected, estimated, number_or_none
 from eval.compare_sections import plus_minus
 from eval.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
 from eval.figures import save
@@ -16,7 +16,7 @@ from eval.live_cell import FORESIGHT, PARTS
 from eval.page import FigureBox, Page, Section, Table, svg, write_page
 from eval.plan_report import printed
 from neuroprior.output import versions, write_csv, write_json
-from neuroprior.statistics import holm, paired_difference
+from neuroprior.statistics import paired_difference
 
 Place = tuple[str, str, str, str, bool]
 """World, prior, what it sees, when it learns, whether the rest of the last plan is a candidate."""
@@ -71,11 +71,7 @@ def paired_rows(cells: Cells) -> Rows:
                 )
                 row = {"world": world, "prior": prior, "sees": sees, "learns": learns, "against": name}
                 rows.append(row | {"difference": gap.mean, "low": gap.low, "high": gap.high, "p_value": gap.p_value})
-    for world in dict.fromkeys(row["world"] for row in rows):
-        tested = [row for row in rows if row["world"] == world]
-        for row, p_value in zip(tested, holm([row["p_value"] for row in tested]), strict=True):
-            row["p_holm"] = float(p_value)
-    return rows
+    return corrected(rows)
 
 
 def _found(cells: Cells) -> dict[Place, dict[int, Mapping[str, Any]]]:
@@ -92,7 +88,8 @@ def _mean(entry: Mapping[str, Any], what: str) -> float:
     """The mean reward in 100 steps of some parts of seasons, see `WHEN`; NaN of none."""
     seasons = np.array(entry["rewards"], dtype=np.float64).reshape(-1, PARTS)
     some = (seasons if what == "rewards" else seasons[1:])[:, WHEN[what]]
-    return 100 * float(some.mean()) if some.size else float("nan")
+    # Rounded, so that means that are the same are seen to be.
+    return round(100 * float(some.mean()), 9) if some.size else float("nan")
 
 
 def _whole(own: Mapping[int, Mapping[str, Any]], what: str) -> float:
@@ -133,7 +130,7 @@ def words(gaps: Rows, world: str) -> str:
     clear = [_told(row) for row in own if _sure(row)]
     unclear = [_told(row) for row in own if not _sure(row)]
     parts = [f"{'; '.join(clear)}: food in 100 steps"] if clear else []
-    parts += [f"in so many tests cannot be told apart: {'; '.join(unclear)}"] if unclear else []
+    parts += [f"Not to be told apart in so many tests: {'; '.join(unclear)}"] if unclear else []
     return f"{world}: {'. '.join(parts)}."
 
 

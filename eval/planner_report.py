@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from rich.console import Console
 
-from eval.compare_rows import Array, Cells, Rows, estimated
+from eval.compare_rows import Array, Cells, Rows, corrected, estimated
 from eval.compare_sections import plus_minus
 from eval.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
 from eval.page import FigureBox, Page, Section, Table, svg, write_page
 from eval.plan_report import printed
 from neuroprior.output import versions, write_csv, write_json
-from neuroprior.statistics import holm, paired_difference
+from neuroprior.statistics import paired_difference
 
 PLAIN = "sampling"
 """The planner that the others are compared with."""
@@ -62,11 +62,7 @@ def paired_rows(cells: Cells, plain: str = PLAIN) -> Rows:
         first, second = (_shares(side, common) for side in (own, rival))
         gap = paired_difference(first, second)
         rows.append(_named(place) | {"difference": gap.mean, "low": gap.low, "high": gap.high, "p_value": gap.p_value})
-    for world in dict.fromkeys(row["world"] for row in rows):
-        tested = [row for row in rows if row["world"] == world]
-        for row, p_value in zip(tested, holm([row["p_value"] for row in tested]), strict=True):
-            row["p_holm"] = float(p_value)
-    return rows
+    return corrected(rows)
 
 
 def _found(cells: Cells) -> dict[Place, dict[int, dict[str, float]]]:

@@ -119,10 +119,10 @@ def test_plans_end_where_it_is_over():
 
 def test_forgetting_follows_the_food():
     """Food moves to another patch: what an agent has learned there helps it to find the next, once it has forgotten."""
-    world = home(period=240)
+    world = home(period=160)
     prior = MarkovPrior(4, 1, num_contexts=36)
-    online = agent(prior, world, number=16, above=0.0).live(720).rewards.double()
-    table_free = agent(UniformPrior(4), world, number=16, learn_every=None).live(720).rewards.double()
+    online = agent(prior, world, number=16, above=0.0).live(480).rewards.double()
+    table_free = agent(UniformPrior(4), world, number=16, learn_every=None).live(480).rewards.double()
     assert online.mean() > 1.1 * table_free.mean()
 
 

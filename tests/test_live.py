@@ -13,7 +13,7 @@ from neuroprior.statistics import paired_difference
 from tests.reports import FROM_ELSEWHERE
 
 SMALL = ["live", "--worlds", "forage_grid", "--kinds", "markov", "--seeds", "2", "--seasons", "2", "--period", "64"]
-SMALL += ["--agents", "3", "--num-plans", "4", "--processes", "1"]
+SMALL += ["--agents", "3", "--items", "2", "--num-plans", "4", "--processes", "1"]
 
 
 def test_a_small_comparison(tmp_path, capsys):
@@ -89,7 +89,7 @@ def test_what_is_told():
     assert (gap["difference"], gap["low"], gap["p_value"]) == pytest.approx((due.mean, due.low, due.p_value))
     said = live_report.words(gaps, "forage_grid")
     assert re.search(r"markov, sees nothing, learns online against random \+(9\.9|10\.)", said)
-    assert "cannot be told apart: random against no warm start" in said
+    assert "Not to be told apart in so many tests: random against no warm start" in said
     table = live_report.table(rows, gaps, "forage_grid")
     assert [row[3].endswith("*") for row in table.rows] == [False, False, False, True, False, True, False, False]
 
