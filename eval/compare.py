@@ -2,7 +2,7 @@
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -119,16 +119,14 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
     words = {"worlds": (worlds, TASKS), "kinds": (settings.kinds, KINDS), "sees": (settings.sees, SEES)}
     words["planners"] = planners, PLANNERS
     for name, (given, known) in words.items():
-        if unknown := [word for word in given if word not in known]:
-            raise ValueError(f"{name}: {unknown[0]!r} is not known; there are {', '.join(known)}")
+        check_known(name, given, known)
     lists = {"worlds": worlds, "num_plans": settings.num_plans}
     for name, some in lists.items():
         if not some:
             raise ValueError(f"{name}: at least one is expected")
     more = {name: getattr(settings, name) for name in ("sees", "kinds", "priors", "lengths")} | {"planners": planners}
     for name, some in (lists | more).items():
-        if len(set(some)) < len(some):
-            raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, some))}")
+        check_once(name, some)
     for number in settings.num_plans:
         if not 1 <= number <= MOST_PLANS or number & (number - 1):
             raise ValueError(f"num_plans: powers of two from 1 to {MOST_PLANS:,} are expected, not {number}")
@@ -144,6 +142,18 @@ def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Se
     blind = [world for world in worlds if settings.sees and not any(map(TASKS[world].shows, settings.sees))]
     if blind:
         raise ValueError(f"sees: {blind[0]} shows nothing that would be of use; leave it out, or add nothing to --sees")
+
+
+def check_known(name: str, given: Sequence[str], known: Collection[str]) -> None:
+    """Raise ValueError where a word that was given for an option is not known."""
+    if unknown := [word for word in given if word not in known]:
+        raise ValueError(f"{name}: {unknown[0]!r} is not known; there are {', '.join(known)}")
+
+
+def check_once(name: str, given: Sequence[Any]) -> None:
+    """Raise ValueError where something was given twice for an option."""
+    if len(set(given)) < len(given):
+        raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, given))}")
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:

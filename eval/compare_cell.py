@@ -177,6 +177,10 @@ class Contest:
             if self.task.shows(sees):
                 yield from self._learners(sees)
 
+    def grown(self) -> Iterator[Contestant]:
+        """Each prior after its growth alone; saved priors and random plans do not grow."""
+        return (one for one in self.contestants() if one.rounds == (0 if one.length is None else self.rounds))
+
     def _learners(self, sees: str) -> Iterator[Contestant]:
         first = as_seen(self.first, sees)
         if "markov" in self.settings.kinds:

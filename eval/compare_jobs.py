@@ -85,7 +85,7 @@ class Study:
         decides = {"settings": asdict(settings), "recipe": recipe or compare_cell.recipe(), "what": run.__qualname__}
         decides |= versions(*DRAWN_BY)
         digest = hashlib.sha256(json.dumps(decides, sort_keys=True).encode())
-        for prior in settings.priors:
+        for prior in settings.priors if isinstance(settings, Settings) else ():
             for name in ("config.json", "model.safetensors"):
                 digest.update((Path(prior) / name).read_bytes())
         folder = out / "cells" / digest.hexdigest()[:12]

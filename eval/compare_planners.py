@@ -70,11 +70,10 @@ def run_planners(task: Task, seed: int, settings: PlannerSettings) -> dict[str, 
     begin = perf_counter()
     contest = Contest(task, seed, replace(settings, sees=settings.sees or task.sights[-1:]), ORDERS)
     entries = []
-    for one in contest.contestants():
-        if one.label == "uniform" or one.rounds == (0 if one.length is None else contest.rounds):
-            for name in settings.planners:
-                if suits(name, contest.worlds.held_out):
-                    entries.append(_entry(contest, one, name))
+    for one in contest.grown():
+        for name in settings.planners:
+            if suits(name, contest.worlds.held_out):
+                entries.append(_entry(contest, one, name))
     cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "num_plans": settings.num_plans}
     return cell | {"entries": entries, "seconds": perf_counter() - begin}
 
@@ -90,7 +89,12 @@ def _entry(contest: Contest, one: Contestant, name: str) -> dict[str, Any]:
     found = [
         _planned(contest.starts, name, one.prior, number, heat, generator) for number in contest.settings.num_plans
     ]
-    entry = {"planner": name, "prior": one.label, "sees": one.sees, "rounds": one.rounds, "temperature": heat}
+    return entry_of(name, one, heat, found)
+
+
+def entry_of(name: str, one: Contestant, temperature: float, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What is kept of a planner and prior: what `planned` told with each number of plans."""
+    entry = {"planner": name, "prior": one.label, "sees": one.sees, "rounds": one.rounds, "temperature": temperature}
     return entry | {what: [some[what] for some in found] for what in ("share", "model_steps", "seconds")}
 
 

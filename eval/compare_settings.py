@@ -54,7 +54,6 @@ class LiveSettings:
         num_plans: candidates of each decision.
         length: actions in a plan.
         seed: of everything random.
-        priors: folders of saved priors: none.
     """
 
     kinds: tuple[str, ...]
@@ -65,4 +64,3 @@ class LiveSettings:
     num_plans: int
     length: int
     seed: int
-    priors: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from eval.compare import check, command
 from eval.compare_cell import Contest
 from eval.compare_curves import starts_of
 from eval.compare_jobs import Study, cells_of, run_cells
-from eval.compare_planners import ORDERS, planned
+from eval.compare_planners import ORDERS, entry_of, planned
 from eval.compare_settings import Settings
 from eval.suite import TASKS, Task
 from neuroprior import HorizonPlanner, Planner, Prior, SamplingPlanner
@@ -107,12 +107,10 @@ def run_depth(task: Task, seed: int, settings: DepthSettings) -> dict[str, Any]:
     contest = Contest(task, seed, replace(settings, sees=task.sights[-1:]), ORDERS)
     starts = starts_of(task, contest.worlds.held_out, settings.starts, settings.length, contest.generator)
     entries = []
-    for one in contest.contestants():
-        if one.label == "uniform" or one.rounds == contest.rounds:
-            for name, makes in _planners(one.prior, task, settings):
-                found = [planned(starts, planner, contest.generator) for planner in makes]
-                entry = {"planner": name, "prior": one.label, "sees": one.sees, "rounds": one.rounds}
-                entries.append(entry | {what: [some[what] for some in found] for what in found[0]})
+    for one in contest.grown():
+        for name, makes in _planners(one.prior, task, settings):
+            found = [planned(starts, planner, contest.generator) for planner in makes]
+            entries.append(entry_of(name, one, 1.0, found))
     cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "num_plans": settings.num_plans}
     return cell | {"entries": entries, "seconds": perf_counter() - begin}
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from eval.compare import command
+from eval.compare import check_known, check_once, command
 from eval.compare_jobs import Study, cells_of, run_cells
 from eval.compare_settings import LiveSettings
 from eval.homes import HOMES
@@ -84,10 +84,8 @@ def live(
 def check(worlds: list[str], seeds: int, processes: int | None, settings: LiveSettings) -> None:
     """Raise ValueError, naming the option, where one is out of range, not known or given twice."""
     for name, given, known in (("worlds", worlds, HOMES), ("kinds", settings.kinds, LEARN_EVERY)):
-        if unknown := [word for word in given if word not in known]:
-            raise ValueError(f"{name}: {unknown[0]!r} is not known; there are {', '.join(known)}")
-        if len(set(given)) < len(given):
-            raise ValueError(f"{name}: each may be given once, not {' '.join(given)}")
+        check_known(name, given, known)
+        check_once(name, given)
     if not worlds:
         raise ValueError("worlds: at least one is expected")
     numbers = {"seeds": seeds} | {name: getattr(settings, name) for name in LEAST if hasattr(settings, name)}

@@ -13,13 +13,17 @@ from eval.compare_sections import plus_minus
 from eval.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
 from eval.figures import save
 from eval.live_cell import FORESIGHT, PARTS
-from eval.page import FigureBox, Page, Section, Table, svg, write_page
-from eval.plan_report import printed
-from neuroprior.output import versions, write_csv, write_json
+from eval.page import FigureBox, Section, Table, svg
+from eval.planner_report import Findings, publish
 from neuroprior.statistics import paired_difference
 
 Place = tuple[str, str, str, str, bool]
 """World, prior, what it sees, when it learns, whether the rest of the last plan is a candidate."""
+
+ABOUT = (
+    "Learning while living",
+    "Agents plan, execute, and learn from what they executed, while food is eaten and grows elsewhere: does it pay?",
+)
 
 COLORS = {"never": "#7d838c", "before": "#d9731a", "online": "#3079d8", "oracle": "#2e9e5b"}
 """Of lines, by when the prior learned."""
@@ -192,32 +196,11 @@ def write_report(cells: Cells, settings: Mapping[str, Any], folder: Path, consol
     """Print the tables; write `report.html`, `results.json`, `rows.csv`, `paired.csv` and a picture of each world."""
     rows, gaps = live_rows(cells), paired_rows(cells)
     about = {cell["world"]: cell for cell in cells}
-    made = [table(rows, gaps, world) for world in about]
-    for world, one in zip(about, made, strict=True):
-        console.print(printed(world, one))
-    said = [words(gaps, world) for world in about]
-    console.print("\n".join(said), highlight=False, markup=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, some in (("rows", rows), ("paired", gaps)):
-        if some:
-            write_csv(folder / f"{name}.csv", some)
-        else:
-            (folder / f"{name}.csv").unlink(missing_ok=True)  # of an earlier run
-    results = {"rows": rows, "paired": gaps, "words": said, "settings": dict(settings), "versions": versions()}
-    write_json(folder / "results.json", results)
+    found = Findings(rows, gaps, [words(gaps, world) for world in about], {w: table(rows, gaps, w) for w in about})
+    figures = Section("Food eaten against time", [], figures=[_box(cells, cell) for cell in about.values()])
+    publish(found, figures, ABOUT, settings, folder, console, command)
     for world in about:
         save(live_figure(cells, world), folder / f"{world}.png")
-    sections = [
-        Section("In plain words", said),
-        Section("Food eaten against time", [], figures=[_box(cells, cell) for cell in about.values()]),
-        Section("Tables", [], tables=made),
-    ]
-    shown = dict(settings) | {f"version: {name}": number for name, number in versions().items()}
-    lead = (
-        "Agents plan, execute, and learn from what they executed, while food is eaten and grows elsewhere: does it pay?"
-    )
-    write_page(folder / "report.html", Page("Learning while living", lead, command, shown, sections))
-    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _box(cells: Cells, cell: Mapping[str, Any]) -> FigureBox:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -200,24 +200,50 @@ def write_report(
     """
     rows, gaps = planner_rows(cells), paired_rows(cells, plain)
     worlds = list(dict.fromkeys(row["world"] for row in rows))
-    made = [table(rows, gaps, world, plain) for world in worlds]
-    for world, one in zip(worlds, made, strict=True):
+    made = {world: table(rows, gaps, world, plain) for world in worlds}
+    found = Findings(rows, gaps, [words(rows, gaps, world, plain) for world in worlds], made)
+    figures = Section("Share of the oracle against model steps", [], figures=list(_boxes(rows, cells, worlds)))
+    publish(found, figures, about, settings, folder, console, command)
+
+
+class Findings(NamedTuple):
+    """What a comparison of planners, or of agents, found.
+
+    Attributes:
+        rows, paired: of the files of that name.
+        words: a line a world.
+        tables: by world.
+    """
+
+    rows: Rows
+    paired: Rows
+    words: list[str]
+    tables: Mapping[str, Table]
+
+
+def publish(
+    found: Findings,
+    figures: Section,
+    about: tuple[str, str],
+    settings: Mapping[str, Any],
+    folder: Path,
+    console: Console,
+    command: str,
+) -> None:
+    """Print what was found, and write it; see `write_report`."""
+    for world, one in found.tables.items():
         console.print(printed(world, one))
-    said = [words(rows, gaps, world, plain) for world in worlds]
-    console.print("\n".join(said), highlight=False, markup=False)
+    console.print("\n".join(found.words), highlight=False, markup=False)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, some in (("rows", rows), ("paired", gaps)):
+    for name, some in (("rows", found.rows), ("paired", found.paired)):
         if some:
             write_csv(folder / f"{name}.csv", some)
         else:
             (folder / f"{name}.csv").unlink(missing_ok=True)  # of an earlier run
-    results = {"rows": rows, "paired": gaps, "words": said, "settings": dict(settings), "versions": versions()}
-    write_json(folder / "results.json", results)
-    sections = [
-        Section("In plain words", said),
-        Section("Share of the oracle against model steps", [], figures=list(_boxes(rows, cells, worlds))),
-        Section("Tables", [], tables=made),
-    ]
+    results = {"rows": found.rows, "paired": found.paired, "words": found.words}
+    write_json(folder / "results.json", results | {"settings": dict(settings), "versions": versions()})
+    tables = Section("Tables", [], tables=list(found.tables.values()))
+    sections = [Section("In plain words", found.words), figures, tables]
     shown = dict(settings) | {f"version: {name}": number for name, number in versions().items()}
     write_page(folder / "report.html", Page(*about, command, shown, sections))
     console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.planners import Decision, Execution, Planner
+from neuroprior.planners.collect import executed, observed
 from neuroprior.planners.execution import Change, follow, joined
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
@@ -160,18 +161,11 @@ class Agent:
     def _remember(self, done: Execution) -> None:
         """Put a plan that was executed from the state `before` into the replay."""
         before = torch.cat([self.before[:, None], done.states[:, :-1]], 1)
-        flat = before.flatten(0, 1)
-        here = ~self.world.is_over(flat).view(before.shape[:2])
-        lengths = here.long().cumprod(1).sum(1)
+        lengths = executed(self.world, before)
         kept = lengths > 0
         if self.above is not None:
             kept &= done.rewards.sum(1) > self.above
-        seen = None
-        if self.prior.context_per == "plan":
-            seen = self.world.observe(self.before)
-        elif self.prior.context_per == "step":
-            seen = self.world.observe(flat)
-            seen = seen.view(*before.shape[:2], *seen.shape[1:])
+        seen = observed(self.world, before, self.prior.context_per)
         plans = Plans(done.actions, self.world.num_actions, lengths, self.world.action_names, seen)
         if kept.any():
             self.replay.add(plans[kept])

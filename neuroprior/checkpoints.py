@@ -15,7 +15,7 @@ from safetensors.torch import save as write_tensors
 from torch import Tensor
 
 from neuroprior.agent import Agent
-from neuroprior.output import write_whole
+from neuroprior.output import read_json, write_whole
 from neuroprior.planners import Decision, Execution
 from neuroprior.plans import Plans
 from neuroprior.priors import folders
@@ -41,7 +41,8 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     before = _read(folder / "agent.json") if (folder / "agent.json").exists() else {}
     partial = folders.save(agent.prior, folder / f".prior.{os.getpid()}.partial")
-    prior = f"prior-{_digest(partial)[:16]}"
+    of_prior = _digest(partial)
+    prior = f"prior-{of_prior[:16]}"
     if (folder / prior).exists():  # the same, saved before
         shutil.rmtree(partial)
     else:
@@ -51,7 +52,7 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
     weights = f"agent-{digest[:16]}.safetensors"
     write_whole(folder / weights, data)
     told = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent)}
-    told |= {"prior": prior, "prior_sha256": _digest(folder / prior), "weights": weights, "sha256": digest}
+    told |= {"prior": prior, "prior_sha256": of_prior, "weights": weights, "sha256": digest}
     told |= {"recent": [done.model_steps for done in agent.recent]}
     write_whole(folder / "agent.json", (json.dumps(told, indent=2) + "\n").encode())
     if before and before["weights"] != weights:
@@ -146,10 +147,7 @@ def _take(agent: Agent, tensors: dict[str, Tensor], steps: Sequence[int]) -> Non
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not JSON ({error})") from error
+    told = read_json(path)
     if not isinstance(told, dict) or told.get("format") != FORMAT or told.get("version") != VERSION:
         raise ValueError(f'{path}: not a checkpoint of an agent ("format": "{FORMAT}", "version": {VERSION})')
     kinds = {

@@ -51,36 +51,48 @@ def collect(
         state = world.reset(num_plans, generator)
     plan, score, _, _, lengths = planner.plan(world, state, generator)
     course = _course(world, state, plan, generator)
-    lengths = _executed(world, course, lengths)
+    lengths = _lengths(world, course, lengths)
     if above is not None:
         kept = score > above
         if not kept.any():
             most = f"; the best {float(score.max())}" if len(score) else ""
             raise ValueError(f"above: none of {len(state)} plans scored more than {above}{most}")
         plan, state, lengths = plan[kept], state[kept], None if lengths is None else lengths[kept]
-        course = [before[kept] for before in course]
-    seen = None
+        course = course[kept]
     if context is not None and sees_each_step(world.observe(state[:1])):
         raise ValueError("observe: indices [N] or floating point features [N, C] are expected of a world")
-    if context == "plan":
-        seen = world.observe(state)
-    elif context == "step":
-        seen = torch.stack([world.observe(before) for before in course], 1)
+    seen = observed(world, course, context)
     return Plans(plan, world.num_actions, lengths, world.action_names, seen, world.group(state))
 
 
-def _course(world: World, state: Tensor, plan: Tensor, generator: torch.Generator | None) -> list[Tensor]:
-    """The states `[N, ...]` before each action of `plan [N, L]`; with chance, of one course of events."""
+def observed(world: World, course: Tensor, context: Literal["plan", "step"] | None) -> Tensor | None:
+    """What is seen along `course [N, L, ...]`, the states before each action: at the start, in each, or None."""
+    if context is None:
+        return None
+    if context == "plan":
+        return world.observe(course[:, 0])
+    seen = world.observe(course.flatten(0, 1))
+    return seen.view(*course.shape[:2], *seen.shape[1:])
+
+
+def executed(world: World, course: Tensor) -> Tensor:
+    """How many actions are executed along `course [N, L, ...]`, the states before each, until it is over: `[N]`."""
+    here = ~world.is_over(course.flatten(0, 1)).view(course.shape[:2])
+    return here.long().cumprod(1).sum(1)
+
+
+def _course(world: World, state: Tensor, plan: Tensor, generator: torch.Generator | None) -> Tensor:
+    """The states `[N, L, ...]` before each action of `plan [N, L]`; with chance, of one course of events."""
     course = []
     for t in range(plan.shape[1]):
         course.append(state)
         state, _ = world.step(state, plan[:, t].long(), generator)
-    return course
+    return torch.stack(course, 1)
 
 
-def _executed(world: World, course: list[Tensor], lengths: Tensor | None) -> Tensor | None:
-    """How many actions of each plan are executed `[N]`: none after it is over; None: all."""
-    executed = torch.stack([~world.is_over(before) for before in course]).sum(0)
+def _lengths(world: World, course: Tensor, lengths: Tensor | None) -> Tensor | None:
+    """How many actions of each plan of `lengths` are executed `[N]`; None: all."""
+    taken = executed(world, course)
     if lengths is not None:
-        return torch.minimum(executed, lengths)
-    return executed if bool((executed < len(course)).any()) else None
+        return torch.minimum(taken, lengths)
+    return taken if bool((taken < course.shape[1]).any()) else None

@@ -96,16 +96,7 @@ class CrossEntropyPlanner(SamplingPlanner):
         for k in range(self.rounds):
             proposer = _Refitted(self.prior, counts, self.order, self.strength, self.temperature)
             number = self.num_plans * (k + 1) // self.rounds - self.num_plans * k // self.rounds
-            drawn = SamplingPlanner(
-                proposer,
-                self.length,
-                number,
-                objective=self.objective,
-                discount=self.discount,
-                value=self.value,
-                any_prefix=self.any_prefix,
-                num_rollouts=self.num_rollouts,
-            )
+            drawn = self.like(proposer, self.length, number)
             found.append(drawn.tried(world, state, generator))
             plans, score, ends = (torch.cat(parts, 1) for parts in zip(*found, strict=True))
             counts = self._counted(plans, score, counts, generator)

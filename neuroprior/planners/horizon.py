@@ -95,17 +95,7 @@ class HorizonPlanner(SamplingPlanner):
 
     def _found(self, world: World, state: Tensor, depth: int, number: int, generator: torch.Generator) -> "_Found":
         """What `number` plans of `depth` actions find."""
-        planner = SamplingPlanner(
-            self.prior,
-            depth,
-            number,
-            objective=self.objective,
-            discount=self.discount,
-            value=self.value,
-            any_prefix=True,
-            temperature=self.temperature,
-            num_rollouts=self.num_rollouts,
-        )
+        planner = self.like(self.prior, depth, number, self.temperature)
         plans, score, ends = planner.tried(world, state, generator)
         best = decide(plans, score, ends, 0, generator)
         # Up to each horizon a plan scores what its best beginning does.

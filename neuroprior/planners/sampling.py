@@ -80,6 +80,20 @@ class SamplingPlanner(Planner):
 
         return in_chunks(some, state, self._steps(world))
 
+    def like(self, prior: Proposer, length: int, num_plans: int, temperature: float = 1.0) -> "SamplingPlanner":
+        """A plain sampler of other plans, which scores them as this planner does."""
+        return SamplingPlanner(
+            prior,
+            length,
+            num_plans,
+            objective=self.objective,
+            discount=self.discount,
+            value=self.value,
+            any_prefix=self.any_prefix,
+            temperature=temperature,
+            num_rollouts=self.num_rollouts,
+        )
+
     def _steps(self, world: World) -> int:
         """Simulator steps for each start."""
         if not world.stochastic:

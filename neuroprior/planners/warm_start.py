@@ -97,11 +97,16 @@ def with_rest(
         return decide(both, score, ends, steps + 2 * num_rollouts * length, generator, allowed)
     score, ends = planner.scored(rollout if planner.any_prefix else rollout._replace(states=None))
     other = decide(plans, score, ends, steps, generator)
-    chosen = random_best(torch.stack([decision.score, other.score.to(decision.score)], 1), generator) == 1
+    return _better(decision, other, generator)._replace(model_steps=steps)
+
+
+def _better(first: Decision, second: Decision, generator: torch.Generator) -> Decision:
+    """Of two decisions for the same states, for each that which scores more; of equals a random one."""
+    takes = random_best(torch.stack([first.score, second.score.to(first.score)], 1), generator) == 1
     parts = []
-    for one, two in zip(decision[:3], other[:3], strict=True):
-        parts.append(torch.where(chosen.view(-1, *[1] * (one.dim() - 1)), two.to(one.dtype), one))
+    for one, two in zip(first[:3], second[:3], strict=True):
+        parts.append(torch.where(takes.view(-1, *[1] * (one.dim() - 1)), two.to(one.dtype), one))
     lengths = None
-    if decision.lengths is not None and other.lengths is not None:
-        lengths = torch.where(chosen, other.lengths, decision.lengths)
-    return Decision(parts[0], parts[1], parts[2], steps, lengths)
+    if first.lengths is not None and second.lengths is not None:
+        lengths = torch.where(takes, second.lengths, first.lengths)
+    return Decision(parts[0], parts[1], parts[2], first.model_steps, lengths)

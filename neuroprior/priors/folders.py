@@ -11,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as read_tensors
 from safetensors.torch import save as write_tensors
 
+from neuroprior.output import read_json
 from neuroprior.priors.prior import Prior
 
 FILES = ("model.safetensors", "config.json")
@@ -92,10 +93,7 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not JSON ({error})") from error
+    config = read_json(path)
     if not isinstance(config, dict) or config.get("format") != FORMAT:
         raise ValueError(f'{path}: not the configuration of a saved prior ("format": "{FORMAT}" is missing)')
     if config.get("version") != VERSION:
