@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from neuroprior.program import run_program
+from neuroprior.cli.program import run_program
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -16,22 +16,22 @@ def _run(arguments: Sequence[str]) -> None:
     # Imported here, so that Ctrl-C is answered while the libraries load too.
     from jsonargparse import ArgumentError, ArgumentParser
 
-    from eval.bench import LISTS as BENCH_LISTS
-    from eval.bench import bench
-    from eval.compare import LISTS as COMPARE_LISTS
-    from eval.compare import compare
-    from eval.depth import LISTS as DEPTH_LISTS
-    from eval.depth import depth
-    from eval.grow import LISTS as GROW_LISTS
-    from eval.grow import grow
-    from eval.live import LISTS as LIVE_LISTS
-    from eval.live import live
-    from eval.mice import LISTS as MICE_LISTS
-    from eval.mice import mice
-    from eval.paper import paper
-    from eval.plans import LISTS as PLANS_LISTS
-    from eval.plans import plans
-    from eval.quality import quality
+    from eval.bench.command import LISTS as BENCH_LISTS
+    from eval.bench.command import bench
+    from eval.compare.command import LISTS as COMPARE_LISTS
+    from eval.compare.command import compare
+    from eval.compare.depth import LISTS as DEPTH_LISTS
+    from eval.compare.depth import depth
+    from eval.compare.growth import LISTS as GROW_LISTS
+    from eval.compare.growth import grow
+    from eval.live.command import LISTS as LIVE_LISTS
+    from eval.live.command import live
+    from eval.mice.command import LISTS as MICE_LISTS
+    from eval.mice.command import mice
+    from eval.paper.command import paper
+    from eval.quality.command import quality
+    from neuroprior.report.report import LISTS as PLANS_LISTS
+    from neuroprior.report.report import plans
 
     about = "Compare behavioural priors. Dashes and underscores in option names are the same."
     parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False, allow_abbrev=True)

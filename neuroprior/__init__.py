@@ -1,8 +1,8 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
 
-from neuroprior.agent import Agent
-from neuroprior.checkpoints import restore_agent, save_agent
-from neuroprior.distinct import Distinct, most_probable, sample_distinct, sample_distinct_in_world
+from neuroprior._version import __version__
+from neuroprior.agents.agent import Agent
+from neuroprior.agents.checkpoints import restore_agent, save_agent
 from neuroprior.planners import (
     CrossEntropyPlanner,
     Decision,
@@ -11,15 +11,15 @@ from neuroprior.planners import (
     ExhaustivePlanner,
     ForagingOracle,
     FrontierPlanner,
-    Growth,
     HorizonPlanner,
+    HorizonRound,
     MCTSPlanner,
     Planner,
     SamplingPlanner,
     collect,
     execute,
     expected_score,
-    grow,
+    extend_horizon,
     oracle,
 )
 from neuroprior.plans import Plans, read_plans, write_plans
@@ -38,7 +38,8 @@ from neuroprior.priors import (
     load,
     save,
 )
-from neuroprior.sampling import sample, sample_in_world
+from neuroprior.sampling.ancestral import sample, sample_in_world
+from neuroprior.sampling.distinct import Distinct, most_probable, sample_distinct, sample_distinct_in_world
 from neuroprior.worlds import (
     EpisodicWorld,
     ForagingWorld,
@@ -58,9 +59,8 @@ from neuroprior.worlds import (
     patches,
 )
 
-__version__ = "0.1.0"
-
 __all__ = [
+    "__version__",
     "Agent",
     "ContextTreePrior",
     "CrossEntropyPlanner",
@@ -75,7 +75,7 @@ __all__ = [
     "FrontierPlanner",
     "GRUPrior",
     "GridWorld",
-    "Growth",
+    "HorizonRound",
     "HorizonPlanner",
     "MCTSPlanner",
     "Macro",
@@ -102,7 +102,7 @@ __all__ = [
     "four_rooms",
     "from_gymnasium",
     "gridworld",
-    "grow",
+    "extend_horizon",
     "labyrinth",
     "learn_macros",
     "load",

@@ -19,7 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from neuroprior.randomness import generator_on
+from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 
 
@@ -74,7 +74,7 @@ def q_learning(
     device, size = world.device, (num_agents, world.num_states, world.num_actions)
     values = torch.rand(size, generator=generator, device=device, dtype=torch.float64) * initial_scale
     values[:, goal] = 1 / discount
-    values.masked_fill_(~world.legal(torch.arange(world.num_states, device=device)), -torch.inf)
+    values.masked_fill_(~world.legal_actions(torch.arange(world.num_states, device=device)), -torch.inf)
     agent = torch.arange(num_agents, device=device)
     cell = _other_cells(goal, world.num_states, num_agents, generator)
     for step in range(steps):
@@ -157,7 +157,7 @@ def _action_rewards(world: TabularWorld, none: bool) -> Tensor:
     """The reward of each action in each cell, `[W, S, A]` float64, or 0 `[1, S, A]`; -inf where it is not legal."""
     shape = 1, world.num_states, world.num_actions
     rewards = (world.reward.new_zeros(shape) if none else world.mean_reward()).double()
-    legal = world.legal(torch.arange(world.num_states, device=world.device))
+    legal = world.legal_actions(torch.arange(world.num_states, device=world.device))
     for where in (rewards.isinf() & legal).nonzero().tolist()[:1]:
         raise ValueError(f"world: the reward of [map, cell, action] {where} is infinite; values need finite ones")
     return rewards.masked_fill(~legal, -torch.inf)
@@ -185,7 +185,7 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
     _require(not world.stochastic, "world", "one without chance", "one in which no plan is sure of where it leads")
     _require(length >= 0, "length", "a number of steps that is not negative", length)
     cells = torch.arange(world.num_states, device=world.device)
-    ends, legal = cells == goal, world.legal(cells)
+    ends, legal = cells == goal, world.legal_actions(cells)
     for _ in range(length):
         one_more = (ends[world.next_state] & legal).any(1)
         ends = ends | one_more if within else one_more

@@ -5,7 +5,7 @@ import torch
 
 from neuroprior.values import network_approximation, tile_approximation, value_iteration
 from neuroprior.worlds import gridworld
-from tests.sources import seeded
+from tests.support.sources import seeded
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import torch
 
 from neuroprior.values import network_approximation, q_learning, value_iteration
 from neuroprior.worlds import TabularWorld, gridworld
-from tests.sources import corridor, seeded
+from tests.support.sources import corridor, seeded
 
 GRID = gridworld(3, 3)
 

@@ -5,7 +5,7 @@ import torch
 
 from neuroprior.values import can_reach, value_iteration
 from neuroprior.worlds import TabularWorld, gridworld
-from tests.sources import CORRIDOR, corridor, distances, every_plan, seeded
+from tests.support.sources import CORRIDOR, corridor, distances, every_plan, seeded
 
 GRID = gridworld(3, 3)
 

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from neuroprior.program import run_program
+from neuroprior.cli.program import run_program
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -13,7 +13,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> None:
     # Imported here, so that Ctrl-C is answered while the libraries load too.
-    from train.cli import run
+    from neuroprior.cli.fit import run
 
     run(list(arguments))
 

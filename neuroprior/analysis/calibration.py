@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuroprior.statistics import Interval, ratio_difference, share_interval
-from neuroprior.worlds.world import check_range, check_sizes, is_integer
+from neuroprior._checks import check_range, check_sizes, is_integer
+from neuroprior.analysis.statistics import Interval, ratio_difference, share_interval
 
 UNITS = 997
 """Independent units kept apart: those whose numbers are alike modulo this prime are one."""
@@ -82,14 +82,14 @@ def reliability(log_probs: Tensor, actions: Tensor, unit: Tensor, bins: int = 10
     """How often actions were taken that had been forecast with a probability of about 0.05, 0.15, ... 0.95.
 
     Each place and action counts as one forecast, in `bins` bins of equal width (DeGroot and Fienberg 1983, reliability
-    diagrams). The share of a bin has the interval of a ratio over units (`neuroprior.statistics.ratio_difference`); a
+    diagrams). The share of a bin has the interval of a ratio over units (`neuroprior.analysis.statistics.ratio_difference`); a
     share of 0 or 1, which has no spread, has Wilson's, with units for trials.
 
     Args:
         log_probs: floating point `[M, A]`, nats: the log-probabilities of all actions at M places, such as
             `prior(plans.actions).log_softmax(-1)[plans.mask()]`.
         actions: integers `[M]`: what was taken.
-        unit: integers `[M]`: the independent unit of each place (see `neuroprior.comparison.units`). Those alike modulo
+        unit: integers `[M]`: the independent unit of each place (see `neuroprior.analysis.comparison.units`). Those alike modulo
             `UNITS` are one, so number few units from 0.
         bins: number of bins.
 

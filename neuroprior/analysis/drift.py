@@ -8,12 +8,12 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
+from neuroprior.analysis.comparison import units
 from neuroprior.analysis.ranks import FEWEST_RANKED, mean_correlation, rank_correlation
-from neuroprior.comparison import units
+from neuroprior.analysis.statistics import Difference, Interval, holm, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
-from neuroprior.statistics import Difference, Interval, holm, ratio_difference
-from neuroprior.worlds.world import check_sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class PositionDrift:
 class PlanDrift:
     """Bits per action of each plan, in the order of the file within its group; groups in the order of their first plan.
 
-    A single plan is cut in `neuroprior.comparison.BLOCKS` parts, which stand for plans (`item` is "parts").
+    A single plan is cut in `neuroprior.analysis.comparison.BLOCKS` parts, which stand for plans (`item` is "parts").
 
     Attributes:
         item: "plans" or "parts".
@@ -83,7 +83,7 @@ class ActionDrift:
         action: its number.
         first, second: its share of the actions of the halves.
         change: the second less the first, with its 95 % interval over units and the p-value of 0.
-        corrected: that p-value, corrected for the number of actions (`neuroprior.statistics.holm`).
+        corrected: that p-value, corrected for the number of actions (`neuroprior.analysis.statistics.holm`).
     """
 
     action: int
@@ -108,12 +108,12 @@ def by_position(plans: Plans, bits: Tensor, mask: Tensor, parts: int = 10) -> Po
     """How the cost of actions changes from the beginning to the end of plans.
 
     The trend is the common least-squares slope of bits on the place in the plan, from 0 to 1, each plan about its own
-    means; its error is that of a ratio over units (`neuroprior.statistics.ratio_difference`), which units of the same
-    length weigh alike. Units are those of `neuroprior.comparison.units`, so a single long plan has a trend too.
+    means; its error is that of a ratio over units (`neuroprior.analysis.statistics.ratio_difference`), which units of the same
+    length weigh alike. Units are those of `neuroprior.analysis.comparison.units`, so a single long plan has a trend too.
 
     Args:
         plans: the plans.
-        bits: floating point `[N, L]`: what each action costs, such as `neuroprior.comparison.action_bits` of a prior
+        bits: floating point `[N, L]`: what each action costs, such as `neuroprior.analysis.comparison.action_bits` of a prior
             that has not learned from these plans.
         mask: bool `[N, L]`: the actions that count (held out), none beyond a plan's end.
         parts: into how many parts of its length each plan is cut. Short plans have actions in some of them only.

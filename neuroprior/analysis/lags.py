@@ -7,12 +7,12 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from neuroprior.comparison import Score, action_bits, unit_name, units
-from neuroprior.plans import Plans, sees_each_step
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
+from neuroprior.analysis.comparison import Score, action_bits, unit_name, units
+from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors import Prior
-from neuroprior.randomness import generator_on
-from neuroprior.worlds.world import check_sizes
 
 MOST_BLOCKS = 200
 """Units beyond this number are taken together in so many blocks, for the jackknife."""
@@ -59,7 +59,7 @@ def mutual_information(
     The bias of the counts is taken off, and the interval made, by a jackknife (for units of unlike size: Busing, Meijer
     and van der Leeden 1999, Delete-m jackknife for unequal m). That of the bias leaves out plan by plan, or one of
     `BLOCKS` consecutive parts where there are fewer plans; unlike the correction of Miller and Madow it holds where
-    successive pairs depend on each other. That of the interval leaves out the units of `neuroprior.comparison.units`,
+    successive pairs depend on each other. That of the interval leaves out the units of `neuroprior.analysis.comparison.units`,
     at most `MOST_BLOCKS` blocks of them. Where the actions are independent, twice the number of pairs times the
     information (in nats) is chi-square distributed but for a factor, which the bias tells (Rao and Scott 1981): from
     that comes `chance`. With fewer than `ENOUGH_PAIRS` pairs per degree of freedom, (A - 1)**2, some bias is left:
@@ -201,7 +201,7 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
     step = start[:, None] + torch.arange(length, device=device)
     context = plans.context
     if context is not None:
-        context = context[plan[:, None], step] if sees_each_step(context) else context[plan]
+        context = context[plan[:, None], step] if is_per_step(context) else context[plan]
     grouped = plans.group is not None and unit_name(plans, start_here) == "groups"
     return replace(
         plans,

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy import sparse
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
+from neuroprior.analysis.statistics import holm
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS
-from neuroprior.randomness import generator_on
-from neuroprior.statistics import holm
-from neuroprior.worlds.world import check_sizes
 
 ORDERS = range(1, 5)
 """Lengths of the n-grams that are compared."""
@@ -53,7 +53,7 @@ class Likeness:
         distance: the total variation between the two distributions, 0 (alike) to 1 (nothing in common).
         chance: the mean distance of two such sets from one source.
         p_value: of both being from one source.
-        corrected: the same, corrected for the number of statistics (`neuroprior.statistics.holm`).
+        corrected: the same, corrected for the number of statistics (`neuroprior.analysis.statistics.holm`).
         permutations: how many were made.
         classes: of n-grams the actions of the `MOST_SHOWN` most frequent ones (in the mean of both distributions); else
             (1,), (2,), ... steps, of which the last, `LONGEST` + 1, stands for all that are longer.

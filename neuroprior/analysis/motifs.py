@@ -11,10 +11,10 @@ from scipy import stats
 from scipy.special import xlogy
 from torch import Tensor
 
+from neuroprior.analysis.comparison import units
 from neuroprior.analysis.hypergeometric import two_sided
 from neuroprior.analysis.windows import Line
 from neuroprior.analysis.words import Windows, Words, candidates, middles
-from neuroprior.comparison import units
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_range, is_integer
 from neuroprior.analysis.windows import Line, ranks
-from neuroprior.plans import Plans, sees_each_step
-from neuroprior.worlds.world import check_range, is_integer
+from neuroprior.plans import Plans, is_per_step
 
 
 @dataclass(frozen=True)
@@ -97,4 +97,4 @@ def _context(plans: Plans, line: Line, num_contexts: int) -> Tensor:
         found = "none" if plans.context is None else str(plans.context.dtype).removeprefix("torch.")
         raise ValueError(f"context: indices below {num_contexts} are expected, not {found}")
     check_range("context", plans.context, num_contexts, "contexts")
-    return plans.context.flatten()[line.place if sees_each_step(plans.context) else line.plan].long()
+    return plans.context.flatten()[line.place if is_per_step(plans.context) else line.plan].long()

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from neuroprior.statistics import Difference, ratio_difference
+from neuroprior.analysis.statistics import Difference, ratio_difference
 
 FEWEST_RANKED = 3
 """Values without which there is no correlation to test."""

@@ -8,10 +8,10 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from neuroprior._random import generator_on
+from neuroprior.analysis.statistics import holm
 from neuroprior.analysis.windows import Line
 from neuroprior.plans import Plans
-from neuroprior.randomness import generator_on
-from neuroprior.statistics import holm
 
 FEWEST_PERMUTATIONS = 99
 """Permutations that are made whatever they cost."""

@@ -8,8 +8,8 @@ from neuroprior.planners.exhaustive import ExhaustivePlanner
 from neuroprior.planners.expected import expected_score
 from neuroprior.planners.foraging import ForagingOracle
 from neuroprior.planners.frontier import FrontierPlanner
-from neuroprior.planners.growth import Growth, grow
 from neuroprior.planners.horizon import HorizonPlanner
+from neuroprior.planners.horizon_curriculum import HorizonRound, extend_horizon
 from neuroprior.planners.mcts import MCTSPlanner
 from neuroprior.planners.oracle import oracle
 from neuroprior.planners.planner import Decision, Planner
@@ -23,7 +23,7 @@ __all__ = [
     "ExhaustivePlanner",
     "ForagingOracle",
     "FrontierPlanner",
-    "Growth",
+    "HorizonRound",
     "HorizonPlanner",
     "MCTSPlanner",
     "Planner",
@@ -31,6 +31,6 @@ __all__ = [
     "collect",
     "execute",
     "expected_score",
-    "grow",
+    "extend_horizon",
     "oracle",
 ]

@@ -6,9 +6,9 @@ from math import ceil, log2
 import torch
 from torch import Tensor
 
+from neuroprior._random import draw_seed
 from neuroprior.planners import planner as limits
 from neuroprior.planners.planner import Planner, random_top
-from neuroprior.randomness import draw_seed
 from neuroprior.worlds.world import World
 
 

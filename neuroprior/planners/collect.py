@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.planners.planner import Planner
-from neuroprior.plans import Plans, sees_each_step
+from neuroprior.plans import Plans, is_per_step
 from neuroprior.worlds.world import World
 
 
@@ -17,7 +17,7 @@ def collect(
     *,
     state: Tensor | None = None,
     context: Literal["plan", "step"] | None = None,
-    above: float | None = None,
+    min_score: float | None = None,
     generator: torch.Generator | None = None,
 ) -> Plans:
     """Plan from many starts and keep the plans that were chosen.
@@ -29,16 +29,16 @@ def collect(
         state: or plan from these, `[N, ...]`.
         context: what is recorded beside the plans: "plan": `world.observe` of the start; "step": of the state before
             each action; None: nothing.
-        above: keep only the plans whose score is higher: those that led somewhere, where most do not. None: all.
+        min_score: keep only the plans whose score is higher: those that led somewhere, where most do not. None: all.
         generator: draws the starts and whatever the planner draws.
 
     Returns:
-        N plans, fewer with `above`, each up to where it was over (`World.is_over`). In a table of several worlds, the
+        N plans, fewer with `min_score`, each up to where it was over (`World.terminated`). In a table of several worlds, the
         world is the plan's group, see `World.group`.
 
     Raises:
         ValueError: neither or both of `num_plans` and `state` are given, one is out of range, or no plan scored more
-            than `above`.
+            than `min_score`.
     """
     if (num_plans is None) == (state is None):
         raise ValueError("collect: give either num_plans or state")
@@ -52,14 +52,14 @@ def collect(
     plan, score, _, _, lengths = planner.plan(world, state, generator)
     course = _course(world, state, plan, generator)
     lengths = _lengths(world, course, lengths)
-    if above is not None:
-        kept = score > above
+    if min_score is not None:
+        kept = score > min_score
         if not kept.any():
             most = f"; the best {float(score.max())}" if len(score) else ""
-            raise ValueError(f"above: none of {len(state)} plans scored more than {above}{most}")
+            raise ValueError(f"min_score: none of {len(state)} plans scored more than {min_score}{most}")
         plan, state, lengths = plan[kept], state[kept], None if lengths is None else lengths[kept]
         course = course[kept]
-    if context is not None and sees_each_step(world.observe(state[:1])):
+    if context is not None and is_per_step(world.observe(state[:1])):
         raise ValueError("observe: indices [N] or floating point features [N, C] are expected of a world")
     seen = observed(world, course, context)
     return Plans(plan, world.num_actions, lengths, world.action_names, seen, world.group(state))
@@ -77,7 +77,7 @@ def observed(world: World, course: Tensor, context: Literal["plan", "step"] | No
 
 def executed(world: World, course: Tensor) -> Tensor:
     """How many actions are executed along `course [N, L, ...]`, the states before each, until it is over: `[N]`."""
-    here = ~world.is_over(course.flatten(0, 1)).view(course.shape[:2])
+    here = ~world.terminated(course.flatten(0, 1)).view(course.shape[:2])
     return here.long().cumprod(1).sum(1)
 
 

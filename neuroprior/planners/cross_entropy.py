@@ -6,12 +6,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
 from neuroprior.planners.planner import Decision, decide, in_chunks, random_top
 from neuroprior.planners.sampling import Proposer, SamplingPlanner
-from neuroprior.priors.packing import pack, unpack
+from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.prior import Prior
-from neuroprior.sampling import sample
-from neuroprior.worlds.world import World, check_sizes
+from neuroprior.sampling.ancestral import sample
+from neuroprior.worlds.world import World
 
 MOST_COUNTS = 2**22
 """Numbers in the counts of a start."""

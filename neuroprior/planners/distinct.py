@@ -6,13 +6,14 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.distinct import try_distinct
-from neuroprior.draws import check_temperature
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks
 from neuroprior.priors.prior import Prior
-from neuroprior.randomness import generator_on
-from neuroprior.sampling import check_in_world
-from neuroprior.worlds.world import World, check_sizes
+from neuroprior.sampling.ancestral import check_in_world
+from neuroprior.sampling.distinct import try_distinct
+from neuroprior.sampling.draws import check_temperature
+from neuroprior.worlds.world import World
 
 
 class DistinctPlanner(Planner):

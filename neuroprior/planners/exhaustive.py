@@ -6,10 +6,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from neuroprior._random import generator_on
 from neuroprior.planners.chance import check_rollouts, mean_scores
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks, random_best
 from neuroprior.plans import action_dtype, all_plans
-from neuroprior.randomness import generator_on
 from neuroprior.worlds.world import World
 
 MOST_PLANS = 2**24
@@ -72,7 +72,7 @@ class ExhaustivePlanner(Planner):
         found = []  # of each depth at which a plan may end: scores, states and, unless all are, legality, [B, A**depth]
         for depth in range(1, self.depth + 1):
             if not world.all_legal:
-                legal = (legal[:, None] & world.legal(now)).flatten()
+                legal = (legal[:, None] & world.legal_actions(now)).flatten()
             now, reward = world.step(_for_each(actions, now), every.repeat(len(now)), generator)
             # A terminal score looks at nothing before the last reward.
             before = _for_each(actions, rewards if self.objective == "return" else rewards[:, :0])

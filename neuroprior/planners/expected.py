@@ -6,9 +6,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_range
 from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.worlds.tabular import TabularWorld
-from neuroprior.worlds.world import check_plans, check_range
+from neuroprior.worlds.world import check_plans
 
 NUMBERS_AT_ONCE = 2**22
 """Outcomes (plans x cells x outcomes of an action) that are looked at together; bounds memory."""

@@ -3,11 +3,12 @@
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
 from neuroprior.plans import action_dtype
-from neuroprior.randomness import generator_on
 from neuroprior.worlds.foraging import ForagingWorld
-from neuroprior.worlds.world import World, check_sizes
+from neuroprior.worlds.world import World
 
 MOST_ITEMS = 12
 
@@ -52,7 +53,7 @@ class ForagingOracle(Planner):
         left = (state[:, 2:] < world.num_places).long() @ bits
         for values in reversed(arriving):
             found = values[world.table.next_state[now[:, 0]], row[:, None], left[:, None]]
-            plan.append(random_best(found, generator, world.legal(now)))
+            plan.append(random_best(found, generator, world.legal_actions(now)))
             now, _ = world.step(now, plan[-1])
             left = left & ~there[row, now[:, 0]]
         plans = torch.stack(plan, 1)

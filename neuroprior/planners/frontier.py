@@ -6,15 +6,16 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior.beams import children, origins
-from neuroprior.codes import row_codes
-from neuroprior.draws import check_temperature
+from neuroprior._checks import check_sizes
+from neuroprior._hashing import row_hashes
+from neuroprior._random import generator_on, gumbel
 from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
 from neuroprior.plans import action_dtype
 from neuroprior.priors.prior import Prior
-from neuroprior.randomness import generator_on, gumbel
-from neuroprior.sampling import advance, check_in_world, start_in_world
-from neuroprior.worlds.world import World, check_sizes
+from neuroprior.sampling.ancestral import advance, check_in_world, start_in_world
+from neuroprior.sampling.beams import children, origins
+from neuroprior.sampling.draws import check_temperature
+from neuroprior.worlds.world import World
 
 
 class FrontierPlanner(Planner):
@@ -106,7 +107,7 @@ class FrontierPlanner(Planner):
     ) -> tuple["_Front", Tensor, Tensor]:
         """The continuations that are tried, and of each, in one line, which row it goes on from and by which action."""
         if not world.all_legal:
-            logits = logits.masked_fill(~world.legal(front.state), -torch.inf)
+            logits = logits.masked_fill(~world.legal_actions(front.state), -torch.inf)
         log_prob = children(front.log_prob.view(-1, 1), logits, self.temperature)
         log_prob = log_prob.view(len(front.log_prob), front.log_prob.shape[1] * world.num_actions)
         height = gumbel(log_prob, generator) if self.noise else log_prob
@@ -151,7 +152,7 @@ class _Front(NamedTuple):
 
     def merged(self, gained: Tensor | None) -> "_Front":
         """Of plans in one state that which has `gained [B, K]` most, else the most probable, stands for all of them."""
-        code = row_codes(self.state).view_as(self.log_prob)
+        code = row_hashes(self.state).view_as(self.log_prob)
         # By state, then by what was gained, then by probability: the first of each state stands for it.
         order = self.log_prob.argsort(dim=1, descending=True, stable=True)
         if gained is not None:

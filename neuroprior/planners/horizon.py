@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, decide, in_chunks
 from neuroprior.planners.sampling import Proposer, SamplingPlanner
-from neuroprior.randomness import generator_on
-from neuroprior.sampling import check_in_world
-from neuroprior.worlds.world import World, check_sizes
+from neuroprior.sampling.ancestral import check_in_world
+from neuroprior.worlds.world import World
 
 POOLED = 4.0
 """The scores from all starts together count as so many of each start's own."""

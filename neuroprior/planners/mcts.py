@@ -6,12 +6,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.draws import Draw, check_temperature
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks, random_best
 from neuroprior.priors.prior import Prior
-from neuroprior.randomness import generator_on
-from neuroprior.sampling import advance, check_in_world, start_in_world
-from neuroprior.worlds.world import Rollout, World, check_sizes
+from neuroprior.sampling.ancestral import advance, check_in_world, start_in_world
+from neuroprior.sampling.draws import Draw, check_temperature
+from neuroprior.worlds.world import Rollout, World
 
 
 class MCTSPlanner(Planner):
@@ -126,7 +127,7 @@ class _Search:
         columns: tuple[list[Tensor], ...] = ([], [], [])  # actions, rewards and states after each step
         for t in range(length):
             if not self.world.all_legal:
-                legal = self.world.legal(now)
+                legal = self.world.legal_actions(now)
                 logits = logits.masked_fill(~legal, -torch.inf)
                 if (logits == -torch.inf).all(1).any():
                     raise ValueError("prior: it gives none of the actions that exist somewhere a probability above 0")

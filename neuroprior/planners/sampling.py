@@ -6,11 +6,11 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from neuroprior.draws import check_temperature
+from neuroprior._random import generator_on
 from neuroprior.planners.chance import check_rollouts, halved_scores, halving, mean_scores
 from neuroprior.planners.planner import Decision, Planner, decide, in_chunks
-from neuroprior.randomness import generator_on
-from neuroprior.sampling import Steppable, check_in_world, sample_in_world
+from neuroprior.sampling.ancestral import Steppable, check_in_world, sample_in_world
+from neuroprior.sampling.draws import check_temperature
 from neuroprior.worlds.world import Rollout, World
 
 

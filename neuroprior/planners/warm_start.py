@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
-from neuroprior.draws import Draw
+from neuroprior._random import generator_on
 from neuroprior.planners.chance import mean_scores
 from neuroprior.planners.planner import Decision, Planner, decide, random_best
-from neuroprior.randomness import generator_on
-from neuroprior.sampling import Steppable, advance, check_in_world, start_in_world
+from neuroprior.sampling.ancestral import Steppable, advance, check_in_world, start_in_world
+from neuroprior.sampling.draws import Draw
 from neuroprior.worlds.world import Rollout, World, join_states
 
 
@@ -38,7 +38,7 @@ def continued(
     draw, now = Draw(prior.num_actions, 1.0, generator), state
     columns: tuple[list[Tensor], ...] = ([], [], [])  # actions, rewards and states
     for t in range(length):
-        legal = None if world.all_legal else world.legal(now)
+        legal = None if world.all_legal else world.legal_actions(now)
         if legal is not None:
             logits = logits.masked_fill(~legal, -torch.inf)
         action = draw.actions(logits, draw.uniform((len(logits),), logits))

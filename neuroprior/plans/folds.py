@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuroprior.plans.plans import Plans, sees_each_step
+from neuroprior.plans.plans import Plans, is_per_step
 
 FEWEST_UNITS = 2
 """Independent units without which there is no interval; below, a finer unit is taken."""
@@ -63,7 +63,7 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
     place = torch.arange(parts * size, device=plans.actions.device).view(parts, size)
     context = plans.context
     if context is not None:
-        each = sees_each_step(context)
+        each = is_per_step(context)
         context = context[0][place.clamp(max=length - 1)] if each else context.expand(parts, *context.shape[1:])
     return replace(
         plans,

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior.randomness import generator_on
-from neuroprior.worlds.world import check_range, is_integer
+from neuroprior._checks import check_range, is_integer
+from neuroprior._random import generator_on
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ class Plans:
         lengths = self.mask().sum(1)
         actions = functional.pad(self.actions.long(), (0, 1)).scatter(1, lengths[:, None], self.num_actions)
         context = self.context
-        if context is not None and sees_each_step(context):
+        if context is not None and is_per_step(context):
             last = (lengths - 1).clamp(min=0)
             closing = context[torch.arange(len(self), device=context.device), last] if self.max_length else None
             if closing is None:
@@ -172,7 +172,7 @@ class Plans:
             num_actions=self.num_actions - 1,
             lengths=lengths,
             action_names=None if self.action_names is None else self.action_names[:-1],
-            context=context[:, :longest] if context is not None and sees_each_step(context) else context,
+            context=context[:, :longest] if context is not None and is_per_step(context) else context,
             end=None,
         )
 
@@ -214,7 +214,7 @@ class Plans:
             self,
             actions=self.actions[:, first:stop],
             lengths=None if self.lengths is None else torch.full_like(self.lengths, stop - first),
-            context=context[:, first:stop] if context is not None and sees_each_step(context) else context,
+            context=context[:, first:stop] if context is not None and is_per_step(context) else context,
         )
 
 
@@ -249,7 +249,7 @@ def check_context(context: Tensor, num_plans: int, length: int) -> None:
         raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
 
 
-def sees_each_step(context: Tensor | None) -> bool:
+def is_per_step(context: Tensor | None) -> bool:
     """True for a context a step (`[N, L]`, `[N, L, C]`), False for none or one a plan (`[N]`, `[N, C]`)."""
     return context is not None and context.dim() == (2 if is_integer(context) else 3)
 

@@ -8,10 +8,10 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior import sampling
-from neuroprior.draws import after_end
-from neuroprior.plans import Plans, check_context, sees_each_step
-from neuroprior.worlds.world import check_range, check_sizes, is_integer
+from neuroprior._checks import check_range, check_sizes, is_integer
+from neuroprior.plans import Plans, check_context, is_per_step
+from neuroprior.sampling import ancestral as sampling
+from neuroprior.sampling.draws import after_end
 
 
 class Prior(nn.Module, ABC):
@@ -156,7 +156,7 @@ class Prior(nn.Module, ABC):
             Logits `[N, L, A]`, equal to those that stepping gives. This default steps.
         """
         num, length = plans.shape
-        per_step = sees_each_step(context)
+        per_step = is_per_step(context)
         if length == 0:
             return torch.zeros(num, 0, self.num_actions, device=self.device)
         out = []
@@ -237,7 +237,7 @@ class Prior(nn.Module, ABC):
         generator: torch.Generator | None = None,
         method: Literal["auto", "ancestral", "tree"] = "auto",
     ) -> Tensor:
-        """Independent plans `[num_plans, length]`; see `neuroprior.sampling.sample`.
+        """Independent plans `[num_plans, length]`; see `neuroprior.sampling.ancestral.sample`.
 
         Raises:
             ValueError: an argument is out of range, or the context does not fit.
@@ -256,7 +256,7 @@ class Prior(nn.Module, ABC):
         if not self.takes_context:
             raise ValueError("context: this prior sees none (make it with num_contexts= or context_size=)")
         if not isinstance(plans, Plans):
-            steps = context.shape[1] if sees_each_step(context) else length
+            steps = context.shape[1] if is_per_step(context) else length
             check_context(context, num_plans, steps)
         if self.num_contexts is not None:
             if not is_integer(context):
@@ -286,7 +286,7 @@ class Prior(nn.Module, ABC):
         if not self.takes_context:
             return replace(plans, context=None, context_names=None)
         self.check_context_of(plans)
-        self.context_per = "step" if sees_each_step(plans.context) else "plan"
+        self.context_per = "step" if is_per_step(plans.context) else "plan"
         if plans.context_names is not None and len(plans.context_names) <= (self.num_contexts or 0):
             self.context_names = tuple(plans.context_names)
         return plans

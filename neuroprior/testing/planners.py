@@ -6,9 +6,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from neuroprior.chi_square import chi_square
 from neuroprior.planners import Decision, Planner, oracle
 from neuroprior.priors import Prior, UniformPrior
+from neuroprior.testing.chi_square import chi_square
 from neuroprior.testing.rules import FALSE_ALARM, raises, require
 from neuroprior.worlds import TabularWorld, World
 
@@ -75,7 +75,7 @@ def _check_decision(planner: Planner, world: TabularWorld, state: Tensor, decisi
     now, rewards, states = state, [], []
     for t in range(length):
         action = decision.plan[:, t].long()
-        there = world.legal(now).gather(1, action[:, None])[:, 0] | (last <= t)
+        there = world.legal_actions(now).gather(1, action[:, None])[:, 0] | (last <= t)
         require(bool(there.all()), f"plan: its action {t} does not exist where it is taken")
         now, reward = world.step(now, action)
         rewards.append(reward)

@@ -6,10 +6,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.chi_square import chi_square
-from neuroprior.plans import all_plans, sees_each_step
+from neuroprior.plans import all_plans, is_per_step
 from neuroprior.priors import Prior, load, save
-from neuroprior.sampling import sample
+from neuroprior.sampling.ancestral import sample
+from neuroprior.testing.chi_square import chi_square
 from neuroprior.testing.rules import FALSE_ALARM, require
 
 
@@ -80,7 +80,7 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
         gap = float((logits.log_softmax(-1) - whole[:, t]).abs().nan_to_num(0).max())
         require(gap < 1e-4, f"stepping differs from forward by {gap:.2g} nats ({where})")
         if t + 1 < length:
-            seen = _at(context, t + 1) if sees_each_step(context) else None
+            seen = _at(context, t + 1) if is_per_step(context) else None
             backwards, _ = prior.step(plans[order, t], state[order], None if seen is None else seen[order])
             logits, state = prior.step(plans[:, t], state, seen)
             gap = float((backwards[order] - logits).abs().nan_to_num(0).max())
@@ -95,7 +95,7 @@ def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> Non
             logits, state = prior.start(num, _at(context, 0))
             _, other = prior.start(num, _at(context, 0))
             for t in range(length - 1):
-                seen = _at(context, t + 1) if sees_each_step(context) else None
+                seen = _at(context, t + 1) if is_per_step(context) else None
                 logits, state = prior.step(plans[:, t], state, seen)
                 again, other = prior.advance(plans[:, t], other, seen, room)
                 gap = float((again - logits).abs().nan_to_num(0).max())
@@ -105,7 +105,7 @@ def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> Non
 
 
 def _at(context: Tensor | None, t: int) -> Tensor | None:
-    return context[:, t] if context is not None and sees_each_step(context) else context
+    return context[:, t] if context is not None and is_per_step(context) else context
 
 
 def _all_log_probs(prior: Prior, length: int, context: Tensor | None) -> Tensor:
@@ -118,7 +118,7 @@ def _check_total(prior: Prior, context: Tensor | None, length: int) -> None:
     log_probs = _all_log_probs(prior, length, context)
     total = float(log_probs.double().exp().sum())
     require(abs(total - 1) < 1e-4, f"the probabilities of all plans of length {length} sum to {total:.6f}, not 1")
-    if context is not None and not sees_each_step(context):
+    if context is not None and not is_per_step(context):
         repeated = _all_log_probs(prior, length, context[:, None].repeat(1, length, *[1] * (context.dim() - 1)))
         gap = float((repeated - log_probs).abs().max())
         require(gap < 1e-3, f"a context a plan differs by {gap:.2g} nats from the same context at each step")

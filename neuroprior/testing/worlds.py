@@ -5,16 +5,16 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from neuroprior.chi_square import alike
+from neuroprior._checks import is_integer
+from neuroprior.testing.chi_square import alike
 from neuroprior.testing.rules import FALSE_ALARM, raises, require, same
 from neuroprior.worlds import TabularWorld, World
-from neuroprior.worlds.world import is_integer
 
 
 def check_world(world: World, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `world` does what a world must.
 
-    `reset`, `step`, `observe` and `legal` return what the interface says; `step` leaves its arguments alone and treats
+    `reset`, `step`, `observe` and `legal_actions` return what the interface says; `step` leaves its arguments alone and treats
     each state of a batch by itself; the same seed gives the same course; `rollout` equals stepping and refuses plans of
     a wrong shape, dtype or range. A world with chance says so (`stochastic`), and its rollouts have the distribution of
     its steps (chi-square tests, together with a false alarm of 1e-6); those of a table let all plans of a start meet
@@ -78,16 +78,16 @@ def _check_step(world: World, state: Tensor, action: Tensor, seed: int) -> None:
 
 
 def _check_views(world: World, state: Tensor) -> None:
-    """`observe` and `legal`."""
+    """`observe` and `legal_actions`."""
     seen = world.observe(state)
     index = is_integer(seen) and seen.dim() == 1
     require(
         len(seen) == len(state) and (index or (seen.is_floating_point() and seen.dim() == 2)),
         f"observe must give indices [N] or floating point features [N, C], not {seen.dtype} {list(seen.shape)}",
     )
-    over = world.is_over(state)
+    over = world.terminated(state)
     require(over.dtype == torch.bool and over.shape == state.shape[:1], f"is_over must be bool [{len(state)}]")
-    legal = world.legal(state)
+    legal = world.legal_actions(state)
     shape = [len(state), world.num_actions]
     require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal must be bool {shape}")
     require(bool(legal.any(1).all()), "legal: a state without any legal action")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from neuroprior.plans import Plans, sees_each_step
+from neuroprior.plans import Plans, is_per_step
 from neuroprior.training.settings import Settings
 
 MOST_DISTINCT = 1024
@@ -142,7 +142,7 @@ class Windows(Dataset[Batch]):
         place = place.clamp(max=plans.max_length - 1)
         context = plans.context
         if context is not None:
-            context = context[plan[:, None], place] if sees_each_step(context) else context[plan]
+            context = context[plan[:, None], place] if is_per_step(context) else context[plan]
         before = None
         if self.window < plans.max_length:
             last = plans.actions[plan, (first - 1).clamp(0, plans.max_length - 1)].long()

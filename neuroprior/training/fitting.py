@@ -17,9 +17,9 @@ from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
-from neuroprior.output import write_whole
+from neuroprior._files import write_whole
+from neuroprior._threads import one_thread
 from neuroprior.plans import Plans
-from neuroprior.threads import one_thread
 from neuroprior.training.batches import PlansModule
 from neuroprior.training.module import PriorModule
 from neuroprior.training.settings import Settings

@@ -7,8 +7,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.randomness import generator_on
-from neuroprior.worlds.world import World, check_range
+from neuroprior._checks import check_range
+from neuroprior._random import generator_on
+from neuroprior.worlds.world import World
 
 FACES = ("U", "R", "F")
 _PERMUTATIONS, _ORIENTATIONS = 5040, 729
@@ -136,7 +137,7 @@ class PocketCube(World):
         orientation = state - permutation * _ORIENTATIONS
         return torch.cat([self._permutation_features[permutation], self._orientation_features[orientation]], -1)
 
-    def is_over(self, state: Tensor) -> Tensor:
+    def terminated(self, state: Tensor) -> Tensor:
         """Where the cube is solved, if that is the end."""
         return (state == 0) & self.absorbing
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuroprior.randomness import generator_on
+from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 
 

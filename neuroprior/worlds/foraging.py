@@ -3,10 +3,11 @@
 import torch
 from torch import Tensor
 
-from neuroprior.randomness import generator_on
+from neuroprior._checks import check_range, check_sizes
+from neuroprior._random import generator_on
 from neuroprior.worlds.grid import GridWorld
 from neuroprior.worlds.tabular import TabularWorld
-from neuroprior.worlds.world import World, check_range, check_sizes
+from neuroprior.worlds.world import World
 
 
 class ForagingWorld(World):
@@ -16,7 +17,7 @@ class ForagingWorld(World):
     item that is eaten is at place `num_places`, which is nowhere. What comes next hangs on the state alone, so that
     every planner can plan here.
 
-    Planners know where food lies, but not where it will grow: for them what is eaten is gone. It comes back by `grow`,
+    Planners know where food lies, but not where it will grow: for them what is eaten is gone. It comes back by `regrow`,
     which is for what happens beside the agent's own steps (`execute`, `Agent`): what was eaten grows again elsewhere,
     at random places of the season, and where a new season begins all items are at new places.
 
@@ -61,7 +62,7 @@ class ForagingWorld(World):
         generator = generator_on(generator, self.table.device)
         cell = self.table.cell(self.table.reset(batch_size, generator))
         nowhere = cell.new_full((batch_size, self.num_items), self.num_places)
-        return self.grow(torch.cat([torch.stack([cell, torch.zeros_like(cell)], 1), nowhere], 1), generator)
+        return self.regrow(torch.cat([torch.stack([cell, torch.zeros_like(cell)], 1), nowhere], 1), generator)
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         cell, _ = self.table.step(state[:, 0], action, generator)
@@ -70,7 +71,7 @@ class ForagingWorld(World):
         left = items.masked_fill(eaten, self.num_places)
         return torch.cat([cell[:, None], state[:, 1:2] + 1, left], 1), eaten.sum(1).float()
 
-    def grow(self, state: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def regrow(self, state: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """What planners do not foresee: the same `state [N, 2 + K]`, with food grown again."""
         generator = generator_on(generator, self.table.device)
         time, items = state[:, 1], state[:, 2:]
@@ -90,8 +91,8 @@ class ForagingWorld(World):
         """What the table shows in the cell: not where food lies."""
         return self.table.observe(state[:, 0])
 
-    def legal(self, state: Tensor) -> Tensor:
-        return self.table.legal(state[:, 0])
+    def legal_actions(self, state: Tensor) -> Tensor:
+        return self.table.legal_actions(state[:, 0])
 
     def check_state(self, state: Tensor) -> None:
         if state.dim() != 2 or state.shape[1] != 2 + self.num_items:

@@ -6,10 +6,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.randomness import generator_on
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.views import check_view, view_table
-from neuroprior.worlds.world import check_sizes
 
 MOVES = ("up", "right", "down", "left")
 """The four moves in the order of their numbers; the reversal of move a is (a + 2) % 4."""

@@ -5,8 +5,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
 from neuroprior.worlds.grid import GridWorld
-from neuroprior.worlds.world import check_sizes
 
 
 def four_rooms(

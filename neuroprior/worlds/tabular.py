@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from neuroprior.randomness import generator_on
+from neuroprior._checks import check_range, is_integer
+from neuroprior._random import generator_on
 from neuroprior.worlds import compiled
 from neuroprior.worlds.chance import Chance
-from neuroprior.worlds.world import Rollout, World, check_plans, check_range, is_integer, join_states
+from neuroprior.worlds.world import Rollout, World, check_plans, join_states
 
 
 class TabularWorld(World):
@@ -209,12 +210,12 @@ class TabularWorld(World):
         """The cell of each state: an agent sees where it is, not which reward map holds."""
         return self.cell(state)
 
-    def legal(self, state: Tensor) -> Tensor:
+    def legal_actions(self, state: Tensor) -> Tensor:
         if self.legal_actions is None:
-            return super().legal(state)
+            return super().legal_actions(state)
         return self.legal_actions[self.cell(state)]
 
-    def is_over(self, state: Tensor) -> Tensor:
+    def terminated(self, state: Tensor) -> Tensor:
         """Where every action stays, without reward."""
         cell = self.cell(state)
         over = (self.next_state[cell].flatten(1) == cell[:, None]).all(1)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_range
+
 
 class Rollout(NamedTuple):
     """What happened when plans were tried: B starts, P plans a start, L steps.
@@ -29,7 +31,7 @@ class World(ABC):
 
     Attributes:
         num_actions: the number of actions, A.
-        all_legal: True where every action exists in every state, so that nobody need ask `legal`.
+        all_legal: True where every action exists in every state, so that nobody need ask `legal_actions`.
         stochastic: True where chance decides what comes of an action, so that one try of a plan says little of it.
         action_names: names of the actions, where there are any.
     """
@@ -94,11 +96,11 @@ class World(ABC):
         """
         return state
 
-    def legal(self, state: Tensor) -> Tensor:
+    def legal_actions(self, state: Tensor) -> Tensor:
         """Which actions exist in `state [N, ...]`: `[N, A]` bool, at least one a row. Default: all."""
         return torch.ones(state.shape[0], self.num_actions, dtype=torch.bool, device=state.device)
 
-    def is_over(self, state: Tensor) -> Tensor:
+    def terminated(self, state: Tensor) -> Tensor:
         """Where nothing can happen any more in `state [N, ...]`, so that no action is executed: `[N]` bool.
 
         Default: nowhere.
@@ -122,11 +124,6 @@ def join_states(states: list[Tensor], start: Tensor, shape: tuple[int, ...]) -> 
     return torch.stack([state.view(shape) for state in states], 2)
 
 
-def is_integer(values: Tensor) -> bool:
-    """True for a tensor of whole numbers (bool is not one)."""
-    return not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
-
-
 def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:
     """Raise ValueError unless `plans` is an integer tensor `[batch_size, P, L]` of actions below `num_actions`."""
     if plans.dim() != 3 or plans.shape[0] != batch_size:
@@ -135,34 +132,3 @@ def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:
             " (for one plan a start, use plans[:, None])"
         )
     check_range("plans", plans, num_actions, "actions")
-
-
-def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
-    """Raise ValueError unless `values` are integers from 0 to `stop` - 1; the message names the first that is not."""
-    if not is_integer(values):
-        raise ValueError(f"{name}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
-    if values.numel() == 0:
-        return
-    # torch cannot compare the wider unsigned types.
-    values = values.long() if values.dtype in (torch.uint16, torch.uint32, torch.uint64) else values
-    low, high = _extremes(values)
-    if low < 0 or high >= stop:
-        where = ((values < 0) | (values.long() >= stop)).nonzero()[0].tolist()
-        value = int(values[tuple(where)])
-        raise ValueError(f"{name}{where}: {value} is out of range: there are {stop} {what}, 0 to {stop - 1}")
-
-
-def _extremes(values: Tensor) -> tuple[int, int]:
-    """The least and the greatest of some integers."""
-    if values.dtype == torch.uint8 and values.device.type == "cpu":
-        # On one thread: those of torch, once awake, would be in the way of the threads of a compiled loop.
-        return 0, int(values.numpy().max())
-    low, high = torch.aminmax(values)
-    return int(low), int(high)
-
-
-def check_sizes(**sizes: object) -> None:
-    """Raise ValueError, naming the argument, unless all are integers of at least 1."""
-    for name, size in sizes.items():
-        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-            raise ValueError(f"{name}: an integer of at least 1 is expected, not {size!r}")

@@ -1,0 +1,179 @@
+"""What a prior's candidate plans reach against their number: the curves behind `python -m eval compare`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from eval.worlds.suite import Task, best_score
+from neuroprior import Prior, SamplingPlanner, TabularWorld, World, expected_score
+from neuroprior.planners.chance import mean_scores
+
+ROLLOUTS = 16
+"""Of each candidate, where chance decides."""
+
+ROWS = 2**15
+"""Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
+
+TEMPERATURES = (1.0, 1.5, 2.0)
+"""At which priors may be sampled: one that is too sure of itself tries the same plans again and again."""
+
+DRAWN, AGAIN = 20, 9
+"""For each start that is wanted so many are drawn, and, where too few of them are of use, so many times again."""
+
+CLOSE = 1e-6
+"""A score this near to the oracle's is as good."""
+
+
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Where priors are compared, or temperatures chosen: B starts of a world, with the best that can be had from each.
+
+    Attributes:
+        task: what is optimised.
+        world: the held-out world, or the validation world.
+        state: `[B, ...]`.
+        length: number of actions in a plan.
+        best: `[B]`: the oracle's scores.
+        reference: the score that counts as nothing: 0 where rewards are never negative, else what a single plan of
+            random moves scores in the mean.
+    """
+
+    task: Task
+    world: World
+    state: Tensor
+    length: int
+    best: Tensor
+    reference: float
+
+    def share(self, score: Tensor) -> float:
+        """The share of the oracle that scores `[B]` are, between the reference and the oracle."""
+        gained, most = (values.double() - self.reference for values in (score, self.best))
+        return float(gained.mean() / most.mean())
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What was reached with each number of candidates: means over starts.
+
+    Attributes:
+        share: of the oracle.
+        at_oracle: share of starts at which the best plan was found.
+        score: what was scored.
+    """
+
+    share: list[float]
+    at_oracle: list[float]
+    score: list[float]
+
+
+def starts_of(task: Task, world: World, number: int, length: int, generator: torch.Generator) -> Starts:
+    """Random starts, where something can be had: with rewards that are never negative the oracle scores above 0.
+
+    Raises:
+        ValueError: there are hardly any.
+    """
+    costs = isinstance(world, TabularWorld) and float(world.reward.min()) < 0
+    states, bests = [], []
+    for _ in range(1 + AGAIN):
+        drawn = world.reset(DRAWN * number, generator)
+        gain = best_score(task, world, drawn, length)
+        useful = (gain > 0) | costs
+        states.append(drawn[useful])
+        bests.append(gain[useful])
+        if sum(map(len, states)) >= number:
+            break
+    state, best = torch.cat(states), torch.cat(bests)
+    if len(state) < number:
+        tried = (1 + AGAIN) * DRAWN * number
+        raise ValueError(f"only {len(state)} of {tried} starts are such that a plan of {length} actions gains")
+    reference = 0.0
+    if costs:
+        plans = torch.randint(world.num_actions, (len(state), 1, length), generator=generator)
+        reference = float(worth(task, world, state, plans).mean())
+    return Starts(task, world, state[:number], length, best[:number], reference)
+
+
+def planner_of(starts: Starts, prior: Prior, num_plans: int, temperature: float) -> SamplingPlanner:
+    """A planner that draws its candidates from a prior."""
+    how = starts.task.scoring | {"num_rollouts": ROLLOUTS, "temperature": temperature}
+    return SamplingPlanner(prior, starts.length, num_plans, **how)
+
+
+def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """What a planner takes its candidates to be worth, and what they are worth; these differ where chance decides.
+
+    Returns:
+        Twice `[B, P]`, of the planner's P candidates.
+    """
+    told, true = [], []
+    for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
+        if starts.world.stochastic:
+            plans = planner.proposals(starts.world, state, generator)
+            told.append(mean_scores(planner, starts.world, state, plans, ROLLOUTS, generator)[0])
+            true.append(worth(starts.task, starts.world, state, plans))
+            continue
+        _, rollout = planner.candidates(starts.world, state, generator)
+        score = planner.scored(rollout)[0]
+        if planner.any_prefix:
+            score = score.amax(-1)
+        told.append(score)
+        true.append(score)
+    return torch.cat(told), torch.cat(true)
+
+
+def best_temperature(starts: Starts, prior: Prior, budget: int, generator: torch.Generator) -> float:
+    """The one of `TEMPERATURES` at which a prior's plans reach the most from these starts."""
+    shares = {t: curve(starts, prior, [budget], generator, t).share[0] for t in TEMPERATURES}
+    return max(shares, key=lambda t: shares[t])
+
+
+def curve(
+    starts: Starts, prior: Prior, budgets: list[int], generator: torch.Generator, temperature: float = 1.0
+) -> Curve:
+    """What a sampling planner reaches with each number of candidates.
+
+    The most are drawn once from each start. Fewer are blocks of them, each block a planner's decision.
+    """
+    told, true = candidate_scores(starts, planner_of(starts, prior, max(budgets), temperature), generator)
+    found = Curve([], [], [])
+    for budget in budgets:
+        blocks = told.shape[1] // budget
+        shape = (len(told), blocks, budget)
+        chosen = told[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
+        score = true[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0].double()
+        found.share.append(starts.share(score.mean(1)))
+        found.at_oracle.append(float((score >= starts.best[:, None] - CLOSE).double().mean()))
+        found.score.append(float(score.mean()))
+    return found
+
+
+def seconds_per_decision(
+    starts: Starts, prior: Prior, budgets: Sequence[int], number: int, generator: torch.Generator, temperature: float
+) -> dict[int, tuple[float, int]]:
+    """How long a sampling planner takes, planning from `number` starts together.
+
+    Returns:
+        By number of candidates: seconds, and model steps, for each start.
+    """
+    state, taken = starts.state[:number], {}
+    planners = [planner_of(starts, prior, budget, temperature) for budget in budgets]
+    # The first call is slower than those that follow, and the largest makes room for all.
+    max(planners, key=lambda planner: planner.num_plans).plan(
+        starts.world, state, torch.Generator(generator.device).manual_seed(0)
+    )
+    for planner in planners:
+        begin = perf_counter()
+        decision = planner.plan(starts.world, state, generator)
+        taken[planner.num_plans] = (perf_counter() - begin) / len(state), decision.model_steps
+    return taken
+
+
+def worth(task: Task, world: World, state: Tensor, plans: Tensor) -> Tensor:
+    """The exact mean scores `[B, P]` of plans in a table."""
+    assert isinstance(world, TabularWorld)
+    how: dict[str, Any] = {"objective": task.objective, "discount": task.discount}
+    return expected_score(world, state, plans, **how)

@@ -1,0 +1,217 @@
+"""The mice's maze drawn as it is, and figures of what priors bring a planner there, as PNG."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from torch import Tensor
+
+from eval.paper.figures import save
+from neuroprior import Plans, Prior, SamplingPlanner, TabularWorld, labyrinth, oracle
+from neuroprior.worlds.labyrinth import DEPTH, WATER
+
+COLORS = {"uniform": "#7f7f7f", "markov": "#2171b5", "gru": "#e6550d", "transformer": "#88419d", "oracle": "black"}
+"""The colour of each kind of prior."""
+
+STYLES = {"": "-", "node": "-", "moves": (0, (4, 2))}
+ENTRANCE = (-8.0, 0.0)
+"""Where the corridor from the home cage begins."""
+
+STAR: dict[str, Any] = {"color": "#00a5cf", "markeredgecolor": "black", "markersize": 15, "zorder": 7}
+START: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "markersize": 8, "zorder": 6}
+
+
+def coordinates(world: TabularWorld) -> Tensor:
+    """Where the nodes lie, in corridor cells from the first junction: `[127, 2]`, right and up.
+
+    A mouse comes from the left to node 0, in the middle. Every junction is a T: its branches leave at right angles,
+    4, 4, 2, 2, 1 and 1 cells long from level to level, so that the maze fills a square of 15 x 15 cells with its 64
+    ends in rows of eight (Rosenberg et al. 2021, figure 1). Which node lies to the left of one who walks in is what the
+    world's moves `in_left` and `in_right` say.
+    """
+    place = torch.zeros(world.num_states, 2)
+    heading = torch.zeros(world.num_states, 2)
+    heading[0, 0] = 1
+    for level in range(DEPTH):
+        node = torch.arange(2**level - 1, 2 ** (level + 1) - 1)
+        to_the_left = torch.stack([-heading[node, 1], heading[node, 0]], 1)
+        for move, way in ((0, to_the_left), (1, -to_the_left)):
+            child = world.next_state[node, move]
+            heading[child] = way
+            place[child] = place[node] + 2 ** (2 - level // 2) * way
+    return place
+
+
+def passages(plans: Plans) -> Tensor:
+    """How often each corridor was walked through, in or out: `[127]`, that of node n leading from it to its parent.
+
+    That of node 0 leads to the home cage; a mouse that comes back from there to node 0 has walked it twice.
+    """
+    assert plans.context is not None
+    after = labyrinth().next_state[plans.context, plans.actions.long()]
+    # The further in of two neighbours is the one with the higher number.
+    inner = torch.maximum(plans.context, after)
+    return inner.flatten().bincount((1 + (plans.context == after)).flatten(), minlength=2 ** (DEPTH + 1) - 1)
+
+
+def left_turns(plans: Plans) -> tuple[Tensor, Tensor]:
+    """At each junction the share of moves in that went to the left, and the number of moves in: `[63]` each."""
+    assert plans.context is not None
+    junctions = 2**DEPTH - 1
+    left, right = (plans.context[plans.actions == move].bincount(minlength=junctions)[:junctions] for move in (0, 1))
+    return left / (left + right), left + right
+
+
+def maze(path: Path, plans: Plans) -> None:
+    """The maze twice: how often mice walked through each corridor, and which way they turned at each junction."""
+    place = coordinates(labyrinth())
+    figure = Figure(figsize=(12.4, 6.2))
+    visits, turns = figure.subplots(1, 2)
+    walked = passages(plans)
+    scale = LogNorm(int(walked.min().clamp(min=1)), int(walked.max()))
+    _corridors(visits, place, 8.5, walked, "YlOrBr", scale)
+    visits.set_title(f"how often mice walked through each corridor\n({len(plans)} x {plans.max_length} moves)")
+    figure.colorbar(ScalarMappable(scale, "YlOrBr"), ax=visits, label="passages, in or out", shrink=0.75, pad=0.02)
+    share, number = left_turns(plans)
+    _corridors(turns, place, 8.5)
+    even = Normalize(0, 1)
+    junction = place[: len(share)].numpy()
+    size = 30 + 190 * (number / number.max()).sqrt().numpy()
+    turns.scatter(*junction.T, s=size, c=share.numpy(), cmap="PuOr", norm=even, edgecolor="#444444", zorder=4)
+    turns.set_title("which way mice turned on their way in\n(the larger, the more moves inward)")
+    bar = figure.colorbar(ScalarMappable(even, "PuOr"), ax=turns, shrink=0.75, pad=0.02, ticks=[0, 0.25, 0.5, 0.75, 1])
+    bar.set_ticklabels(["always right", "25 % left", "as often", "75 % left", "always left"])
+    for axes in (visits, turns):
+        _signs(axes, place)
+    save(figure, path)
+
+
+def plans_in_maze(path: Path, priors: dict[str, Prior], world: TabularWorld, seed: int, number: int = 60) -> None:
+    """Plans of 16 moves from a node far from the water, a panel for each of up to three priors."""
+    place, start = coordinates(world), far_from_water(world)
+    figure = Figure(figsize=(4.3 * len(priors), 4.9))
+    colors = (COLORS["uniform"], COLORS["markov"], COLORS["gru"])
+    for axes, (name, prior), color in zip(figure.subplots(1, len(priors)), priors.items(), colors, strict=True):
+        _corridors(axes, place, 5.5)
+        generator = torch.Generator().manual_seed(seed)
+        planner = SamplingPlanner(prior, 16, number, any_prefix=True)
+        _, rollout = planner.candidates(world, start, generator)
+        assert rollout.states is not None
+        course = torch.cat([start.expand(number, 1), rollout.states[0]], 1)
+        shift = 0.4 * (torch.rand(number, 1, 2, generator=generator) - 0.5)
+        lines = LineCollection(list((place[course] + shift).numpy()), colors=color, linewidths=1.1, alpha=0.4, zorder=3)
+        axes.add_collection(lines)
+        axes.plot(*place[start].T.numpy(), "o", label="start", **START)
+        _signs(axes, place)
+        reached = int((rollout.rewards.sum(-1) > 0).sum())
+        axes.set_title(f"{name}\n{reached} of {number} plans reach the water", fontsize=10)
+    figure.tight_layout()
+    save(figure, path)
+
+
+def far_from_water(world: TabularWorld) -> Tensor:
+    """`[1]`: of the nodes from which the water is furthest to walk, the one that lies furthest from it."""
+    place, every = coordinates(world), torch.arange(world.num_states)
+    short = [oracle(world, every, length, objective="return") == 0 for length in range(1, 2 * DEPTH)]
+    moves = torch.stack(short).sum(0) * (every != WATER)
+    apart = (place - place[WATER]).norm(dim=1)
+    return torch.where(moves == moves.max(), apart, -1).argmax()[None]
+
+
+def _corridors(
+    axes: Axes,
+    place: Tensor,
+    width: float,
+    value: Tensor | None = None,
+    colors: str | Colormap = "Greys",
+    scale: Normalize | None = None,
+) -> None:
+    """The corridors as wide lines, light grey or coloured by `value [127]`."""
+    parent = (torch.arange(len(place)) - 1).div(2, rounding_mode="floor")
+    ends = torch.stack([place[parent.clamp(min=0)], place], 1).numpy()
+    ends[0, 0] = ENTRANCE
+    order = np.arange(len(place))[::-1]  # wide corridors meet at junctions: the inner ones last, on top
+    edges = LineCollection(list(ends), colors="#9a9a9a", linewidths=width + 1.6, capstyle="projecting", zorder=1)
+    axes.add_collection(edges)
+    paint: dict[str, Any] = {"colors": "#efefef"}
+    if value is not None:
+        paint = {"array": value.numpy()[order].clip(1), "cmap": colors, "norm": scale}
+    lines = LineCollection(list(ends[order]), linewidths=width, capstyle="projecting", zorder=2, **paint)
+    axes.add_collection(lines)
+    axes.set(xlim=(-9.6, 8.1), ylim=(-8.1, 8.1), aspect="equal", xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+
+
+def _signs(axes: Axes, place: Tensor) -> None:
+    """The water, the entrance and a legend."""
+    axes.plot(*place[WATER, :, None].numpy(), "*", label="water", **STAR)
+    x = ENTRANCE[0]
+    axes.annotate("home", ENTRANCE, xytext=(x - 1.5, 0.75), fontsize=9, va="center")
+    axes.annotate("", (x + 0.9, 0), xytext=(x - 0.9, 0), arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=8)
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, -0.05), ncols=2, frameon=False, handletextpad=0.1)
+
+
+def reached_against_candidates(path: Path, rows: list[dict[str, Any]]) -> None:
+    """The share of nodes from which the water was found against the number of candidates.
+
+    A column of panels for each length of plans, a row for what the priors learned from, with 95 % bands.
+    """
+    lengths = sorted({row["length"] for row in rows})
+    sources = [source for source in dict.fromkeys(row["learned_from"] for row in rows) if source]
+    figure = Figure(figsize=(3.1 * len(lengths) + 1, 2.6 * len(sources) + 0.4))
+    panels = figure.subplots(len(sources), len(lengths), sharex=True, sharey=True, squeeze=False)
+    for line, source in zip(panels, sources, strict=True):
+        for axes, length in zip(line, lengths, strict=True):
+            shown = [row for row in rows if row["length"] == length and row["learned_from"] in ("", source)]
+            _panel(axes, shown)
+        line[0].set_ylabel(f"{TITLES[source]}\nwater reached, % of nodes")
+    for axes, length in zip(panels[0], lengths, strict=True):
+        axes.set_title(f"plans of {length} moves", fontsize=10)
+    for axes in panels[-1]:
+        axes.set_xlabel("candidate plans")
+    _legend(figure, panels[0, -1])
+    figure.tight_layout()
+    save(figure, path)
+
+
+TITLES = {"mice": "learned from mice", "planner": "from a short look-ahead", "reached": "from lucky random plans"}
+
+
+def _panel(axes: Axes, rows: list[dict[str, Any]]) -> None:
+    best = next(row for row in rows if row["prior"] == "oracle")
+    axes.axhline(100 * best["reached"], color=COLORS["oracle"], linestyle=":", linewidth=1.4)
+    for kind, sees in dict.fromkeys((row["prior"], row["sees"]) for row in rows if row["prior"] != "oracle"):
+        some = [row for row in rows if (row["prior"], row["sees"]) == (kind, sees)]
+        some.sort(key=lambda row: row["num_plans"])
+        number = [row["num_plans"] for row in some]
+        axes.plot(
+            number, [100 * row["reached"] for row in some], color=COLORS[kind], linestyle=STYLES[sees], linewidth=1.8
+        )
+        low, high = ([100 * row[end] for row in some] for end in ("low", "high"))
+        axes.fill_between(number, low, high, color=COLORS[kind], alpha=0.18, linewidth=0)
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(number, [f"{n:,}" for n in number])
+    axes.minorticks_off()
+    axes.set_ylim(0, 104)
+    axes.grid(color="#e6e6e6", linewidth=0.7)
+    axes.set_axisbelow(True)
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """What colours and lines mean, beside the panels."""
+    lines: dict[str, tuple[str, Any]] = {"random legal moves": (COLORS["uniform"], "-")}
+    lines |= {kind: (COLORS[kind], "-") for kind in ("markov", "gru", "transformer")}
+    lines |= {
+        "sees the node": ("black", "-"),
+        "sees its own moves": ("black", STYLES["moves"]),
+        "oracle": ("black", ":"),
+    }
+    handles = [Line2D([], [], color=color, linestyle=style, linewidth=1.8) for color, style in lines.values()]
+    axes.legend(handles, list(lines), frameon=False, loc="upper left", bbox_to_anchor=(1.02, 1.0))

@@ -1,0 +1,183 @@
+"""`python -m eval quality`: how near priors come to sources whose entropy is known."""
+
+import time
+from dataclasses import dataclass
+from math import log
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from eval.paper.tables import columns, titled
+from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior
+from neuroprior._files import versions, write_csv, write_json
+from neuroprior._random import draw_seed
+
+LENGTH = 32
+CONTEXTS = 8
+LAG, REPEAT = 12, 0.8
+
+
+@dataclass(frozen=True)
+class Source:
+    """A process that plans are drawn from.
+
+    Attributes:
+        name: of tables.
+        table: `[C, A**order, A]`: the probabilities of each action in each context after each history; before there
+            are `order` actions, all are equally likely.
+        order: actions that count.
+        context: whether each plan has a context, each step one of its own, or there is none (C is 1).
+        lag: in place of a table: the action so many steps ago comes again with probability `REPEAT`.
+    """
+
+    name: str
+    table: Tensor
+    order: int
+    context: str | None = None
+    lag: int = 0
+
+    @property
+    def num_actions(self) -> int:
+        return self.table.shape[-1]
+
+    def draw(self, num_plans: int, generator: torch.Generator) -> tuple[Plans, Tensor]:
+        """Plans, and the log-probability `[N, L]` (nats) of each action under the source."""
+        actions = torch.zeros(num_plans, LENGTH, dtype=torch.long)
+        size = (num_plans, LENGTH if self.context == "step" else 1)
+        context = torch.randint(len(self.table), size, generator=generator).expand(num_plans, LENGTH)
+        history = torch.zeros(num_plans, dtype=torch.long)
+        taken = torch.zeros(num_plans, LENGTH, dtype=torch.double)
+        for t in range(LENGTH):
+            probs = self._probs(actions, context[:, t], history, t)
+            action = torch.multinomial(probs, 1, generator=generator)
+            taken[:, t] = probs.gather(1, action)[:, 0].log()
+            actions[:, t] = action[:, 0]
+            history = (history * self.num_actions + action[:, 0]) % self.num_actions**self.order
+        seen = None if self.context is None else context if self.context == "step" else context[:, 0]
+        return Plans(actions, self.num_actions, context=seen), taken
+
+    def _probs(self, actions: Tensor, context: Tensor, history: Tensor, t: int) -> Tensor:
+        even = torch.full((len(actions), self.num_actions), 1 / self.num_actions, dtype=torch.double)
+        if t < (self.lag or self.order):
+            return even
+        if not self.lag:
+            return self.table[context, history]
+        again = torch.nn.functional.one_hot(actions[:, t - self.lag], self.num_actions)
+        return REPEAT * again + (1 - REPEAT) * even
+
+    @property
+    def contexts(self) -> int | None:
+        """The number of contexts that a prior for this source sees."""
+        return None if self.context is None else len(self.table)
+
+    def context_at(self, plans: Plans, t: int) -> Tensor | int:
+        """The context of `plans` at action t."""
+        if plans.context is None:
+            return 0
+        return plans.context[:, t] if self.context == "step" else plans.context
+
+    def make(self, kind: type[Prior]) -> Prior:
+        if kind is MarkovPrior:
+            return MarkovPrior(self.num_actions, self.order, num_contexts=self.contexts)
+        return kind(self.num_actions, num_contexts=self.contexts)
+
+
+def sources(generator: torch.Generator) -> list[Source]:
+    """Sources with random tables (Dirichlet, 1/2), by which each kind of dependence is met."""
+
+    def table(contexts: int, order: int, num_actions: int) -> Tensor:
+        gamma = torch.distributions.Gamma(torch.tensor(0.5, dtype=torch.double), torch.tensor(1.0, dtype=torch.double))
+        with torch.random.fork_rng():
+            torch.manual_seed(draw_seed(generator))
+            draws = gamma.sample((contexts, num_actions**order, num_actions)).clamp(min=1e-6)
+        return draws / draws.sum(-1, keepdim=True)
+
+    return [
+        Source("order 1, 4 actions", table(1, 1, 4), 1),
+        Source("order 3, 4 actions", table(1, 3, 4), 3),
+        Source("order 6, 2 actions", table(1, 6, 2), 6),
+        Source(f"repeats at distance {LAG}", torch.full((1, 1, 4), 0.25, dtype=torch.double), 0, lag=LAG),
+        Source("order 1, context a plan", table(CONTEXTS, 1, 4), 1, "plan"),
+        Source("order 1, context a step", table(CONTEXTS, 1, 4), 1, "step"),
+    ]
+
+
+def quality(num_plans: int = 100_000, held_out: int = 5_000, seed: int = 0, out: str = "runs/quality") -> None:
+    """Fit priors to sources whose entropy is known; print how many bits more than the source they take.
+
+    Args:
+        num_plans: plans of 32 actions to learn from.
+        held_out: plans to score.
+        seed: draws sources and plans.
+        out: folder for `quality.csv` and `results.json`.
+    """
+    if num_plans < 100 or held_out < 100:
+        raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
+    folder, console = Path(out), Console()
+    folder.mkdir(parents=True, exist_ok=True)
+    generator = torch.Generator().manual_seed(seed)
+    rows = []
+    for source in sources(generator):
+        training, _ = source.draw(num_plans, generator)
+        test, true = source.draw(held_out, generator)
+        for kind in (MarkovPrior, GRUPrior, TransformerPrior):
+            with console.status(f"{source.name}: {kind.__name__}"):
+                rows.append(_fit(source, kind, training, test, true, seed))
+            _print(console, rows[-1])
+    console.print(_table(rows, num_plans, held_out))
+    write_csv(folder / "quality.csv", rows)
+    write_json(folder / "results.json", {"rows": rows, "versions": versions()})
+
+
+def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, object]:
+    prior, began = source.make(kind), time.perf_counter()
+    how = {} if kind is MarkovPrior else {"generator": torch.Generator().manual_seed(seed), "progress": False}
+    prior.fit(training, **how)
+    seconds = time.perf_counter() - began
+    with torch.no_grad():
+        taken = prior.action_log_probs(test).double()
+    # The first actions are drawn evenly; the entropy rate is that of those which depend on what was before.
+    first = max(source.order, source.lag)
+    true, taken = true[:, first:], taken[:, first:]
+    rate, excess = -float(true.mean()) / log(2), float((true - taken).mean()) / log(2)
+    free = source.table.numel() // source.num_actions * (source.num_actions - 1)
+    return {
+        "source": source.name,
+        "model": kind.__name__.removesuffix("Prior").lower(),
+        "entropy_rate": rate,
+        "bits_per_action": rate + excess,
+        "excess_percent": 100 * excess / rate,
+        # What maximum likelihood of so many free probabilities costs on new plans, for many plans.
+        "expected_percent": 100 * free / (2 * log(2) * len(training) * (LENGTH - first)) / rate
+        if kind is MarkovPrior and not source.lag
+        else None,
+        "seconds": seconds,
+    }
+
+
+def _print(console: Console, row: dict[str, object]) -> None:
+    console.print(f"{row['source']}: {row['model']} {row['excess_percent']:+.2f} %, {row['seconds']:.0f} s")
+
+
+def _table(rows: list[dict[str, object]], num_plans: int, held_out: int):
+    table = titled(
+        f"Bits more than the source, % ({num_plans:,} plans of {LENGTH} actions, {held_out:,} held out)", gap=1
+    )
+    columns(table, ("source", "entropy", "markov", "expected", "gru", "transformer"), 1)
+    for name in dict.fromkeys(row["source"] for row in rows):
+        markov, *neural = (row for row in rows if row["source"] == name)
+        expected = markov["expected_percent"]
+        table.add_row(
+            str(name),
+            f"{markov['entropy_rate']:.4f}",
+            f"{markov['excess_percent']:+.3f}",
+            "" if expected is None else f"{expected:+.3f}",
+            *(f"{row['excess_percent']:+.2f} ({row['seconds']:.0f} s)" for row in neural),
+        )
+    table.caption = (
+        "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
+        " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. (s): seconds of training."
+    )
+    return table

@@ -1,0 +1,40 @@
+"""Checks of arguments, each of which names the argument that is wrong."""
+
+import torch
+from torch import Tensor
+
+
+def is_integer(values: Tensor) -> bool:
+    """True for a tensor of whole numbers (bool is not one)."""
+    return not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
+
+
+def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
+    """Raise ValueError unless `values` are integers from 0 to `stop` - 1; the message names the first that is not."""
+    if not is_integer(values):
+        raise ValueError(f"{name}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
+    if values.numel() == 0:
+        return
+    # torch cannot compare the wider unsigned types.
+    values = values.long() if values.dtype in (torch.uint16, torch.uint32, torch.uint64) else values
+    low, high = _extremes(values)
+    if low < 0 or high >= stop:
+        where = ((values < 0) | (values.long() >= stop)).nonzero()[0].tolist()
+        value = int(values[tuple(where)])
+        raise ValueError(f"{name}{where}: {value} is out of range: there are {stop} {what}, 0 to {stop - 1}")
+
+
+def _extremes(values: Tensor) -> tuple[int, int]:
+    """The least and the greatest of some integers."""
+    if values.dtype == torch.uint8 and values.device.type == "cpu":
+        # On one thread: those of torch, once awake, would be in the way of the threads of a compiled loop.
+        return 0, int(values.numpy().max())
+    low, high = torch.aminmax(values)
+    return int(low), int(high)
+
+
+def check_sizes(**sizes: object) -> None:
+    """Raise ValueError, naming the argument, unless all are integers of at least 1."""
+    for name, size in sizes.items():
+        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+            raise ValueError(f"{name}: an integer of at least 1 is expected, not {size!r}")

@@ -1,0 +1,312 @@
+"""Independent jobs: on the cores of this machine or on a Dask cluster, each result kept in a file.
+
+Needs joblib and rich (`neuroprior[report]`); a cluster needs dask.distributed (`neuroprior[dask]`).
+"""
+
+import ast
+import hashlib
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache, partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from neuroprior._files import read_json, versions, write_json
+from neuroprior._threads import one_thread
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+PACKAGES = ("neuroprior", "eval")
+"""Packages whose source counts in `code_version`."""
+
+
+class JobRun(Generic[Job, Result]):
+    """Jobs whose results are kept in a folder, so that an interrupted run can be resumed.
+
+    A result is found again only if the same was asked of the same code: the folder's name is a digest of `asked`, of the
+    source that does the work, and of the versions of the packages it depends on.
+
+    Args:
+        run: does a job and returns its result. It can be pickled, and is called in one thread.
+        folder: the folder below which results are kept.
+        asked: JSON values: all that decides a result beside the job and the code.
+        name: the name of a job's file (without its ending); it must be unique.
+        save, load, suffix: how a result is written and read; JSON by default.
+        packages: further packages whose version decides a result.
+    """
+
+    def __init__(
+        self,
+        run: Callable[[Job], Result],
+        folder: Path,
+        asked: dict[str, Any],
+        *,
+        name: Callable[[Job], str] = str,
+        save: Callable[[Path, Any], None] = write_json,
+        load: Callable[[Path], Any] = read_json,
+        suffix: str = ".json",
+        packages: Sequence[str] = (),
+    ) -> None:
+        self.run, self.name, self._save, self._load, self.suffix = run, name, save, load, suffix
+        self.code = code_version(run)
+        decides = {"asked": asked, "code": self.code, "versions": versions(*packages)}
+        digest = hashlib.sha256(json.dumps(decides, sort_keys=True, default=str).encode()).hexdigest()[:12]
+        self.folder = folder / digest
+        self._asked = asked
+
+    def path(self, job: Job) -> Path:
+        """The file that holds a job's result."""
+        return self.folder / (self.name(job) + self.suffix)
+
+    def finished(self, job: Job) -> bool:
+        """Whether the result of a job is there."""
+        return self.path(job).exists()
+
+    def read(self, job: Job) -> Result:
+        """The result of a finished job.
+
+        Raises:
+            ValueError: its file is damaged.
+            OSError: its file cannot be read.
+        """
+        try:
+            result: Result = self._load(self.path(job))
+        except ValueError as error:
+            raise ValueError(f"{self.path(job)}: damaged; delete it, and the same command does the job again") from error
+        return result
+
+    def do(
+        self, jobs: Sequence[Job], *, processes: int | None = None, dask: str | None = None, title: str = "jobs"
+    ) -> list[Result]:
+        """Do the jobs that have no result yet; returns the results of all, in the order of `jobs`.
+
+        Progress goes to standard error: a bar in a terminal, elsewhere a line for each finished job.
+
+        Args:
+            jobs: the jobs.
+            processes: how many run at a time; None: one for each core.
+            dask: the address of a Dask scheduler, `tcp://host:port`, whose workers do the jobs; None: this machine.
+            title: what the progress is called.
+
+        Raises:
+            ValueError: a job failed (the message names it), or the cluster cannot be used.
+            MemoryError: memory ran out or a process was killed.
+            KeyboardInterrupt: the message says how to go on.
+        """
+        missing = [job for job in jobs if not self.finished(job)]
+        if missing:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(self.folder / "asked.json", self._asked)
+            try:
+                self._do(missing, processes or os.cpu_count() or 1, dask, Progress(title, len(jobs), len(missing)))
+            except KeyboardInterrupt as interrupted:
+                raise KeyboardInterrupt(
+                    f"interrupted; finished jobs are kept in {self.folder}, and the same command goes on"
+                ) from interrupted
+        return [self.read(job) for job in jobs]
+
+    def _do(self, jobs: Sequence[Job], processes: int, dask: str | None, progress: "Progress") -> None:
+        call = partial(_attempt, self.run)
+        if dask is not None:
+            call = partial(call, code=self.code)
+        with progress:
+            for index, result in _unordered(call, jobs, processes, dask):
+                where = self.name(jobs[index])
+                if isinstance(result, Failure):
+                    raise result.error(where)
+                self._save(self.path(jobs[index]), result)
+                progress.advance(where)
+
+
+class Failure:
+    """An error of a job, in a form that every process can send."""
+
+    def __init__(self, error: BaseException) -> None:
+        # torch has no exception of its own for memory that it could not get
+        out = isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "memory" in str(error))
+        expected = isinstance(error, ValueError | OSError | ImportError | OverflowError)
+        self.kind = MemoryError if out else ValueError if expected else RuntimeError
+        self.message = "out of memory; a smaller run may fit" if out else str(error) or type(error).__name__
+        if self.kind is RuntimeError:
+            import traceback
+
+            self.message = "".join(traceback.format_exception(error))
+
+    def error(self, where: str) -> Exception:
+        """The error that names the job."""
+        return self.kind(f"{where}: {self.message}")
+
+
+def _attempt(run: Callable[[Job], Result], job: Job, index: int, code: str | None = None) -> tuple[int, Any]:
+    """Do a job in one thread, since the number of threads changes the last digits."""
+    _end_with_parent()
+    if code is not None and code_version(run) != code:
+        return index, Failure(ValueError("the cluster's workers have another version of the code than this program"))
+    try:
+        with one_thread():
+            return index, run(job)
+    except Exception as error:
+        return index, Failure(error)
+
+
+def _unordered(
+    call: Callable[..., tuple[int, Any]], jobs: Sequence[Any], processes: int, dask: str | None
+) -> Iterator[tuple[int, Any]]:
+    """The results of all jobs, each as soon as it is there."""
+    if dask is None and (processes == 1 or len(jobs) == 1):
+        yield from (call(job, index) for index, job in enumerate(jobs))
+        return
+    from joblib import Parallel, delayed, parallel_config
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    tasks = (delayed(call)(job, index) for index, job in enumerate(jobs))
+    with _cluster(dask):
+        how: dict[str, Any] = {"backend": "dask"} if dask else {"backend": "loky", "inner_max_num_threads": 1}
+        with parallel_config(**how):
+            number = -1 if dask else min(processes, len(jobs))
+            parallel = Parallel(n_jobs=number, batch_size=1, pre_dispatch="all", return_as="generator_unordered")
+            results = parallel(tasks)
+            try:
+                yield from results
+            except TerminatedWorkerError as error:
+                raise MemoryError("a process was killed, probably for want of memory; try --processes 1") from error
+            finally:
+                results.close()
+                if not dask:
+                    _stop_workers()
+
+
+def _stop_workers() -> None:
+    """End joblib's idle processes, which would otherwise wait for more work for minutes."""
+    from joblib.externals.loky import get_reusable_executor
+
+    get_reusable_executor().shutdown(wait=False, kill_workers=True)
+
+
+@contextmanager
+def _cluster(address: str | None) -> Iterator[None]:
+    """A connection to a Dask cluster, while it is needed."""
+    if address is None:
+        yield
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ImportError("dask: install it with pip install 'neuroprior[dask]'") from error
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"dask: no scheduler answers at {address}") from error
+    try:
+        yield
+    finally:
+        client.close()
+
+
+class Progress:
+    """Progress on standard error: a bar in a terminal, elsewhere a line for each finished job.
+
+    Args:
+        title: what is done.
+        total: number of jobs.
+        missing: how many of them are still to be done.
+    """
+
+    def __init__(self, title: str, total: int, missing: int) -> None:
+        self.title, self.total, self.missing, self.done = title, total, missing, 0
+        self._bar: Any = None
+        if sys.stderr.isatty():
+            from rich import progress as bars
+            from rich.console import Console
+
+            columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn())
+            times = (bars.TimeElapsedColumn(), bars.TimeRemainingColumn())
+            self._bar = bars.Progress(*columns, *times, transient=True, console=Console(stderr=True))
+            self._task = self._bar.add_task(title, total=total, completed=total - missing)
+
+    def __enter__(self) -> "Progress":
+        self._begun = time.monotonic()
+        if self._bar is not None:
+            self._bar.start()
+        elif self.missing < self.total:
+            print(f"{self.title}: {self.total - self.missing}/{self.total} were finished before", file=sys.stderr)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def advance(self, what: str) -> None:
+        """Report a finished job."""
+        self.done += 1
+        if self._bar is not None:
+            self._bar.advance(self._task)
+            return
+        gone = time.monotonic() - self._begun
+        left = gone / self.done * (self.missing - self.done)
+        count = f"{self.total - self.missing + self.done}/{self.total}"
+        print(f"{self.title}: {count} {what} ({_clock(gone)}, {_clock(left)} left)", file=sys.stderr, flush=True)
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+
+
+def code_version(run: Callable[..., Any]) -> str:
+    """A digest of the source of a function's module and of all modules of this project that it imports."""
+    while isinstance(run, partial):
+        run = run.func
+    return _digest(getattr(run, "__module__", None) or type(run).__module__)
+
+
+@lru_cache
+def _digest(module: str) -> str:
+    found: dict[str, bytes] = {}
+    todo = [module]
+    while todo:
+        name = todo.pop()
+        if name in found:
+            continue
+        spec = find_spec(name) if name != "__main__" else None
+        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+            continue
+        found[name] = Path(spec.origin).read_bytes()
+        for node in ast.walk(ast.parse(found[name])):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            todo += [each for each in names if each.split(".")[0] in PACKAGES and _is_module(each)]
+    digest = hashlib.sha256()
+    for name in sorted(found):
+        digest.update(name.encode() + b"\0" + found[name] + b"\0")
+    return digest.hexdigest()
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+@lru_cache
+def _end_with_parent() -> None:
+    """In a process that joblib started: end when the main process is gone, since nobody else would end it."""
+    if not any("loky" in word for word in sys.orig_argv):
+        return
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,171 @@
+"""Checkpoints of agents: folders from which an interrupted life goes on as if it had not been interrupted."""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as read_tensors
+from safetensors.torch import save as write_tensors
+from torch import Tensor
+
+from neuroprior._files import read_json, write_whole
+from neuroprior.agents.agent import Agent
+from neuroprior.planners import Decision, Execution
+from neuroprior.plans import Plans
+from neuroprior.priors import serialization as folders
+
+FORMAT, VERSION = "neuroprior agent", 1
+
+PARTS = ("actions", "rewards", "states")
+"""Of what was done since a plan was remembered last."""
+
+
+def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
+    """Save an agent to a folder, made if need be: where it is, what it remembers, its prior and its random numbers.
+
+    Files are named after what is in them, and `agent.json`, which names those that belong to it, is written last: the
+    folder holds the last whole checkpoint at all times. What the one before named is then removed, and nothing else.
+    World and planner are not saved.
+
+    Raises:
+        OSError: the folder cannot be written.
+        ValueError: the `agent.json` that is there is of something else.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    before = _read(folder / "agent.json") if (folder / "agent.json").exists() else {}
+    partial = folders.save(agent.prior, folder / f".prior.{os.getpid()}.partial")
+    of_prior = _digest(partial)
+    prior = f"prior-{of_prior[:16]}"
+    if (folder / prior).exists():  # the same, saved before
+        shutil.rmtree(partial)
+    else:
+        partial.rename(folder / prior)
+    data = write_tensors({name: value.detach().cpu().contiguous().clone() for name, value in _tensors(agent).items()})
+    digest = hashlib.sha256(data).hexdigest()
+    weights = f"agent-{digest[:16]}.safetensors"
+    write_whole(folder / weights, data)
+    told = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent)}
+    told |= {"prior": prior, "prior_sha256": of_prior, "weights": weights, "sha256": digest}
+    told |= {"recent": [done.model_steps for done in agent.recent]}
+    write_whole(folder / "agent.json", (json.dumps(told, indent=2) + "\n").encode())
+    if before and before["weights"] != weights:
+        (folder / before["weights"]).unlink(missing_ok=True)
+    if before and before["prior"] != prior:
+        shutil.rmtree(folder / before["prior"], ignore_errors=True)
+    return folder
+
+
+def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
+    """Let an agent go on where another one, made in the same way, was saved; returns it.
+
+    Args:
+        agent: made anew with the same world, planner, kind of prior and arguments; its prior takes over what was
+            learned, in place. Of world and planner no more can be checked than that states and class fit.
+        folder: where `save_agent` saved.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: a file is damaged, or the agent was made in another way. The agent is as it was before.
+    """
+    folder = Path(folder)
+    told = _read(folder / "agent.json")
+    if told["agent"] != _settings(agent):
+        other = [name for name, value in _settings(agent).items() if told["agent"].get(name) != value]
+        raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; make this one in the same way")
+    path = folder / told["weights"]
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != told["sha256"] or _digest(folder / told["prior"]) != told["prior_sha256"]:
+        raise ValueError(f"{folder}: {path.name} or {told['prior']} is truncated, changed, or of another checkpoint")
+    try:
+        tensors = read_tensors(data)
+    except SafetensorError as error:
+        raise ValueError(f"{path}: not a file of tensors ({error})") from error
+    if sum(name.startswith("recent.") for name in tensors) != len(PARTS) * len(told["recent"]):
+        raise ValueError(f"{folder / 'agent.json'}: 'recent' does not fit {path.name}")
+    prior = folders.load(folder / told["prior"], agent.prior.device)
+    agent.world.check_state(tensors["state"].to(agent.state.device))
+    agent.prior.restore(prior.learned)
+    agent.prior.load_state_dict(prior.state_dict())
+    agent.time = told["time"]
+    _take(agent, tensors, told["recent"])
+    return agent
+
+
+def _digest(prior: Path) -> str:
+    """Of both files of a saved prior."""
+    return hashlib.sha256(b"".join((prior / name).read_bytes() for name in folders.FILES)).hexdigest()
+
+
+def _settings(agent: Agent) -> dict[str, Any]:
+    """What decides how an agent lives, beside its world and planner; as JSON gives it back."""
+    told = {name: getattr(agent, name) for name in ("replan_every", "warm_start", "num_rollouts", "learn_every")}
+    told |= {name: getattr(agent, name) for name in ("plan_length", "min_score", "training")}
+    told |= {
+        "retention": agent.replay.retention,
+        "agents": list(agent.state.shape),
+        "planner": type(agent.planner).__name__,
+    }
+    told |= {"prior": type(agent.prior).__name__, "config": agent.prior.config}
+    settings = json.loads(json.dumps(told, default=str))
+    assert isinstance(settings, dict)
+    return settings
+
+
+def _tensors(agent: Agent) -> dict[str, Tensor]:
+    """All that is not the prior's."""
+    found = {"state": agent.state, "before": agent.before, "generator": agent.generator.get_state()}
+    if agent.last is not None:
+        found |= {"last.plan": agent.last.plan}
+        found |= {} if agent.last.lengths is None else {"last.lengths": agent.last.lengths}
+    for k, done in enumerate(agent.recent):
+        found |= {f"recent.{k}.{name}": getattr(done, name) for name in PARTS}
+    return found | {f"replay.{name}": value for name, value in agent.replay.tensors().items()}
+
+
+def _take(agent: Agent, tensors: dict[str, Tensor], steps: Sequence[int]) -> None:
+    """Take over what `_tensors` gave."""
+    on = {name: value.to(agent.state.device) for name, value in tensors.items() if name != "generator"}
+    agent.generator.set_state(tensors["generator"])
+    agent.state, agent.before = on["state"], on["before"]
+    agent.last = None
+    if "last.plan" in on:
+        # Of what is left of a plan only its actions are looked at.
+        nothing = torch.empty(0, device=agent.state.device)
+        agent.last = Decision(on["last.plan"], nothing, nothing, 0, on.get("last.lengths"))
+    agent.recent = []
+    for k, number in enumerate(steps):
+        done, rewards, states = (on[f"recent.{k}.{name}"] for name in PARTS)
+        agent.recent.append(Execution(done, rewards, states, number))
+    if "replay.actions" in on:
+        actions, lengths, context = (on.get(f"replay.{name}") for name in ("actions", "lengths", "context"))
+        assert actions is not None
+        world = agent.world
+        agent.replay.plans = Plans(actions, world.num_actions, lengths, world.action_names, context)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    told = read_json(path)
+    if not isinstance(told, dict) or told.get("format") != FORMAT or told.get("version") != VERSION:
+        raise ValueError(f'{path}: not a checkpoint of an agent ("format": "{FORMAT}", "version": {VERSION})')
+    kinds = {
+        "time": int,
+        "agent": dict,
+        "prior": str,
+        "prior_sha256": str,
+        "weights": str,
+        "sha256": str,
+        "recent": list,
+    }
+    for key, kind in kinds.items():
+        if not isinstance(told.get(key), kind):
+            raise ValueError(f"{path}: {key!r} is missing or of another kind than it was saved")
+    if not all(isinstance(steps, int) for steps in told["recent"]):
+        raise ValueError(f"{path}: 'recent': whole numbers are expected")
+    return told

@@ -1,0 +1,74 @@
+"""Replay: the executed plans that an agent learns from, the older the fewer."""
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import Plans
+
+
+class Replay:
+    """Executed plans that are forgotten at random.
+
+    Each time `forget` is called, each plan is kept with probability `retention`, so that one that has been there for n of
+    these calls is still there with probability `keep ** n`. What counts on it are counts with exponential forgetting
+    (in the mean; whole numbers, as every way to smooth them needs), and what trains on it is trained the more on what
+    is new; neither needs to know.
+
+    Args:
+        retention: above 0, at most 1: nothing is forgotten.
+
+    Attributes:
+        plans: what is remembered; None: nothing yet.
+
+    Raises:
+        ValueError: `retention` is out of range.
+    """
+
+    def __init__(self, retention: float) -> None:
+        if not 0 < retention <= 1:
+            raise ValueError(f"retention: a probability above 0 and at most 1 is expected, not {retention}")
+        self.retention = retention
+        self.plans: Plans | None = None
+
+    def __len__(self) -> int:
+        return 0 if self.plans is None else len(self.plans)
+
+    def forget(self, generator: torch.Generator) -> None:
+        """Keep each plan with probability `retention`."""
+        if self.plans is not None and self.retention < 1:
+            draws = torch.rand(len(self.plans), generator=generator, device=generator.device)
+            self.plans = self.plans[(draws < self.retention).to(self.plans.actions.device)]
+
+    def add(self, plans: Plans) -> None:
+        """Remember more plans.
+
+        Raises:
+            ValueError: they have not as many actions as those before, or contexts of another kind.
+        """
+        if self.plans is None:
+            self.plans = plans
+            return
+        before = self.plans
+        if (before.num_actions, before.max_length) != (plans.num_actions, plans.max_length):
+            raise ValueError(
+                f"plans: {before.max_length} of {before.num_actions} actions are remembered,"
+                f" {plans.max_length} of {plans.num_actions} cannot be added"
+            )
+        kinds = [None if one.context is None else (one.context.dtype, one.context.shape[1:]) for one in (before, plans)]
+        if kinds[0] != kinds[1]:
+            raise ValueError("plans: their context is of another kind than that of the plans that are remembered")
+        lengths = None
+        if before.lengths is not None or plans.lengths is not None:
+            lengths = torch.cat([before.mask().sum(1), plans.mask().sum(1)])
+        context = None
+        if before.context is not None and plans.context is not None:
+            context = torch.cat([before.context, plans.context])
+        actions = torch.cat([before.actions, plans.actions])
+        self.plans = Plans(actions, plans.num_actions, lengths, plans.action_names, context)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What is remembered, by name; for files."""
+        if self.plans is None:
+            return {}
+        found = {"actions": self.plans.actions, "lengths": self.plans.lengths, "context": self.plans.context}
+        return {name: value for name, value in found.items() if value is not None}

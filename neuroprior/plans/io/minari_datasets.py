@@ -1,0 +1,180 @@
+"""Plans in Minari's local datasets of episodes, where actions are discrete."""
+
+import json
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import torch
+
+from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
+from neuroprior.plans.plans import Plans, is_per_step
+
+OURS = "neuroprior"
+"""Key of what only Plans know, in a dataset's metadata."""
+
+
+def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
+    """Plans of a local Minari dataset, one an episode. Nothing is downloaded.
+
+    Observations of a Discrete space are indices a step, of a Box, MultiDiscrete or MultiBinary space features a step
+    (flattened, float32); numbers of spaces that start elsewhere are counted from 0. What `write_minari` wrote comes
+    back as it was.
+
+    Args:
+        dataset_id: such as "minigrid/BabyAI-Pickup/optimal-v0", in `MINARI_DATASETS_PATH` or `~/.minari/datasets`.
+        observations: whether they are the context.
+
+    Raises:
+        FileNotFoundError: there is no such local dataset; the message tells how to get it.
+        ImportError: Minari is not installed.
+        ValueError: actions that are not discrete, observations of a Dict, Tuple or Text space, or a damaged dataset.
+    """
+    minari = _module("minari")
+    spaces = _module("gymnasium.spaces")
+    try:
+        dataset = minari.load_dataset(dataset_id)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"{dataset_id}: not among the local Minari datasets; `minari download {dataset_id}` gets a public one"
+        ) from None
+    with _one_line(dataset_id):
+        space, seen = dataset.action_space, dataset.observation_space
+        if not isinstance(space, spaces.Discrete):
+            raise ValueError(f"actions of the space {_shown(space)}; discrete actions are expected")
+        known = (spaces.Discrete, spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)
+        if observations and not isinstance(seen, known):
+            raise ValueError(f"observations of the space {_shown(seen)}; read without, by observations=False")
+        first = int(seen.start) if isinstance(seen, spaces.Discrete) else 0
+        episodes = [
+            {
+                "actions": episode.actions - int(space.start),
+                "observations": episode.observations - first if observations else None,
+            }
+            for episode in dataset.iterate_episodes()
+        ]
+        plans = from_trajectories(episodes, int(space.n))
+        groups = [about.get("group") for about in dataset.storage.get_episode_metadata(dataset.episode_indices)]
+        ours = json.loads(dataset.storage.metadata.get(OURS, "{}"))
+        return _restored(plans, groups, ours, observations)
+
+
+def write_minari(plans: Plans, dataset_id: str) -> None:
+    """Write plans as a new local Minari dataset, one episode each, for thousands of plans rather than millions.
+
+    The context is the observation (0 where there is none); after the last action the last one is repeated. Rewards are
+    0 and each episode is terminated at its end, for Plans know neither. Groups are metadata of the episodes ("group").
+
+    Args:
+        plans: one at least, each with an action at least.
+        dataset_id: such as "mice/open-field-v0", not there yet.
+
+    Raises:
+        ImportError: Minari is not installed.
+        ValueError: a plan without actions, or a dataset of this name is there already.
+    """
+    minari = _module("minari")
+    lengths = plans.mask().sum(1).tolist()
+    if not lengths or min(lengths) == 0:
+        raise ValueError(f"{dataset_id}: Minari cannot hold {'a plan without actions' if lengths else 'no plans'}")
+    context, space = _context_of_steps(plans)
+    shown = Plans(plans.actions, plans.num_actions, plans.lengths, context=context)
+    buffers = [
+        minari.data_collector.EpisodeBuffer(
+            observations=np.concatenate([episode["observations"], episode["observations"][-1:]]),
+            actions=episode["actions"],
+            rewards=np.zeros(length, np.float32),
+            terminations=np.arange(1, length + 1) == length,
+            truncations=np.zeros(length, bool),
+        )
+        for episode, length in zip(to_trajectories(shown), lengths, strict=True)
+    ]
+    with _one_line(dataset_id), warnings.catch_warnings(), _whole(dataset_id):
+        warnings.simplefilter("ignore", UserWarning)  # of missing authors, code and environment
+        dataset = minari.create_dataset_from_buffers(
+            dataset_id,
+            buffers,
+            action_space=_module("gymnasium.spaces").Discrete(plans.num_actions),
+            observation_space=space,
+            description="plans written by neuroprior",
+        )
+        if plans.group is not None:
+            dataset.storage.update_episode_metadata([{"group": group} for group in plans.group.tolist()])
+        names = {key: getattr(plans, key) for key in ("action_names", "context_names", "group_names", "end")}
+        ours = {key: value for key, value in names.items() if value is not None} | {"context": _kind(plans)}
+        dataset.storage.update_metadata({OURS: json.dumps(ours)})
+
+
+def _kind(plans: Plans) -> str | None:
+    return None if plans.context is None else "step" if is_per_step(plans.context) else "plan"
+
+
+def _context_of_steps(plans: Plans) -> tuple[torch.Tensor, Any]:
+    """The context of each step, and Gymnasium's space of it."""
+    spaces = _module("gymnasium.spaces")
+    context = torch.zeros(plans.actions.shape, dtype=torch.long) if plans.context is None else plans.context
+    if plans.context is not None and not is_per_step(plans.context):
+        context = plans.context[:, None].expand(-1, plans.max_length, *plans.context.shape[1:])
+    if context.is_floating_point():
+        context = context.float()
+        return context, spaces.Box(-np.inf, np.inf, (context.shape[-1],), np.float32)
+    count = len(plans.context_names) if plans.context_names is not None else int(context.max()) + 1
+    return context, spaces.Discrete(count)
+
+
+def _restored(plans: Plans, groups: list[Any], ours: dict[str, Any], observations: bool) -> Plans:
+    """Plans as they were written: with names, groups and `end`, and a context a plan where it was one."""
+    context = plans.context
+    if "context" in ours and ours["context"] != "step" and context is not None:
+        context = context[:, 0] if ours["context"] == "plan" else None
+    grouped = bool(groups) and all(group is not None for group in groups)
+    lengths = plans.mask().sum(1) if ours.get("end") is not None else plans.lengths
+    return Plans(
+        plans.actions,
+        plans.num_actions,
+        lengths,
+        ours.get("action_names"),
+        context,
+        torch.tensor([int(group) for group in groups]) if grouped else None,
+        ours.get("context_names") if context is not None else None,
+        ours.get("group_names") if grouped else None,
+        ours.get("end"),
+    )
+
+
+@contextmanager
+def _one_line(dataset_id: str) -> Iterator[None]:
+    """Turn what Minari, h5py and pyarrow raise over a dataset into one line."""
+    try:
+        yield
+    except (ValueError, KeyError, OSError, AssertionError, TypeError, AttributeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:300]
+        raise ValueError(f"{dataset_id}: {reason or type(error).__name__}") from error
+
+
+@contextmanager
+def _whole(dataset_id: str) -> Iterator[None]:
+    """Leave no half of a dataset behind where writing it fails."""
+    path = import_module("minari.storage.datasets_root_dir").get_dataset_path(dataset_id)
+    was_there = path.exists()
+    try:
+        yield
+    except BaseException:
+        if not was_there:
+            shutil.rmtree(path, ignore_errors=True)
+        raise
+
+
+def _module(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ImportError(f"Minari cannot be used ({error}); pip install 'neuroprior[gym]'") from error
+
+
+def _shown(space: Any) -> str:
+    return " ".join(str(space).split())[:100]

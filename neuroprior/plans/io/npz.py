@@ -1,0 +1,112 @@
+"""Plans in NumPy's `.npz`: the arrays of `Plans` by their names; nothing is pickled."""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neuroprior._files import written_whole
+from neuroprior.plans.io.columns import Names, renamed
+from neuroprior.plans.io.opening import check_file
+from neuroprior.plans.plans import Plans
+
+NUMBERS = ("actions", "lengths", "context", "group")
+NAMES = ("action_names", "context_names", "group_names")
+
+
+def read_npz(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:
+    """Plans of a `.npz` file: see `read_plans`."""
+    arrays = _arrays(path)
+    for key in NUMBERS:
+        if key in arrays and arrays[key].dtype.kind not in "iuf":
+            raise ValueError(f"{path}: {key}: an array of numbers is expected, not of {arrays[key].dtype}")
+    if "actions" not in arrays:
+        raise ValueError(f"{path}: no array 'actions'; it has {', '.join(sorted(arrays)) or 'none'}")
+    numbers: dict[str, Any] = {key: torch.from_numpy(_native(arrays[key])) for key in NUMBERS if key in arrays}
+    names: dict[str, Any] = {key: _names(path, key, arrays[key]) for key in NAMES if key in arrays}
+    end = _whole(path, "end", arrays)
+    known = num_actions or _whole(path, "num_actions", arrays)
+    if known is None and "action_names" in names:
+        known = len(names["action_names"])
+    try:
+        if known is None:
+            known = len(action_names) if action_names is not None else _largest(numbers) + 1
+        return renamed(Plans(num_actions=known, end=end, **numbers, **names), action_names, str(path))
+    except (ValueError, TypeError, RuntimeError) as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise ValueError(f"{path}: {reason.splitlines()[0]}") from error
+
+
+def write_npz(plans: Plans, path: Path) -> None:
+    """Write a `.npz` file, not compressed."""
+    tensors = {key: getattr(plans, key) for key in NUMBERS}
+    arrays = {key: _array(value) for key, value in tensors.items() if value is not None}
+    for key in NAMES:
+        if getattr(plans, key) is not None:
+            arrays[key] = np.array(getattr(plans, key), str)
+    for key in ("num_actions", "end"):
+        if getattr(plans, key) is not None:
+            arrays[key] = np.array(getattr(plans, key))
+    with written_whole(path, "wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    check_file(path)
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: not a .npz file (a zip archive of arrays), or cut off; np.savez writes one")
+    key = None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = {}
+            for key in [key for key in file.files if key in (*NUMBERS, *NAMES, "num_actions", "end")]:
+                found[key] = np.asarray(file[key])
+            return found
+    except Exception as error:  # numpy, zipfile and zlib raise a dozen unrelated kinds over damaged bytes
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        if "allow_pickle" in reason:
+            reason = "an array of Python objects; numbers, or texts of a fixed size, are expected"
+        raise ValueError(f"{path}: {key or 'the archive'}: {reason}") from error
+
+
+def _native(array: NDArray[Any]) -> NDArray[Any]:
+    """The same numbers in an order of bytes and a type that torch knows."""
+    if array.dtype.kind == "f" and array.dtype.itemsize > 8:
+        return array.astype(np.float64)
+    if array.dtype.kind == "u" and array.dtype.itemsize > 1:
+        # what is too large for int64 turns negative, and is refused as such
+        return np.ascontiguousarray(array.astype(np.int64)).reshape(array.shape)
+    return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("="))).reshape(array.shape)
+
+
+def _names(path: Path, key: str, array: NDArray[Any]) -> Names:
+    if array.ndim != 1 or array.dtype.kind != "U":
+        raise ValueError(f"{path}: {key}: one row of texts is expected, not {array.dtype} of shape {list(array.shape)}")
+    return tuple(str(name) for name in array)
+
+
+def _whole(path: Path, key: str, arrays: dict[str, NDArray[Any]]) -> int | None:
+    if key not in arrays:
+        return None
+    array = arrays[key]
+    if array.size != 1 or array.dtype.kind not in "iu":
+        raise ValueError(f"{path}: {key}: one integer is expected, not {array.dtype} of shape {list(array.shape)}")
+    return int(array.item())
+
+
+def _largest(numbers: dict[str, torch.Tensor]) -> int:
+    """The largest action, of those that count."""
+    actions, lengths = numbers["actions"], numbers.get("lengths")
+    if actions.dim() == 2 and lengths is not None and lengths.shape == actions.shape[:1]:
+        actions = actions.long()[torch.arange(actions.shape[1]) < lengths[:, None]]
+    if not actions.numel():
+        raise ValueError("no plan has an action, so num_actions must be given")
+    return int(actions.long().max())
+
+
+def _array(values: torch.Tensor) -> NDArray[Any]:
+    values = values.detach().cpu()
+    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()

@@ -1,0 +1,161 @@
+"""Plans from trajectories as Gymnasium's environments give them, and plans as such trajectories."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neuroprior.plans.io.columns import LARGEST_INTEGER, Gathered, Integers, check_names
+from neuroprior.plans.plans import Plans, is_per_step
+
+
+def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observations: str | None = "context") -> Plans:
+    """Plans of trajectories (episodes), one each.
+
+    Args:
+        trajectories: each a list of steps `(observation, action, reward, terminated, truncated, info)`, where the agent
+            saw the observation and then took the action (what follows the action is not used); or a dict or an object
+            with `actions [T]` and perhaps `observations`, T of them or T + 1, of which the last is dropped (such are
+            the episodes of Minari).
+        num_actions: A; actions are integers from 0 to A - 1.
+        observations: "context" for the observations as the context of each step: integers as indices, arrays as
+            features, flattened, float32. None to leave them out.
+
+    Returns:
+        Plans, padded to the longest trajectory. Without a context where no trajectory has observations.
+
+    Raises:
+        ValueError: actions that are not integers, observations that are neither integers nor arrays of one shape, or a
+            trajectory with more or fewer of them; the message names the trajectory, counted from 0.
+    """
+    check_names(num_actions, None)
+    if observations not in ("context", None):
+        raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")
+    actions: list[Integers] = []
+    seen: list[NDArray[Any] | None] = []
+    for number, trajectory in enumerate(trajectories):
+        taken, observed = _parts(trajectory, f"trajectory {number}")
+        actions.append(_actions(taken, num_actions, f"trajectory {number}"))
+        if observations is not None:
+            length = len(actions[-1])
+            seen.append(None if observed is None else _observations(observed, length, f"trajectory {number}"))
+    if not actions:
+        raise ValueError("trajectories: none are given")
+    return Gathered(
+        name="trajectories",
+        lengths=np.array([len(part) for part in actions]),
+        actions=np.concatenate(actions),
+        num_actions=num_actions,
+        context=_joined(seen),
+        per_step=True,
+    ).plans()
+
+
+def to_trajectories(plans: Plans) -> list[dict[str, NDArray[Any]]]:
+    """Each plan as a dict of `actions [T]`, int64, and `observations [T]` or `[T, C]` where it has a context a step."""
+    actions, lengths = plans.actions.long().cpu().numpy(), plans.mask().sum(1).tolist()
+    context = plans.context if is_per_step(plans.context) else None
+    found = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
+    if context is not None:
+        for trajectory, row, length in zip(found, context.detach().cpu().numpy(), lengths, strict=True):
+            trajectory["observations"] = row[:length].copy()
+    return found
+
+
+def _parts(trajectory: Any, place: str) -> tuple[Any, Any]:
+    """Actions and observations (or None) of a trajectory."""
+    if isinstance(trajectory, Mapping):
+        if "actions" not in trajectory:
+            raise ValueError(f"{place}: no 'actions'; it has {', '.join(map(str, trajectory)) or 'nothing'}")
+        return trajectory["actions"], trajectory.get("observations")
+    if hasattr(trajectory, "actions"):
+        return trajectory.actions, getattr(trajectory, "observations", None)
+    if not isinstance(trajectory, list | tuple):
+        raise ValueError(
+            f"{place}: a list of steps or a dict with 'actions' is expected, not {type(trajectory).__name__}"
+        )
+    for number, step in enumerate(trajectory):
+        if not isinstance(step, list | tuple) or len(step) != 6:
+            raise ValueError(
+                f"{place}: step {number}: (observation, action, reward, terminated, truncated, info) is expected"
+            )
+    return [step[1] for step in trajectory], [step[0] for step in trajectory]
+
+
+def _actions(values: Any, num_actions: int, place: str) -> Integers:
+    actions = _array(values, f"{place}: actions")
+    if not actions.size and actions.ndim == 1:
+        return np.zeros(0, np.int64)
+    if actions.dtype.kind not in "iu" or actions.ndim != 1:
+        raise ValueError(
+            f"{place}: actions are {actions.dtype} of shape {list(actions.shape)}; one integer a step is expected"
+            " (discrete actions)"
+        )
+    wrong = np.flatnonzero((actions < 0) | (actions >= num_actions))
+    if wrong.size:
+        raise ValueError(
+            f"{place}: action {actions[wrong[0]]} of step {wrong[0]} is out of range; there are {num_actions}, "
+            f"0 to {num_actions - 1}"
+        )
+    return actions.astype(np.int64)
+
+
+def _observations(values: Any, length: int, place: str) -> NDArray[Any]:
+    """Indices `[T]` or features `[T, C]`."""
+    if isinstance(values, Mapping | tuple) or (isinstance(values, list) and values and isinstance(values[0], Mapping)):
+        raise ValueError(
+            f"{place}: observations are of a Dict or Tuple space; flatten them first (gymnasium.spaces.flatten)"
+        )
+    observed = _array(values, f"{place}: observations")
+    if observed.ndim == 0 or len(observed) not in (length, length + 1):
+        shown = list(observed.shape)[:1] or "one"
+        raise ValueError(f"{place}: {shown} observations for {length} actions; {length} or {length + 1} are expected")
+    observed = observed[:length]
+    if observed.ndim == 1 and observed.dtype.kind in "iu":
+        if observed.size and not 0 <= int(observed.min()) <= int(observed.max()) < LARGEST_INTEGER:
+            raise ValueError(f"{place}: observation {observed.min()} is out of range; 0 or more is expected")
+        return observed.astype(np.int64)
+    if observed.dtype.kind not in "iufb":
+        raise ValueError(f"{place}: observations are {observed.dtype}; integers or arrays of numbers are expected")
+    width = int(np.prod(observed.shape[1:]))
+    features = observed.reshape(length, width).astype(np.float32)
+    wrong = np.flatnonzero(~np.isfinite(features).all(1))
+    if wrong.size:
+        raise ValueError(f"{place}: the observation of step {wrong[0]} is not finite")
+    return features
+
+
+def _joined(seen: list[NDArray[Any] | None]) -> NDArray[Any] | None:
+    """All observations end to end: `[S]` or `[S, C]`, or None where there are none."""
+    there = [i for i, part in enumerate(seen) if part is not None]
+    if not there:
+        return None
+    parts = [part for part in seen if part is not None]
+    if len(parts) < len(seen):
+        missing = next(i for i, part in enumerate(seen) if part is None)
+        raise ValueError(f"trajectory {missing}: no observations, which trajectory {there[0]} has")
+    # A trajectory without steps tells nothing of the kind of its observations.
+    kinds = [(i, part) for i, part in enumerate(parts) if len(part)] or [(0, parts[0])]
+    first = kinds[0][1]
+    for i, part in kinds:
+        if part.shape[1:] != first.shape[1:] or part.dtype != first.dtype:
+            raise ValueError(
+                f"trajectory {i}: observations of another kind than trajectory {kinds[0][0]}: "
+                f"{_kind(part)}, not {_kind(first)}"
+            )
+    return np.concatenate([part for _, part in kinds])
+
+
+def _kind(part: NDArray[Any]) -> str:
+    return "integers" if part.ndim == 1 else f"{part.shape[1]} features"
+
+
+def _array(values: Any, place: str) -> NDArray[Any]:
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+        raise ValueError(f"{place}: one number or one array of a fixed shape a step is expected") from error
+    if array.dtype.kind == "O":
+        raise ValueError(f"{place}: {array.dtype} values; a number or an array of numbers a step is expected")
+    return array

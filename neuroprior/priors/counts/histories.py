@@ -1,0 +1,290 @@
+"""The tree of the histories in plans, counted chunk by chunk: what Markov priors and context trees are made of."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import Plans, is_per_step
+from neuroprior.priors.counts.grams import few_grams, grams
+from neuroprior.priors.counts.tally import Tally, merge, number
+
+ACTIONS_AT_ONCE = 2**18
+"""Actions that are counted together; small enough for a processor's cache."""
+
+MAX_TABLE_BYTES = 2**31
+"""The tables of a prior may take this much; beyond it `fit` raises."""
+
+
+class TooLargeError(ValueError):
+    """Tables over the limit of `MAX_TABLE_BYTES`."""
+
+
+class Tree(NamedTuple):
+    """The histories that occurred, as a state machine.
+
+    Node 0 is the empty history; then come the histories of 1, 2, ..., `depth` actions, wherever in a plan they stood;
+    then the openings: the whole past of 0, 1, ..., `depth` - 1 actions since a plan began. A node's parent comes before
+    it: the history without its oldest action; of an opening, the same actions wherever they stood.
+    """
+
+    next_node: Tensor  # int32 [M, A]: the longest history of the tree after one more action
+    parent: Tensor  # int64 [M]; of node 0: itself
+    start: int  # the node before the first action
+    bounds: list[int]  # each level's nodes are bounds[i] to bounds[i + 1] - 1
+
+    @staticmethod
+    def empty(num_actions: int, device: torch.device) -> "Tree":
+        next_node = torch.zeros(1, num_actions, dtype=torch.int32, device=device)
+        return Tree(next_node, torch.zeros(1, dtype=torch.long, device=device), 0, [0, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """What followed the histories of a tree; a row is a pair of a node and a context that occurred, in that order.
+
+    Only what occurred is here: P triples of a row, an action and how often it followed.
+    """
+
+    row_code: Tensor  # int64 [R]: node * contexts + context of each row, ascending
+    row: Tensor  # int64 [P], ascending
+    action: Tensor  # int64 [P], ascending within a row
+    count: Tensor  # int64 [P]
+    kinds: Tensor  # int64 [P]: after how many histories longer by an action or a beginning; of the longest: the count
+
+    @staticmethod
+    def empty(device: torch.device) -> "Counts":
+        none = torch.zeros(0, dtype=torch.long, device=device)
+        return Counts(none, none, none, none, none)
+
+    def total(self) -> Tensor:
+        """`[R]`: how many actions followed each row."""
+        return torch.zeros_like(self.row_code).index_add_(0, self.row, self.count)
+
+    def pooled(self, contexts: int, num_actions: int, values: Tensor) -> Tensor:
+        """`[A]`: the sums of `values [P]` over all contexts after the empty history."""
+        first = int(torch.searchsorted(self.row_code, contexts))
+        until = int(torch.searchsorted(self.row, first))
+        sums = torch.zeros(num_actions, dtype=values.dtype, device=values.device)
+        return sums.index_add_(0, self.action[:until], values[:until])
+
+    def dense(self, first: int, until: int, num_actions: int, values: Tensor) -> Tensor:
+        """`values [P]` of the rows from `first` to `until` - 1 as a table `[until - first, A]`, float64."""
+        here = slice(int(torch.searchsorted(self.row, first)), int(torch.searchsorted(self.row, until)))
+        table = torch.zeros(until - first, num_actions, dtype=torch.double, device=self.row.device)
+        table[self.row[here] - first, self.action[here]] = values[here].double()
+        return table
+
+
+def rows_above(tree: Tree, counts: Counts, contexts: int) -> Tensor:
+    """`[R]`: the row of each row's parent in the same context; R above the empty history."""
+    node = counts.row_code.div(contexts, rounding_mode="floor")
+    above = torch.searchsorted(counts.row_code, tree.parent[node] * contexts + counts.row_code % contexts)
+    return above.masked_fill_(node == 0, len(node))
+
+
+def row_ends(tree: Tree, counts: Counts, contexts: int) -> list[int]:
+    """Each level's rows are those from entry i to entry i + 1, less one."""
+    bounds = torch.tensor(tree.bounds, device=counts.row.device)
+    return torch.searchsorted(counts.row_code, bounds * contexts).tolist()
+
+
+def row_blocks(tree: Tree, counts: Counts, contexts: int, num_actions: int) -> Iterator[tuple[int, int, int]]:
+    """Blocks of rows to compute together: the level, the first row and the one after the last; parents come first."""
+    size = max(2**22 // num_actions, 1)
+    ends = row_ends(tree, counts, contexts)
+    for level in range(len(ends) - 1):
+        for first in range(ends[level], ends[level + 1], size):
+            yield level, first, min(first + size, ends[level + 1])
+
+
+def count_histories(
+    plans: Plans, depth: int, num_contexts: int | None, openings: bool, device: torch.device
+) -> tuple[Tree, Counts]:
+    """The histories of up to `depth` actions in `plans`, and what followed them.
+
+    The plans are read once, some at a time; beside them and the tree this takes memory for one such part alone.
+
+    Args:
+        plans: with context indices where `num_contexts` is given.
+        depth: the longest history, in actions.
+        num_contexts: number of contexts that are counted apart; None: one.
+        openings: False leaves openings out, and the tree starts in the empty history.
+        device: where to count.
+
+    Raises:
+        TooLargeError: the tables would be larger than `MAX_TABLE_BYTES`.
+    """
+    histories = _Histories(plans.num_actions, depth, num_contexts or 1, device)
+    size = max(ACTIONS_AT_ONCE // max(plans.max_length, 1), 1)
+    if num_contexts is None and plans.lengths is None and few_grams(plans, depth):
+        actions = plans.actions
+        histories.add(*grams(actions[:, :depth], depth, plans.num_actions, size, device))
+        histories.add(*grams(actions, depth + 1, plans.num_actions, size, device), begins=False)
+        return histories.finish(openings)
+    for at in range(0, len(plans), size):
+        part = plans[at : at + size]
+        actions, here, context = part.actions.to(device).long(), None, None
+        if part.lengths is not None:
+            actions = actions[:, : int(part.lengths.max())]
+            here = part.mask()[:, : actions.shape[1]].to(device)
+        if num_contexts is not None and part.context is not None:
+            context = part.context.to(device).long()
+            context = context[:, : actions.shape[1]] if is_per_step(context) else context[:, None].expand_as(actions)
+        histories.add(actions, None, here, context)
+    return histories.finish(openings)
+
+
+class _Level:
+    """Histories of one length: numbered from 0 in the order in which they were met."""
+
+    def __init__(self, num_actions: int, device: torch.device, size: int = 0) -> None:
+        self.follow = torch.full((size, num_actions), -1, dtype=torch.int32, device=device)
+        self.parent = torch.zeros(size, dtype=torch.long, device=device)
+        self.tally = Tally(device)
+
+    def __len__(self) -> int:
+        return len(self.parent)
+
+    def grow(self, parent: Tensor, last: bool) -> None:
+        self.parent = torch.cat([self.parent, parent])
+        if not last:
+            self.follow = torch.cat([self.follow, self.follow.new_full((len(parent), self.follow.shape[1]), -1)])
+
+
+class _Histories:
+    """Counts at the longest history of each action alone; `finish` sums them up for the shorter ones."""
+
+    def __init__(self, num_actions: int, depth: int, contexts: int, device: torch.device) -> None:
+        self.num_actions, self.contexts = num_actions, contexts
+        # In this order: what follows histories of t actions, and what followed t actions at the beginning of a plan.
+        self.levels = [_Level(num_actions, device, int(t == 0)) for t in range(depth + 1)]
+        self.openings = [_Level(num_actions, device, int(t == 0)) for t in range(depth)]
+
+    def add(
+        self,
+        actions: Tensor,
+        times: Tensor | None,
+        here: Tensor | None = None,
+        context: Tensor | None = None,
+        begins: bool = True,
+    ) -> None:
+        """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), seen with `context [n, L]`.
+
+        Each row counts `times [n]` (None: once), if it has at most `depth` + 1 actions, all of them there; `begins`
+        says whether rows are the beginnings of plans.
+        """
+        length, depth = actions.shape[1], len(self.openings)
+        node, opening = torch.zeros_like(actions), torch.zeros_like(actions[:, :1])
+        for t in range(min(depth, length)):
+            if begins:
+                self._count(self.openings[t], opening, actions, context, here, slice(t, t + 1), times)
+            if t + 1 == length:
+                return
+            now, after = actions[:, t:-1], None if here is None else here[:, t + 1 :]
+            node = self._go(self.levels, t, node[:, :-1], now, node[:, 1:], after)
+            if begins and t + 1 < depth:
+                first = None if after is None else after[:, :1]
+                opening = self._go(self.openings, t, opening, now[:, :1], node[:, :1], first)
+        if length > depth:
+            self._count(self.levels[depth], node, actions, context, here, slice(depth, None), times)
+
+    def _count(
+        self,
+        level: _Level,
+        node: Tensor,
+        actions: Tensor,
+        context: Tensor | None,
+        here: Tensor | None,
+        steps: slice,
+        times: Tensor | None,
+    ) -> None:
+        """Count the actions of some steps, which followed `node`."""
+        row = node if context is None else node * self.contexts + context[:, steps]
+        codes = row * self.num_actions + actions[:, steps]
+        codes = codes.reshape(-1) if here is None else codes[here[:, steps]]
+        level.tally.add(codes, len(level) * self.contexts * self.num_actions, times)
+
+    def _go(
+        self, levels: list[_Level], t: int, node: Tensor, actions: Tensor, parent: Tensor, here: Tensor | None
+    ) -> Tensor:
+        """The nodes of level t + 1 after `actions` in the nodes of level t; those not yet there are made."""
+        level, below = levels[t], levels[t + 1]
+        codes = node * self.num_actions + actions
+        found = level.follow.view(-1)[codes]
+        new = found < 0 if here is None else (found < 0) & here
+        if bool(new.any()):
+            distinct, rank = number(codes[new], level.follow.numel())
+            self._check_size(len(distinct))
+            level.follow.view(-1)[distinct] = torch.arange(
+                len(below), len(below) + len(distinct), dtype=torch.int32, device=codes.device
+            )
+            above = torch.empty_like(distinct)
+            above[rank] = parent[new]
+            below.grow(above, last=t + 2 == len(levels))
+            found = level.follow.view(-1)[codes]
+        # Past the end of a plan there may be no node; what is there is never counted.
+        return found.long() if here is None else found.long().clamp_(min=0)
+
+    def _check_size(self, more: int, rows: int | None = None) -> None:
+        nodes = more + sum(len(level) for level in (*self.levels, *self.openings))
+        rows = nodes if rows is None else rows
+        size = 4 * self.num_actions * (nodes + rows)
+        if size > MAX_TABLE_BYTES:
+            raise TooLargeError(
+                f"plans: tables of {max(nodes, rows):,} histories x {self.num_actions} actions, or more, need"
+                f" {size / 1e9:.1f} GB, over the limit of {MAX_TABLE_BYTES / 1e9:.1f} GB;"
+                f" with histories of fewer than {len(self.openings)} actions they would be smaller"
+            )
+
+    def finish(self, openings: bool) -> tuple[Tree, Counts]:
+        """The tree and its counts; nothing can be added any more."""
+        if not any(level.tally.size for level in (self.levels[-1], *self.openings)):
+            device = self.levels[0].parent.device
+            return Tree.empty(self.num_actions, device), Counts.empty(device)
+        pairs = self._sum_up()
+        keep = [*self.levels, *(self.openings if openings else [])]
+        bounds = torch.tensor([0, *map(len, keep)]).cumsum(0).tolist()
+        below = self.contexts * self.num_actions
+        codes = torch.cat([codes + first * below for (codes, _, _), first in zip(pairs, bounds, strict=False)])
+        count, kinds = (torch.cat([pair[i] for pair in pairs[: len(keep)]]) for i in (1, 2))
+        codes = codes[: len(count)]
+        code = codes.div(self.num_actions, rounding_mode="floor")
+        row_code, row = torch.unique_consecutive(code, return_inverse=True)
+        self._check_size(0, len(row_code))
+        return self._tree(keep, bounds, openings), Counts(row_code, row, codes % self.num_actions, count, kinds)
+
+    def _sum_up(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Codes (node * contexts + context) * A + action, counts and kinds of each level; then of the openings."""
+        below = self.contexts * self.num_actions
+
+        def lift(level: _Level, codes: Tensor) -> Tensor:
+            return level.parent[codes.div(below, rounding_mode="floor")] * below + codes % below
+
+        first = [merge(level.tally.parts) for level in self.openings]
+        codes, count, _ = merge(self.levels[-1].tally.parts)
+        out = [(codes, count, count)]
+        for t in range(len(self.openings) - 1, -1, -1):
+            longer = lift(self.levels[t + 1], out[0][0]), out[0][1]
+            begun = lift(self.openings[t], first[t][0]), first[t][1]
+            out.insert(0, merge([longer, begun]))
+        return [*out, *((codes, count, count) for codes, count, _ in first)]
+
+    def _tree(self, keep: list[_Level], bounds: list[int], openings: bool) -> Tree:
+        depth, device = len(self.openings), self.levels[0].parent.device
+        next_node = torch.zeros(bounds[-1], self.num_actions, dtype=torch.int32, device=device)
+        parents = []
+        for i, level in enumerate(keep):
+            # Openings have their parents among the histories of as many actions.
+            parent = level.parent + (bounds[max(i - 1, 0)] if i <= depth else bounds[i - depth - 1])
+            # Where no longer history occurred, one more action leads where it leads from the shorter one.
+            rows = next_node[parent]
+            if len(level.follow) and i + 1 < len(keep):
+                rows = torch.where(level.follow >= 0, level.follow + bounds[i + 1], rows)
+            next_node[bounds[i] : bounds[i + 1]] = rows
+            level.follow = level.follow[:0]
+            parents.append(parent)
+        start = bounds[depth + 1] if openings and depth else 0
+        return Tree(next_node, torch.cat(parents), start, bounds)

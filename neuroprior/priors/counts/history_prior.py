@@ -1,0 +1,165 @@
+"""What priors over the tree of histories share: the state machine, its tables, counting and reading them back."""
+
+from abc import abstractmethod
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+
+from neuroprior.plans import Plans, is_per_step
+from neuroprior.priors.counts.histories import Counts, Tree, count_histories
+from neuroprior.priors.prior import Prior
+
+_TABLES = ("next_node", "parent", "start_node", "row_code", "log_probs")
+
+
+PART = 256
+"""Actions of a long plan that are walked through one after the other."""
+
+
+class HistoryPrior(Prior):
+    """A prior whose next action depends on the longest history, of those that occurred, that ends the plan so far.
+
+    The histories are the nodes of a tree, and the state is the number of that history (times `num_contexts`, plus the
+    context seen last), int64 `[N]`: `step` is two gathers, for any depth.
+
+    Args:
+        num_actions: A.
+        depth: >= 0, the most past actions that count.
+        num_contexts: number of context indices, where the prior sees one.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    next_node: Tensor
+    parent: Tensor
+    start_node: Tensor
+    row_code: Tensor
+    log_probs: Tensor
+
+    tables: tuple[str, ...] = _TABLES
+    """The names of the buffers whose sizes depend on what was learned."""
+
+    openings = True
+    """Whether the whole past since a plan's beginning is a history of its own."""
+
+    def __init__(self, num_actions: int, depth: int, num_contexts: int | None = None) -> None:
+        super().__init__(num_actions, num_contexts)
+        self._depth = depth
+        self.learn(Tree.empty(num_actions, self.device), Counts.empty(self.device))
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        node = self.start_node.expand(batch_size)
+        return self._at(node, torch.zeros_like(node) if context is None else context.long())
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        contexts = self.num_contexts or 1
+        node = self.next_node.view(-1)[state.div(contexts, rounding_mode="floor") * self.num_actions + action].long()
+        return self._at(node, state % contexts if context is None else context.long())
+
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        num, length = plans.shape
+        node = self._nodes(plans.long())
+        seen = torch.zeros_like(node)
+        if context is not None:
+            seen = context.long() if is_per_step(context) else context.long()[:, None].expand(num, length)
+        return self.log_probs[self._row(node.flatten(), seen.flatten())].view(num, length, self.num_actions)
+
+    def _nodes(self, actions: Tensor) -> Tensor:
+        """The node before each action of `actions [N, L]`."""
+        num, length = actions.shape
+        part = max(PART, self._depth)  # so that a part reaches back to no more than the one before it
+        if num and length > 2 * (part + self._depth):
+            # A node depends on the last `depth` actions alone, so the parts of long plans are walked through side by
+            # side, each from that many actions before it.
+            first = self._walk(actions[:, :part], self.start_node.long().expand(num))
+            padded = nn.functional.pad(actions[:, part - self._depth :], (0, -(length - part) % part))
+            parts = padded.unfold(1, part + self._depth, part).flatten(0, 1)
+            late = self._walk(parts, torch.zeros_like(parts[:, 0]))[:, self._depth :]
+            return torch.cat([first, late.reshape(num, -1)[:, : length - part]], 1)
+        return self._walk(actions, self.start_node.long().expand(num))
+
+    def _walk(self, actions: Tensor, node: Tensor) -> Tensor:
+        """The node before each action, `[N, L]`, from `node [N]` on."""
+        nodes, follow = torch.empty_like(actions), self.next_node.view(-1)
+        for t in range(actions.shape[1]):
+            nodes[:, t] = node
+            node = follow[node * self.num_actions + actions[:, t]].long()
+        return nodes
+
+    def fit(self, plans: Plans | Tensor) -> Self:
+        """Count; whatever was learned before is forgotten. Returns self.
+
+        The plans are counted some at a time: beside them and the tables this takes little memory.
+
+        Raises:
+            ValueError: the plans do not fit this prior, or so many histories occur in them that the tables would need
+                over 2 GB.
+        """
+        self.learn(*self.count(plans))
+        return self
+
+    def count(self, plans: Plans | Tensor) -> tuple[Tree, Counts]:
+        """What `fit` counts and `learn` takes over; the same for every prior of this depth that sees the same.
+
+        Raises:
+            ValueError: as `fit`.
+        """
+        return count_histories(self.training_plans(plans), self._depth, self.num_contexts, self.openings, self.device)
+
+    @abstractmethod
+    def estimate(self, tree: Tree, counts: Counts) -> Tensor:
+        """The log-probabilities `[R + 1, A]` (float32) of each row of `counts`; the last: of a context never seen."""
+
+    def learn(self, tree: Tree, counts: Counts) -> None:
+        """Take over a tree and its counts."""
+        start = torch.tensor(tree.start)
+        values = (tree.next_node, tree.parent, start, counts.row_code, self.estimate(tree, counts))
+        for name, value in zip(_TABLES, values, strict=True):
+            self.register_buffer(name, value.to(self.device))
+
+    def _at(self, node: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
+        """The logits and the state at `node [N]` where `context [N]` is seen."""
+        contexts = self.num_contexts or 1
+        return self.log_probs[self._row(node, context)], node * contexts + context
+
+    def _row(self, node: Tensor, context: Tensor) -> Tensor:
+        """The row of `log_probs` for each history and context: that of the longest history seen in the context."""
+        if self.num_contexts is None or len(self.row_code) == 0:
+            return node
+        fallback = len(self.row_code)
+        row = torch.full_like(node, fallback)
+        for _ in range(self._depth + 2):
+            code = node * self.num_contexts + context
+            at = torch.searchsorted(self.row_code, code).clamp_(max=fallback - 1)
+            row = torch.where((row == fallback) & (self.row_code[at] == code), at, row)
+            node = self.parent[node]
+        return row
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        # The tables' sizes depend on what was learned, so they are taken from the file.
+        for name in self.tables:
+            if prefix + name in state_dict:
+                value = state_dict[prefix + name]
+                self.register_buffer(name, torch.empty_like(value, device=self.device))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        if not self.tables_fit():
+            raise RuntimeError(f"the tables of a {type(self).__name__} do not fit one another")
+
+    def tables_fit(self) -> bool:
+        """Whether the tables may be those of a prior of this kind; for files that come from elsewhere."""
+        nodes, rows, contexts = len(self.next_node), len(self.log_probs), self.num_contexts or 1
+        whole = (self.next_node, self.parent, self.start_node, self.row_code)
+        return (
+            all(not t.is_floating_point() for t in whole)
+            and self.next_node.shape == (nodes, self.num_actions)
+            and self.log_probs.shape == (rows, self.num_actions)
+            and self.parent.shape == (nodes,)
+            and self.start_node.shape == ()
+            and self.row_code.shape == (rows - 1,)
+            and all(int(t.min()) >= 0 and int(t.max()) < nodes for t in (self.next_node, self.parent, self.start_node))
+            and (rows == 1 or (int(self.row_code.min()) >= 0 and int(self.row_code.max()) < nodes * contexts))
+            and (self.num_contexts is not None or rows == 1 or rows == nodes + 1)
+            and not bool(self.log_probs.isnan().any())
+        )

@@ -1,0 +1,131 @@
+"""Macro-actions: sequences that executed plans repeat, learned by recoding pairs of actions as new actions."""
+
+from dataclasses import dataclass
+from math import log, log2
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_sizes
+from neuroprior.plans import Plans
+
+Criterion = Literal["count", "information", "compression"]
+
+CRITERIA = ("count", "information", "compression")
+
+
+@dataclass(frozen=True)
+class Macro:
+    """A sequence of actions that is taken as one.
+
+    Attributes:
+        actions: of the plans, two or more.
+        count: how often it replaced its two halves when it was learned.
+        gain: bits by which it shortened the plans then, each symbol coded by its frequency, less those that tell what
+            it stands for; it may be negative where it was not learned for its gain.
+    """
+
+    actions: tuple[int, ...]
+    count: int
+    gain: float
+
+
+def learn_macros(plans: Plans, num_macros: int, by: Criterion = "count") -> tuple[list[Macro], Plans]:
+    """Find the macro-actions of executed plans, and recode the plans with them.
+
+    Again and again the best pair of symbols that follow one another is replaced, wherever it occurs, from left to
+    right, by a new symbol: byte-pair encoding (Gage 1994; of actions: Iba 1989, McGovern 1998). The best is
+
+    - "count": the pair that occurs most often;
+    - "information": the pair with the greatest n log2(p(xy) / (p(x) p(y))), n being how often it occurs: the mutual
+      information that it has a part in;
+    - "compression": the pair whose replacement shortens the plans most; see `Macro.gain`.
+
+    It ends when no pair occurs twice or, by "information" and "compression", none is better than nothing.
+
+    Args:
+        plans: of A actions; their context is left aside.
+        num_macros: M, the most macros to find.
+        by: what a good pair is.
+
+    Returns:
+        At most M macros, in the order in which they were found, and the plans with A + M actions, of which A + i is
+        macro i. A macro may hold earlier ones; its actions are always those of the plans.
+
+    Raises:
+        ValueError: an argument is out of range, or the plans have an end symbol.
+    """
+    check_sizes(num_macros=num_macros)
+    if by not in CRITERIA:
+        raise ValueError(f"by: one of {', '.join(map(repr, CRITERIA))} is expected, not {by!r}")
+    if plans.end is not None:
+        raise ValueError("plans: an end symbol cannot be part of a macro; learn from plans without one")
+    symbols = plans.actions.long().masked_fill(~plans.mask(), -1)
+    meaning: list[tuple[int, ...]] = [(action,) for action in range(plans.num_actions)]
+    macros: list[Macro] = []
+    while len(macros) < num_macros and (best := _best_pair(symbols, len(meaning), by)) is not None:
+        first, second, gain = best
+        starts = _occurrences(symbols)
+        starts &= (symbols[:, :-1] == first) & (symbols[:, 1:] == second)
+        symbols = _replaced(symbols, starts, len(meaning))
+        meaning.append(meaning[first] + meaning[second])
+        macros.append(Macro(meaning[-1], int(starts.sum()), gain))
+    lengths = (symbols >= 0).sum(1)
+    longest = int(lengths.max()) if len(lengths) else 0
+    actions = symbols[:, :longest].clamp(min=0)
+    return macros, Plans(actions, plans.num_actions + num_macros, lengths, group=plans.group)
+
+
+def _occurrences(symbols: Tensor) -> Tensor:
+    """Where pairs begin, `[N, L - 1]`; of those of equal symbols that overlap, every other one."""
+    first, second = symbols[:, :-1], symbols[:, 1:]
+    same = first == second
+    place = torch.arange(first.shape[1], device=symbols.device).expand_as(first)
+    run = torch.where(same, -1, place).cummax(1).values if first.shape[1] else place
+    return (second >= 0) & (~same | ((place - run) % 2 == 1))
+
+
+def _best_pair(symbols: Tensor, kinds: int, by: Criterion) -> tuple[int, int, float] | None:
+    """The best pair, and the bits that it saves; of equals the first. None where none is of use."""
+    starts = _occurrences(symbols)
+    code, count = (symbols[:, :-1] * kinds + symbols[:, 1:])[starts].unique(return_counts=True)
+    code, count = code[count > 1], count[count > 1].double()
+    if len(code) == 0:
+        return None
+    single = symbols[symbols >= 0].bincount(minlength=kinds).double()
+    first, second = code.div(kinds, rounding_mode="floor"), code % kinds
+    total = single.sum()
+    gain = _gain(single, first, second, count, kinds)
+    merit = {
+        "count": lambda: count,
+        "information": lambda: count * (count * total / (single[first] * single[second])).log2(),
+        "compression": lambda: gain,
+    }[by]()
+    best = int(merit.argmax())
+    if merit[best] <= 0:
+        return None
+    return int(first[best]), int(second[best]), float(gain[best])
+
+
+def _gain(single: Tensor, first: Tensor, second: Tensor, count: Tensor, kinds: int) -> Tensor:
+    """The bits that each pair saves, `[K]`: symbols that occur n of N times take log2(N / n) each."""
+    total, same = single.sum(), first == second
+
+    def weight(number: Tensor) -> Tensor:
+        weights: Tensor = torch.special.xlogy(number, number)
+        return weights
+
+    left = torch.where(same, single[first] - 2 * count, single[first] - count)
+    change = weight(left) - weight(single[first]) + weight(count)
+    change += torch.where(same, 0.0, weight(single[second] - count) - weight(single[second]))
+    saved: Tensor = weight(total) - weight(total - count) + change
+    return saved / log(2) - 2 * log2(kinds)
+
+
+def _replaced(symbols: Tensor, starts: Tensor, new: int) -> Tensor:
+    """The symbols with pairs that begin at `starts [N, L - 1]` as `new` ones; what is left moves up, -1 follows."""
+    symbols = symbols.clone()
+    symbols[:, :-1][starts] = new
+    symbols[:, 1:][starts] = -1
+    return symbols.gather(1, (symbols < 0).int().argsort(dim=1, stable=True))

@@ -1,0 +1,109 @@
+"""Model folders: a prior saved as `model.safetensors` and `config.json`, and read back; never pickle."""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as read_tensors
+from safetensors.torch import save as write_tensors
+
+from neuroprior._files import read_json
+from neuroprior.priors.prior import Prior
+
+FILES = ("model.safetensors", "config.json")
+
+FORMAT = "neuroprior model"
+VERSION = 1
+
+
+def save(prior: Prior, folder: str | os.PathLike[str]) -> Path:
+    """Save a prior to a folder, made if need be: `model.safetensors` (weights or counts) and `config.json`.
+
+    Both files are written beside their places and moved there when they are whole.
+
+    Args:
+        prior: any `Prior` whose `config` gives its constructor's arguments.
+        folder: where.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    data = write_tensors({name: value.detach().cpu().clone() for name, value in prior.state_dict().items()})
+    config = {
+        "format": FORMAT,
+        "version": VERSION,
+        "prior": type(prior).__name__,
+        "config": prior.config,
+        "learned": prior.learned,
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    contents = {"model.safetensors": data, "config.json": (json.dumps(config, indent=2) + "\n").encode()}
+    for name, content in contents.items():
+        (folder / f".{name}.partial").write_bytes(content)
+    for name in contents:
+        os.replace(folder / f".{name}.partial", folder / name)
+    return folder
+
+
+def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> Prior:
+    """The prior that `save` wrote to a folder.
+
+    Args:
+        folder: where.
+        device: where the prior shall compute.
+
+    Raises:
+        FileNotFoundError: the folder or one of its two files is not there.
+        ValueError: a file is damaged or not of this kind, the prior's class is not known (import it first), or there is
+            no such device.
+    """
+    folder = Path(folder)
+    config = _read_config(folder / "config.json")
+    data = (folder / "model.safetensors").read_bytes()
+    digest = hashlib.sha256(data).hexdigest()
+    unfinished = folder / ".config.json.partial"
+    if digest != config["sha256"] and unfinished.exists():
+        # A save was cut off between its two moves: the new model is in place, its configuration still waits.
+        config = _read_config(unfinished)
+    if digest != config["sha256"]:
+        raise ValueError(f"{folder / 'model.safetensors'}: truncated, changed or of another model than config.json")
+    try:
+        prior = Prior.known[config["prior"]](**config["config"])
+        prior.restore(config["learned"])
+    except (RuntimeError, TypeError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{folder / 'config.json'}: no configuration of a {config['prior']} ({reason})") from error
+    try:
+        prior.load_state_dict(read_tensors(data))
+    except (SafetensorError, RuntimeError) as error:
+        raise ValueError(f"{folder / 'model.safetensors'}: does not fit the prior that config.json tells of") from error
+    try:
+        return prior.to(device).eval()
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"device: {str(device)!r} cannot be used here ({str(error).splitlines()[0][:200]})") from error
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    config = read_json(path)
+    if not isinstance(config, dict) or config.get("format") != FORMAT:
+        raise ValueError(f'{path}: not the configuration of a saved prior ("format": "{FORMAT}" is missing)')
+    if config.get("version") != VERSION:
+        raise ValueError(f"{path}: version {config.get('version')} of the format; this library reads {VERSION}")
+    missing = [key for key in ("prior", "config", "learned", "sha256") if key not in config]
+    if missing:
+        raise ValueError(f"{path}: {missing[0]!r} is missing")
+    if not isinstance(config["prior"], str) or config["prior"] not in Prior.known:
+        raise ValueError(f"{path}: the prior {config['prior']!r} is not known; import the module that defines it first")
+    for key in ("config", "learned"):
+        if not isinstance(config[key], dict):
+            raise ValueError(f"{path}: {key!r} must be an object")
+    return config

@@ -1,0 +1,228 @@
+"""A page of results that stands alone: one HTML file that holds its tables and figures and needs no network."""
+
+import re
+import unicodedata
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from neuroprior._files import write_whole
+
+INK = "#0a0b0c"
+"""Drawn with this colour, text and axes of a figure take that of the page's text, light or dark."""
+
+PAPER = "#f3f4f5"
+"""Drawn with this colour, an area of a figure takes that of the page's background."""
+
+STYLE: dict[str, Any] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": INK,
+    "axes.facecolor": "none",
+    "axes.labelcolor": INK,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": INK,
+    # A narrow screen shows the left of a figure first.
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "figure.facecolor": "none",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 10,
+    "grid.alpha": 0.15,
+    "grid.color": INK,
+    "hatch.color": INK,
+    "legend.frameon": False,
+    "savefig.facecolor": "none",
+    "svg.fonttype": "none",
+    # Names of ids are drawn from it: without it they would differ from run to run.
+    "svg.hashsalt": "neuroprior",
+    "text.color": INK,
+    # A name such as "$x" is a name, not a formula.
+    "text.parse_math": False,
+    "xtick.color": INK,
+    "xaxis.labellocation": "left",
+    "ytick.color": INK,
+}
+"""Settings of matplotlib under which a figure for a page is made."""
+
+SMALLEST = 9.5
+"""Height of the smallest text of a figure, CSS pixels, down to which it shrinks with the page; then its box scrolls."""
+
+
+def breakable(name: str) -> str:
+    """A long name, which may be broken where its words end."""
+    return name.replace("_", "_\N{ZERO WIDTH SPACE}")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text.
+
+    Attributes:
+        headings: K of them.
+        rows: of K cells each; the first cell names its row.
+        caption: what the numbers are, and what their intervals go over.
+        align: K letters, "l" (left) or "r" (right, for numbers); None: the first column left, the others right.
+
+    Raises:
+        ValueError: a row, or `align`, does not have as many columns as there are headings.
+    """
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    align: str | None = None
+
+    def __post_init__(self) -> None:
+        wide = len(self.headings)
+        for number, row in enumerate(self.rows):
+            if len(row) != wide:
+                raise ValueError(f"rows[{number}]: {wide} cells are expected, one a heading, not {len(row)}")
+        if self.align is None:
+            object.__setattr__(self, "align", "l" + "r" * (wide - 1))
+        elif len(self.align) != wide or set(self.align) - set("lr"):
+            raise ValueError(f"align: {wide} letters l or r are expected, not {self.align!r}")
+
+
+@dataclass(frozen=True)
+class FigureBox:
+    """A figure with its words.
+
+    Attributes:
+        svg: as `svg` makes it.
+        caption: below the figure: what is seen, in which units, and what intervals go over.
+        alt: what the figure says, for readers who do not see it.
+    """
+
+    svg: str
+    caption: str
+    alt: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page with a line in its contents: paragraphs, then figures, then tables.
+
+    Where `beside` is set, figures stand beside one another as far as there is room: small ones, up to 3 inches wide.
+    """
+
+    title: str
+    text: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    figures: Sequence[FigureBox] = ()
+    beside: bool = False
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of results.
+
+    Attributes:
+        title: of the page.
+        lead: the findings in a few sentences, before everything else.
+        command: the command line that made the page.
+        settings: all settings under which it was made, by name; shown with the command at the end.
+        sections: in the order of the contents.
+    """
+
+    title: str
+    lead: str
+    command: str
+    settings: Mapping[str, Any]
+    sections: Sequence[Section]
+
+
+def write_page(path: Path, page: Page) -> None:
+    """Write a page as one HTML file, whole or not at all; the same page gives the same bytes.
+
+    All text is escaped: names in a user's file may hold anything.
+
+    Raises:
+        ValueError: the place is a directory.
+        OSError: the file cannot be written.
+    """
+    # Autoescape for every template: the ending .j2 would not switch it on.
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        finalize=_printable,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    drawings = [
+        [_drawing(box, f"figure-{s}-{number}-") for number, box in enumerate(section.figures, 1)]
+        for s, section in enumerate(page.sections, 1)
+    ]
+    text = environment.get_template("page.html.j2").render(page=page, drawings=drawings)
+    write_whole(path, text.encode())
+
+
+def svg(figure: Figure) -> str:
+    """A figure as an SVG element to stand inside a page: its text stays text, `INK` and `PAPER` follow the page.
+
+    The same figure gives the same text. Figures are made with matplotlib's settings `STYLE`.
+    """
+    content = StringIO()
+    nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        # Text is not drawn with matplotlib's font, so that font need not have the letter.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        figure.savefig(content, format="svg", metadata=nothing, bbox_inches="tight", pad_inches=0.03)
+    text = content.getvalue()
+    # Its style sheet would hold for the whole page, and its metadata name addresses.
+    text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text[text.index("<svg") :], flags=re.DOTALL)
+    return _in_tags(_following, _sized(text)).strip()
+
+
+def clean(text: str) -> str:
+    """Text in one line without characters that HTML and XML cannot hold; each becomes U+FFFD."""
+    one_line = " ".join(text.split())
+    return "".join("\N{REPLACEMENT CHARACTER}" if _forbidden(letter) else letter for letter in one_line)
+
+
+def _forbidden(letter: str) -> bool:
+    return unicodedata.category(letter) in ("Cc", "Cs") or ord(letter) & 0xFFFE == 0xFFFE
+
+
+def _printable(value: Any) -> Any:
+    """What stands in the page for a value of the template; what is markup already stays as it is."""
+    if isinstance(value, Markup):
+        return value
+    return clean(", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value))
+
+
+def _sized(text: str) -> str:
+    """The SVG as wide as the page has room for: at most its own width, and at least what keeps its text legible."""
+    width = 4 / 3 * float(re.findall(r'<svg[^>]* width="([\d.]+)pt"', text)[0])
+    letters = 4 / 3 * min(map(float, re.findall(r'<text style="[^"]*font-size: ([\d.]+)px', text)), default=SMALLEST)
+    least = width * min(SMALLEST / letters, 1)
+    style = f"width:100%;min-width:{least:.0f}px;max-width:{width:.0f}px;height:auto;stroke-linejoin:round"
+    return text.replace("<svg ", f'<svg style="{style}" ', 1)
+
+
+def _following(tag: str) -> str:
+    """A tag with the page's colours and font."""
+    tag = tag.replace(INK, "currentColor").replace(PAPER, "var(--paper, #fff)")
+    return tag.replace("font-family: 'DejaVu Sans', sans-serif", "font-family: inherit")
+
+
+def _drawing(box: FigureBox, prefix: str) -> Markup:
+    """The SVG of a figure under ids of its own: matplotlib numbers those of every figure alike."""
+    told = Markup('<svg role="img" aria-label="{}" ').format(clean(box.alt))
+    text = _in_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), box.svg)
+    return Markup(text.replace("<svg ", told, 1))
+
+
+def _in_tags(change: Any, text: str) -> str:
+    """Change the tags of XML and leave the text between them, in which matplotlib escapes < and >."""
+    return re.sub(r"<[^>]*>", lambda match: change(match[0]), text)

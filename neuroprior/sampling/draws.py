@@ -1,0 +1,98 @@
+"""Drawing actions: from logits one by one, or a number of plans split over the actions that go on from a prefix."""
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import action_dtype
+from neuroprior.sampling.rows import rows_of
+
+
+def check_temperature(temperature: float) -> None:
+    """Raise ValueError unless logits can be divided by it."""
+    if not 0 < temperature < float("inf"):
+        raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+
+
+def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:
+    """`logits [..., A]`, but nothing else than the end symbol where the action `before [...]` was that symbol."""
+    if end is None:
+        return logits
+    ended = torch.full_like(logits[..., :1], -torch.inf).repeat_interleave(logits.shape[-1], -1)
+    ended[..., end] = 0
+    return torch.where((before == end)[..., None], ended, logits)
+
+
+class Draw:
+    """Draws actions from logits."""
+
+    def __init__(
+        self, num_actions: int, temperature: float, generator: torch.Generator, end: int | None = None
+    ) -> None:
+        self.num_actions, self.temperature, self.generator, self.end = num_actions, temperature, generator, end
+        self.dtype = action_dtype(num_actions)
+
+    def uniform(self, shape: tuple[int, ...], logits: Tensor) -> Tensor:
+        """Numbers from 0 to below 1 to draw actions by, of the dtype of their `logits`."""
+        return torch.rand(shape, generator=self.generator, device=logits.device, dtype=logits.dtype)
+
+    def actions(self, logits: Tensor, uniform: Tensor) -> Tensor:
+        """One action a row of `logits [N, A]`, by `uniform [N]`: int64 `[N]`. None of probability 0 is ever drawn."""
+        # A row an action: with few actions and many rows each operation is several times as fast this way round.
+        cumulative = self._weights(logits.T.contiguous(), 0).cumsum(0)
+        total = cumulative[-1]
+        action = (cumulative <= uniform * total).sum(0)
+        # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
+        return torch.minimum(action, (cumulative < total).sum(0))
+
+    def _weights(self, logits: Tensor, dim: int) -> Tensor:
+        """Probabilities but for a factor that is the same along `dim`."""
+        # The largest is taken off first, so that no temperature makes it infinite.
+        return ((logits - logits.amax(dim, keepdim=True)) / self.temperature).exp_()
+
+    def split(self, counts: Tensor, logits: Tensor) -> Tensor:
+        """Split `counts [M]` multinomially by the rows of `logits [M, A]`: `[M, A]`, a binomial draw an action."""
+        probs = self._weights(logits.double(), -1)
+        # The share of an action among those not yet dealt out: exact 0 and 1 are kept by summing from the end.
+        rest = probs.flip(-1).cumsum(-1).flip(-1)
+        share = torch.where(rest > 0, probs / rest, 0).clamp_(0, 1)
+        share[:, -1] = 1
+        left = counts.double()
+        parts = []
+        for action in range(self.num_actions):
+            part = torch.binomial(left, share[:, action].contiguous(), generator=self.generator)
+            parts.append(part)
+            left = left - part
+        return torch.stack(parts, -1).long()
+
+
+def worth_splitting(children: int, total: int) -> bool:
+    """A split costs one evaluation a child; drawing plan by plan costs one a plan and needs no shuffling."""
+    return 8 * children <= total
+
+
+def levels_worth_splitting(prefixes: int, total: int, num_actions: int) -> int:
+    """How many levels of a tree are worth it beyond one with so many prefixes, if all of them branch."""
+    levels = 0
+    while num_actions > 1 and worth_splitting(prefixes * num_actions ** (levels + 1), total):
+        levels += 1
+    return levels
+
+
+def shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> Tensor:
+    """The prefix of each plan (int32 where that is enough): m `counts[m]` times; by root, in random order within."""
+    # The narrowest numbers that will do: to shuffle and to sort is to move memory.
+    row = torch.repeat_interleave(counts.to(_narrow(int(counts.sum()))), output_size=int(counts.sum()))
+    if len(row) == 0 or len(counts) == int(root[-1]) + 1:
+        return row  # one prefix a root
+    order = torch.randperm(len(row), generator=generator, device=row.device, dtype=_narrow(len(row)))
+    row = rows_of(row, order)
+    last = int(root[-1])
+    if last == 0:
+        return row
+    root = root.to(torch.int16 if last < 2**15 else _narrow(last))
+    return rows_of(row, rows_of(root, row).argsort(stable=True))
+
+
+def _narrow(number: int) -> torch.dtype:
+    """The integers that can tell so many things apart and be indices."""
+    return torch.int32 if number < 2**31 else torch.int64

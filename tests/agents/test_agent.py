@@ -1,0 +1,303 @@
+"""Agents: they do what their planner says, learn from what they did and from nothing else, and go on after a pause."""
+
+import json
+import re
+
+import pytest
+import torch
+
+from neuroprior import (
+    Agent,
+    ForagingWorld,
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    SamplingPlanner,
+    UniformPrior,
+    execute,
+    gridworld,
+    load,
+    patches,
+    restore_agent,
+    save,
+    save_agent,
+)
+from neuroprior.agents import checkpoints
+from tests.support.sources import corridor, every_plan, refuses, seeded
+
+TRAINING = {"max_steps": 4, "progress": False}
+
+
+def home(period=100):
+    table = gridworld(6, 6, edges="torus")
+    return ForagingWorld(table, patches(table, 3, 1, seeded(0)), period, 3)
+
+
+def sampler(prior, length=6, num_plans=8, **more):
+    return SamplingPlanner(prior, length, num_plans, objective="return", discount=0.9, **more)
+
+
+def agent(prior=None, world=None, number=5, seed=1, planner=None, **more):
+    prior, world = prior or MarkovPrior(4, 2), world or home()
+    settings = {"replan_every": 2, "change": world.regrow, "learn_every": 12, "plan_length": 6, "retention": 0.9} | more
+    return Agent(
+        world, planner or sampler(prior), prior, world.reset(number, seeded(7)), generator=seeded(seed), **settings
+    )
+
+
+def test_without_learning_and_warm_starts_it_executes():
+    world, prior = home(), UniformPrior(4)
+    one = agent(prior, world, learn_every=None, warm_start=False)
+    done = one.run(10)
+    due = execute(sampler(prior), world, world.reset(5, seeded(7)), 10, 2, seeded(1), world.regrow)
+    for name in ("actions", "rewards", "states"):
+        assert torch.equal(getattr(done, name), getattr(due, name))
+    assert done.model_steps == due.model_steps == 5 * 48
+    assert torch.equal(one.state, done.states[:, -1])
+    assert one.time == 10
+
+
+def test_warm_starts_are_counted():
+    assert agent(learn_every=None).run(10).model_steps == 5 * 48 + 4 * 6
+
+
+def test_it_learns_from_what_it_did():
+    """All that was executed, cut into plans of six: a prior that is fitted to it is what the agent has learned."""
+    one = agent(retention=1.0)
+    done = one.run(36)
+    plans = done.actions.view(5, 6, 6).transpose(0, 1).flatten(0, 1)
+    assert torch.equal(one.replay.plans.actions.long(), plans)
+    due = MarkovPrior(4, 2).fit(Plans(plans, 4))
+    assert torch.equal(one.prior.log_prob(every_plan(4, 3)), due.log_prob(every_plan(4, 3)))
+
+
+@pytest.mark.parametrize("per", ["plan", "step"])
+def test_it_remembers_what_it_saw(per):
+    prior, world = MarkovPrior(4, 1, num_contexts=36), home()
+    prior.context_per = per
+    one = agent(prior, world, retention=1.0)
+    start = one.state
+    done = one.run(24)
+    cells = torch.cat([start[:, None], done.states[:, :-1]], 1)[..., 0].view(5, 4, 6).transpose(0, 1).flatten(0, 1)
+    assert torch.equal(one.replay.plans.context, cells if per == "step" else cells[:, 0])
+    assert prior.context_per == per
+
+
+def test_only_what_was_rewarded():
+    one = agent(retention=1.0, min_score=0.0)
+    done = one.run(60)
+    rewarded = done.rewards.view(5, 10, 6).sum(2).T.flatten() > 0
+    assert 0 < int(rewarded.sum()) < 50
+    plans = done.actions.view(5, 10, 6).transpose(0, 1).flatten(0, 1)
+    assert torch.equal(one.replay.plans.actions.long(), plans[rewarded])
+
+
+def test_plans_end_where_it_is_over():
+    """Cell 3 of a corridor is the end of everything; an agent there executes nothing."""
+    table = corridor()
+    table.next_state[3] = 3
+    prior = UniformPrior(2)
+    state = torch.tensor([3, 2, 2, 1, 0])
+    one = Agent(
+        table,
+        SamplingPlanner(prior, 4, 64, value=lambda state: state.float()),
+        prior,
+        state,
+        replan_every=4,
+        learn_every=4,
+        plan_length=4,
+        retention=1.0,
+        generator=seeded(0),
+    )
+    done = one.run(4)
+    before = torch.cat([state[:, None], done.states[:, :-1]], 1)
+    due = (before != 3).sum(1).tolist()
+    assert due[0] == 0
+    assert one.replay.plans.lengths.tolist() == due[1:]
+    assert min(due[1:]) < 4
+
+
+def test_forgetting_follows_the_food():
+    """Food moves to another patch: what an agent has learned there helps it to find the next, once it has forgotten."""
+    world = home(period=160)
+    prior = MarkovPrior(4, 1, num_contexts=36)
+    online = agent(prior, world, number=16, min_score=0.0).run(480).rewards.double()
+    table_free = agent(UniformPrior(4), world, number=16, learn_every=None).run(480).rewards.double()
+    assert online.mean() > 1.1 * table_free.mean()
+
+
+@pytest.mark.parametrize("kind", ["blind", "seeing", "gru", "prefixes"])
+@pytest.mark.parametrize("at", [8, 12, 14])
+def test_a_pause_changes_nothing(kind, at, tmp_path):
+    def made():
+        if kind == "gru":
+            return agent(GRUPrior(4, hidden_size=8), training=TRAINING)
+        if kind == "seeing":
+            return agent(MarkovPrior(4, 1, num_contexts=36), min_score=0.0)
+        prior = MarkovPrior(4, 2)
+        return (
+            agent(prior, planner=sampler(prior, any_prefix=True), replan_every=1)
+            if kind == "prefixes"
+            else agent(prior)
+        )
+
+    through = made()
+    whole = through.run(40)
+    first = made()
+    before = first.run(at)
+    save_agent(first, tmp_path / "saved")
+    first.run(4)
+    save_agent(first, tmp_path / "other")
+    again = restore_agent(made(), tmp_path / "saved")
+    assert again.time == at
+    after = again.run(40 - at)
+    for name in ("actions", "rewards", "states"):
+        assert torch.equal(torch.cat([getattr(before, name), getattr(after, name)], 1), getattr(whole, name))
+    assert torch.equal(again.generator.get_state(), through.generator.get_state())
+    assert len(again.replay) == len(through.replay)
+
+
+def test_networks_are_trained_from_its_generator():
+    """Whatever torch's own generator is at."""
+    lives = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        one = agent(GRUPrior(4, hidden_size=4), training={"max_steps": 2, "progress": False})
+        lives.append((one.run(24).actions, one.prior.log_prob(every_plan(4, 2))))
+    for first, second in zip(*lives, strict=True):
+        assert torch.equal(first, second)
+    assert agent(GRUPrior(4, hidden_size=4)).training == {}
+
+
+def test_a_folder_holds_one_checkpoint(tmp_path):
+    one = agent()
+    for _ in range(3):
+        one.run(6)
+        save_agent(one, tmp_path)
+        save_agent(one, tmp_path)  # again at the same time
+    assert [re.sub("-.*", "", path.name) for path in sorted(tmp_path.iterdir())] == ["agent", "agent.json", "prior"]
+
+
+def test_what_others_put_there_stays(tmp_path):
+    save(MarkovPrior(4, 1), tmp_path / "prior-mine")
+    (tmp_path / "agent-notes.safetensors").write_text("mine")
+    (tmp_path / "prior-notes.txt").write_text("mine")
+    one = agent()
+    for _ in range(2):
+        one.run(12)
+        save_agent(one, tmp_path)
+    assert restore_agent(agent(), tmp_path).time == 24
+    assert len(list(tmp_path.iterdir())) == 6
+    load(tmp_path / "prior-mine")
+
+
+def test_another_life_that_is_cut_off_leaves_the_last(tmp_path, monkeypatch):
+    """Two agents at the same time of their lives, one of which is not saved whole."""
+    one, other = agent(seed=1), agent(seed=2)
+    for some in (one, other):
+        some.run(12)
+    save_agent(one, tmp_path)
+    write = checkpoints.write_whole
+    for last in ("agent.json", "safetensors"):
+
+        def cut_off(path, content, last=last):
+            if last in path.name:
+                raise KeyboardInterrupt
+            write(path, content)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(checkpoints, "write_whole", cut_off)
+            with pytest.raises(KeyboardInterrupt):
+                save_agent(other, tmp_path)
+        again = restore_agent(agent(), tmp_path)
+        assert torch.equal(again.state, one.state)
+        assert torch.equal(again.prior.log_prob(every_plan(4, 3)), one.prior.log_prob(every_plan(4, 3)))
+
+
+def test_a_save_that_is_cut_off_leaves_the_last(tmp_path, monkeypatch):
+    one = agent()
+    one.run(6)
+    save_agent(one, tmp_path)
+    one.run(12)
+
+    def full(path, content):
+        raise OSError(28, "No space left on device", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("neuroprior.agents.checkpoints.write_whole", full)
+        with pytest.raises(OSError, match="No space"):
+            save_agent(one, tmp_path)
+    assert restore_agent(agent(), tmp_path).time == 6
+
+
+def test_damaged_checkpoints(tmp_path):
+    one = agent()
+    one.run(6)
+    save_agent(one, tmp_path)
+    with pytest.raises(FileNotFoundError):
+        restore_agent(agent(), tmp_path / "nowhere")
+    for other, word in (
+        (agent(replan_every=1), "replan_every"),
+        (agent(MarkovPrior(4, 1)), "config"),
+        (agent(number=3), "agents"),
+    ):
+        with refuses(word):
+            restore_agent(other, tmp_path)
+    path = tmp_path / "agent.json"
+    told = json.loads(path.read_text())
+    for content, word in (
+        ("{", "not JSON"),
+        ("[]", "not a checkpoint"),
+        (json.dumps(told | {"version": 9}), "not a checkpoint"),
+        (json.dumps({k: v for k, v in told.items() if k != "weights"}), "weights"),
+        (json.dumps(told | {"agent": []}), "agent"),
+        (json.dumps(told | {"prior": 3}), "prior"),
+        (json.dumps(told | {"time": "x"}), "time"),
+        (json.dumps(told | {"recent": [1, "x"]}), "recent"),
+        (json.dumps(told | {"recent": [1] * 9}), "recent"),
+        (json.dumps(told | {"sha256": "0"}), "truncated"),
+    ):
+        path.write_text(content)
+        with refuses(word):
+            restore_agent(agent(), tmp_path)
+    path.write_text(json.dumps(told))
+    weights = tmp_path / told["weights"]
+    weights.write_bytes(weights.read_bytes()[:-10])
+    with refuses("truncated"):
+        restore_agent(agent(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"replan_every": 0}, "every"),
+        ({"plan_length": 5}, "plan_length: a multiple of every = 2"),
+        ({"learn_every": 8}, "learn_every: a multiple of plan_length = 6"),
+        ({"num_rollouts": 0}, "num_rollouts"),
+        ({"retention": 0.0}, "keep"),
+        ({"learn_every": "12"}, "learn_every"),
+        ({"training": {"max_steps": 5}}, "training: a MarkovPrior counts"),
+        ({"prior": MarkovPrior(3, 1)}, "3 actions, the world 4"),
+    ],
+)
+def test_bad_agents(given, word):
+    with refuses(word):
+        agent(**given)
+
+
+def test_bad_lives():
+    with refuses("num_steps: a multiple of every = 2"):
+        agent().run(5)
+    with refuses("num_steps"):
+        agent().run(0)
+    prior = MarkovPrior(4, 1)
+    with refuses("fewer"):
+        agent(prior, planner=sampler(prior, length=1)).run(4)
+    with refuses("state"):
+        Agent(home(), sampler(prior), prior, torch.zeros(3, dtype=torch.long))
+
+
+def test_alone_it_starts_anywhere():
+    world, prior = home(), MarkovPrior(4, 1)
+    one = Agent(world, sampler(prior), prior, generator=seeded(0))
+    assert one.run(3).actions.shape == (1, 3)

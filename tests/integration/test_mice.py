@@ -1,0 +1,230 @@
+"""`python -m eval mice`: the maze as it is drawn, what random candidates reach, and the program end to end."""
+
+import csv
+import itertools
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from scipy import stats
+
+from eval.__main__ import main
+from eval.mice.command import DATA
+from eval.mice.figures import ENTRANCE, coordinates, far_from_water, left_turns, passages
+from eval.mice.study import Study, collected, shares_reached
+from neuroprior import Plans, SamplingPlanner, UniformPrior, labyrinth, oracle, read_plans
+from neuroprior.worlds.labyrinth import WATER
+from tests.support.sources import FALSE_ALARM, every_plan, in_world_distribution, seeded
+
+INNER = range(63)
+TINY = Study(2, 6, (2, 8), (4, 8), 200, 5, 0)
+DRY = torch.tensor([node for node in range(127) if node != WATER])
+
+
+def parent(node: int) -> int:
+    return (node - 1) // 2
+
+
+def heading(place: torch.Tensor, node: int) -> torch.Tensor:
+    """The way one walks on entering a node from outside."""
+    return place[node] - (place[parent(node)] if node else torch.tensor(ENTRANCE))
+
+
+def test_left_is_drawn_on_the_left():
+    world, place = labyrinth(), coordinates(labyrinth())
+    for node in INNER:
+        ahead = heading(place, node)
+        for move, side in ((0, 1), (1, -1)):
+            child = int(world.next_state[node, move])
+            way = place[child] - place[node]
+            assert child in (2 * node + 1, 2 * node + 2)
+            assert float(ahead @ way) == 0
+            assert side * float(ahead[0] * way[1] - ahead[1] * way[0]) > 0  # the cross product
+            # Out of a branch that is on the left the move back is out_left, and it leads where one came from.
+            assert int(world.next_state[child, 2 + move]) == node
+
+
+def test_first_branches_lie_up_or_to_the_left_of_the_drawing():
+    """Numbers follow the drawing: that the first branch is now the left, now the right one comes from the headings."""
+    place = coordinates(labyrinth())
+    for node in INNER:
+        first, second = (place[2 * node + branch] - place[node] for branch in (1, 2))
+        assert torch.equal(first, -second)
+        assert float(first[1] - first[0]) > 0
+
+
+def test_ends_fill_a_square_of_eight_by_eight():
+    ends = {tuple(end) for end in coordinates(labyrinth())[63:].tolist()}
+    assert ends == set(itertools.product(range(-7, 8, 2), repeat=2))
+
+
+def test_no_corridor_crosses_another():
+    """Every cell of the 15 x 15 belongs to one corridor at most, the one from the home cage included."""
+    place, cells = coordinates(labyrinth()), [(x, 0) for x in range(-7, 1)]
+    for node in range(1, 127):
+        way = place[node] - place[parent(node)]
+        length = int(way.abs().sum())
+        cells += [tuple((place[parent(node)] + way / length * step).tolist()) for step in range(1, length + 1)]
+    assert len(cells) == len(set(cells)) == 8 + 2 * 4 + 4 * 4 + 8 * 2 + 16 * 2 + 32 + 64
+    assert max(abs(value) for cell in cells for value in cell) == 7
+
+
+def test_passages_and_turns_of_one_walk():
+    """Home and back, left, out again, right, right: counted by hand."""
+    actions, world = torch.tensor([2, 0, 2, 1, 1]), labyrinth()
+    nodes = [0]
+    for action in actions:
+        nodes.append(int(world.next_state[nodes[-1], action]))
+    walk = Plans(actions[None], 4, context=torch.tensor(nodes[:-1])[None])
+    expected = torch.zeros(127)
+    expected[[0, nodes[2], nodes[4], nodes[5]]] = torch.tensor([2.0, 2, 1, 1])
+    assert torch.equal(passages(walk), expected.to(passages(walk)))
+    share, number = left_turns(walk)
+    assert number.nonzero()[:, 0].tolist() == sorted({0, nodes[4]})
+    assert (float(share[0]), float(share[nodes[4]])) == (0.5, 0.0)
+
+
+def test_every_corridor_was_walked_and_moves_are_all_counted():
+    plans = read_plans(DATA)
+    walked = passages(plans)
+    stays = int((plans.context == labyrinth().next_state[plans.context, plans.actions.long()]).sum())
+    assert int(walked.sum()) == plans.actions.numel() + stays
+    assert int(walked.min()) > 0
+
+
+def test_the_far_node_is_as_far_as_can_be():
+    start = far_from_water(labyrinth(absorbing=True))
+    needed = [float(oracle(labyrinth(), start, moves, objective="return")) for moves in (11, 12)]
+    assert needed == [0, 1]
+
+
+def chance(length: int) -> torch.Tensor:
+    """`[127]`: the probability that so many uniform legal moves pass the water, by dynamic programming."""
+    world = labyrinth(absorbing=True)
+    legal = world.legal_actions.double()
+    reached = (torch.arange(127) == WATER).double()
+    for _ in range(length):
+        reached = (legal * reached[world.next_state]).sum(1) / legal.sum(1)
+    return reached
+
+
+@pytest.mark.parametrize("node", [57, 115, 28])
+def test_the_chance_is_that_of_all_plans(node):
+    world = labyrinth(absorbing=True)
+    probs = in_world_distribution(UniformPrior(4), world, node, 4)
+    found = world.rollout(torch.tensor([node]), every_plan(4, 4)[None]).rewards[0].sum(-1) > 0
+    assert float(probs[found].sum()) == pytest.approx(float(chance(4)[node]), abs=1e-6)
+
+
+@pytest.mark.parametrize("node", [57, 115, 13, 0])
+def test_uniform_candidates_reach_what_they_must(node):
+    """P independent candidates reach it with probability 1 - (1 - q) ** P; as a planner decides, and as is counted."""
+    world, times, lengths, numbers = labyrinth(absorbing=True), 500, (6, 10), (1, 5, 16)
+    start = torch.full((times,), node)
+    shares = shares_reached(UniformPrior(4), world, start, lengths, numbers, seeded(node))
+    for t, length in enumerate(lengths):
+        for p, number in enumerate(numbers):
+            expected = 1 - (1 - float(chance(length)[node])) ** number
+            trials = times * (16 // number)
+            hits = round(float(shares[t, p]) * trials)
+            assert stats.binomtest(hits, trials, expected).pvalue > FALSE_ALARM
+            planner = SamplingPlanner(UniformPrior(4), length, number, objective="return")
+            decided = int((planner.plan(world, start, seeded(node + number)).score > 0).sum())
+            assert stats.binomtest(decided, times, expected).pvalue > FALSE_ALARM
+
+
+def test_what_is_learned_from():
+    world, plans = labyrinth(absorbing=True), read_plans(DATA)
+    sources = collected(TINY, world, plans, DRY, seeded(0))
+    pieces = sources["mice"]
+    assert pieces.actions.shape == (190 * 62, 8)
+    assert torch.equal(pieces.actions[62:124].flatten(), plans.actions[1, :496])
+    assert torch.equal(pieces.group.bincount(), torch.full((190,), 62))
+    for name in ("planner", "reached"):
+        some = sources[name]
+        after, mask = world.next_state[some.context, some.actions.long()], some.mask()
+        assert world.legal_actions(some.context[mask]).gather(1, some.actions[mask].long()[:, None]).all()
+        assert torch.equal(after[:, :-1][mask[:, 1:]], some.context[:, 1:][mask[:, 1:]])
+        arrives = (after == WATER) & mask
+        last = torch.arange(some.max_length) == some.lengths[:, None] - 1
+        assert (arrives <= last).all()
+        assert (name == "planner") == (arrives.any(1) < 1).any()
+        assert int(mask.sum()) <= plans.actions.numel()
+    assert len(sources["planner"]) == TINY.training_plans
+    # The exhaustive planner misses nothing: what it leaves out is further away than six moves.
+    far = oracle(world, sources["planner"].context[:, 0], 6, objective="return") == 0
+    ends = world.next_state[sources["planner"].context[:, -1], sources["planner"].actions[:, -1].long()]
+    assert torch.equal((sources["planner"].lengths == 6) & (ends != WATER), far)
+
+
+OPTIONS = ["--seeds=2", "--starts=6", "--training-plans=200", "--steps=5"]
+
+
+@pytest.fixture(scope="module")
+def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("mice")
+    arguments = [*OPTIONS, "--num-plans", "2", "8", "--lengths", "4", "8", "--out", str(folder)]
+    assert main(["mice", *arguments]) == 0
+    return folder
+
+
+def test_results(tiny_run):
+    results = json.loads((tiny_run / "results.json").read_text())
+    rows = results["rows"]
+    names = {(row["prior"], row["learned_from"], row["sees"]) for row in rows}
+    sights = ("moves", "node")
+    learned = [(prior, "mice", sees) for prior in ("markov", "gru", "transformer") for sees in sights]
+    learned += [(prior, own, sees) for prior in ("markov", "gru") for own in ("planner", "reached") for sees in sights]
+    assert names == {*learned, ("uniform", "", ""), ("oracle", "", "")}
+    assert len(rows) == 2 * (2 * (len(names) - 1) + 1)
+    best = {row["length"]: row["reached"] for row in rows if row["prior"] == "oracle"}
+    for row in rows:
+        assert 0 <= row["low"] <= row["reached"] <= row["high"] <= 1
+        assert row["reached"] <= best[row["length"]] + 1e-9
+        if row["num_plans"] is not None:
+            assert row["model_steps"] == row["length"] * row["num_plans"]
+        assert best[row["length"]] == 0 or row["oracle_share"] == pytest.approx(row["reached"] / best[row["length"]])
+    with open(tiny_run / "mice.csv") as file:
+        assert [float(row["reached"]) for row in csv.DictReader(file)] == [row["reached"] for row in rows]
+    assert {row["source"]: row["plans"] for row in results["learned"]}["planner"] == 200
+
+
+def test_differences_are_those_of_the_rows(tiny_run):
+    results = json.loads((tiny_run / "results.json").read_text())
+    columns = ("prior", "learned_from", "sees", "length", "num_plans")
+    at = {tuple(row[name] for name in columns): row for row in results["rows"]}
+    assert len(results["paired"]) == (8 + 8 + 7) * 4
+    for row in results["paired"]:
+        ends = [[row[name].split(" - ")[end] for name in columns[:3]] for end in (0, -1)]
+        first, second = (at[(*end, row["length"], row["num_plans"])]["reached"] for end in ends)
+        assert ends[0] != ends[1]
+        assert row["difference"] == pytest.approx(first - second, abs=1e-6)
+        assert row["low"] <= row["difference"] <= row["high"]
+
+
+def test_figures_are_written(tiny_run):
+    for name in ("mice_planner.png", "maze.png", "maze_plans.png"):
+        assert (tiny_run / name).read_bytes().startswith(b"\x89PNG")
+    assert not list(tiny_run.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--seeds", "1"], "seeds: at least 2"),
+        (["--starts", "127"], "starts: from 1 to 126"),
+        (["--num-plans", "4", "0"], "num_plans: at least 1"),
+        (["--num-plans", "4", "4"], "num_plans: each may be given once"),
+        (["--lengths", "501"], "lengths: from 1 to 500"),
+        (["--lengths", "long"], "lengths"),
+        (["--steps", "0"], "steps: at least 1"),
+        (["--training-plans", "2", "--seeds", "2"], "training_plans"),
+    ],
+)
+def test_bad_options_are_one_line(options, says, tmp_path, capsys):
+    assert main(["mice", *options, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out" / "results.json").exists()

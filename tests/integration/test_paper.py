@@ -1,0 +1,197 @@
+"""The program `python -m eval`, end to end on small cases, and its answers to bad input."""
+
+import csv
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from eval.__main__ import main
+from eval.paper.first_simulation import PAPER_BEST, Protocol, training_plans
+from eval.paper.second_simulation import PAPER_REACHED
+from neuroprior import gridworld
+from neuroprior._files import write_json
+
+SMALL = ["--worlds=3", "--starts=20", "--training-plans=200", "--size=8", "--num-plans=16"]
+SMALL += ["--value-functions=2", "--q-steps=300", "--max-plans=2"]
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("paper")
+    assert main(["paper", *SMALL, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_paper_writes_results(small_run: Path) -> None:
+    results = json.loads((small_run / "results.json").read_text())
+    assert results["settings"]["worlds"] == 3
+    assert results["seed"] == 0
+    assert results["versions"]["torch"] == str(torch.__version__)
+    rows = {row["planner"]: row for row in results["simulation_1"]["rows"]}
+    assert list(rows) == ["deterministic", "random", "markov-1", "markov-2", "markov-3", "gru", "transformer", "oracle"]
+    for name, row in rows.items():
+        assert 0 <= row["low"] <= row["best"] <= row["high"] <= 1
+        assert row["paper"] == PAPER_BEST.get(name)
+        assert row["mean_reward"] <= rows["oracle"]["mean_reward"] + 1e-9
+        assert row["oracle_share"] <= 1 + 1e-9
+    assert rows["oracle"]["best"] == 1
+    # At least one of the paper's four is best at every start.
+    assert sum(rows[name]["best"] for name in PAPER_BEST) >= 1
+    matrix = torch.tensor(results["simulation_1"]["transition_matrix"])
+    assert torch.allclose(matrix.sum(1), torch.ones(4))
+
+
+def test_paper_writes_table_2(small_run: Path) -> None:
+    found = json.loads((small_run / "results.json").read_text())["simulation_2"]
+    rows = {row["planner"]: row for row in found["rows"]}
+    whole = ["deterministic", "random", "markov-1", "markov-2", "markov-3", "gru", "transformer"]
+    assert list(rows) == whole + [name + " (any prefix)" for name in whole]
+    assert all(0 <= row["low"] <= row["reached"] <= row["high"] <= 1 for row in rows.values())
+    assert all(row["paper"] == PAPER_REACHED.get(name) for name, row in rows.items())
+    assert max(rows[name]["reached"] for name in whole) <= found["ceiling"] + 1e-9
+    assert found["ceiling"] <= found["ceiling_any_prefix"] <= 1
+    with open(small_run / "table_2.csv") as file:
+        assert len(list(csv.DictReader(file))) == 14
+
+
+def test_paper_writes_tables_and_figures(small_run: Path) -> None:
+    with open(small_run / "table_1.csv") as file:
+        assert [row["planner"] for row in csv.DictReader(file)][:2] == ["deterministic", "random"]
+    for name in ("table_1.png", "transition_matrix.png", "world.png", "figure_1.png", "value_quality.png"):
+        assert (small_run / name).read_bytes().startswith(b"\x89PNG")
+    assert not list(small_run.glob(".*"))
+
+
+def test_same_seed_same_results_in_80_columns(
+    small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["paper", *SMALL, "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= 80
+    for name in ("table_1.csv", "table_2.csv", "value_quality.csv"):
+        assert (tmp_path / name).read_text() == (small_run / name).read_text()
+
+
+def test_all_protocols_and_one_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["paper", *SMALL, "--worlds", "1", "--protocols", "all", "--out", str(tmp_path)]) == 0
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert len(results["protocols"]) == 8
+    distances = [row["table_distance"] for row in results["protocols"]]
+    nearest = results["protocols"][distances.index(min(distances))]
+    assert all(nearest[key] == value for key, value in results["nearest"]["table"].items())
+    assert [(row["edges"], row["initial_scale"]) for row in results["scales"]][:2] == [("torus", 1e-4), ("torus", 0.01)]
+    assert "nearest to the paper's matrix" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("edges", ["torus", "wall"])
+def test_protocols_choose_the_plans_they_say(edges: str) -> None:
+    world = gridworld(9, 9, edges, num_worlds=2, seed=3)
+    states = world.reset(300, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(1)
+    first = training_plans(world, states, 3, Protocol(edges, "first", "all"), generator)
+    uniform = training_plans(world, states, 3, Protocol(edges, "uniform", "all"), generator)
+    for plans in (first, uniform):
+        rewards = world.rollout(states, plans.actions[:, None]).rewards[:, 0, -1]
+        every = torch.cartesian_prod(*[torch.arange(4)] * 3)
+        scores = world.rollout(states, every.expand(300, -1, -1)).rewards[..., -1]
+        assert rewards.equal(scores.amax(1))
+    assert first.actions.long().equal(every[(scores == scores.amax(1, keepdim=True)).int().argmax(1)])
+    shortest = training_plans(world, states, 3, Protocol(edges, "uniform", "shortest"), generator)
+    assert 0 < len(shortest) < 300
+    # A plan of three moves is a shortest one exactly if it never reverses a move that it made (or bumps).
+    for plan in shortest.actions.tolist():
+        assert not any((a + 2) % 4 in plan for a in plan)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["paper", "--worlds", "0"], "worlds"),
+        (["paper", "--edges", "cliff"], "edges"),
+        (["paper", "--worlds", "many"], "worlds"),
+        (["paper", "--no-such-option", "1"], "no_such_option"),
+        (["paper", "--q-steps", "-1"], "q_steps"),
+        (["paper", "--initial-scale", "-1"], "initial_scale"),
+        (["paper", "--num-plans", "0"], "num_plans"),
+        (["paper", "--seed", "-1"], "seed"),
+        (["paper", "--size", "100000"], "memory"),
+        (["papers"], "papers"),
+        (["paper", "--depth", "20", "--worlds", "1", "--starts", "2", "--training-plans", "2"], "depth"),
+        (["bench", "--repetitions", "0"], "repetitions"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main([*arguments, *(["--out", str(tmp_path)] if arguments != ["papers"] else [])]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert words in error
+
+
+def test_unwritable_folder_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["paper", *SMALL, "--out", str(tmp_path / "file" / "below")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_help_is_readable() -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "eval", "paper", "--help"], capture_output=True, text=True, check=True
+    ).stdout
+    assert "reward maps to compare in" in shown
+    assert re.search(r"--learn_from.*\{all,shortest\}", shown)
+
+
+def test_tables_fit_80_columns(small_run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["paper", *SMALL, "--protocols=all", "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    assert max(map(len, shown.splitlines())) <= 80
+
+
+def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
+    write_json(tmp_path / "x.json", {"a": [float("nan"), 1.5], "b": {"c": float("inf")}})
+    assert json.loads((tmp_path / "x.json").read_text()) == {"a": [None, 1.5], "b": {"c": None}}
+
+
+def test_an_interrupted_command_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def interrupted(*args: object, **settings: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("eval.paper.first_simulation.simulate", interrupted)
+    assert main(["paper", *SMALL, "--out", str(tmp_path)]) == 130
+    error = capsys.readouterr().err
+    assert error.startswith("interrupted")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [2.0, 6.0, 20.0])
+def test_ctrl_c_is_one_line(seconds: float, tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "eval", "paper", "--worlds=50", "--out", str(tmp_path)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[2],
+    )
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert error.count("\n") == 1
+    assert error.startswith("interrupted")

@@ -1,0 +1,131 @@
+"""`python -m eval plans FILE` on files that are hard to take: a report, or one line that says what is wrong."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from eval.__main__ import main
+from neuroprior import Plans
+from neuroprior.plans import write_plans
+from tests.support.chains import markov_plans, markov_probs
+from tests.support.reports import QUICK, bits, fails, report
+from tests.support.sources import seeded
+
+
+def chain(num: int, length: int, actions: int = 3, **more) -> Plans:
+    return markov_plans(markov_probs(actions, 1, 0, 1.5), num, length, 1, **more)
+
+
+def random_context(*shape: int, most: int = 3) -> torch.Tensor:
+    return torch.randint(most, shape, generator=seeded(2))
+
+
+HARD = {
+    "two actions": chain(12, 5, 2),
+    "one action": Plans(torch.zeros(12, 5).long(), 1),
+    "an action that never occurs": replace(chain(12, 5), num_actions=5, action_names=tuple("abcde")),
+    "always the same": Plans(torch.zeros(12, 5).long(), 3),
+    "two plans": chain(2, 6),
+    "a single plan": chain(1, 60),
+    "a short single plan": chain(1, 12),
+    "a single plan with a context": chain(1, 60, context=torch.tensor([7])),
+    "a single plan with an end": chain(1, 60).with_end(),
+    "plans of one action": chain(20, 1),
+    "plans of two actions": chain(9, 2),
+    "many empty": replace(chain(20, 5), lengths=torch.arange(20) % 4 * 5 // 3),
+    "all but one empty": replace(chain(20, 40), lengths=40 * (torch.arange(20) == 3).long()),
+    "an empty group": replace(chain(12, 5), lengths=5 * (torch.arange(12) % 3 > 0).long(), group=torch.arange(12) % 3),
+    "one group": chain(12, 5, group=torch.full((12,), 5)),
+    "a group for each": chain(12, 5, group=torch.arange(12).flip(0) - 4),
+    "contexts far apart": chain(12, 5, context=random_context(12, 5) * 10**18),
+    "a context a plan": chain(12, 5, context=random_context(12).to(torch.uint8)),
+    "features": chain(12, 5, context=torch.randn(12, 5, 2, generator=seeded(2)).half()),
+}
+
+
+@pytest.mark.parametrize("what", HARD)
+def test_hard_files_have_a_report(what, tmp_path, recwarn):
+    plans = HARD[what]
+    closed = int(plans.end is not None)
+    results = report(plans, tmp_path, "--folds", "2")
+    found = bits(results)
+    assert found["uniform"] == pytest.approx(math.log2(plans.num_actions - closed), abs=1e-6)
+    assert len(found) == 9
+    lengths = plans.mask().sum(1) - closed
+    assert results["file"]["actions"] == int(lengths.sum())
+    assert results["settings"].get("plans without actions, left out", 0) == int((lengths == 0).sum())
+    assert not [warning.message for warning in recwarn if "neuroprior" in str(warning.filename)]
+
+
+def test_long_plans_of_many_actions(tmp_path):
+    assert len(bits(report(chain(2, 2500, 57), tmp_path, "--folds", "2"))) == 9
+
+
+def test_names_are_text(tmp_path, capsys):
+    """With all figures, in the page, in the terminal and in the name of the folder."""
+    names = ('<b>"x"</b>', "[bold]", "[/red]", "日本\u202eé & $x_1$")
+    groups = ("</td>", "[/i]", "{{ 7 }}")
+    plans = chain(12, 6, 4, action_names=names, group=torch.arange(12) % 3, group_names=groups)
+    folder = tmp_path / "[/x] <b> $y$"
+    folder.mkdir(parents=True)
+    results = report(plans, folder, "--models", "counts", "gru", name="[red]plans <i>.csv", drawn=True)
+    said = capsys.readouterr().out
+    assert str(folder / "out" / "report.html") in said
+    assert {row["from"] for row in results["transitions"]} == set(names)
+    page = (folder / "out" / "report.html").read_text()
+    for text in ('<b>"x"</b>', "<i>.csv", "</td>.</td>"):
+        assert text not in page
+    assert "&lt;b&gt;" in page
+    assert "{{ 7 }}" in page
+
+
+FEW = chain(20, 5)
+BAD = {
+    "no action at all": (Plans(torch.zeros(3, 4).long(), 3, torch.zeros(3).long()), [], ("no plan has an action",)),
+    "a single action": (Plans(torch.zeros(1, 1).long(), 3), [], ("at least two plans", "new.npz")),
+    "one fold": (FEW, ["--folds", "1"], ("folds", "at least 2", "not 1")),
+    "no folds": (FEW, ["--folds", "0"], ("folds", "not 0")),
+    "more folds than plans": (FEW, ["--folds", "21"], ("folds", "20", "not 21")),
+    "more folds than groups": (replace(FEW, group=torch.arange(20) % 4), ["--folds", "5"], ("groups, 4", "not 5")),
+    "nothing left to score": (FEW, ["--skip", "5"], ("skip", "first 5")),
+    "a negative skip": (FEW, ["--skip=-1"], ("skip", "-1")),
+    "no steps": (FEW, ["--max-steps", "0"], ("max_steps", "0")),
+    "no processes": (FEW, ["--processes", "0"], ("processes", "0")),
+    "a large seed": (FEW, ["--seed", str(10**30)], ("seed", str(10**30))),
+    "a negative seed": (FEW, ["--seed=-1"], ("seed", "-1")),
+    "a model that is not known": (FEW, ["--models", "lstm"], ("models",)),
+    "a negative context": (replace(FEW, context=-torch.arange(20)), [], ("context", "-19")),
+    "a context of no features": (replace(FEW, context=torch.zeros(20, 0)), [], ("context",)),
+    "too few names": (FEW, ["--action-names", "a", "b"], ("2",)),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_what_cannot_be_taken_is_one_line(what, tmp_path, capsys):
+    plans, options, words = BAD[what]
+    write_plans(plans, tmp_path / "new.npz")
+    fails([str(tmp_path / "new.npz"), "--out", str(tmp_path / "out"), *QUICK, *options], capsys, *words)
+    assert not (tmp_path / "out" / "results.json").exists()
+
+
+@pytest.mark.parametrize("text", ["", "action_1,action_2\n", 'action_1\n"', "plan,action\n1,left\n1,\n", "\x00\x01"])
+def test_damaged_files_are_one_line(text, tmp_path, capsys):
+    (tmp_path / "new.csv").write_text(text)
+    fails([str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICK], capsys, "new.csv")
+
+
+def test_a_csv_file_of_names(tmp_path):
+    """Names and groups of a CSV file, one plan a row, with empty cells after the ends."""
+    rows = [f"{'left' if n % 2 else 'right'},on,{'' if n % 3 else 'left'},mouse {n % 4}" for n in range(24)]
+    (tmp_path / "new.csv").write_text("action_1,action_2,action_3,group\n" + "\n".join(rows) + "\n")
+    assert main(["plans", str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICK]) == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["unit"] == "groups"
+    assert results["file"]["groups"] == 4
+    assert results["file"]["actions"] == 24 * 2 + 8
+    assert {row["name"] for row in results["drift"] if row["what"] == "group"} == {f"mouse {n}" for n in range(4)}
+    on = [r for r in results["transitions"] if (r["group"], r["from"]) == ("all", "on")]
+    assert [(row["to"], row["count"], row["probability"]) for row in on] == [("left", 8, 1)]

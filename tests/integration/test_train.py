@@ -1,0 +1,286 @@
+"""`python -m train` end to end: recipes, files, the table, faults, interruption and resuming."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, load
+from neuroprior.plans import read_plans, write_minari, write_plans
+from neuroprior.training import PriorModule
+from tests.support.sources import seeded
+from train.__main__ import main
+
+ROOT = Path(__file__).parents[2]
+SMALL = {
+    "gru": ["--model.prior.hidden_size", "8"],
+    "transformer": ["--model.prior.width", "16"],
+    "markov": [],
+}
+QUICK = [
+    "--data.num_plans",
+    "400",
+    "--data.world.num_worlds",
+    "40",
+    "--data.check_every",
+    "10",
+    "--data.batch_size",
+    "64",
+]
+QUICK += ["--trainer.max_steps", "30", "--trainer.accelerator", "cpu"]
+
+
+def recipe(name: str) -> list[str]:
+    return ["fit", "--config", str(ROOT / "train" / f"{name}.yaml")]
+
+
+def small(name: str, out: Path) -> list[str]:
+    return [*recipe(name), *SMALL[name], *QUICK, "--out", str(out)]
+
+
+def some_plans(num_plans: int = 300, **more) -> Plans:
+    """Plans that mostly repeat their last action, of several lengths."""
+    actions = torch.randint(3, (num_plans, 6), generator=seeded(1))
+    again = torch.rand(num_plans, 6, generator=seeded(2)) < 0.7
+    for t in range(1, 6):
+        actions[:, t] = torch.where(again[:, t], actions[:, t - 1], actions[:, t])
+    lengths = torch.randint(2, 7, (num_plans,), generator=seeded(3))
+    return Plans(actions, 3, lengths=lengths, **more)
+
+
+def run(arguments: list[str], **more) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "train", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300, **more
+    )
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_each_recipe(name, tmp_path, capsys):
+    assert main(small(name, tmp_path / "run")) == 0
+    printed = capsys.readouterr().out
+    prior = load(tmp_path / "run")
+    assert isinstance(prior, {"gru": GRUPrior, "transformer": TransformerPrior, "markov": MarkovPrior}[name])
+    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
+    models = [row["model"] for row in rows]
+    assert models[0] == "uniform"
+    assert models[-1] == type(prior).__name__
+    assert [model for model in models if model.startswith("markov-")] == [f"markov-{k}" for k in range(7)]
+    assert "context tree" in models
+    for row in rows:
+        assert row["low"] <= row["bits_per_action"] <= row["high"]
+        assert f"{row['bits_per_action']:.4f}" in printed
+    assert rows[0]["bits_per_action"] == pytest.approx(2)
+    assert rows[-1]["bits_per_action"] < 1.99
+    assert (tmp_path / "run" / "learning_curve.png").exists() == (name != "markov")
+
+
+def test_the_table_is_of_the_held_out_plans(tmp_path):
+    """The trained prior's row is what the saved prior takes for the plans that the split holds out."""
+    write_plans(some_plans(), tmp_path / "plans.npz")
+    out = tmp_path / "run"
+    assert main([*recipe("markov"), "--data.file", str(tmp_path / "plans.npz"), "--out", str(out)]) == 0
+    report = json.loads((out / "metrics.json").read_text())
+    generator = seeded(0)
+    rest, held_out = some_plans().split(0.1, generator)
+    assert report["plans"] == {"training": 240, "validation": 30, "held_out": 30}
+    bits = -load(out).log_prob(held_out.actions, lengths=held_out.lengths).sum() / torch.log(torch.tensor(2.0))
+    assert report["rows"][-1]["bits_per_action"] == pytest.approx(float(bits / held_out.lengths.sum()), abs=1e-5)
+    learned, _ = rest.split(1 / 9, generator)
+    again = MarkovPrior(3, 3).fit(learned)
+    assert torch.equal(again.log_prob(held_out.actions), load(out).log_prob(held_out.actions))
+
+
+def files() -> dict[str, tuple[Plans, str]]:
+    groups = torch.arange(300) // 10
+    steps = torch.randint(4, (300, 6), generator=seeded(4))
+    return {
+        "plain.npz": (some_plans(), "actions"),
+        "names.jsonl": (some_plans(action_names=("left", "on", "right"), group=groups), "actions"),
+        "context.jsonl": (some_plans(context=steps), "context"),
+        "features.npz": (some_plans(context=torch.randn(300, 2, generator=seeded(5))), "context"),
+        "rows.csv": (some_plans(group=groups), "actions"),
+        "rows.tsv": (some_plans(action_names=("left", "on", "right")), "actions"),
+        "steps.csv": (some_plans(context=steps, group=groups), "context"),
+    }
+
+
+@pytest.mark.parametrize("name", files())
+def test_each_kind_of_file(name, tmp_path):
+    plans, sees = files()[name]
+    write_plans(plans, tmp_path / name)
+    arguments = ["--data.file", str(tmp_path / name), "--out", str(tmp_path / "run"), *QUICK, *SMALL["gru"]]
+    assert main([*recipe("gru"), *arguments]) == 0
+    report = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert report["unit"] == ("plans" if plans.group is None else "groups")
+    assert ("context" in report["rows"][-1]["sees"]) == (sees == "context")
+    assert read_plans(tmp_path / "run" / "plans.npz").actions.shape == plans.actions.shape
+
+
+def test_a_minari_dataset(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    write_minari(some_plans(60, context=torch.randint(4, (60, 6), generator=seeded(4))), "mice/train-v0")
+    arguments = ["--data.file", "minari:mice/train-v0", "--out", str(tmp_path / "run"), *QUICK, *SMALL["gru"]]
+    assert main([*recipe("gru"), *arguments]) == 0
+    assert load(tmp_path / "run").num_contexts == 4
+
+
+def test_an_end_symbol(tmp_path):
+    write_plans(some_plans(), tmp_path / "plans.npz")
+    arguments = ["--data.file", str(tmp_path / "plans.npz"), "--data.end", "true", "--out", str(tmp_path / "run")]
+    assert main([*recipe("markov"), "--model.prior.order", "6", *arguments]) == 0
+    prior = load(tmp_path / "run")
+    assert prior.end == 3
+    lengths = Plans(prior.sample(4000, 9, generator=seeded(0)), 4, end=3).without_end().lengths
+    drawn = lengths.bincount(minlength=10)
+    assert drawn[2:7].min() > 400
+    assert drawn[2:7].sum() > 3600
+
+
+def test_two_processes_learn_what_one_does(tmp_path):
+    two = run([*small("gru", tmp_path / "two"), "--trainer.devices", "2", "--trainer.strategy", "ddp"])
+    assert two.returncode == 0, two.stderr
+    assert main(small("gru", tmp_path / "one")) == 0
+    curves = [json.loads((tmp_path / name / "metrics.json").read_text())["curve"] for name in ("one", "two")]
+    assert len(curves[0]) == len(curves[1]) == 3
+    for one, other in zip(*curves, strict=True):
+        assert one["step"] == other["step"]
+        assert one["validation_bits"] == pytest.approx(other["validation_bits"], abs=1e-4)
+
+
+LONG = ["--data.check_every", "5", "--trainer.max_steps", "200", "--trainer.patience", "200"]
+LONG += ["--model.prior.dropout", "0.1"]
+
+
+def test_killed_and_resumed_gives_the_same_prior_bit_for_bit(tmp_path):
+    whole = [*small("gru", tmp_path / "whole"), *LONG]
+    assert run(whole).returncode == 0
+    process = subprocess.Popen(
+        [sys.executable, "-m", "train", *small("gru", tmp_path / "cut"), *LONG],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    last = tmp_path / "cut" / "checkpoints" / "last.ckpt"
+    while not last.exists() and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "cut" / "model.safetensors").exists(), "killed too late to test anything"
+    moved = tmp_path / "moved"
+    os.rename(tmp_path / "cut", moved)
+    assert main(["fit", "--resume", str(moved)]) == 0
+    for name in ("model.safetensors",):
+        assert (moved / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    first, second = (json.loads((f / "metrics.json").read_text()) for f in (tmp_path / "whole", moved))
+    assert len(first["curve"]) == 40
+    assert first["curve"] == second["curve"]
+    assert first["rows"] == second["rows"]
+
+
+def test_ctrl_c_says_how_to_resume(tmp_path, capsys, monkeypatch):
+    step, calls = PriorModule.training_step, []
+
+    def interrupted(self, *batch):
+        calls.append(batch)
+        if len(calls) == 15:
+            raise KeyboardInterrupt
+        return step(self, *batch)
+
+    monkeypatch.setattr(PriorModule, "training_step", interrupted)
+    out = tmp_path / "run"
+    assert main(small("gru", out)) == 130
+    said = capsys.readouterr().err
+    assert "saved up to step 10" in said
+    assert f"--resume {out}" in said
+    assert said.count("\n") == 1
+    assert main(["fit", "--resume", str(out)]) == 0
+    assert [row["step"] for row in json.loads((out / "metrics.json").read_text())["curve"]] == [10, 20, 30]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["fit"], "--config"),
+        ([*recipe("gru"), "--data.file", "missing.npz"], "missing.npz"),
+        ([*recipe("gru"), "--model.prior.hidden_size", "0"], "hidden_size"),
+        ([*recipe("gru"), "--model.prior", "NoPrior"], "NoPrior"),
+        ([*recipe("gru"), "--nonsense", "1"], "nonsense"),
+        ([*recipe("gru"), "--trainer.devices", "0"], "devices"),
+        (["fit", "--config", "missing.yaml"], "missing.yaml"),
+        (["fit", "--resume", "missing"], "run.yaml"),
+        ([*recipe("gru"), "--data.held_out", "0.95"], "held_out"),
+        ([*recipe("gru"), "--data.world", "null"], "--data.file"),
+        ([], "fit"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, says, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*arguments, *(["--out", "run"] if "--config" in arguments else [])]) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
+    assert "Traceback" not in said
+
+
+def test_a_run_is_never_overwritten(tmp_path, capsys):
+    assert main(small("markov", tmp_path / "run")) == 0
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").glob("*.*")}
+    assert main(small("gru", tmp_path / "run")) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").glob("*.*")} == before
+
+
+class Poison:
+    def __init__(self, target):
+        self.target = target
+
+    def __reduce__(self):
+        return (Path.touch, (self.target,))
+
+
+def test_no_pickle_is_executed(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(small("gru", out)) == 0
+    for name in ("checkpoints/last.ckpt", "checkpoints/best.ckpt"):
+        torch.save({"state_dict": Poison(tmp_path / "poisoned")}, out / name)
+    capsys.readouterr()
+    assert main(["fit", "--resume", str(out)]) == 2
+    assert "last.ckpt" in capsys.readouterr().err
+    (out / "plans.npz").write_bytes(pickle.dumps(Poison(tmp_path / "poisoned")))
+    assert main(["fit", "--resume", str(out)]) == 2
+    assert not (tmp_path / "poisoned").exists()
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    limit = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)); "
+    program = limit + "from train.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *small("gru", tmp_path / "run")], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "error" in done.stderr
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_an_unwritable_folder_is_one_line(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert main(small("gru", tmp_path / "run")) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_long_sequence_trains_in_windows(tmp_path):
+    actions = torch.arange(6000) // 3 % 4
+    write_plans(Plans(actions[None], 4), tmp_path / "plans.npz")
+    arguments = ["--data.file", str(tmp_path / "plans.npz"), "--data.window", "16", "--out", str(tmp_path / "run")]
+    assert main([*recipe("gru"), *SMALL["gru"], *QUICK, *arguments, "--trainer.max_steps", "120"]) == 0
+    report = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert report["unit"] == "parts of the plan"
+    assert report["rows"][-1]["bits_per_action"] < 0.5

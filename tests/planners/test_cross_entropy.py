@@ -1,0 +1,113 @@
+"""The cross-entropy planner: it refits as its docstring says, to the best plans, in every kind of world."""
+
+import pytest
+import torch
+
+from neuroprior import CrossEntropyPlanner, GRUPrior, MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, cube
+from neuroprior.planners.cross_entropy import _places, _Refitted
+from tests.support.sources import chance_world, every_plan, fits, random_world, refuses, seeded
+
+WALK = every_plan(3, 4)
+
+
+def refitted(order, counts, strength=2.0, temperature=1.0):
+    prior = MarkovPrior(3, 2).fit(torch.randint(3, (200, 6), generator=seeded(0)))
+    return prior, _Refitted(prior, counts, order, strength, temperature)
+
+
+@pytest.mark.parametrize("order", [None, 1, 2])
+@pytest.mark.parametrize("temperature", [1.0, 0.5])
+def test_it_draws_from_counts_and_prior_together(order, temperature):
+    """Against (n(a) + s p(a)) / (n + s), worked out for every plan of four actions, for two starts."""
+    histories = 4 if order is None else 4**order
+    counts = torch.randint(6, (2, histories, 3), generator=seeded(1)).float()
+    prior, proposer = refitted(order, counts, temperature=temperature)
+    probs = (prior(WALK) / temperature).softmax(-1).gather(2, WALK[..., None])[..., 0].double()
+    where = _places(WALK, 3, order)
+    if order is None:
+        assert where.tolist() == [[0, 1, 2, 3]] * len(WALK)
+    for start in range(2):
+        n = counts[start][where, WALK].double()
+        total = counts[start][where].double().sum(-1)
+        expected = ((n + 2 * probs) / (total + 2)).prod(1)
+        assert torch.isclose(expected.sum(), torch.tensor(1.0).double(), atol=1e-5)
+        plans = proposer.sample(2 * 50_000, 4, temperature=1.0, generator=seeded(start)).view(2, -1, 4)
+        assert fits(plans[start], expected, 3)
+
+
+def test_places_tell_last_actions_apart():
+    places = _places(WALK, 3, 2)
+    before = torch.nn.functional.pad(WALK + 1, (2, 0))[:, :-1].unfold(1, 2, 1)
+    assert torch.equal(places, before[..., 0] * 4 + before[..., 1])
+
+
+def test_elites_are_the_best_plans_so_far():
+    planner = CrossEntropyPlanner(UniformPrior(3), 4, 10, elites=0.2)
+    plans = torch.stack([WALK[:10], WALK[30:40]]).to(torch.uint8)
+    score = torch.tensor([[0, 1, 2, 9, 4, 5, 6, 7, 8, 3], [5, 5, 0, 0, 0, 0, 0, 0, 0, 0]]).float()
+    counts = planner._counted(plans, score, torch.zeros(2, 4, 3), seeded(0))
+    for start, best in ((0, (3, 8)), (1, (0, 1))):
+        expected = sum(torch.nn.functional.one_hot(plans[start, k].long(), 3) for k in best)
+        assert torch.equal(counts[start], expected.float())
+
+
+def test_it_comes_nearer_step_by_step():
+    """The more of eight digits are right the better, and a sample has two of them: refitting finds nearly all."""
+    table = torch.arange(9)[:, None].expand(9, 4).clone()
+    right = torch.randint(4, (8,), generator=seeded(0))
+    table[:8] = torch.arange(1, 9)[:, None]
+    world = TabularWorld(table, torch.cat([torch.nn.functional.one_hot(right, 4), torch.zeros(1, 4)]).float())
+    state = torch.zeros(200, dtype=torch.long)
+    how = {"objective": "return"}
+    found = CrossEntropyPlanner(UniformPrior(4), 8, 400, rounds=8, strength=1.0, **how).plan(world, state, seeded(1))
+    sampled = SamplingPlanner(UniformPrior(4), 8, 400, **how).plan(world, state, seeded(1))
+    assert found.score.mean() > sampled.score.mean() + 1
+    assert found.model_steps == sampled.model_steps == 3200
+
+
+def test_in_worlds_with_chance_and_where_not_all_is_legal():
+    world, state = chance_world(0), torch.zeros(7, dtype=torch.long)
+    planner = CrossEntropyPlanner(UniformPrior(world.num_actions), 3, 12, num_rollouts=5)
+    assert planner.plan(world, state, seeded(0)).model_steps == 12 * 3 * 5
+    world = random_world(0, "WSA", legal=True)
+    state = world.reset(50, seeded(0))
+    decision = CrossEntropyPlanner(UniformPrior(3), 4, 20, objective="return").plan(world, state, seeded(0))
+    assert (decision.score > -torch.inf).all()
+
+
+def test_counts_of_many_starts_are_kept_a_few_at_a_time():
+    world = random_world(0)
+    planner = CrossEntropyPlanner(UniformPrior(3), 4, 8, order=8)
+    decision = planner.plan(world, world.reset(40, seeded(0)), seeded(0))  # 65,536 x 3 counts a start
+    assert decision.plan.shape == (40, 4)
+    assert CrossEntropyPlanner(UniformPrior(3), 4, 2).rounds == 2
+
+
+def test_priors_that_see():
+    world = cube(scramble=2)
+    state = world.reset(5, seeded(0))
+    prior = GRUPrior(world.num_actions, hidden_size=8, context_size=world.observe(state).shape[-1])
+    decision = CrossEntropyPlanner(prior, 2, 200, any_prefix=True).plan(world, state, seeded(0))
+    assert decision.score.mean() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"rounds": 0}, "rounds"),
+        ({"elites": 0.0}, "elites"),
+        ({"elites": 1.5}, "elites"),
+        ({"order": 0}, "order"),
+        ({"strength": 0.0}, "strength"),
+        ({"strength": float("inf")}, "strength"),
+    ],
+)
+def test_refuses(given, word):
+    with refuses(word):
+        CrossEntropyPlanner(UniformPrior(3), 4, 20, **given)
+
+
+def test_refuses_orders_that_cannot_be_counted():
+    world = random_world(0)
+    with refuses("order"):
+        CrossEntropyPlanner(UniformPrior(3), 4, 20, order=14).plan(world, world.reset(3, seeded(0)), seeded(0))

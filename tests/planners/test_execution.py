@@ -1,0 +1,71 @@
+"""Executing plans: what is done is what was planned, open loop or closed, and replanning pays where chance decides."""
+
+import pytest
+import torch
+
+from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, execute, gridworld
+from tests.support.sources import chance_world, random_world, refuses, seeded
+
+
+def test_an_open_loop_is_the_plan():
+    world = random_world(0)
+    state = world.reset(20, seeded(0))
+    planner = ExhaustivePlanner(4, objective="return")
+    done = execute(planner, world, state, 4, every=4, generator=seeded(1))
+    decision = planner.plan(world, state, seeded(1))
+    assert torch.equal(done.actions, decision.plan.long())
+    assert torch.allclose(done.rewards.sum(1), decision.score)
+    assert torch.equal(done.states[:, -1], decision.final_state)
+    assert done.model_steps == decision.model_steps
+
+
+@pytest.mark.parametrize(("every", "decisions"), [(1, 7), (2, 4), (3, 3)])
+def test_it_is_planned_anew_after_every_few_steps(every, decisions):
+    world = gridworld(8, 8, num_worlds=3)
+    state = world.reset(5, seeded(0))
+    planner = SamplingPlanner(UniformPrior(4), 3, 10)
+    done = execute(planner, world, state, 7, every, seeded(1))
+    assert done.actions.shape == done.rewards.shape == done.states.shape == (5, 7)
+    assert done.model_steps == decisions * 30
+    now = state
+    for t in range(7):
+        now, reward = world.step(now, done.actions[:, t])
+        assert torch.equal(now, done.states[:, t])
+        assert torch.equal(reward, done.rewards[:, t])
+
+
+def test_a_closed_loop_answers_what_chance_did():
+    """A coin leads to cell 1 or 2, where the right answer is another: a closed loop is always right, an open one half.
+
+    Wrong answers of 4,000 coins: by Hoeffding their share is within .05 of a half but with probability 5e-9.
+    """
+    table = torch.tensor([[[1, 2]] * 2, [[3, 3], [4, 4]], [[4, 4], [3, 3]], [[3, 3]] * 2, [[4, 4]] * 2])
+    world = TabularWorld(table, torch.tensor([0.0, 0, 0, 1, 0]), probability=torch.full((5, 2, 2), 0.5))
+    state = torch.zeros(4000, dtype=torch.long)
+    planner = ExhaustivePlanner(2, num_rollouts=8, objective="return")
+    closed, opened = (execute(planner, world, state, 2, every, seeded(0)).rewards[:, -1].mean() for every in (1, 2))
+    assert closed == 1
+    assert abs(float(opened) - 0.5) < 0.05
+
+
+def test_the_same_seed_does_the_same():
+    world, state = chance_world(0), torch.arange(5)
+    planner = SamplingPlanner(UniformPrior(3), 3, 10)
+    first, second = (execute(planner, world, state, 5, generator=seeded(3)) for _ in range(2))
+    for one, other in zip(first[:3], second[:3], strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("given", "word"), [({"num_steps": 0}, "num_steps"), ({"every": 0}, "every"), ({"every": 4}, "fewer")]
+)
+def test_refuses(given, word):
+    world = random_world(0)
+    with refuses(word):
+        execute(ExhaustivePlanner(3), world, world.reset(2, seeded(0)), **({"num_steps": 5, "every": 2} | given))
+
+
+def test_refuses_to_execute_beyond_the_prefix_that_won():
+    world = TabularWorld(torch.tensor([[1], [2], [2]]), torch.tensor([0.0, 1.0, 0.0]))
+    with refuses("fewer"):
+        execute(ExhaustivePlanner(3, any_prefix=True), world, torch.tensor([0]), 3, every=3)

@@ -1,0 +1,151 @@
+"""The horizon planner: it spends what it may, chooses what promises most, and `eval depth` compares it."""
+
+import json
+import re
+
+import pytest
+import torch
+
+from eval.__main__ import main
+from neuroprior import HorizonPlanner, MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld, labyrinth
+from neuroprior.planners.horizon import _Found
+from neuroprior.testing import check_planner
+from tests.support.reports import FROM_ELSEWHERE
+from tests.support.sources import FALSE_ALARM, chance_world, p_value, refuses, seeded
+
+
+@pytest.mark.parametrize("settings", [{"pilot": 0.1}, {"pilot": 1.0}, {"rounds": 8, "temperature": 2.0}])
+def test_it_is_a_planner(settings):
+    check_planner(lambda prior, length, number: HorizonPlanner(prior, length, number, objective="return", **settings))
+
+
+@pytest.mark.parametrize("num_plans", [1, 2, 3, 10, 64])
+@pytest.mark.parametrize("prior", [UniformPrior(4), MarkovPrior(4, 1, num_contexts=64)])
+def test_it_spends_hardly_less_than_it_may(num_plans, prior):
+    world = gridworld(8, 8, num_worlds=3)
+    planner = HorizonPlanner(prior, 12, num_plans)
+    decision = planner.plan(world, world.reset(40, seeded(0)), seeded(1))
+    assert num_plans * 12 - planner.rounds * 11 <= decision.model_steps <= num_plans * 12
+    assert decision.plan.shape == (40, 12)
+    beyond = torch.arange(12) >= decision.lengths[:, None]
+    assert (decision.plan.masked_select(beyond) == 0).all()
+
+
+def gathered(scores):
+    """What a planner of the longest horizon 3 knows after plans whose prefixes scored so much, `[B, P, 3]`."""
+    scores = torch.tensor(scores, dtype=torch.float64)
+    so_far = scores.cummax(2).values
+    moments = torch.stack([torch.ones_like(so_far), so_far, so_far**2], -1).sum(1)
+    best = SamplingPlanner(UniformPrior(4), 3, 1).plan(gridworld(3, 3), torch.zeros(len(scores), dtype=torch.long))
+    best = best._replace(score=so_far.amax((1, 2)))
+    return _Found(best, torch.ones(len(scores)), moments, torch.zeros(len(scores)))
+
+
+def test_what_promises_most():
+    """Scores spread at once: many short plans. Only the last action tells: few long ones. Nothing tells: long ones."""
+    planner = HorizonPlanner(UniformPrior(100), 3, 60)
+    short = [[[0.0] * 3, [1.0] * 3, [0.5] * 3, [0.2] * 3]]
+    long = [[[0.0, 0.0, 0.1], [0.0, 0.0, 1.0], [0.0, 0.0, 0.6], [0.0, 0.0, 0.3]]]
+    nothing = [[[0.0] * 3] * 4]
+    for scores, horizon in ((short, 1), (long, 3), (nothing, 3)):
+        assert planner._horizon(gathered(scores), 60).tolist() == [horizon]
+
+
+def test_of_few_actions_there_are_few_plans():
+    """Two actions: of one step there are two plans, of which sixty tries tell no more."""
+    scores = [[[0.0] * 3, [1.0] * 3, [0.5] * 3, [0.2] * 3]]
+    assert HorizonPlanner(UniformPrior(100), 3, 60)._horizon(gathered(scores), 60).tolist() == [1]
+    assert HorizonPlanner(UniformPrior(2), 3, 60)._horizon(gathered(scores), 60).tolist() == [3]
+
+
+def test_deep_horizons_count():
+    """Only the last of 64 actions tells; so many plans of four actions there are that their number overflows."""
+    scores = torch.zeros(1, 8, 64, dtype=torch.float64)
+    scores[0, :, -1] = torch.arange(8) / 8
+    found = gathered(scores.tolist())
+    found = found._replace(decision=found.decision._replace(score=torch.tensor([0.5])))
+    for actions in (2, 4, 300):
+        planner = HorizonPlanner(UniformPrior(actions), 64, 16)
+        assert planner._horizon(found, 640).tolist() == [64]
+    scores[0, :, 40:] = scores[0, :, -1:]
+    found = gathered(scores.tolist())
+    assert HorizonPlanner(UniformPrior(4), 64, 16)._horizon(found, 640).tolist() == [42]  # 15 plans, as of 41
+
+
+def test_what_others_found_counts_for_a_little():
+    """A start that found nothing goes by the others; alone it would plan as deep as it may."""
+    planner = HorizonPlanner(UniformPrior(100), 3, 60)
+    short, nothing = [[0.0] * 3, [1.0] * 3, [0.5] * 3, [0.2] * 3], [[0.0] * 3] * 4
+    assert planner._horizon(gathered([nothing, short, short]), 60).tolist() == [1, 1, 1]
+
+
+def test_ties_over_rounds():
+    """All eight plans of a binary tree of three steps are worth the same: chi-square over 8,000 decisions.
+
+    One step is worth nothing, so that nothing is to be expected of it; the last one is all that counts.
+    """
+    table = torch.arange(30).view(15, 2).add(1).clamp(max=15)
+    table = torch.cat([table, torch.full((1, 2), 15)])
+    reward = torch.zeros(16)
+    reward[7:15] = 1
+    state = torch.zeros(8000, dtype=torch.long)
+    decision = HorizonPlanner(UniformPrior(2), 3, 12).plan(TabularWorld(table, reward), state, seeded(0))
+    assert (decision.lengths == 3).all()
+    number = (decision.plan.long() * torch.tensor([4, 2, 1])).sum(1)
+    assert p_value(number, torch.ones(8)) > FALSE_ALARM
+
+
+def test_with_chance_and_where_not_all_is_legal():
+    world = chance_world(0)
+    planner = HorizonPlanner(UniformPrior(3), 4, 10, objective="return", num_rollouts=5)
+    decision = planner.plan(world, world.reset(20, seeded(0)), seeded(1))
+    assert decision.model_steps <= 10 * 4 * 5
+    maze = labyrinth()
+    found = HorizonPlanner(UniformPrior(4), 16, 64, objective="return", discount=0.9).plan(
+        maze, torch.arange(126), seeded(0)
+    )
+    now = torch.arange(126)
+    for t in range(16):
+        on = found.lengths > t
+        action = found.plan[:, t].long()
+        assert (maze.legal_actions(now).gather(1, action[:, None])[:, 0] | ~on).all()
+        now = torch.where(on, maze.step(now, action)[0], now)
+    assert torch.equal(now, found.final_state)
+
+
+@pytest.mark.parametrize(
+    ("given", "word"), [({"pilot": 0.0}, "pilot"), ({"pilot": 1.1}, "pilot"), ({"rounds": 0}, "rounds")]
+)
+def test_bad_settings(given, word):
+    with refuses(word):
+        HorizonPlanner(UniformPrior(2), 3, 4, **given)
+
+
+SMALL = ["depth", "--worlds", "frozen_lake", "--seeds", "2", "--starts", "4", "--training-starts", "60"]
+SMALL += ["--length", "8", "--num-plans", "4", "16", "--processes", "1"]
+
+
+def test_a_small_comparison(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main([*SMALL, "--out", str(out)]) == 0
+    assert "frozen_lake, 16 plans:" in " ".join(capsys.readouterr().out.split())
+    rows = json.loads((out / "results.json").read_text())["rows"]
+    assert {row["planner"] for row in rows} == {"2 actions", "4 actions", "8 actions", "chosen"}
+    for row in rows:
+        assert 0 <= row["oracle_share"] <= 1 + 1e-6
+        most = 8 * row["num_plans"]
+        assert row["model_steps"] == most or (row["planner"] == "chosen" and most - 21 <= row["model_steps"] <= most)
+    page = (out / "report.html").read_text()
+    assert "<title>How deep to plan" in page
+    assert not re.search(FROM_ELSEWHERE, page)
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [(["--length", "6"], "length"), (["--worlds", "slippery"], "slippery"), (["--num-plans", "3"], "num_plans")],
+)
+def test_bad_options(given, word, tmp_path, capsys):
+    assert main([*SMALL, *given, "--out", str(tmp_path)]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert word in told

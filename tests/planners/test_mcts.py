@@ -1,0 +1,134 @@
+"""Tree search: nothing is tried twice, everything in the end; the prior and the scores steer it."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuroprior import (
+    GRUPrior,
+    MarkovPrior,
+    MCTSPlanner,
+    SamplingPlanner,
+    TabularWorld,
+    UniformPrior,
+    cube,
+    gridworld,
+    oracle,
+)
+from tests.support.sources import chance_world, random_world, refuses, seeded
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 999),
+    legal=st.booleans(),
+    kind=st.sampled_from(["WS", "WSA"]),
+    num_plans=st.integers(1, 40),
+    length=st.integers(1, 4),
+    exploration=st.sampled_from([0.0, 1.25, 100.0]),
+)
+def test_it_finds_what_the_oracle_does_in_the_end(seed, legal, kind, num_plans, length, exploration):
+    """A tree of at most 3 + 9 + 27 + 81 nodes takes at most 120 x 4 steps."""
+    world = random_world(seed, kind, legal)
+    state = world.reset(4, seeded(seed))
+    planner = MCTSPlanner(UniformPrior(3), length, num_plans, objective="return", exploration=exploration)
+    decision = planner.plan(world, state, seeded(seed))
+    assert decision.model_steps <= num_plans * length
+    best = oracle(world, state, length, objective="return").double()
+    assert (decision.score <= best + 1e-5).all()
+    if num_plans >= sum(3**k for k in range(1, length + 1)):
+        assert torch.allclose(decision.score.double(), best, atol=1e-5)
+
+
+def test_each_simulation_adds_a_node_and_takes_steps_from_there_on():
+    """A single action: the first simulation walks down, and then all has been tried."""
+    world = TabularWorld(torch.tensor([[1], [2], [0]]), torch.tensor([0.0, 1.0, 2.0]))
+    decision = MCTSPlanner(UniformPrior(1), 5, 10).plan(world, torch.tensor([0]), seeded(0))
+    assert decision.model_steps == 5 + 4 + 3 + 2 + 1
+    assert decision.score.tolist() == [2.0]
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.1])
+def test_nor_does_a_prior_that_is_sure_of_the_wrong_way_stop_it(temperature):
+    """A line of five cells with a reward at its end, and a prior that goes the other way."""
+    cell = torch.arange(5)
+    world = TabularWorld(torch.stack([(cell - 1).clamp(min=0), (cell + 1).clamp(max=4)], 1), (cell == 4).float())
+    prior = MarkovPrior(2, 0).fit(torch.zeros(200, 4).long())
+    planner = MCTSPlanner(prior, 4, 30, temperature=temperature)
+    assert planner.plan(world, torch.zeros(3, dtype=torch.long), seeded(0)).score.tolist() == [1.0] * 3
+
+
+def test_scores_steer_it_better_than_chance():
+    """Rewards on the way tell where more are: with as many steps it finds more than samples do."""
+    world = gridworld(15, 15, "torus", num_worlds=5, reward_power=4)
+    state = world.reset(300, seeded(0))
+    how = {"objective": "return"}
+    found = MCTSPlanner(UniformPrior(4), 10, 64, **how).plan(world, state, seeded(1))
+    sampled = SamplingPlanner(UniformPrior(4), 10, 64, **how).plan(world, state, seeded(1))
+    assert found.model_steps <= sampled.model_steps
+    assert found.score.mean() > 1.05 * sampled.score.mean()
+
+
+def test_other_states_than_numbers_and_priors_that_see():
+    world = cube(scramble=2)
+    state = world.reset(10, seeded(0))
+    prior = GRUPrior(world.num_actions, hidden_size=8, context_size=world.observe(state).shape[-1])
+    decision = MCTSPlanner(prior, 2, 80, any_prefix=True).plan(world, state, seeded(1))
+    assert decision.score.mean() > 0.8
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_impossible_rewards_are_no_trouble(share):
+    """Where some, or all, scores are infinite, plans are legal, end where is said, and the best is found."""
+    world = random_world(0, "WS", legal=True)
+    reward = world.reward.masked_fill(torch.rand(world.reward.shape, generator=seeded(1)) < share, -torch.inf)
+    world = TabularWorld(world.next_state, reward, world.legal_actions)
+    state = world.reset(60, seeded(0))
+    decision = MCTSPlanner(UniformPrior(3), 3, 60).plan(world, state, seeded(0))
+    assert torch.equal(decision.score, oracle(world, state, 3))
+    now = state
+    for t in range(3):
+        action = decision.plan[:, t].long()
+        assert world.legal_actions(now).gather(1, action[:, None]).all()
+        now = world.step(now, action)[0]
+    assert torch.equal(now, decision.final_state)
+
+
+def test_rewards_are_as_precise_as_the_worlds():
+    world = random_world(0)
+    world = TabularWorld(world.next_state, world.reward.double() + 2**25)
+    state = world.reset(20, seeded(0))
+    decision = MCTSPlanner(UniformPrior(3), 3, 60, objective="return").plan(world, state, seeded(0))
+    assert torch.allclose(decision.score, oracle(world, state, 3, objective="return"), rtol=0, atol=1e-6)
+
+
+def test_the_start_that_took_most_steps_tells_how_many(monkeypatch):
+    """A start where little can be tried before others, in chunks of one."""
+    world = TabularWorld(torch.tensor([[0, 0], [2, 3], [4, 5], [6, 1], [1, 2], [3, 4], [5, 6]]), torch.rand(7))
+    state = torch.tensor([0, 1, 0])
+    planner = MCTSPlanner(UniformPrior(2), 4, 6)
+    together = planner.plan(world, state, seeded(0)).model_steps
+    monkeypatch.setattr("neuroprior.planners.planner.STEPS_AT_ONCE", 1)
+    assert planner.plan(world, state, seeded(0)).model_steps == together == 24
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"length": 0}, "length"),
+        ({"num_plans": 0}, "num_plans"),
+        ({"temperature": 0.0}, "temperature"),
+        ({"exploration": -1.0}, "exploration"),
+        ({"exploration": float("nan")}, "exploration"),
+    ],
+)
+def test_refuses(given, word):
+    with refuses(word):
+        MCTSPlanner(UniformPrior(4), **({"length": 2, "num_plans": 2} | given))
+
+
+def test_refuses_chance():
+    world = chance_world(0)
+    with refuses("chance"):
+        MCTSPlanner(UniformPrior(world.num_actions), 2, 2).plan(world, torch.zeros(1, dtype=torch.long))

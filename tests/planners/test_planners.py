@@ -1,0 +1,292 @@
+"""Planners against brute force over all plans, ties, chunks, the oracle, and what is collected."""
+
+import pytest
+import torch
+
+from neuroprior import (
+    ExhaustivePlanner,
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    SamplingPlanner,
+    TabularWorld,
+    UniformPrior,
+    World,
+    collect,
+    gridworld,
+    oracle,
+)
+from neuroprior.planners import planner as planner_module
+from tests.support.sources import (
+    FALSE_ALARM,
+    best_plan_distribution,
+    every_plan,
+    fits,
+    p_value,
+    plan_number,
+    random_world,
+    refuses,
+    seeded,
+)
+
+VALUES = torch.rand(12, generator=seeded(99)) * 2 - 1
+
+
+def value_of(state):
+    return VALUES[state]
+
+
+OBJECTIVES = [
+    {},
+    {"value": value_of},
+    {"objective": "return"},
+    {"objective": "return", "discount": 0.7},
+    {"objective": "return", "discount": 0.7, "value": value_of},
+]
+KINDS = ("S", "SA", "WS", "WSA")
+WORLDS = pytest.mark.parametrize("world", [random_world(s, k, legal) for s, k in enumerate(KINDS) for legal in (0, 1)])
+GOALS = pytest.mark.parametrize("goal", OBJECTIVES)
+
+
+def brute_force(world, start, plan, goal):
+    """The score of one plan, step by step, or None where it is not legal; and where it ends."""
+    state, rewards = torch.tensor([start]), []
+    for action in plan.tolist():
+        if not world.legal_actions(state)[0, action]:
+            return None, None
+        state, reward = world.step(state, torch.tensor([action]))
+        rewards.append(float(reward))
+    discount = goal.get("discount", 1.0)
+    if goal.get("objective") == "return":
+        score, weight = sum(r * discount**t for t, r in enumerate(rewards)), discount ** len(rewards)
+    else:
+        score, weight = rewards[-1], 1.0
+    return score + (weight * float(VALUES[state]) if "value" in goal else 0.0), int(state)
+
+
+@WORLDS
+@GOALS
+@pytest.mark.parametrize("depth", [1, 3])
+def test_exhaustive_is_brute_force_and_so_is_the_oracle(world, goal, depth):
+    states = torch.arange(world.num_maps * 6)
+    decision = ExhaustivePlanner(depth, **goal).plan(world, states, seeded(0))
+    assert decision.model_steps == sum(3**d for d in range(1, depth + 1))
+    assert decision.plan.shape == (len(states), depth)
+    for state in states.tolist():
+        scores = {}
+        for plan in every_plan(3, depth):
+            score, end = brute_force(world, state, plan, goal)
+            if score is not None:
+                scores[tuple(plan.tolist())] = (score, end)
+        best = max(score for score, _ in scores.values())
+        assert float(decision.score[state]) == pytest.approx(best, abs=1e-5)
+        score, end = scores[tuple(decision.plan[state].tolist())]  # a legal plan
+        assert score == pytest.approx(best, abs=1e-5)
+        assert int(decision.final_state[state]) == end
+    torch.testing.assert_close(oracle(world, states, depth, **goal), decision.score, rtol=1e-5, atol=1e-5)
+
+
+@WORLDS
+@GOALS
+@pytest.mark.parametrize("prior", [UniformPrior(3), MarkovPrior(3, 1), GRUPrior(3, 8, num_contexts=6)])
+def test_sampling_decides_for_the_best_of_its_candidates(world, goal, prior):
+    class Watched(SamplingPlanner):
+        def candidates(self, *arguments):
+            self.seen = super().candidates(*arguments)
+            return self.seen
+
+    states, planner = torch.arange(world.num_maps * 6), Watched(prior, 4, 5, **goal)
+    decision = planner.plan(world, states, seeded(1))
+    plans, rollout = planner.seen
+    assert decision.model_steps == 20
+    assert plans.shape == (len(states), 5, 4)
+    again = world.rollout(states, plans)
+    assert torch.equal(again.rewards, rollout.rewards)
+    assert torch.equal(again.final_state, rollout.final_state)
+    for i in range(len(states)):
+        found = [brute_force(world, i, plan, goal) for plan in plans[i]]
+        assert None not in found[0]
+        best = max(score for score, _ in found)
+        assert float(decision.score[i]) == pytest.approx(best, abs=1e-5)
+        score, end = brute_force(world, i, decision.plan[i], goal)
+        assert score == pytest.approx(best, abs=1e-5)
+        assert decision.plan[i].tolist() in plans[i].tolist()
+        assert int(decision.final_state[i]) == end
+    assert (decision.score <= oracle(world, states, 4, **goal) + 1e-5).all()
+    many = SamplingPlanner(prior, 2, 400, **goal).plan(world, states, seeded(2))
+    torch.testing.assert_close(many.score, oracle(world, states, 2, **goal), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [lambda: ExhaustivePlanner(3), lambda: SamplingPlanner(UniformPrior(3), 3, 1000)])
+def test_ties_are_broken_uniformly(make):
+    """All plans are equally good: the decision is a uniform draw. Then cells 0 and 1 alone are good."""
+    flat = TabularWorld(torch.tensor([[0, 1, 2]] * 3), torch.ones(3))
+    start = torch.zeros(20_000, dtype=torch.long)
+    world = TabularWorld(flat.next_state, torch.tensor([1.0, 1.0, 0.0]))
+    good = torch.tensor([1.0, 1.0, 0.0]).repeat(9)
+    planner = make()
+    assert fits(planner.plan(world, start[:5000], seeded(1)).plan, good, 3)
+    assert fits(planner.plan(flat, start[:5000], seeded(0)).plan, torch.ones(27), 3)
+
+
+def test_candidates_of_a_start_are_independent_of_its_place():
+    """Plans are drawn for all starts together: each start's candidates must still have the prior's distribution."""
+    world = random_world(0)
+    planner = SamplingPlanner(UniformPrior(3), 2, 4)
+    plans, _ = planner.candidates(world, torch.zeros(20_000, dtype=torch.long), seeded(0))
+    number = plan_number(plans, 3)
+    for part in (number[:10_000], number[10_000:], number[:, 0]):
+        assert p_value(part, torch.ones(9)) > FALSE_ALARM
+    assert p_value(number[:, 0] * 9 + number[:, 3], torch.ones(81)) > FALSE_ALARM
+
+
+@pytest.mark.parametrize("steps", [1, 100, 2**22])
+@pytest.mark.parametrize("make", [lambda: ExhaustivePlanner(3), lambda: SamplingPlanner(UniformPrior(3), 2, 500)])
+def test_chunks(make, steps, monkeypatch):
+    monkeypatch.setattr(planner_module, "STEPS_AT_ONCE", steps)
+    world = random_world(4, "WSA", legal=True)
+    states = torch.randint(12, (50,), generator=seeded(0))
+    planner = make()
+    sizes, reference = [], world.step
+    monkeypatch.setattr(world, "step", lambda s, a, g=None: sizes.append(len(s)) or reference(s, a, g))
+    decision = planner.plan(world, states, seeded(1))
+    length = decision.plan.shape[1]
+    assert max(sizes) <= max(steps, 500)  # at least one start at a time
+    torch.testing.assert_close(decision.score, oracle(world, states, length))
+    got = world.rollout(states, decision.plan[:, None])
+    assert torch.equal(got.rewards[:, 0, -1], decision.score)
+    assert torch.equal(got.final_state[:, 0], decision.final_state)
+    assert decision.model_steps == (39 if isinstance(planner, ExhaustivePlanner) else 1000)
+
+
+PLANNERS = [ExhaustivePlanner(3), SamplingPlanner(UniformPrior(3), 3, 20), SamplingPlanner(MarkovPrior(3), 3, 20)]
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("legal", [False, True])
+def test_same_seed_same_decisions_and_no_global_state(planner, legal):
+    world = random_world(1, legal=legal)
+    drawn = []
+    for seed in (3, 3, 4):
+        torch.manual_seed(len(drawn))
+        before = torch.get_rng_state()
+        plans = collect(planner, world, 200, generator=seeded(seed), context="step")
+        assert torch.equal(before, torch.get_rng_state())
+        drawn.append(plans)
+    assert torch.equal(drawn[0].actions, drawn[1].actions)
+    assert torch.equal(drawn[0].context, drawn[1].context)
+    assert not torch.equal(drawn[0].context, drawn[2].context)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("legal", [False, True])
+def test_no_start_at_all(planner, legal):
+    decision = planner.plan(random_world(1, legal=legal), torch.zeros(0, dtype=torch.long))
+    assert decision.plan.shape == (0, 3)
+    assert decision.score.shape == decision.final_state.shape == (0,)
+
+
+@pytest.mark.parametrize("bad", [-torch.inf, -1e30])
+def test_a_legal_plan_wins_however_bad(bad):
+    """From cell 0 only action 0 exists; it is as bad as can be, and action 1, which does not exist, would be good."""
+    world = TabularWorld(
+        torch.tensor([[0, 1], [0, 1]]), torch.tensor([bad, 5.0]), torch.tensor([[True, False], [True, True]])
+    )
+    starts = torch.zeros(50, dtype=torch.long)
+    for planner in (ExhaustivePlanner(2), SamplingPlanner(UniformPrior(2), 2, 3)):
+        decision = planner.plan(world, starts, seeded(0))
+        assert not decision.plan.any()
+        assert not decision.final_state.any()
+
+
+@pytest.mark.parametrize("context", [None, "plan", "step"])
+@pytest.mark.parametrize("maps", [1, 3])
+def test_collect(context, maps):
+    world = gridworld(4, 5, "torus", num_worlds=maps, seed=2)
+    state = torch.randint(20 * maps, (30,), generator=seeded(0))
+    plans = collect(ExhaustivePlanner(3), world, state=state, context=context, generator=seeded(1))
+    assert isinstance(plans, Plans)
+    assert (len(plans), plans.max_length, plans.num_actions) == (30, 3, 4)
+    assert plans.action_names == ("up", "right", "down", "left")
+    rollout = world.rollout(state, plans.actions[:, None])
+    torch.testing.assert_close(rollout.rewards[:, 0, -1], oracle(world, state, 3))
+    assert (plans.group is None) if maps == 1 else torch.equal(plans.group, state // 20)
+    if context is None:
+        assert plans.context is None
+    elif context == "plan":
+        assert torch.equal(plans.context, state % 20)
+    else:
+        now, seen = state, []
+        for t in range(3):
+            seen.append(world.observe(now))
+            now, _ = world.step(now, plans.actions[:, t].long())
+        assert torch.equal(plans.context, torch.stack(seen, 1))
+
+
+def test_collect_from_random_starts_has_the_closed_form_on_a_torus():
+    """A reward map for each start, so that plans are independent; 9 x 9 cells are enough not to meet oneself."""
+    world = gridworld(9, 9, "torus", num_worlds=30_000, seed=5)
+    plans = collect(ExhaustivePlanner(4), world, state=40 + 81 * torch.arange(30_000), generator=seeded(0))
+    assert fits(plans.actions, best_plan_distribution(), 4)
+    drawn = collect(ExhaustivePlanner(1), world, 5000, context="plan", generator=seeded(1))
+    assert p_value(drawn.context, torch.ones(81)) > FALSE_ALARM
+    assert p_value(drawn.group // 300, torch.ones(100)) > FALSE_ALARM
+
+
+class Walk(World):
+    """A world with states of two numbers, without a table; the reward is minus the distance from (2, 0)."""
+
+    num_actions = 4
+
+    def reset(self, batch_size, generator=None):
+        return torch.zeros(batch_size, 2)
+
+    def step(self, state, action, generator=None):
+        after = state + torch.tensor([[0.0, 1], [1, 0], [0, -1], [-1, 0]])[action.long()]
+        return after, -(after - torch.tensor([2.0, 0])).norm(dim=-1)
+
+
+@pytest.mark.parametrize("planner", [ExhaustivePlanner(2), SamplingPlanner(UniformPrior(4), 2, 300)])
+def test_states_of_more_than_one_number(planner):
+    decision = planner.plan(Walk(), Walk().reset(3), seeded(0))
+    assert decision.plan.tolist() == [[1, 1]] * 3
+    assert decision.final_state.tolist() == [[2.0, 0]] * 3
+    assert decision.score.tolist() == [0.0] * 3
+    plans = collect(planner, Walk(), 3, context="step", generator=seeded(0))
+    assert plans.context.tolist() == [[[0.0, 0], [1, 0]]] * 3
+    assert plans.group is None
+    planner.value = lambda state: 10 * state[:, 1]
+    assert planner.plan(Walk(), Walk().reset(3), seeded(0)).final_state.tolist() == [[0.0, 2]] * 3
+
+
+@pytest.mark.parametrize(
+    ("call", "word"),
+    [
+        (lambda: ExhaustivePlanner(0), "depth"),
+        (lambda: ExhaustivePlanner(16).plan(random_world(0), torch.tensor([0])), "depth"),
+        (lambda: ExhaustivePlanner(2, objective="mean"), "objective"),
+        (lambda: ExhaustivePlanner(2, objective="return", discount=0), "discount"),
+        (lambda: ExhaustivePlanner(2, objective="return", discount=1.1), "discount"),
+        (lambda: ExhaustivePlanner(2, discount=0.9), "discount"),
+        (lambda: ExhaustivePlanner(2).plan(random_world(0), torch.tensor([12])), "12"),
+        (lambda: SamplingPlanner(UniformPrior(3), 0, 2), "length"),
+        (lambda: SamplingPlanner(UniformPrior(3), 2, 0), "num_plans"),
+        (
+            lambda: SamplingPlanner(UniformPrior(3), 2, 2, temperature=0).plan(random_world(0), torch.tensor([0])),
+            "temp",
+        ),
+        (lambda: SamplingPlanner(UniformPrior(4), 2, 2).plan(random_world(0), torch.tensor([0])), "4 actions"),
+        (lambda: SamplingPlanner(UniformPrior(3), 2, 2).plan(random_world(0), torch.tensor([-1])), "-1"),
+        (lambda: oracle(random_world(0), torch.tensor([0]), 0), "length"),
+        (lambda: oracle(random_world(0), torch.tensor([12]), 2), "12"),
+        (lambda: oracle(random_world(0), torch.tensor([0]), 2, objective="x"), "objective"),
+        (lambda: oracle(random_world(0), torch.tensor([0]), 2, discount=0.5), "discount"),
+        (lambda: collect(ExhaustivePlanner(1), random_world(0)), "num_plans"),
+        (lambda: collect(ExhaustivePlanner(1), random_world(0), 2, state=torch.tensor([0])), "num_plans"),
+        (lambda: collect(ExhaustivePlanner(1), random_world(0), 0), "num_plans"),
+        (lambda: collect(ExhaustivePlanner(1), random_world(0), 2, context="both"), "context"),
+    ],
+)
+def test_refuses(call, word):
+    with refuses(word):
+        call()

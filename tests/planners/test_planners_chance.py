@@ -1,0 +1,324 @@
+"""Planners where chance decides: exact means against enumerated courses, means over rollouts, ties, what is refused."""
+
+import pytest
+import torch
+
+from neuroprior import (
+    ExhaustivePlanner,
+    MarkovPrior,
+    SamplingPlanner,
+    TabularWorld,
+    UniformPrior,
+    World,
+    collect,
+    expected_score,
+    oracle,
+)
+from neuroprior.planners import expected as expected_module
+from neuroprior.planners import planner as planner_module
+from neuroprior.planners.chance import mean_scores
+from tests.support.sources import (
+    FALSE_ALARM,
+    TablePrior,
+    chance_world,
+    courses,
+    every_plan,
+    p_value,
+    random_world,
+    refuses,
+    seeded,
+)
+
+VALUES = torch.rand(10, generator=seeded(99)) * 2 - 1
+
+
+def value_of(state):
+    return VALUES[state]
+
+
+OBJECTIVES = [
+    {},
+    {"value": value_of},
+    {"objective": "return"},
+    {"objective": "return", "discount": 0.7, "value": value_of},
+]
+KINDS = ("S", "SA", "SAK", "WS", "WSA", "WSAK")
+PLANS = every_plan(3, 3)
+
+
+def brute_force(world, state, plan, goal):
+    """The exact mean score of one plan, course by course."""
+    total = 0.0
+    discount = goal.get("discount", 1.0)
+    for p, states, rewards in courses(world, state, plan):
+        score = rewards[-1]
+        if goal.get("objective") == "return":
+            score = sum(reward * discount**t for t, reward in enumerate(rewards))
+        if "value" in goal:
+            score += discount ** len(rewards) * float(VALUES[states[-1]])
+        total += p * score
+    return total
+
+
+@pytest.mark.parametrize("goal", OBJECTIVES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_expected_scores_are_those_of_all_courses(kind, goal, monkeypatch):
+    world = chance_world(1, kind)
+    states = torch.arange(world.num_maps * 5)
+    plans = torch.randint(3, (len(states), 4, 3), generator=seeded(2))
+    lengths = torch.randint(1, 4, (len(states), 4), generator=seeded(3))
+    whole, cut = (
+        expected_score(world, states, plans, **goal),
+        expected_score(world, states, plans.to(torch.uint8), lengths=lengths, **goal),
+    )
+    assert whole.shape == cut.shape == (len(states), 4)
+    assert whole.dtype == torch.float32
+    for b in range(len(states)):
+        for p in range(4):
+            plan = plans[b, p].tolist()
+            assert float(whole[b, p]) == pytest.approx(brute_force(world, b, plan, goal), abs=1e-5)
+            assert float(cut[b, p]) == pytest.approx(brute_force(world, b, plan[: int(lengths[b, p])], goal), abs=1e-5)
+    monkeypatch.setattr(expected_module, "NUMBERS_AT_ONCE", 60)
+    assert torch.equal(expected_score(world, states, plans, **goal), whole)
+
+
+@pytest.mark.parametrize("goal", OBJECTIVES)
+@pytest.mark.parametrize("kind", ["S", "SA", "WS", "WSA"])
+def test_without_chance_the_expected_score_is_the_score(kind, goal):
+    world = random_world(3, kind, states=5)
+    states = world.reset(20, seeded(0))
+    plans = torch.randint(3, (20, 6, 4), generator=seeded(1))
+    rollout = world.rollout(states, plans)
+    want = ExhaustivePlanner(1, **goal).score(rollout.rewards, rollout.final_state)
+    torch.testing.assert_close(expected_score(world, states, plans, **goal), want)
+
+
+def test_a_cell_that_cannot_be_has_no_part_in_the_mean():
+    world = TabularWorld(torch.tensor([[0], [0]]), torch.tensor([[[1.0], [-torch.inf]]]))
+    assert expected_score(world, torch.tensor([0]), torch.zeros(1, 1, 2, dtype=torch.long)).tolist() == [[1.0]]
+
+
+@pytest.mark.parametrize("kind", ["SAK", "WS"])
+def test_means_over_rollouts_come_to_the_expected_score(kind):
+    """Rewards are in [0, 1]: by Hoeffding a mean of 4000 misses by 0.055 with probability 2 exp(-24), 1e-8 for all."""
+    world = chance_world(4, kind)
+    states = torch.arange(world.num_maps * 5)
+    plans = PLANS.expand(len(states), -1, -1)
+    planner = ExhaustivePlanner(3)
+    score, ends = mean_scores(planner, world, states, plans, 4000, seeded(0))
+    want = expected_score(world, states, plans)
+    assert score.shape == ends.shape == (len(states), 27)
+    assert float((score - want).abs().max()) < 0.055
+    decision = ExhaustivePlanner(3, num_rollouts=4000).plan(world, states, seeded(1))
+    assert decision.model_steps == 4000 * 27 * 3
+    chosen = expected_score(world, states, decision.plan[:, None])[:, 0]
+    assert (chosen > want.amax(1) - 0.11).all()
+    assert (decision.score - chosen).abs().max() < 0.055
+
+
+@pytest.mark.parametrize("prefix", [False, True])
+@pytest.mark.parametrize("rollouts", [1, 6])
+def test_all_plans_meet_the_same_chance_whatever_is_tried_together(prefix, rollouts, monkeypatch):
+    world = chance_world(5, "WSAK")
+    states, planner = torch.arange(10), ExhaustivePlanner(3, any_prefix=prefix)
+    plans = torch.cat([PLANS, PLANS]).expand(10, -1, -1)
+    together = mean_scores(planner, world, states, plans, rollouts, seeded(0))
+    monkeypatch.setattr(planner_module, "STEPS_AT_ONCE", 1000)
+    sizes, rollout = [], world.rollout
+    monkeypatch.setattr(world, "rollout", lambda s, p, *rest: sizes.append(p.numel()) or rollout(s, p, *rest))
+    apart = mean_scores(planner, world, states, plans, rollouts, seeded(0))
+    assert max(sizes) <= 1000
+    assert len(sizes) > 1
+    for first, second in zip(together, apart, strict=True):
+        assert torch.equal(first, second)
+        assert torch.equal(first[:, :27], first[:, 27:])
+
+
+@pytest.mark.parametrize("prefix", [False, True])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **rest: ExhaustivePlanner(3, **rest),
+        lambda **rest: SamplingPlanner(UniformPrior(3), 3, 9, **rest),
+        lambda **rest: SamplingPlanner(MarkovPrior(3, num_contexts=5), 3, 9, **rest),
+    ],
+)
+def test_a_decision_is_what_the_first_rollout_says(make, prefix, monkeypatch):
+    """With one rollout and rewards on arrival the score is the reward where the plan, or its executed part, ends."""
+    world = chance_world(6, "WS")
+    planner = make(any_prefix=prefix)
+    decision = planner.plan(world, torch.arange(10).repeat(20), seeded(0))
+    assert torch.equal(decision.score, world.reward.view(-1)[decision.final_state])
+    assert (decision.lengths is not None) == prefix
+    tried, rollout = [], world.rollout
+    monkeypatch.setattr(world, "rollout", lambda *rest: tried.append(rollout(*rest)) or tried[-1])
+    many = make(any_prefix=prefix, num_rollouts=50).plan(world, torch.arange(10).repeat(20), seeded(0))
+    ((final, _, states),) = tried
+    first = (final if states is None else states)[::50].flatten(1)
+    assert (first == many.final_state[:, None]).any(1).all()
+    times = 51 if isinstance(planner, SamplingPlanner) and planner.prior.takes_context else 50
+    assert many.model_steps == times * 3 * (27 if isinstance(planner, ExhaustivePlanner) else 9)
+    if many.lengths is not None:
+        assert not many.plan[torch.arange(3) >= many.lengths[:, None]].any()
+        exact = expected_score(world, torch.arange(10).repeat(20), many.plan[:, None], lengths=many.lengths[:, None])
+    else:
+        exact = expected_score(world, torch.arange(10).repeat(20), many.plan[:, None])
+    # One rollout flatters its winner by more than fifty do.
+    assert float((many.score - exact[:, 0]).mean()) < float((decision.score - exact[:, 0]).mean())
+
+
+def test_prefixes_win_ties_as_often_as_each_other():
+    """All is equally good: each of the 3 + 9 + 27 distinct prefixes is a uniform draw, as without chance."""
+    table = torch.randint(3, (3, 3, 2), generator=seeded(0))
+    world = TabularWorld(table, torch.ones(3), probability=torch.full((3, 3, 2), 0.5))
+    for rollouts in (1, 3):
+        planner = ExhaustivePlanner(3, any_prefix=True, num_rollouts=rollouts)
+        decision = planner.plan(world, torch.zeros(10_000, dtype=torch.long), seeded(1))
+        number = (decision.plan.long() * torch.tensor([9, 3, 1])).sum(1)
+        code = (decision.lengths - 1) * 27 + number
+        weight = torch.zeros(3, 27)
+        weight[0, ::9] = weight[1, ::3] = weight[2] = 1
+        assert p_value(code, weight.flatten()) > FALSE_ALARM
+
+
+def test_plans_that_a_prior_drew_seeing_the_world_are_scored_anew():
+    """A coin leads to cell 1 or 2; the prior sees which and answers right, but a plan cannot see: it wins half."""
+    table = torch.tensor([[[1, 2]] * 2, [[3, 3], [4, 4]], [[4, 4], [3, 3]], [[3, 3]] * 2, [[4, 4]] * 2])
+    world = TabularWorld(table, torch.tensor([0.0, 0, 0, 1, 0]), probability=torch.full((5, 2, 2), 0.5))
+    prior = TablePrior([torch.zeros(1, 1, 2), torch.zeros(1, 2, 2)])
+    prior.num_contexts, prior.context_per = 5, "step"
+    answers = torch.tensor([[0.0, 0], [100, 0], [0, 100], [0, 0], [0, 0]])
+    prior.start = lambda n, context=None: (answers[context], context[:, None])
+    prior.step = lambda action, state, context=None: (answers[context], state)
+    planner = SamplingPlanner(prior, 2, 1)
+    state = torch.zeros(5000, dtype=torch.long)
+    assert bool((planner.candidates(world, state, seeded(0))[1].rewards[..., -1] == 1).all())
+    decision = planner.plan(world, state, seeded(0))
+    assert p_value(decision.score.long(), torch.ones(2)) > FALSE_ALARM
+
+
+@pytest.mark.parametrize("goal", OBJECTIVES)
+@pytest.mark.parametrize("prefix", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_oracle_is_the_best_policy_and_no_plan_is_better(kind, prefix, goal):
+    world = chance_world(7, kind)
+    states = torch.arange(world.num_maps * 5)
+    discount = goal.get("discount", 1.0)
+
+    def best(state, left):
+        """The best of all policies, by recursion over what may happen."""
+        if left == 0:
+            return float(VALUES[state]) if "value" in goal else 0.0
+        found = []
+        for action in range(3):
+            counts = goal.get("objective") == "return" or left == 1
+            found.append(
+                sum(
+                    p * (counts * rewards[0] + discount * best(after[0], left - 1))
+                    for p, after, rewards in courses(world, state, [action])
+                )
+            )
+        return max(found)
+
+    depths = (1, 2) if prefix else (2,)
+    got = oracle(world, states, 2, any_prefix=prefix, **goal)
+    want = [max(best(state, depth) for depth in depths) for state in states.tolist()]
+    torch.testing.assert_close(got, torch.tensor(want), atol=1e-5, rtol=0)
+    for depth in depths:
+        plans = every_plan(3, depth).expand(len(states), -1, -1)
+        assert (expected_score(world, states, plans, **goal).amax(1) <= got + 1e-5).all()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **rest: ExhaustivePlanner(3, **rest),
+        lambda **rest: SamplingPlanner(UniformPrior(3), 3, 9, **rest),
+        lambda **rest: SamplingPlanner(MarkovPrior(3, num_contexts=6), 3, 9, any_prefix=True, **rest),
+    ],
+)
+def test_without_chance_one_rollout_is_taken(make):
+    world, states = random_world(1), torch.arange(12)
+    one, five = (make(num_rollouts=n).plan(world, states, seeded(0)) for n in (1, 5))
+    for first, second in zip(one, five, strict=True):
+        assert first == second if not isinstance(first, torch.Tensor) else torch.equal(first, second)
+
+
+@pytest.mark.parametrize("rollouts", [1, 3])
+def test_same_seed_same_decisions_and_no_global_state(rollouts):
+    world = chance_world(8)
+    for planner in (
+        ExhaustivePlanner(3, num_rollouts=rollouts),
+        SamplingPlanner(UniformPrior(3), 3, 20, num_rollouts=rollouts),
+        SamplingPlanner(MarkovPrior(3, num_contexts=5), 3, 20, num_rollouts=rollouts),
+    ):
+        before = torch.get_rng_state()
+        drawn = [collect(planner, world, 200, generator=seeded(seed), context="step") for seed in (3, 3, 4)]
+        assert torch.equal(before, torch.get_rng_state())
+        assert torch.equal(drawn[0].actions, drawn[1].actions)
+        assert torch.equal(drawn[0].context, drawn[1].context)
+        assert not torch.equal(drawn[0].context, drawn[2].context)
+        assert planner.plan(world, torch.zeros(0, dtype=torch.long)).plan.shape == (0, 3)
+
+
+class Gusty(World):
+    """A world of one's own, with chance and states of two numbers: a gust may add a half to the right move."""
+
+    num_actions = 2
+    stochastic = True
+
+    def reset(self, batch_size, generator=None):
+        return torch.zeros(batch_size, 2)
+
+    def step(self, state, action, generator=None):
+        gust = (torch.rand(len(state), generator=generator) < 0.5) * 0.5
+        after = state + torch.stack([action * (1 + gust), torch.ones(len(state))], 1)
+        return after, after[:, 0] - state[:, 0]
+
+
+def test_worlds_of_ones_own():
+    for planner in (ExhaustivePlanner(3, num_rollouts=200), SamplingPlanner(UniformPrior(2), 3, 60, num_rollouts=200)):
+        planner.objective = "return"
+        decision = planner.plan(Gusty(), torch.zeros(4, 2), seeded(0))
+        assert decision.plan.tolist() == [[1, 1, 1]] * 4
+        assert decision.final_state.shape == (4, 2)
+        assert ((decision.score - 3.75).abs() < 0.4).all()  # 200 x 3 gusts, each 0 or a half: 13 standard deviations
+
+
+def half_legal():
+    world = Gusty()
+    world.all_legal = False
+    return world
+
+
+ONE = torch.zeros(1, 1, 2, dtype=torch.long)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: ExhaustivePlanner(2, num_rollouts=0), ["num_rollouts", "0"]),
+        (lambda: SamplingPlanner(UniformPrior(3), 2, 2, num_rollouts=-1), ["num_rollouts", "-1"]),
+        (lambda: ExhaustivePlanner(2).plan(half_legal(), torch.zeros(1, 2)), ["legal"]),
+        (lambda: SamplingPlanner(UniformPrior(2), 2, 2).plan(half_legal(), torch.zeros(1, 2)), ["legal"]),
+        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE[0]), ["plans", "[1, 2]"]),
+        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE[:, :, :0]), ["plans", "action"]),
+        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE + 3), ["plans", "3"]),
+        (lambda: expected_score(chance_world(0), torch.tensor([10]), ONE), ["state", "10"]),
+        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, objective="x"), ["objective"]),
+        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, discount=0.5), ["discount"]),
+        (
+            lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([[3]])),
+            ["lengths[0, 0]", "3"],
+        ),
+        (
+            lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([[0]])),
+            ["lengths", "0"],
+        ),
+        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([1])), ["[B, P]", "[1]"]),
+        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.ones(1, 1)), ["lengths"]),
+    ],
+)
+def test_refuses(call, words):
+    with refuses(*words):
+        call()

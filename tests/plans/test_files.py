@@ -1,0 +1,274 @@
+"""Files of plans: what is written comes back, and what others write is read as they mean it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuroprior import Plans
+from neuroprior.plans import is_per_step, read_plans, write_plans
+from neuroprior.plans.io.columns import number_in
+
+NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
+SUFFIXES = (".npz", ".jsonl", ".csv", ".tsv")
+CONTEXTS = ("none", "index", "name", "index a step", "name a step", "features", "features a step")
+FLOATS = st.floats(width=32, allow_nan=False, allow_infinity=False)
+
+
+def in_csv(name):
+    return bool(name) and name == name.strip() and not set(name) & set("\r\n") and number_in(name) is None
+
+
+@st.composite
+def plans_of_all_kinds(draw, shortest=0, names=NAMES):
+    """Plans of which one at least has an action, with any kind of context, names, groups and `end`."""
+    lengths = draw(st.lists(st.integers(shortest, 5), min_size=1, max_size=6))
+    lengths[0] = max(lengths[0], 1)
+    num, longest, num_actions = len(lengths), max(lengths), draw(st.sampled_from([1, 3, 300]))
+
+    def numbers(stop, *shape):
+        size = int(np.prod(shape))
+        return torch.tensor(
+            draw(st.lists(st.integers(0, stop - 1), min_size=size, max_size=size)), dtype=torch.long
+        ).reshape(shape)
+
+    def some_names(count):
+        return tuple(draw(st.lists(names, min_size=count, max_size=count, unique=True)))
+
+    actions, kind = numbers(num_actions, num, longest), draw(st.sampled_from(CONTEXTS))
+    there = torch.arange(longest) < torch.tensor(lengths)[:, None]
+    context = None
+    if kind.startswith("features"):
+        shape = (num, longest, 2) if kind.endswith("step") else (num, 2)
+        size = int(np.prod(shape))
+        context = torch.tensor(draw(st.lists(FLOATS, min_size=size, max_size=size))).reshape(shape)
+        context = context * there[..., None] if kind.endswith("step") else context
+    elif kind != "none":
+        context = numbers(4, num, longest) * there if kind.endswith("step") else numbers(4, num)
+    group_names = some_names(3) if draw(st.booleans()) else None
+    return Plans(
+        actions,
+        num_actions,
+        None if min(lengths) == longest else torch.tensor(lengths),
+        some_names(3) if num_actions == 3 and draw(st.booleans()) else None,
+        context,
+        numbers(3, num) if group_names or draw(st.booleans()) else None,
+        some_names(4) if kind.startswith("name") else None,
+        group_names,
+    )
+
+
+def called(numbers, names):
+    return None if numbers is None else [names[i] if names else i for i in numbers.flatten().tolist()]
+
+
+def assert_same(one, other, numbering=True):
+    """The same plans; with `numbering` False, contexts and groups need have the same names only, not numbers."""
+    assert (one.num_actions, one.end) == (other.num_actions, other.end)
+    for key in ("actions", "lengths", "context", "group"):
+        a, b = getattr(one, key), getattr(other, key)
+        assert (a is None) == (b is None), key
+        names = f"{key}_names"
+        if a is None:
+            continue
+        assert a.shape == b.shape
+        if numbering or (key != "group" and not getattr(one, names, None)):
+            assert a.dtype == b.dtype
+            assert torch.equal(a, b), key
+        elif a.dim() == 2:  # names of contexts; what stands beyond a plan's end does not count
+            for row, (x, y) in enumerate(zip(a, b, strict=True)):
+                length = int(one.mask()[row].sum())
+                assert called(x[:length], one.context_names) == called(y[:length], other.context_names)
+        else:
+            assert list(map(str, called(a, getattr(one, names)))) == list(map(str, called(b, getattr(other, names))))
+    assert one.action_names == other.action_names
+    if numbering:
+        assert (one.context_names, one.group_names) == (other.context_names, other.group_names)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".jsonl"])
+@settings(derandomize=True, deadline=None, max_examples=150)
+@given(plans=plans_of_all_kinds(), closed=st.booleans())
+def test_npz_and_jsonl_hold_everything(tmp_path_factory, suffix, plans, closed):
+    path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
+    plans = plans.with_end(name="the end") if closed and "the end" not in (plans.action_names or ()) else plans
+    write_plans(plans, path)
+    assert_same(read_plans(path), plans)
+
+
+@pytest.mark.parametrize(("suffix", "layout"), [(".csv", None), (".csv", "step"), (".tsv", None)])
+@settings(derandomize=True, deadline=None, max_examples=150)
+@given(plans=plans_of_all_kinds(shortest=1, names=NAMES.filter(in_csv)))
+def test_csv_holds_actions_contexts_and_groups(tmp_path_factory, suffix, layout, plans):
+    path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
+    write_plans(plans, path, layout=layout)
+    back = read_plans(path, num_actions=plans.num_actions, action_names=plans.action_names)
+    if layout == "step" and plans.context is not None and not is_per_step(plans.context):
+        plans, back = (replace(p, context=None, context_names=None) for p in (plans, back))
+    assert_same(back, plans, numbering=False)
+
+
+def test_csv_holds_plans_without_actions_beside_others(tmp_path):
+    plans = Plans(torch.tensor([[0], [1], [0]]), 2, torch.tensor([0, 1, 0]))
+    write_plans(plans, tmp_path / "a.csv")
+    assert_same(read_plans(tmp_path / "a.csv"), plans)
+
+
+@pytest.mark.parametrize(
+    ("context", "layout", "columns"),
+    [
+        (torch.tensor([3, 1]), None, ["action_1", "action_2", "context"]),
+        (torch.tensor([[3, 1], [0, 0]]), None, ["plan", "action", "context"]),
+        (torch.tensor([[0.5, 1], [2, 3]]), None, ["action_1", "action_2", "context_1", "context_2"]),
+        (torch.ones(2, 2, 1), None, ["plan", "action", "context_1"]),
+        (None, None, ["action_1", "action_2"]),
+        (None, "step", ["plan", "action"]),
+    ],
+)
+def test_the_layout_of_csv_follows_the_context(tmp_path, context, layout, columns):
+    path = tmp_path / "a.csv"
+    write_plans(Plans(torch.tensor([[0, 1], [1, 1]]), 2, context=context), path, layout=layout)
+    assert path.read_text().splitlines()[0].split(",") == columns
+    back = read_plans(path)
+    assert back.actions.tolist() == [[0, 1], [1, 1]]
+    assert context is None or torch.equal(back.context, context)
+
+
+def test_a_context_a_plan_is_repeated_on_its_steps(tmp_path):
+    write_plans(Plans(torch.tensor([[0, 1]]), 2, context=torch.tensor([7])), tmp_path / "a.csv", layout="step")
+    assert read_plans(tmp_path / "a.csv").context.tolist() == [[7, 7]]
+
+
+def read_text(tmp_path, name, text, **options):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_plans(path, **options)
+
+
+def test_jsonl_by_hand(tmp_path):
+    plans = read_text(
+        tmp_path,
+        "a.jsonl",
+        '{"plan": 1, "actions": ["rear", "groom"], "context": ["light", "dark"], "group": "m2"}\n\n'
+        '{"plan": 2, "actions": ["walk"], "context": ["dark"], "group": "m10"}\r\n',
+    )
+    assert plans.action_names == ("groom", "rear", "walk")
+    assert plans.actions.tolist() == [[1, 0], [2, 0]]
+    assert plans.lengths.tolist() == [2, 1]
+    assert (plans.context.tolist(), plans.context_names) == ([[1, 0], [0, 0]], ("dark", "light"))
+    assert (plans.group.tolist(), plans.group_names) == ([1, 0], ("m10", "m2"))
+
+
+@pytest.mark.parametrize(
+    ("contexts", "expected"),
+    [
+        (["4", "0"], torch.tensor([4, 0])),
+        (["[4, 0]", "[1, 1]"], torch.tensor([[4, 0], [1, 1]])),
+        (["[4, 0]", "[1, 1.0]"], torch.tensor([[4.0, 0], [1, 1]])),
+        (["[4, 0, 2]", "[1, 1e0, 3]"], torch.tensor([[4.0, 0, 2], [1, 1, 3]])),
+        (["[[4], [0]]", "[[1], [2]]"], torch.tensor([[[4.0], [0]], [[1], [2]]])),
+        (["null", "null"], None),
+    ],
+)
+def test_jsonl_context_is_of_the_kind_of_the_whole_file(tmp_path, contexts, expected):
+    lines = [f'{{"actions": [0, 1], "context": {context}}}' for context in contexts]
+    back = read_text(tmp_path, "a.jsonl", "\n".join(lines)).context
+    assert (back is None and expected is None) or (torch.equal(back, expected) and back.dtype == expected.dtype)
+
+
+def test_a_decimal_point_may_come_in_a_later_block(tmp_path, monkeypatch):
+    monkeypatch.setattr("neuroprior.plans.io.jsonl.BLOCK", 16)
+    lines = ['{"actions": [0, 1], "context": [1, 2]}'] * 20 + ['{"actions": [0, 1], "context": [1, 2.5]}'] * 20
+    plans = read_text(tmp_path, "a.jsonl", "\n".join(lines))
+    assert plans.context.tolist() == [[1, 2]] * 20 + [[1, 2.5]] * 20
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "action_1,action_2,action_3\n0,1,2\n1,,\n",
+        "0,1,2\n1,,\n",
+        "0;1;2\r\n1;;\r\n",
+        "\ufeffaction_1\taction_2\taction_3\r\n0\t1\t2\r\n1\t\t\r\n",
+        "Action_2,note,action_1,action_3\n1,x,0,2\n,y,1,\n",
+        "0.0,1.0,2.0\n1.0,,\n",
+        "0.000000e+00,1.000000e+00,2.000000e+00\n1e0, ,\n",
+        "plan,action\n7,0\n7,1\n7,2\n8,1\n",
+        '\ufeffnote;plan;action\n"a;b\n c";x;0\n;x;1\n;x;2\n;y;1',
+    ],
+)
+def test_csv_by_hand(tmp_path, text):
+    plans = read_text(tmp_path, "a.csv", text)
+    assert (plans.actions.tolist(), plans.lengths.tolist()) == ([[0, 1, 2], [1, 0, 0]], [3, 1])
+    assert plans.num_actions == 3
+
+
+def test_csv_of_numpy(tmp_path):
+    actions = np.random.default_rng(0).integers(5, size=(3000, 4))
+    for form in ("%d", "%.18e"):
+        np.savetxt(tmp_path / "a.csv", actions, fmt=form, delimiter=",")
+        assert read_plans(tmp_path / "a.csv").actions.tolist() == actions.tolist()
+
+
+def test_csv_of_a_coded_video(tmp_path):
+    plans = read_text(
+        tmp_path,
+        "a.tsv",
+        "Plan\tTime\tAction\tContext\tGroup\n1\t0.5\trear\tlight\t12\n"
+        "1\t1.5\tgroom up\tdark\t12\n2\t9\trear\tdark\t12b\n",
+        action_names=["rear", "walk", "groom up"],
+    )
+    assert (plans.actions.tolist(), plans.num_actions) == ([[0, 2], [0, 0]], 3)
+    assert (plans.context.tolist(), plans.context_names) == ([[1, 0], [0, 0]], ("dark", "light"))
+    assert (plans.group.tolist(), plans.group_names) == ([0, 1], ("12", "12b"))
+
+
+def test_names_that_are_numbers_are_names_where_they_are_given(tmp_path):
+    plans = read_text(tmp_path, "a.csv", "9,1.5\n1.5,up\n", action_names=["1.5", "9", "up"])
+    assert plans.actions.tolist() == [[1, 0], [0, 2]]
+    assert read_text(tmp_path, "a.csv", "1,0\n", action_names=["up", "down"]).actions.tolist() == [[1, 0]]
+    plans = read_text(tmp_path, "a.jsonl", '{"actions": ["10", "9"]}')
+    assert (plans.action_names, plans.actions.tolist()) == (("10", "9"), [[0, 1]])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".jsonl"])
+def test_given_names_number_the_actions_anew(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    write_plans(Plans(torch.tensor([[0, 1, 2], [1, 2, 0]]), 3, action_names=("a", "b", "end"), end=2), path)
+    plans = read_plans(path, action_names=["end", "a", "c", "b"])
+    assert (plans.actions.tolist(), plans.lengths.tolist()) == ([[1, 3, 0], [3, 0, 0]], [3, 2])
+    assert (plans.end, plans.num_actions) == (0, 4)
+    with pytest.raises(ValueError, match=f"{path}.*'a' is none of b, c"):
+        read_plans(path, action_names=["b", "c", "end"])
+
+
+def test_npz_needs_actions_only(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", actions=np.array([[0, 9, 9], [1, 2, 3]], ">i4"), lengths=[1, 3], other=1)
+    plans = read_plans(tmp_path / "a.npz")
+    assert (plans.actions.tolist(), plans.num_actions) == ([[0, 0, 0], [1, 2, 3]], 4)
+    assert read_plans(tmp_path / "a.npz", num_actions=7).num_actions == 7
+
+
+def test_blocks_and_lines_agree(tmp_path):
+    """More rows than a block holds, each plan with its own length, context and group."""
+    lengths = [1 + i % 4 for i in range(5000)]
+    lines = [json.dumps({"actions": [i % 7] * n, "context": [i] * n, "group": i}) for i, n in enumerate(lengths)]
+    plans = read_text(tmp_path, "a.jsonl", "\n".join(lines))
+    write_plans(plans, tmp_path / "a.csv")
+    assert_same(read_plans(tmp_path / "a.csv"), plans)
+    assert plans.group.tolist() == list(range(5000))
+
+
+def test_an_old_file_is_replaced_or_stays(tmp_path, monkeypatch):
+    path = tmp_path / "a.jsonl"
+    write_plans(Plans(torch.tensor([[0]]), 2), path)
+    before = path.read_bytes()
+    monkeypatch.setattr("neuroprior.plans.io.jsonl._named", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_plans(Plans(torch.tensor([[1]]), 2), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,300 @@
+"""Files that hold no plans: one line, which names the file and the line or the array."""
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuroprior import Plans
+from neuroprior.plans import read_plans, write_plans
+from tests.support.sources import refuses
+
+ONE = Plans(torch.tensor([[0, 1]]), 2)
+
+
+def refused(tmp_path, name, content, *words, **options):
+    """Reading `content` must raise one line that says the words; "line N" is one of them where a line is wrong."""
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ValueError, match=r"\S") as caught:
+        read_plans(path, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in (str(path), *words):
+        assert word in message, message
+
+
+OK = '{"actions": [0, 1]}'
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([OK, '{"actions": [0, 1]'], ["line 2", "not JSON"]),
+        ([OK, "", OK + OK], ["line 3", "one object a line"]),
+        ([OK, "[0, 1]"], ["line 2", "is no plan"]),
+        ([OK, '{"action": [0]}'], ["line 2", '"actions"', "nothing"]),
+        ([OK, '{"actions": 3}'], ["line 2", "a list is expected, not 3"]),
+        ([OK, '{"actions": [0, true]}'], ["line 2", "action True"]),
+        ([OK, '{"actions": [0, 1.0]}'], ["line 2", "action 1.0"]),
+        ([OK, '{"actions": [NaN]}'], ["line 2", "NaN is not a finite number"]),
+        ([OK, '{"actions": [0, -1]}'], ["line 2", "action -1", "0 or more"]),
+        ([OK, '{"actions": [99999999999999999999]}'], ["line 2", "out of range"]),
+        ([OK, '{"actions": ["up"]}'], ["line 2", "mixed"]),
+        (['{"actions": ["up", 0]}'], ["line 1", "mixed"]),
+        ([OK, '{"actions": [0], "group": 1}'], ["line 2", "group: 1", "in none"]),
+        (['{"actions": [0], "group": 1}', '{"actions": [0], "group": "m"}'], ["line 2", "group: 'm'"]),
+        (["[" * 100000], ["line 1"]),
+        (["9" * 5000], ["line 1"]),
+        (['{"num_actions": 2}', OK, '{"actions": [2]}'], ["line 3", "action 2 is out of range", "0 to 1"]),
+        (['{"num_actions": 0}', OK], ["line 1", "num_actions"]),
+        (['{"num_actions": 2, "action_names": ["a"]}', OK], ["line 1", "2 are expected, not 1"]),
+        (['{"action_names": ["a", "a"]}', OK], ["line 1", "'a' is there twice"]),
+        (['{"action_names": "ab"}', OK], ["line 1", "a list of names"]),
+        (['{"action_names": ["a"]}', '{"actions": ["b"]}'], ["line 2", "action 'b' is none of a"]),
+        (['{"num_actions": 2, "end": "x"}', OK], ["line 1", "end"]),
+        (['{"num_actions": 2, "end": 0}', OK], ["goes on after the end symbol"]),
+        (['{"num_actions": 2, "group_names": ["m"]}', '{"actions": [0], "group": 1}'], ["line 2", "group 1"]),
+        (['{"num_actions": 3}', '{"actions": ["a"]}'], ["1 names of 3 actions"]),
+        (['{"num_actions": 2}'], ["no plan"]),
+        (['{"name": "x"}'], ["line 1", '"actions"']),
+        (['{"actions": []}'], ["num_actions must be given"]),
+    ],
+)
+def test_bad_jsonl(tmp_path, lines, words):
+    refused(tmp_path, "a.jsonl", "\n".join(lines), *words)
+
+
+@pytest.mark.parametrize(
+    ("contexts", "words"),
+    [
+        (["1", "[1, 2]"], ["line 2", "a list of numbers", "have an integer"]),
+        (["1", "null"], ["line 2", "no context"]),
+        (["[1, 2]", "[1, 2, 3]"], ["line 2", "3 entries for 2 actions", "decimal point"]),
+        (["[1.0, 2]", "[1, 2, 3]"], ["line 2", "3 features", "has 2"]),
+        (["[1, 2]", '["a", "b"]'], ["line 2", "a list of names"]),
+        (['["a"]', '["a", "b"]'], ["line 1", "1 entries for 2 actions"]),
+        (["[[1], [2]]", "[[1], [2, 3]]"], ["line 2", "2 features"]),
+        (["[[1], [2]]", "[[1]]"], ["line 2", "1 entries for 2 actions"]),
+        (["[[], []]"], ["line 1", "empty list"]),
+        (["[1, true]"], ["line 1", "True is not a number"]),
+        (["[1.0, NaN]"], ["line 1", "NaN"]),
+        (["[1.0, 1e999]"], ["line 1", "too large"]),
+        (["[1.0, 1e39]"], ["line 1", "too large"]),
+        (["-1"], ["line 1", "context -1"]),
+        (["[0, 1]", "[0, -1]"], ["line 2", "context -1"]),
+        (["[]"], ["line 1", "0 entries for 2 actions"]),
+        (["[]", "3"], ["line 2", "an integer", "an empty list"]),
+        (['{"x": 1}'], ["line 1", "neither"]),
+    ],
+)
+def test_bad_context_in_jsonl(tmp_path, contexts, words):
+    refused(tmp_path, "a.jsonl", "\n".join(f'{{"actions": [0, 1], "context": {c}}}' for c in contexts), *words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("action_1,action_2\n0,1\n\n0,1,1\n", ["line 4", "3 cells", "header has 2"]),
+        ("a1,a2\n0,1\n", ["line 2", "'0' is a number where others are names", "header"]),
+        ("0,1,1\n0,,1\n", ["line 2", "action 2 is empty"]),
+        ("0,1\n0,-1\n", ["line 2", "action -1 is out of range"]),
+        ("0,1\n0,0.5\n", ["line 2", "'0.5' is not a whole number"]),
+        ("0,1\n0,nan\n", ["line 2", "'nan' is not a whole number"]),
+        ("0,1\n0,up\n", ["line 2", "'up' is a name where others are numbers", "action_names"]),
+        ("up,1\n", ["line 1", "'1' is a number where others are names"]),
+        ("action_1,action_3\n0,1\n", ["line 1", "action_2 is missing"]),
+        ("action_1,action_1\n0,1\n", ["line 1", "'action_1' is there twice"]),
+        ("action_1,context,context_1\n0,1,2\n", ["line 1", "one of them"]),
+        ("action_1,context\n0,1\n0,\n", ["line 3", "context: an empty cell"]),
+        ("action_1,context\n0,1\n0,x\n", ["line 3", "context 'x' is a name"]),
+        ("action_1,context\n0,1\n0,1.0\n", ["line 3", "context_1"]),
+        ("action_1,context\n0,-1\n", ["line 2", "context -1"]),
+        ("action_1,context_1\n0,1\n0,nan\n", ["line 3", "'nan' is not a finite number"]),
+        ("action_1,context_1\n0,1e39\n", ["line 2", "'1e39' is not a finite number"]),
+        ("action_1,group\n0,1\n0,\n", ["line 3", "group: an empty cell"]),
+        ("plan,action\n1,0\n1,\n", ["line 3", "action: an empty cell"]),
+        ("plan,action\n1,0\n,1\n", ["line 3", "plan: an empty cell"]),
+        ("plan,action\n1,0\n2,1\n1,1\n", ["line 4", "plan '1' goes on", "sort"]),
+        ("plan,action,group\n1,0,a\n1,0,b\n", ["line 3", "another group"]),
+        ('plan,action,note\n1,0,"a\nb"\n1,x,c\n', ["line 4", "'x' is a name"]),
+        ("plan,behavior\n1,0\n", ["line 1", "'plan' and 'action'"]),
+        ("plan,action\n", ["no step below"]),
+        ("action_1\n", ["no plan below"]),
+        ("\n\n", ["no rows"]),
+        ('0,"1\n', ["line 1", "not CSV"]),
+        ('action_1\n""\n', ["num_actions must be given"]),
+    ],
+)
+def test_bad_csv(tmp_path, text, words):
+    refused(tmp_path, "a.csv", text, *words)
+
+
+def test_given_actions(tmp_path):
+    refused(tmp_path, "a.csv", "0,1\n0,2\n", "line 2", "action 2", "0 to 1", num_actions=2)
+    refused(tmp_path, "a.csv", "a,b\na,c\n", "line 2", "'c' is one more than the 2", num_actions=2)
+    refused(tmp_path, "a.csv", "a,b\na,c\n", "line 2", "'c' is none of a, b", action_names=["a", "b"])
+    refused(tmp_path, "a.csv", "0,1\n0,2\n", "line 2", "action 2", action_names=["a", "b"])
+    refused(tmp_path, "a.jsonl", f'{OK}\n{{"actions": [2]}}', "line 2", "action 2", num_actions=2)
+    refused(tmp_path, "a.jsonl", '{"actions": ["c"]}', "line 1", "'c' is none of a, b", action_names=["a", "b"])
+    for options in ({"num_actions": 0}, {"num_actions": True}, {"num_actions": 2.0}):
+        with refuses("num_actions"):
+            read_plans(tmp_path / "a.csv", **options)
+    for names in ("ab", [], ["a", "a"], [1, 2]):
+        with refuses("action_names"):
+            read_plans(tmp_path / "a.csv", action_names=names)
+    with refuses("action_names", "3 are expected, not 2"):
+        read_plans(tmp_path / "a.csv", num_actions=3, action_names=["a", "b"])
+
+
+def test_the_line_of_a_later_block(tmp_path):
+    rows = ["0,1"] * 5000
+    refused(tmp_path, "a.csv", "\n".join([*rows, "0,7"]), "line 5001", num_actions=2)
+    refused(tmp_path, "a.csv", "\n".join([*rows, ",1"]), "line 5001")
+    refused(tmp_path, "a.csv", "\n".join([*rows, "1"]), "line 5001")
+    refused(tmp_path, "a.jsonl", "\n".join([OK] * 5000 + ['{"actions": [7]}']), "line 5001", num_actions=2)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl", ".npz", ".tsv"])
+def test_what_is_no_such_file(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    with refuses(str(path), error=FileNotFoundError):
+        read_plans(path)
+    refused(tmp_path, path.name, "", "an empty file")
+    path.unlink()
+    path.mkdir()
+    with refuses(str(path), "a directory"):
+        read_plans(path)
+    with refuses(str(path), "a directory"):
+        write_plans(ONE, path)
+    with refuses(".csv, .tsv, .jsonl, .npz", "'.xlsx'"):
+        read_plans(tmp_path / "a.xlsx")
+    with refuses(".csv, .tsv, .jsonl, .npz", "no suffix"):
+        write_plans(ONE, tmp_path / "a")
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.jsonl"])
+def test_other_encodings(tmp_path, name):
+    refused(tmp_path, name, "0,1\n0,grün\n".encode("latin-1"), "line 2", "byte 5", "UTF-8")
+    refused(tmp_path, name, "0,1\n0,2\n".encode("utf-16"), "line 1", "UTF-8")
+
+
+def npz(**arrays):
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+GOOD = npz(actions=np.zeros((20, 3), np.uint8), num_actions=2)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"0,1", ["not a .npz file"]),
+        (GOOD[:-30], ["not a .npz file"]),
+        (npz(plans=[[1]]), ["no array 'actions'"]),
+        (npz(actions=np.array([[1, None]], object)), ["actions", "Python objects"]),
+        (npz(actions=[["a"]]), ["actions", "numbers"]),
+        (npz(actions=[[1.0]]), ["actions", "integers"]),
+        (npz(actions=[1, 2]), ["actions", "[N, L]"]),
+        (npz(actions=[[0, 1], [0, 2]], num_actions=2), ["actions[1, 1]: 2 is out of range"]),
+        (npz(actions=[[0, -1]]), ["actions[0, 1]: -1"]),
+        (npz(actions=[[0, 1]], num_actions=[2, 2]), ["num_actions", "one integer"]),
+        (npz(actions=[[0, 1]], lengths=[3]), ["lengths[0]: 3"]),
+        (npz(actions=[[0, 1]], lengths=[0]), ["num_actions must be given"]),
+        (npz(actions=[[0, 1]], context=[[1.0, np.nan]]), ["context[0, 1]: nan"]),
+        (npz(actions=[[0, 1]], action_names=["a"]), ["actions[0, 1]"]),
+        (npz(actions=[[0, 1]], action_names=[["a", "b"]]), ["action_names", "texts"]),
+        (npz(actions=[[0, 1]], lengths=[2], end=0), ["goes on after the end"]),
+    ],
+)
+def test_bad_npz(tmp_path, content, words):
+    refused(tmp_path, "a.npz", content, *words)
+
+
+def test_an_array_alone_is_no_npz(tmp_path):
+    file = io.BytesIO()
+    np.save(file, np.zeros((2, 2), int))
+    refused(tmp_path, "a.npz", file.getvalue(), "not a .npz file")
+    with zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
+        archive.writestr("actions.npy", b"no array")
+    with refuses(str(tmp_path / "b.npz"), "actions"):
+        read_plans(tmp_path / "b.npz")
+
+
+def test_one_long_plan_among_many_short_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr("neuroprior.plans.io.columns.MOST_ENTRIES", 300)
+    lines = [OK] * 3 + [f'{{"actions": {[0] * 100}}}']
+    refused(tmp_path, "a.jsonl", "\n".join(lines), "plan 4 of 100 actions", "400 entries")
+
+
+@pytest.mark.parametrize(
+    ("plans", "name", "words"),
+    [
+        (ONE[:0], "a.npz", ["no plans"]),
+        (Plans(torch.zeros(1, 0, dtype=torch.long), 2), "a.csv", ["none has an action"]),
+        (ONE.with_end(), "a.csv", ["end symbol", "without_end"]),
+        (Plans(torch.tensor([[0]]), 1, action_names=[" a"]), "a.csv", ["action_names", "' a'"]),
+        (Plans(torch.tensor([[0]]), 2, action_names=["a", "a"]), "a.jsonl", ["'a' is there twice"]),
+        (Plans(torch.tensor([[0]]), 1, context=torch.tensor([0]), context_names=["7"]), "a.csv", ["context_names"]),
+        (Plans(torch.tensor([[0]]), 1, context=torch.zeros(1, 0)), "a.csv", ["no features"]),
+        (Plans(torch.tensor([[0]]), 1, context=torch.tensor([[1e300]], dtype=torch.float64)), "a.jsonl", ["too large"]),
+    ],
+)
+def test_what_cannot_be_written(tmp_path, plans, name, words):
+    with refuses(str(tmp_path) if "names" not in words[0] and "twice" not in words[0] else words[0], *words):
+        write_plans(plans, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_layouts_that_cannot_be_written(tmp_path):
+    with refuses("layout", "'rows'"):
+        write_plans(ONE, tmp_path / "a.csv", layout="rows")
+    with refuses("layout", "CSV files only"):
+        write_plans(ONE, tmp_path / "a.npz", layout="plan")
+    with refuses("layout='step'"):
+        write_plans(Plans(ONE.actions, 2, context=torch.tensor([[0, 1]])), tmp_path / "a.csv", layout="plan")
+    with refuses("plan 0 has no actions"):
+        write_plans(Plans(torch.tensor([[0], [0]]), 2, torch.tensor([0, 1])), tmp_path / "a.csv", layout="step")
+    assert not list(tmp_path.iterdir())
+
+
+WORDS = """action_1 plan action context context_1 group , ; " 0 1 -1 1.5 nan x { } {"actions":[ {"num_actions":3} ]}
+    ,"context": [ ] : "a" true null 1e999 "actions" é"""
+PIECES = st.sampled_from([*WORDS.split(), "\n", "\r\n", "", " ", "\ufeff", "\x00"])
+
+
+@settings(derandomize=True, deadline=None, max_examples=500)
+@given(pieces=st.lists(PIECES, max_size=25), suffix=st.sampled_from([".csv", ".tsv", ".jsonl"]))
+def test_any_text_is_plans_or_one_line(tmp_path_factory, pieces, suffix):
+    assert_plans_or_one_line(tmp_path_factory.getbasetemp() / f"any{suffix}", "".join(pieces).encode())
+
+
+@settings(derandomize=True, deadline=None, max_examples=300)
+@given(data=st.data(), suffix=st.sampled_from([".csv", ".jsonl", ".npz"]))
+def test_damaged_files_are_plans_or_one_line(tmp_path_factory, data, suffix):
+    texts = {
+        ".npz": GOOD,
+        ".csv": b"plan,action,group\n1,a,b\n1,c,b\n",
+        ".jsonl": b'{"actions": [0, 1], "context": [1, 2.5]}\n',
+    }
+    content = bytearray(texts[suffix])
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    assert_plans_or_one_line(tmp_path_factory.getbasetemp() / f"damaged{suffix}", bytes(content))
+
+
+def assert_plans_or_one_line(path, content):
+    path.write_bytes(content)
+    message = f"{path}: read"
+    try:
+        read_plans(path)
+    except ValueError as error:
+        message = str(error)
+    assert str(path) in message
+    assert len(message.splitlines()) == 1

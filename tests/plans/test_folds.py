@@ -1,0 +1,121 @@
+"""Plans divided so that each is held out once: folds over units, and a single plan in parts."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuroprior import Plans
+from neuroprior.plans.folds import BLOCKS, folds, in_parts
+from tests.support.sources import refuses
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.lists(st.integers(-3, 6), min_size=2, max_size=30), st.booleans(), st.integers(0, 5), st.data())
+def test_folds(numbers, grouped, seed, data):
+    """Each plan is held out once, groups stay together, and folds differ by a unit at most."""
+    group = torch.tensor(numbers)
+    grouped = grouped and len(group.unique()) > 1
+    plans = Plans(torch.zeros(len(group), 2).long(), 2, group=group if grouped else group * 0)
+    unit = group if grouped else torch.arange(len(group))
+    number = data.draw(st.integers(2, len(unit.unique())))
+    found = folds(plans, number, seed)
+    assert len(found) == number
+    everyone = torch.arange(len(plans))
+    assert torch.cat([held_out for _, held_out in found]).sort().values.equal(everyone)
+    sizes = []
+    for learned, held in found:
+        assert torch.cat([learned, held]).sort().values.equal(everyone)
+        assert learned.equal(learned.sort().values)
+        assert held.equal(held.sort().values)
+        assert not set(unit[learned].tolist()) & set(unit[held].tolist())
+        sizes.append(len(unit[held].unique()))
+    assert max(sizes) - min(sizes) <= 1
+    again = folds(plans, number, seed)
+    assert all(a.equal(c) and b.equal(d) for (a, b), (c, d) in zip(found, again, strict=True))
+
+
+def test_the_seed_draws_the_folds():
+    plans = Plans(torch.zeros(30, 2).long(), 2)
+    drawn = {tuple(folds(plans, 5, seed)[0][1].tolist()) for seed in range(20)}
+    assert len(drawn) > 15  # of 142,506; two alike among 20 have a probability of 0.001
+    state = torch.get_rng_state()
+    folds(plans, 5, 7)
+    assert state.equal(torch.get_rng_state())
+
+
+@pytest.mark.parametrize(
+    ("group", "number", "words"),
+    [
+        (None, 1, ("plans, 4", "not 1")),
+        (None, 0, ("not 0",)),
+        (None, -1, ("not -1",)),
+        (None, 5, ("plans, 4", "not 5")),
+        ([0, 0, 1, 1], 3, ("groups, 2", "not 3")),
+        ([7, 7, 7, 7], 5, ("plans, 4", "not 5")),
+    ],
+)
+def test_bad_numbers_of_folds(group, number, words):
+    with refuses("folds", *words):
+        folds(Plans(torch.zeros(4, 2).long(), 2, group=None if group is None else torch.tensor(group)), number)
+
+
+def test_no_plans_have_no_folds():
+    with refuses("folds", "0"):
+        folds(Plans(torch.zeros(0, 2).long(), 2), 2)
+
+
+def in_steps(length: int, kind: str, pad: int = 0) -> Plans:
+    """A single plan whose context tells the place of each action, with `pad` columns beyond its end."""
+    actions = torch.arange(length + pad) % 5
+    place = torch.arange(length + pad)
+    context = {
+        "none": None,
+        "index a plan": torch.tensor([3]),
+        "features a plan": torch.tensor([[0.5, 2.0]]),
+        "index a step": place[None],
+        "features a step": torch.stack([place.double(), -place.double()], -1)[None],
+    }[kind]
+    lengths = torch.tensor([length]) if pad else None
+    return Plans(actions[None], 5, lengths, context=context, group=torch.tensor([4]), action_names=tuple("abcde"))
+
+
+@pytest.mark.parametrize("kind", ["none", "index a plan", "features a plan", "index a step", "features a step"])
+@pytest.mark.parametrize(("length", "number", "pad"), [(10, 3, 0), (10, 3, 4), (40, 40, 1), (41, 40, 0), (7, 1, 2)])
+def test_parts_make_the_plan_again(length, number, pad, kind):
+    plan = in_steps(length, kind, pad)
+    parts = in_parts(plan, number)
+    sizes = parts.mask().sum(1)
+    assert 1 <= len(parts) <= number
+    assert len(sizes[:-1].unique()) <= 1  # alike but for the last
+    assert 0 < int(sizes[-1]) <= int(sizes[0])
+    mask = parts.mask()
+    assert parts.actions[mask].tolist() == plan.actions[0, :length].tolist()
+    assert parts.action_names == plan.action_names
+    assert parts.group is None
+    if kind.endswith("step"):
+        assert parts.context[mask].equal(plan.context[0, :length])
+    elif kind.endswith("plan"):
+        assert parts.context.equal(plan.context.expand(len(parts), *plan.context.shape[1:]))
+
+
+def test_parts_by_default():
+    assert len(in_parts(in_steps(1000, "none"))) == BLOCKS
+    closed = in_parts(in_steps(10, "none").with_end(), 3)
+    assert closed.end == 5
+    assert closed.actions[closed.mask()].tolist() == [*(torch.arange(10) % 5).tolist(), 5]
+
+
+@pytest.mark.parametrize(
+    ("plans", "number", "words"),
+    [
+        (Plans(torch.zeros(2, 9).long(), 2), 3, ("single", "2 of 18")),
+        (Plans(torch.zeros(0, 9).long(), 2), 1, ("single", "0 of 0")),
+        (Plans(torch.zeros(1, 9).long(), 2, torch.tensor([4])), 5, ("single", "5", "1 of 4")),
+        (Plans(torch.zeros(1, 9).long(), 2), 0, ("number", "0")),
+        (Plans(torch.zeros(1, 9).long(), 2), -2, ("number", "-2")),
+    ],
+)
+def test_what_cannot_be_cut(plans, number, words):
+    with refuses(*words):
+        in_parts(plans, number)

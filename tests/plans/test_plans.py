@@ -1,0 +1,187 @@
+"""Plans: shapes, dtypes, lengths, contexts, splits, and what is refused."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuroprior import Plans
+from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
+
+ACTIONS = torch.tensor([[0, 1, 2], [2, 2, 0], [1, 0, 1], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(("num_actions", "dtype"), [(3, torch.uint8), (256, torch.uint8), (257, torch.int64)])
+@pytest.mark.parametrize("given_as", [torch.uint8, torch.int32, torch.int64])
+def test_actions_are_stored_small(num_actions, dtype, given_as):
+    plans = Plans(ACTIONS.to(given_as), num_actions)
+    assert plans.actions.dtype == dtype
+    assert plans.actions.tolist() == ACTIONS.tolist()
+    assert (len(plans), plans.max_length, plans.num_actions) == (4, 3, num_actions)
+
+
+def test_large_actions_survive():
+    assert Plans(torch.tensor([[299, 255, 256]]), 300).actions.tolist() == [[299, 255, 256]]
+    assert Plans(torch.tensor([[255]]), 256).actions.tolist() == [[255]]
+
+
+def test_lengths_mask_the_rest_away():
+    padded = torch.tensor([[0, 1, 2], [2, -1, 99], [-7, -7, -7]])
+    plans = Plans(padded, 3, lengths=torch.tensor([3, 1, 0]))
+    assert plans.actions.tolist() == [[0, 1, 2], [2, 0, 0], [0, 0, 0]]
+    assert plans.mask().tolist() == [[True] * 3, [True, False, False], [False] * 3]
+    assert Plans(ACTIONS, 3).mask().all()
+    assert Plans(torch.zeros(2, 0, dtype=torch.long), 3).mask().shape == (2, 0)
+
+
+@pytest.mark.parametrize(
+    "context",
+    [torch.arange(4), torch.arange(12).view(4, 3), torch.rand(4, 5), torch.rand(4, 3, 5), None],
+    ids=["index", "index a step", "features", "features a step", "none"],
+)
+@pytest.mark.parametrize(
+    "index", [slice(1, 3), torch.tensor([3, 0, 0]), torch.tensor([True, False, False, True]), slice(0, 0)]
+)
+def test_indexing_takes_everything_along(context, index):
+    group, lengths = torch.tensor([7, 7, 8, 9]), torch.tensor([3, 2, 1, 0])
+    plans = Plans(ACTIONS, 3, lengths, ("a", "b", "c"), context, group)[index]
+    assert torch.equal(plans.actions, Plans(ACTIONS, 3, lengths).actions[index])
+    assert torch.equal(plans.lengths, lengths[index])
+    assert torch.equal(plans.group, group[index])
+    assert plans.action_names == ("a", "b", "c")
+    assert (plans.context is None) if context is None else torch.equal(plans.context, context[index])
+
+
+GOOD = {"actions": ACTIONS, "num_actions": 3}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"num_actions": 0}, ["num_actions", "0"]),
+        ({"num_actions": 2}, ["actions[0, 2]", "2"]),
+        ({"actions": ACTIONS - 1}, ["actions[0, 0]", "-1"]),
+        ({"actions": ACTIONS.float()}, ["actions", "float32"]),
+        ({"actions": ACTIONS > 0}, ["actions", "bool"]),
+        ({"actions": ACTIONS[0]}, ["actions", "[3]"]),
+        ({"actions": ACTIONS[None]}, ["actions", "[1, 4, 3]"]),
+        ({"lengths": torch.tensor([1, 2, 3])}, ["lengths", "[3]"]),
+        ({"lengths": torch.tensor([1, 2, 3, 4])}, ["lengths[3]", "4"]),
+        ({"lengths": torch.tensor([1, -1, 3, 3])}, ["lengths[1]", "-1"]),
+        ({"lengths": torch.ones(4)}, ["lengths", "float32"]),
+        ({"lengths": torch.ones(4).long(), "actions": ACTIONS + 2}, ["actions[1, 0]", "4"]),
+        ({"lengths": torch.ones(4).long(), "actions": ACTIONS.float()}, ["actions", "float32"]),
+        ({"action_names": ["a"]}, ["action_names", "3", "1"]),
+        ({"group": torch.zeros(3).long()}, ["group", "[3]"]),
+        ({"group": torch.zeros(4)}, ["group", "float32"]),
+        ({"context": torch.zeros(3).long()}, ["context", "[3]"]),
+        ({"context": torch.zeros(4, 2).long()}, ["context", "[4, 2]"]),
+        ({"context": torch.zeros(4)}, ["context", "[4]"]),
+        ({"context": torch.zeros(4, 2, 5)}, ["context", "[4, 2, 5]"]),
+        ({"context": torch.zeros(3, 5)}, ["context", "[3, 5]"]),
+        ({"context": torch.zeros(4).bool()}, ["context", "bool"]),
+        ({"context": torch.tensor([[0.0], [1], [float("nan")], [1]])}, ["context[2, 0]", "nan"]),
+        ({"context": torch.full((4, 3, 1), float("inf"))}, ["context[0, 0, 0]", "inf"]),
+    ],
+)
+def test_refuses(change, words):
+    with refuses(*words):
+        Plans(**(GOOD | change))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    group=st.lists(st.integers(-5, 5), min_size=2, max_size=40).filter(lambda g: len(set(g)) > 1),
+    share=st.floats(0.01, 0.99),
+    seed=st.integers(0, 1000),
+)
+def test_split_keeps_groups_together(group, share, seed):
+    number = torch.arange(len(group))
+    plans = Plans(number[:, None], len(group), context=number, group=torch.tensor(group))
+    parts = plans.split(share, seeded(seed))
+    again = plans.split(share, seeded(seed))
+    for part, same in zip(parts, again, strict=True):
+        assert torch.equal(part.actions, same.actions)
+        assert len(part) > 0
+        assert torch.equal(part.context, part.actions[:, 0].long())
+    training, validation = parts
+    assert not set(training.group.tolist()) & set(validation.group.tolist())
+    assert sorted(training.context.tolist() + validation.context.tolist()) == number.tolist()
+    held_out = len(set(validation.group.tolist()))
+    assert abs(held_out - share * len(set(group))) <= 1
+
+
+def test_split_is_random():
+    plans = Plans(torch.arange(5)[:, None], 5)
+    generator = seeded(0)
+    held_out = torch.cat([plans.split(0.2, generator)[1].actions[:, 0].long() for _ in range(2000)])
+    assert len(held_out) == 2000
+    assert p_value(held_out, torch.ones(5)) > FALSE_ALARM
+
+
+def test_split_leaves_the_global_generator_alone():
+    before = torch.get_rng_state()
+    Plans(ACTIONS, 3).split()
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("share", [0, 1, -0.5, 1.5, float("nan")])
+def test_split_refuses_a_share(share):
+    with refuses("validation"):
+        Plans(ACTIONS, 3).split(share)
+
+
+@pytest.mark.parametrize("plans", [Plans(ACTIONS[:1, :1], 3), Plans(ACTIONS, 3, group=torch.ones(4).long())])
+def test_split_refuses_one_of_a_kind(plans):
+    with refuses("1"):
+        plans.split()
+
+
+def test_one_plan_is_cut_in_time():
+    plan = Plans(torch.arange(10)[None], 10, lengths=torch.tensor([8]), context=torch.arange(10)[None])
+    first, last = plan.split(0.25)
+    assert first.actions.tolist() == [[0, 1, 2, 3, 4, 5]]
+    assert last.actions.tolist() == last.context.tolist() == [[6, 7]]
+    assert first.lengths.tolist() == [6]
+    assert last.lengths.tolist() == [2]
+
+
+def test_the_end_symbol_closes_every_plan_and_comes_off_again():
+    plans = Plans(ACTIONS, 3, lengths=torch.tensor([0, 1, 2, 3])[: len(ACTIONS)], action_names=("a", "b", "c"))
+    closed = plans.with_end()
+    assert closed.num_actions == 4
+    assert closed.end == 3
+    assert closed.action_names == ("a", "b", "c", "end")
+    assert closed.lengths.tolist() == [1, 2, 3, 4]
+    assert (closed.actions == 3).sum(1).tolist() == [1, 1, 1, 1]
+    opened = closed.without_end()
+    assert opened.lengths.tolist() == [0, 1, 2, 3]
+    assert opened.end is None
+    assert opened.action_names == ("a", "b", "c")
+    assert opened.actions.masked_fill(~opened.mask(), 9).tolist() == (
+        plans.actions[:, :3].masked_fill(~plans.mask()[:, :3], 9).tolist()
+    )
+
+
+def test_where_lengths_are_not_given_the_first_end_symbol_tells_them():
+    sampled = torch.tensor([[0, 2, 2], [2, 2, 2], [0, 1, 0]])
+    assert Plans(sampled, 3, end=2).lengths.tolist() == [2, 1, 3]
+    assert Plans(sampled, 3, end=2).without_end().lengths.tolist() == [1, 0, 3]
+
+
+def test_nothing_comes_after_the_end_symbol():
+    with refuses("end symbol"):
+        Plans(torch.tensor([[2, 0]]), 3, lengths=torch.tensor([2]), end=2)
+    with refuses("already"):
+        Plans(torch.tensor([[0, 2]]), 3, end=2).with_end()
+    with refuses("end"):
+        Plans(torch.tensor([[0, 2]]), 3).without_end()
+    with refuses("end"):
+        Plans(torch.tensor([[0, 2]]), 3, end=3)
+
+
+def test_names_must_name_every_number():
+    with refuses("group"):
+        Plans(ACTIONS, 3, group=torch.tensor([0, 1, 2, 2]), group_names=("a", "b"))
+    with refuses("context_names"):
+        Plans(ACTIONS, 3, context_names=("a",))

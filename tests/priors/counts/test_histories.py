@@ -1,0 +1,139 @@
+"""The tree of histories against a dictionary of all of them; read in one part or in many; and its limits."""
+
+from collections import Counter
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuroprior import ContextTreePrior, MarkovPrior, Plans
+from neuroprior.priors.counts import histories
+from neuroprior.priors.counts.grams import few_grams, grams
+from neuroprior.priors.counts.histories import count_histories
+from tests.support.sources import refuses, seeded
+
+
+@st.composite
+def problems(draw):
+    num_actions, num, length = draw(st.integers(1, 5)), draw(st.integers(0, 20)), draw(st.integers(0, 8))
+    contexts, generator = draw(st.sampled_from([None, 3])), seeded(draw(st.integers(0, 2**31)))
+    actions = torch.randint(num_actions, (num, length), generator=generator)
+    lengths = torch.randint(length + 1, (num,), generator=generator) if draw(st.booleans()) else None
+    context = None
+    if contexts:
+        shape = draw(st.sampled_from([(num,), (num, length)]))
+        context = torch.randint(contexts, shape, generator=generator)
+    return Plans(actions, num_actions, lengths, context=context), contexts, draw(st.integers(0, 10))
+
+
+def dictionary(plans, contexts, depth):
+    """How often each action followed each (at a plan's beginning, history, context)."""
+    out = Counter()
+    for i in range(len(plans)):
+        length = plans.max_length if plans.lengths is None else int(plans.lengths[i])
+        actions = plans.actions[i, :length].tolist()
+        for t, action in enumerate(actions):
+            seen = 0
+            if contexts:
+                seen = int(plans.context[i] if plans.context.dim() == 1 else plans.context[i, t])
+            for k in range(min(t, depth) + 1):
+                out[False, tuple(actions[t - k : t]), seen, action] += 1
+            if t < depth:
+                out[True, tuple(actions[:t]), seen, action] += 1
+    return out
+
+
+def names(tree, depth):
+    """Every node's (at a plan's beginning, history), by walking from the two roots."""
+    out = {0: (False, ())}
+    if tree.start:
+        out[tree.start] = (True, ())
+    todo = list(out)
+    for node in todo:
+        opening, history = out[node]
+        for action, after in enumerate(tree.next_node[node].tolist()):
+            longer = (*history, action)
+            if after not in out and len(longer) <= depth:
+                out[after] = (opening and after >= tree.start, longer)
+                todo.append(after)
+    return out
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(problems(), st.sampled_from([1, 7, 2**18]))
+def test_the_tree_and_its_counts(problem, at_once):
+    plans, contexts, depth = problem
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(histories, "ACTIONS_AT_ONCE", at_once)
+        tree, counts = count_histories(plans, depth, contexts, True, torch.device("cpu"))
+    truth = dictionary(plans, contexts, depth)
+    name = names(tree, depth)
+    assert len(name) == len(tree.parent) == len(tree.next_node)
+    found = {}
+    for row, action, count in zip(counts.row.tolist(), counts.action.tolist(), counts.count.tolist(), strict=True):
+        node, seen = divmod(int(counts.row_code[row]), contexts or 1)
+        found[(*name[node], seen, action)] = count
+    assert found == dict(truth)
+    for node, (opening, history) in name.items():
+        if node:
+            assert name[int(tree.parent[node])] == (False, history if opening else history[1:])
+            assert int(tree.parent[node]) < node
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: MarkovPrior(3, 4, num_contexts=2), lambda: ContextTreePrior(3, 6, num_contexts=2)]
+)
+def test_read_in_parts(make, monkeypatch):
+    """Parts of any size give the same prior, but for the numbering of its histories."""
+    generator = seeded(0)
+    lengths = torch.randint(10, (300,), generator=generator)
+    plans = Plans(torch.randint(3, (300, 9), generator=generator), 3, lengths, context=torch.arange(300) % 2)
+    test, seen = torch.randint(3, (50, 12), generator=generator), torch.randint(2, (50, 12), generator=generator)
+    want = make().fit(plans)(test, seen)
+    monkeypatch.setattr(histories, "ACTIONS_AT_ONCE", 50)
+    torch.testing.assert_close(make().fit(plans)(test, seen), want)
+
+
+@pytest.mark.parametrize("prior", [MarkovPrior(300, 3), ContextTreePrior(300, 3)])
+def test_tables_over_the_limit_are_refused(prior, monkeypatch):
+    monkeypatch.setattr(histories, "MAX_TABLE_BYTES", 10**6)
+    plans = torch.randint(300, (50, 20), generator=seeded(0))
+    with refuses("fewer than 3 actions"):
+        prior.fit(plans)
+    with refuses("x 300 actions"):
+        prior.fit(plans)
+
+
+def test_rows_of_contexts_over_the_limit_are_refused(monkeypatch):
+    plans = Plans(torch.zeros(1_000, 2).long(), 10, context=torch.arange(1_000))
+    monkeypatch.setattr(histories, "MAX_TABLE_BYTES", 10**5)
+    MarkovPrior(10, 1).fit(plans)
+    with refuses("histories"):
+        MarkovPrior(10, 1, num_contexts=1_000).fit(plans)
+
+
+def test_many_plans_are_counted_by_their_short_sequences():
+    plans = Plans(torch.randint(4, (200, 30), dtype=torch.uint8, generator=seeded(0)), 4)
+    kept = plans.actions.clone()
+    assert few_grams(plans, 2)
+    assert not few_grams(plans, 30)
+    assert not few_grams(plans, 0)
+    assert not few_grams(plans[:2], 2)
+    sequences, times = grams(plans.actions, 3, 4, 7, torch.device("cpu"))
+    found = {tuple(one): number for one, number in zip(sequences.tolist(), times.tolist(), strict=True)}
+    assert found == Counter(tuple(plan[t : t + 3]) for plan in plans.actions.tolist() for t in range(28))
+    assert torch.equal(plans.actions, kept)
+
+
+@pytest.mark.parametrize("initial", ["joint", "lower"])
+@pytest.mark.parametrize(
+    ("num_actions", "depth", "length"), [(1, 1, 3), (2, 1, 2), (2, 3, 4), (3, 2, 9), (4, 2, 30), (5, 1, 3)]
+)
+def test_counted_first_or_not_the_prior_is_the_same(num_actions, depth, length, initial, monkeypatch):
+    plans = Plans(torch.randint(num_actions, (2000, length), generator=seeded(0)).square() % num_actions, num_actions)
+    assert few_grams(plans, depth)
+    test = torch.randint(num_actions, (50, length + 3), generator=seeded(1))
+    got = MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test)
+    monkeypatch.setattr(histories, "few_grams", lambda plans, depth: False)
+    torch.testing.assert_close(got, MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test))

@@ -1,0 +1,145 @@
+"""Mixtures: Bayes' rule against enumeration, fixed share against its recursion, learned weights, packed states."""
+
+import math
+from functools import cache
+
+import pytest
+import torch
+
+from neuroprior import (
+    ContextTreePrior,
+    GRUPrior,
+    MarkovPrior,
+    MixturePrior,
+    Plans,
+    StackedPrior,
+    TransformerPrior,
+    UniformPrior,
+    load,
+    save,
+)
+from neuroprior.priors.ensembles.packing import DIGITS, pack, unpack
+from neuroprior.testing import check_prior
+from tests.support.sources import every_plan, seeded
+
+A = 3
+
+
+def some_plans(num: int = 40, seed: int = 0, contexts: int | None = None) -> Plans:
+    actions = torch.randint(A, (num, 6), generator=seeded(seed)).cumsum(1) % A
+    context = None if contexts is None else torch.randint(contexts, (num, 6), generator=seeded(seed + 1))
+    return Plans(actions, A, context=context)
+
+
+def experts() -> list:
+    plans = some_plans()
+    return [UniformPrior(A), MarkovPrior(A, 2).fit(plans), GRUPrior(A, 8, seed=1), MarkovPrior(A, 0).fit(plans)]
+
+
+def weighted(mixture: MixturePrior, weights: list[float], share: float = 0.0) -> MixturePrior:
+    mixture.first, mixture.share = torch.tensor(weights).log(), share
+    return mixture
+
+
+@torch.no_grad()
+def test_a_plan_has_its_probability_in_the_mixture():
+    """Without a share the mixture of whole plans, over all plans of four actions."""
+    weights = [0.1, 0.4, 0.3, 0.2]
+    mixture = weighted(MixturePrior(A, experts()), weights)
+    plans = every_plan(A, 4)
+    parts = [w * e.log_prob(plans).exp() for w, e in zip(weights, mixture.experts, strict=True)]
+    assert mixture.log_prob(plans).exp().allclose(torch.stack(parts).sum(0), atol=1e-6)
+    assert float(mixture.log_prob(plans).exp().sum()) == pytest.approx(1, abs=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+def test_weights_follow_the_recursion_of_fixed_share(share):
+    weights = [0.1, 0.4, 0.3, 0.2]
+    mixture = weighted(MixturePrior(A, experts()), weights, share)
+    plan = torch.tensor([[0, 2, 2, 1, 0]])
+    forecasts = [e(plan).softmax(-1)[0] for e in mixture.experts]
+    now, total = list(weights), 0.0
+    for t, action in enumerate(plan[0].tolist()):
+        told = [w * float(f[t, action]) for w, f in zip(now, forecasts, strict=True)]
+        total += math.log(sum(told))
+        now = [(1 - share) * w / sum(told) + share * first for w, first in zip(told, weights, strict=True)]
+    assert float(mixture.log_prob(plan)) == pytest.approx(total, abs=1e-5)
+
+
+@cache
+def conformance() -> list[MixturePrior]:
+    plans, seen = some_plans(), some_plans(contexts=4)
+    small = {"max_steps": 5, "progress": False}
+    made = [weighted(MixturePrior(A, experts()), [0.1, 0.4, 0.3, 0.2], 0.1)]
+    some = [MarkovPrior(A, 1, num_contexts=4), ContextTreePrior(A, 2), GRUPrior(A, 8, num_contexts=4)]
+    made.append(MixturePrior(A, some).fit(seen, seeded(0), **small))
+    made.append(MixturePrior(A, [TransformerPrior(A, 16, window=2), GRUPrior(A, 8, window=1)]))
+    nested = MixturePrior(A, [StackedPrior(A, 8, orders=(1,), depth=2), UniformPrior(A)])
+    return [*made, MixturePrior(A, [nested, MarkovPrior(A, 1)]).fit(plans, seeded(0), **small)]
+
+
+@pytest.mark.parametrize("number", range(4), ids=["no context", "contexts", "windows", "nested"])
+def test_it_is_a_prior(number):
+    check_prior(conformance()[number], 3, 2000)
+
+
+def test_weights_are_learned():
+    """Plans of a chain: all weight goes to the chain; half of the plans each of two experts: half the weight."""
+    plans = MarkovPrior(A, 1).fit(some_plans()).sample(400, 30, generator=seeded(3))
+    right, wrong = MarkovPrior(A, 1).fit(some_plans()), MarkovPrior(A, 1).fit(torch.arange(60).view(2, 30) % A)
+    mixture = MixturePrior(A, [right, wrong])
+    mixture.learn_weights(Plans(plans, A))
+    assert mixture.first.exp()[0] > 0.99
+    both = torch.cat([plans[:200], wrong.sample(200, 30, generator=seeded(4))])
+    mixture.learn_weights(Plans(both, A))
+    assert mixture.share == 0
+    assert float(mixture.first.exp()[0]) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_share_is_learned_where_the_best_expert_changes():
+    one, two = (MarkovPrior(A, 0).fit(torch.full((4, 20), action)) for action in (0, 1))
+    switching = (torch.arange(400).view(10, 40) // 10) % 2
+    mixture = MixturePrior(A, [one, two])
+    mixture.learn_weights(Plans(switching, A))
+    assert 0 < mixture.share < 0.5
+
+
+def test_it_is_saved_and_loaded(tmp_path):
+    plans = some_plans(contexts=4)
+    made = [MarkovPrior(A, 2, num_contexts=4), GRUPrior(A, 8, num_contexts=4), StackedPrior(A, 8, num_contexts=4)]
+    prior = MixturePrior(A, made).fit(plans, seeded(0), max_steps=5, progress=False)
+    again = load(save(prior, tmp_path / "mixture"))
+    assert isinstance(again, MixturePrior)
+    assert again.share == prior.share
+    assert again.log_prob(plans.actions, plans.context).equal(prior.log_prob(plans.actions, plans.context))
+
+
+@pytest.mark.parametrize(
+    ("made", "more", "word"),
+    [
+        ([], {}, "at least one"),
+        ([UniformPrior(2)], {}, "experts\\[0\\]: has 2 actions"),
+        ([UniformPrior(A)], {"share": 1.5}, "share"),
+        ([MarkovPrior(A, 1, num_contexts=2), MarkovPrior(A, 1, num_contexts=3)], {}, "the same"),
+    ],
+)
+def test_experts_that_do_not_fit(made, more, word):
+    with pytest.raises(ValueError, match=word):
+        MixturePrior(A, made, **more)
+
+
+def test_states_side_by_side():
+    parts = [
+        torch.tensor([0, 7, DIGITS - 1, DIGITS, DIGITS * 5 + 3]),
+        torch.randn(5, 2),
+        torch.randint(2**40, (5, 3)),
+        torch.randn(5, 2, 4),
+        torch.zeros(5, 0),
+    ]
+    packed = pack(parts)
+    assert packed.dtype == torch.float32
+    for before, after in zip(parts, unpack(packed, 5), strict=True):
+        assert after.shape == before.shape
+        assert after.equal(before)
+    assert all(a.equal(b[[3, 1]]) for a, b in zip(unpack(packed[[3, 1]], 5), parts, strict=True))

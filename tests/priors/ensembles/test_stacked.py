@@ -1,0 +1,140 @@
+"""The stacked prior: what its network sees, that experts forecast plans new to them, and what it gains."""
+
+import math
+
+import pytest
+import torch
+
+from neuroprior import MarkovPrior, Plans, StackedPrior, load, save
+from neuroprior.analysis.comparison import score
+from neuroprior.priors.ensembles.stacked import LONG_AGO
+from neuroprior.testing import check_prior
+from tests.support.sources import seeded
+
+A, C = 3, 4
+
+
+def some_plans(num: int = 30, length: int = 12, per: str = "step", seed: int = 0) -> Plans:
+    shape = (num,) if per == "plan" else (num, length)
+    actions = torch.randint(A, (num, length), generator=seeded(seed))
+    lengths = torch.randint(2, length + 1, (num,), generator=seeded(seed + 1))
+    return Plans(actions, A, lengths, context=torch.randint(C, shape, generator=seeded(seed + 2)))
+
+
+def fitted(plans: Plans, sees: bool, **settings) -> StackedPrior:
+    prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C if sees else None)
+    return prior.fit(plans, seeded(0), **({"max_steps": 10, "progress": False} | settings))
+
+
+@pytest.mark.parametrize("sees", [False, True])
+@pytest.mark.parametrize("per", ["plan", "step"])
+def test_it_is_a_prior(sees, per):
+    check_prior(fitted(some_plans(per=per), sees), 3, 2000)
+
+
+def test_fresh_it_forecasts_the_experts_geometric_mean():
+    prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C)
+    plans = some_plans()
+    for expert in prior.experts:
+        expert.fit(plans)
+    actions, context = plans.actions[:5], plans.context[:5]
+    with torch.no_grad():
+        forecasts = [e(actions, context if e.takes_context else None) for e in prior.experts]
+        expected = torch.stack(forecasts).mean(0).log_softmax(-1)
+        assert prior(actions, context).log_softmax(-1).allclose(expected, atol=1e-5)
+
+
+def test_it_sees_how_long_ago_an_action_was_taken_here():
+    """Against a search backwards, and what stepping sees against what is seen of whole plans."""
+    prior = fitted(some_plans(), True)
+    plans = some_plans(6, 20, seed=5)
+    actions, context = plans.actions.long(), plans.context
+    forecasts = torch.zeros(6, 20, len(prior.experts), A)
+    ago = prior._all_features(forecasts, actions, context)[..., -A:]
+    for n in range(6):
+        for t in range(20):
+            for a in range(A):
+                before = [s for s in range(t) if context[n, s] == context[n, t] and actions[n, s] == a]
+                steps = t - before[-1] if before else LONG_AGO
+                assert ago[n, t, a].item() == pytest.approx(math.log(steps + 1) * 2 / 3, abs=1e-5)
+    _, state = prior.start(6, context[:, 0])
+    for t in range(19):
+        _, state = prior.step(actions[:, t], state, context[:, t + 1])
+        _, _, since, here = prior._open(state)
+        assert here.equal(context[:, t + 1])
+        code = here[:, None] * A + torch.arange(A)
+        assert ((since.gather(1, code) + 1).log() * 2 / 3).allclose(ago[:, t + 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("grouped", [False, True])
+def test_experts_forecast_plans_that_they_did_not_learn_from(grouped):
+    """Each plan (group) always does the same one thing that no other does: an expert that knew it would tell."""
+    group = torch.arange(12) // 3 if grouped else None
+    own = torch.arange(12)[:, None] if group is None else group[:, None]
+    plans = Plans(own.expand(12, 20).clone(), 12, group=group)
+    prior = StackedPrior(12, 8, orders=(0, 1), depth=2)
+    forecasts = prior._forecasts(plans, seeded(0))
+    told = forecasts.exp().gather(-1, plans.actions.long()[:, :, None, None].expand(-1, -1, len(prior.experts), 1))
+    assert float(told[:, 0].max()) < 1 / 12 + 1e-6
+    for expert in prior.experts:
+        expert.fit(plans)
+    assert float(prior.experts[1](plans.actions[:1])[0, 5].exp()[0]) > 0.5
+
+
+def memories(num: int, seed: int) -> Plans:
+    """In one of four rooms, visited at random, an action is never the one that was last taken in this room."""
+    generator = seeded(seed)
+    context = torch.randint(C, (num, 60), generator=generator)
+    shift = torch.randint(1, A, (num, 60), generator=generator)
+    last = torch.randint(A, (num, C), generator=generator)
+    actions = torch.zeros(num, 60, dtype=torch.long)
+    row = torch.arange(num)
+    for t in range(60):
+        actions[:, t] = (last[row, context[:, t]] + shift[:, t]) % A
+        last[row, context[:, t]] = actions[:, t]
+    return Plans(actions, A, context=context)
+
+
+def test_it_learns_what_counts_cannot_hold():
+    """One bit is what an action holds, two choices; a chain of any order knows little of it."""
+    training, held_out = memories(200, 0), memories(100, 1)
+    stacked = StackedPrior(A, 32, 0.1, (1, 2), 3, num_contexts=C)
+    stacked.fit(training, seeded(0), max_steps=250, progress=False)
+    mine = score("stacked", stacked, held_out).bits_per_action().mean
+    chains = [MarkovPrior(A, order, num_contexts=C).fit(training) for order in range(4)]
+    best = min(score("chain", chain, held_out).bits_per_action().mean for chain in chains)
+    assert 1 < mine < 1.3  # 1 and what first visits of a room cost beyond
+    assert best > 1.4
+
+
+def test_it_is_saved_and_loaded(tmp_path):
+    plans = some_plans()
+    prior = fitted(plans, True)
+    again = load(save(prior, tmp_path / "stacked"))
+    assert again.log_prob(plans.actions, plans.context).equal(prior.log_prob(plans.actions, plans.context))
+    assert again.config == prior.config
+    same = fitted(plans, True)
+    assert all(a.equal(b) for a, b in zip(prior.state_dict().values(), same.state_dict().values(), strict=True))
+
+
+def test_long_plans_and_a_single_one():
+    """Past the training window memory is carried on; a single plan is cut in parts."""
+    one = Plans(torch.randint(A, (1, 300), generator=seeded(3)), A)
+    prior = fitted(one, False, window=16)
+    assert prior.action_log_probs(one).shape == (1, 300)
+    assert prior.mixer.window is None
+
+
+@pytest.mark.parametrize(
+    ("plans", "word"),
+    [
+        (Plans(torch.zeros(0, 5, dtype=torch.long), A), "at least two plans"),
+        (Plans(torch.zeros(1, 1, dtype=torch.long), A), "at least two plans"),
+        (Plans(torch.zeros(4, 5, dtype=torch.long), 5), "5 actions"),
+    ],
+)
+def test_plans_that_it_cannot_learn_from(plans, word):
+    with pytest.raises(ValueError, match=word):
+        StackedPrior(A, 8).fit(plans)
+    with pytest.raises(ValueError, match="context"):
+        StackedPrior(A, 8, num_contexts=2).fit(torch.zeros(4, 5, dtype=torch.long))

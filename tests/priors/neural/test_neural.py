@@ -1,0 +1,331 @@
+"""Neural priors: fitting, the exact divergence from a known source, reproducibility, and what is refused."""
+
+import random
+
+import numpy as np
+import pytest
+import torch
+
+from neuroprior import GRUPrior, Plans, TransformerPrior
+from tests.support.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
+
+BOTH = pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
+QUICK = {"max_steps": 30, "progress": False}
+
+
+def small(kind, num_actions=3, **arguments):
+    size = {"hidden_size": 8} if kind is GRUPrior else {"width": 8, "num_layers": 1, "num_heads": 2}
+    return kind(num_actions, **size, **arguments)
+
+
+def weights(prior):
+    return torch.cat([weight.detach().flatten() for weight in prior.parameters()])
+
+
+@pytest.fixture(scope="module")
+def torus_plans():
+    return Plans(best_plans(100_000, seed=0), 4)
+
+
+@BOTH
+def test_divergence_from_the_torus_source(kind, torus_plans):
+    """With default settings, in bits per action over all 256 plans; Markov-2, which cannot know it, is at .01387."""
+    prior = kind(4).fit(torus_plans, generator=seeded(0), progress=False)
+    with torch.no_grad():
+        log_probs = prior.log_prob(every_plan(4, 4))
+    assert float(log_probs.exp().sum()) == pytest.approx(1, abs=1e-4)
+    assert bits_per_action(best_plan_distribution(), log_probs, 4) < 0.005
+    assert prior.window == 3
+    assert not prior.training
+
+
+@BOTH
+def test_same_seed_same_weights_whatever_the_global_seed(kind):
+    plans = Plans(torch.randint(3, (300, 5), generator=seeded(0)), 3)
+    fitted = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        fitted.append(weights(small(kind).fit(plans, generator=seeded(5), **QUICK)))
+    assert torch.equal(*fitted)
+    assert not torch.equal(fitted[0], weights(small(kind)))
+    assert not torch.equal(fitted[0], weights(small(kind).fit(plans, generator=seeded(6), **QUICK)))
+
+
+@BOTH
+def test_global_generators_are_left_alone(kind):
+    before = torch.get_rng_state(), random.getstate(), np.random.get_state()[1].copy()  # noqa: NPY002
+    prior = small(kind)
+    prior.sample(50, 4)
+    prior.sample(50, 4, method="ancestral")
+    prior.fit(torch.randint(3, (50, 4), generator=seeded(0)), **QUICK)
+    assert torch.equal(before[0], torch.get_rng_state())
+    assert before[1] == random.getstate()
+    assert (before[2] == np.random.get_state()[1]).all()  # noqa: NPY002
+
+
+@BOTH
+def test_seed_of_the_weights(kind):
+    assert torch.equal(weights(small(kind, seed=3)), weights(small(kind, seed=3)))
+    assert not torch.equal(weights(small(kind, seed=3)), weights(small(kind, seed=4)))
+
+
+@BOTH
+@pytest.mark.parametrize("per", ["plan", "step"])
+@pytest.mark.parametrize("what", ["index", "features"])
+def test_learns_from_each_kind_of_context(kind, what, per):
+    """Actions are what the context says: a prior that sees it knows them, all in all, far better than chance."""
+    context = torch.randint(3, (600, 4) if per == "step" else (600, 1), generator=seeded(0))
+    actions = context.expand(600, 4)
+    context = context if per == "step" else context[:, 0]
+    arguments = {"num_contexts": 3}
+    if what == "features":
+        context, arguments = torch.nn.functional.one_hot(context, 3).float(), {"context_size": 3}
+    prior = small(kind, **arguments)
+    prior.fit(Plans(actions, 3, context=context), generator=seeded(0), max_steps=60, learning_rate=0.03, progress=False)
+    assert prior.context_per == per
+    assert prior.log_prob(actions, context).exp().mean() > 0.7  # chance: 1/81
+    wrong = context.roll(1, -1) if what == "features" else (context + 1) % 3
+    assert prior.log_prob(actions, wrong).exp().mean() < 1 / 81
+
+
+@BOTH
+def test_lengths_mask_the_loss(kind):
+    """Beyond a plan's length nothing is learned: there action 0 is stored, but 1 and 2 are all that is ever done."""
+    actions = torch.randint(1, 3, (400, 6), generator=seeded(0))
+    lengths = torch.randint(7, (400,), generator=seeded(1))
+    prior = small(kind).fit(Plans(actions, 3, lengths), seeded(0), max_steps=60, learning_rate=0.03, progress=False)
+    with torch.no_grad():
+        first = prior(torch.randint(1, 3, (50, 6), generator=seeded(2))).softmax(-1)[..., 0]
+    assert first.max() < 0.05
+
+
+@BOTH
+@pytest.mark.parametrize("lengths", [None, torch.tensor([1, 3] * 10)])
+def test_fit_sets_the_window_to_the_longest_plan(kind, lengths):
+    plans = Plans(torch.randint(3, (20, 5), generator=seeded(0)), 3, lengths)
+    assert small(kind).fit(plans, **QUICK).window == (4 if lengths is None else 2)
+    assert small(kind, window=1).fit(plans, **QUICK).window == 1
+
+
+@BOTH
+def test_plans_of_one_action(kind):
+    prior = small(kind).fit(torch.tensor([[1], [1], [1], [2]] * 50), seeded(0), progress=False, max_steps=200)
+    probs = prior(torch.zeros(1, 4, dtype=torch.long)).softmax(-1)[0]
+    torch.testing.assert_close(probs, torch.tensor([[0, 0.75, 0.25]]).expand(4, 3), atol=0.1, rtol=0)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "plans",
+    [
+        torch.zeros(1, 1).long(),
+        torch.zeros(0, 4).long(),
+        torch.zeros(9, 0).long(),
+        Plans(torch.zeros(9, 4).long(), 3, lengths=torch.zeros(9).long()),
+        Plans(torch.zeros(9, 4).long(), 3, group=torch.zeros(9).long()),
+    ],
+)
+def test_refuses_too_few_plans(kind, plans):
+    with refuses("plans"):
+        small(kind).fit(plans, **QUICK)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        ({"num_actions": 0}, "num_actions"),
+        ({"window": -1}, "window"),
+        ({"window": 1.5}, "window"),
+        ({"num_contexts": 0}, "num_contexts"),
+        ({"context_size": 0}, "context_size"),
+        ({"num_contexts": 2, "context_size": 2}, "not both"),
+        ({"num_layers": 0}, "num_layers"),
+    ],
+)
+def test_refuses_arguments(kind, arguments, word):
+    with refuses(word):
+        kind(**({"num_actions": 3} | arguments))
+
+
+@pytest.mark.parametrize("arguments", [{"width": 10, "num_heads": 4}, {"width": 12, "num_heads": 4}, {"num_heads": 0}])
+def test_refuses_a_width_that_the_heads_cannot_share(arguments):
+    with refuses("num_heads"):
+        TransformerPrior(3, **arguments)
+
+
+@pytest.mark.parametrize(
+    "name", ["max_steps", "batch_size", "learning_rate", "gradient_clip", "check_every", "patience"]
+)
+def test_refuses_settings(name):
+    with refuses(name):
+        small(GRUPrior).fit(torch.zeros(9, 4).long(), progress=False, **{name: 0})
+
+
+@pytest.mark.parametrize("batch", [3, 5])  # fewer than actions, and more
+@pytest.mark.parametrize("lags", [1, 3])
+@pytest.mark.parametrize("num_layers", [1, 2])
+@pytest.mark.parametrize("sees", [{}, {"num_contexts": 3}, {"context_size": 2}])
+def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, sees, monkeypatch):
+    """Without gradients a step has a path of its own; with them it is `nn.GRU`'s."""
+    prior = GRUPrior(4, hidden_size=8, num_layers=num_layers, lags=lags, dropout=0.3, seed=1, **sees)
+    action = torch.randint(4, (6, batch), generator=seeded(0))
+    context = {"num_contexts": torch.arange(batch) % 3, "context_size": torch.rand(batch, 2, generator=seeded(1))}
+    seen = next((context[name] for name in sees), None)
+    one_step, calls = prior._one_step, []
+    monkeypatch.setattr(prior, "_one_step", lambda *given: calls.append(given) or one_step(*given))
+
+    def steps():
+        logits, state = prior.start(batch, seen)
+        told = [logits]
+        for one in action:
+            logits, state = prior.step(one, state)
+            told.append(logits)
+        return torch.stack(told), state
+
+    with torch.no_grad():
+        fast = steps()
+    assert len(calls) == len(action)
+    plain = steps()
+    assert plain[0].requires_grad
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        rough = steps()
+    assert len(calls) == len(action)
+    for one, other, third in zip(fast, plain, rough, strict=True):
+        torch.testing.assert_close(one, other.detach(), atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(third.float(), one, atol=0.05, rtol=0.05)
+
+
+@pytest.mark.parametrize("lags", [1, 3])
+@pytest.mark.parametrize("window", [None, 4, 9])
+@pytest.mark.parametrize("span", [None, 3])
+@pytest.mark.parametrize("sees", [{}, {"num_contexts": 3}, {"context_size": 2}])
+def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, span, sees, monkeypatch):
+    """Without gradients a step writes behind a copy of the cache; with them, and past a window or span, it does not."""
+    prior = TransformerPrior(4, width=8, num_heads=2, window=window, lags=lags, dropout=0.3, seed=1, **sees)
+    prior.span, batch = span, 3
+    action = torch.randint(4, (7, batch), generator=seeded(0))
+    context = {"num_contexts": torch.arange(batch), "context_size": torch.rand(batch, 2, generator=seeded(1))}
+    seen = next((context[name] for name in sees), None)
+    may, answers = prior._may_write, []
+    monkeypatch.setattr(prior, "_may_write", lambda state: answers.append(may(state)) or answers[-1])
+
+    def steps(step, learning=False):
+        with torch.set_grad_enabled(learning):
+            logits, state = prior.start(batch, seen)
+            told = [logits]
+            for one in action:
+                logits, state = step(one, state)
+                told.append(logits)
+        return torch.stack(told), state
+
+    fast = steps(prior.step)
+    # Of s + 1 inputs the first s are in the cache when the last is read.
+    limits = [min(window or 99, (span or 99) - 1) - s for s in range(1, len(action) + 1)]
+    assert [answer is not None for answer in answers] == [limit >= 0 for limit in limits]
+    if window or span:
+        assert [answer for answer in answers if answer is not None] == [limit for limit in limits if limit >= 0]
+    answers.clear()
+    plain = steps(prior.step, learning=True)
+    assert answers == [None] * len(action)
+    assert plain[0].requires_grad
+    written_over = steps(lambda one, state: prior.advance(one, state, None, len(action)))
+    for one, other, third in zip(fast, plain, written_over, strict=True):
+        torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
+        assert torch.equal(one, third)
+
+
+def test_no_plans_at_all():
+    prior = TransformerPrior(4, width=8, num_heads=2, window=5)
+    with torch.no_grad():
+        _, state = prior.start(0)
+        for _ in range(3):
+            logits, state = prior.advance(torch.zeros(0, dtype=torch.long), state, None, 2)
+    assert logits.shape == (0, 4)
+
+
+def test_a_transformer_that_advances_takes_memory_once():
+    """A step leaves the state as it was; to advance takes room for all further steps, and then writes there."""
+    prior = TransformerPrior(4, width=8, num_heads=2, window=9)
+    with torch.no_grad():
+        _, state = prior.start(3)
+        whole = state.clone()
+        _, after = prior.step(torch.tensor([0, 1, 2]), state)
+        assert torch.equal(state, whole)
+        _, first = prior.advance(torch.tensor([0, 1, 2]), state, None, 2)
+        assert torch.equal(first, after)
+        places = {first.data_ptr()}
+        for _ in range(2):
+            _, first = prior.advance(torch.tensor([3, 1, 0]), first, None, 0)
+            places.add(first.data_ptr())
+        assert len(places) == 1
+        _, more = prior.advance(torch.tensor([3, 1, 0]), first, None, 0)
+        assert more.data_ptr() not in places
+
+
+def test_a_transformer_in_training_or_in_rough_numbers_does_not_write_in_place():
+    prior = TransformerPrior(4, width=8, num_heads=2)
+    with torch.no_grad():
+        _, state = prior.start(3)
+        assert prior._may_write(state) is not None
+        with torch.autocast("cpu", torch.bfloat16):
+            assert prior._may_write(state) is None
+        assert prior.train()._may_write(state) is None
+
+
+class NeverFirst(TransformerPrior):
+    """Without the first action, by steps of its own."""
+
+    def step(self, action, state, context=None):
+        logits, state = super().step(action, state, context)
+        return logits.index_fill(1, torch.tensor(0), -torch.inf), state
+
+
+class Loud(TransformerPrior):
+    """Reads in a way of its own."""
+
+    def encode(self, inputs, memory=None):
+        logits, memory = super().encode(inputs, memory)
+        return 2 * logits + 1, memory
+
+
+@pytest.mark.parametrize("kind", [NeverFirst, Loud])
+def test_subclasses_that_step_or_read_in_their_own_way_do(kind):
+    prior = kind(3, width=8, num_heads=2)
+    with torch.no_grad():
+        _, state = prior.start(4)
+        action = torch.tensor([0, 1, 2, 0])
+        want = kind.encode(prior, action[:, None, None].float(), state[:, :-1])[0][:, 0]
+        for logits, _ in (prior.step(action, state), prior.advance(action, state, None, 3)):
+            assert torch.allclose(logits[:, 1:], want[:, 1:], atol=1e-5)
+            assert (logits[:, 0] == -torch.inf).all() == (kind is NeverFirst)
+
+
+@pytest.mark.parametrize("part", [slice(None, None, 2), slice(1, None, 2), slice(0, 2), slice(3, None)])
+def test_a_state_that_is_part_of_another_tensor_is_not_written_over(part):
+    """Rows of a state that has room, and columns of a tensor that holds others."""
+    prior = TransformerPrior(4, width=8, num_heads=2)
+    with torch.no_grad():
+        _, state = prior.start(6)
+        action = torch.tensor([0, 1, 2, 3, 0, 1])
+        _, roomy = prior.advance(action, state, None, 5)
+        kept = roomy.clone()
+        want, _ = prior.step(action[part], roomy[part])
+        got, _ = prior.advance(action[part], roomy[part], None, 3)
+        assert torch.equal(got, want)
+        assert torch.equal(roomy, kept)
+        beside = torch.cat([kept, torch.ones(6, 500)], 1)
+        prior.advance(action, beside[:, : kept.shape[1]], None, 0)
+        assert (beside[:, kept.shape[1] :] == 1).all()
+
+
+@pytest.mark.parametrize(("window", "span"), [(5, None), (None, 6), (9, 4)])
+def test_no_more_room_is_taken_than_is_used(window, span):
+    prior = TransformerPrior(4, width=8, num_heads=2, window=window)
+    prior.span = span
+    with torch.no_grad():
+        _, state = prior.start(2)
+        _, state = prior.advance(torch.tensor([0, 1]), state, None, 10**6)
+    assert state.untyped_storage().nbytes() < 2 * 4 * 12 * (prior._cache_size + prior.lags + 1)

@@ -1,0 +1,294 @@
+"""What every prior promises: stepping equals `forward`, states reorder, contexts of all kinds, checks of its input."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, sample, sample_in_world
+from tests.support.sources import distribution, every_plan, random_world, refuses, seeded
+
+A, L, C = 3, 7, 4
+SMALL = {
+    "gru": partial(GRUPrior, A, hidden_size=8, num_layers=2),
+    "transformer": partial(TransformerPrior, A, width=16, num_layers=2, num_heads=2),
+    "markov": partial(MarkovPrior, A, order=2),
+    "uniform": partial(UniformPrior, A),
+}
+SEES = {
+    "nothing": ({}, None),
+    "index a plan": ({"num_contexts": C}, "plan"),
+    "index a step": ({"num_contexts": C}, "step"),
+    "features a plan": ({"context_size": 2}, "plan"),
+    "features a step": ({"context_size": 2}, "step"),
+}
+NEURAL = [
+    (kind, sees, window) for kind in ("gru", "transformer") for sees in SEES for window in (None, 0, 1, 3, L - 1, L)
+]
+MARKOV = [("markov", sees, None) for sees in ("nothing", "index a plan", "index a step")]
+ALL = [*NEURAL, *MARKOV, ("uniform", "nothing", None)]
+
+
+def draw_context(sees, num, length, seed=0):
+    arguments, per = SEES[sees]
+    if per is None:
+        return None
+    shape = (num,) if per == "plan" else (num, length)
+    if "num_contexts" in arguments:
+        return torch.randint(C, shape, generator=seeded(seed))
+    return torch.randn(*shape, 2, generator=seeded(seed))
+
+
+def make(kind, sees, window=None, seed=0):
+    """A prior whose predictions depend on all that it may look at: random weights, or counts of random plans."""
+    extra = {} if window is None else {"window": window}
+    if kind in ("gru", "transformer"):
+        prior = SMALL[kind](**SEES[sees][0], **extra, seed=seed)
+        with torch.no_grad():
+            for weight in prior.parameters():
+                weight.mul_(2)  # away from the near-uniform predictions of fresh weights
+        return prior.eval()
+    prior = SMALL[kind](**SEES[sees][0])
+    plans = torch.randint(A, (60, 5), generator=seeded(seed))
+    return prior.fit(Plans(plans, A, context=draw_context(sees, 60, 5)))
+
+
+def steps(prior, plans, context, per, explicit=False):
+    """Logits `[N, L, A]` and the states before each action, by stepping; `explicit` repeats a plan's context."""
+    per_step = per == "step"
+    logits, state = prior.start(len(plans), context[:, 0] if per_step else context)
+    out, states = [logits], [state]
+    for t in range(plans.shape[1] - 1):
+        seen = context[:, t + 1] if per_step else context if explicit else None
+        logits, state = prior.step(plans[:, t], state, seen)
+        out.append(logits)
+        states.append(state)
+    return torch.stack(out, 1), states
+
+
+@pytest.mark.parametrize(("kind", "sees", "window"), ALL)
+@torch.no_grad()
+def test_stepping_is_forward(kind, sees, window):
+    prior = make(kind, sees, window)
+    plans, context, per = torch.randint(A, (9, L), generator=seeded(1)), draw_context(sees, 9, L), SEES[sees][1]
+    forward = prior(plans, context)
+    assert forward.shape == (9, L, A)
+    assert forward.dtype == torch.float32
+    torch.testing.assert_close(prior(plans.to(torch.uint8), context), forward)
+    stepped, states = steps(prior, plans, context, per)
+    torch.testing.assert_close(stepped.log_softmax(-1), forward.log_softmax(-1), rtol=1e-4, atol=1e-5)
+    assert all(isinstance(state, torch.Tensor) and len(state) == 9 for state in states)
+    again, _ = steps(prior, plans, context, per, explicit=True)
+    torch.testing.assert_close(again, stepped)
+    taken = forward.log_softmax(-1).gather(-1, plans[..., None])[..., 0]
+    torch.testing.assert_close(prior.log_prob(plans, context), taken.sum(1))
+    lengths = torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
+    shorter = torch.stack([row[:n].sum() for row, n in zip(taken, lengths, strict=True)])
+    torch.testing.assert_close(prior.log_prob(plans, context, lengths), shorter)
+
+
+@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None])
+def test_log_prob_in_parts(kind, sees, monkeypatch):
+    prior, context = make(kind, sees), draw_context(sees, 9, L)
+    plans, lengths = torch.randint(A, (9, L), generator=seeded(1)), torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
+    whole = prior.log_prob(plans, context, lengths)
+    monkeypatch.setattr(type(prior), "actions_at_once", 2 * L)
+    torch.testing.assert_close(prior.log_prob(plans, context, lengths), whole)
+
+
+@pytest.mark.parametrize("end", [False, True])
+@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None])
+@torch.no_grad()
+def test_forecasts(kind, sees, end, monkeypatch):
+    """What is forecast of every action, some plans at a time, is what `log_prob` takes of the one that came."""
+    prior = make(kind, sees)
+    lengths = torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
+    actions = torch.randint(A, (9, L), generator=seeded(1))
+    if end:  # action 2 closes plans, and the prior has learned so
+        actions = torch.where(torch.arange(L) == lengths[:, None] - 1, 2, actions.clamp(max=1))
+        prior.end = 2
+    plans = Plans(actions, A, lengths, context=draw_context(sees, 9, L), end=2 if end else None)
+    (whole,) = list(prior.forecasts(plans))
+    assert whole[0].actions.equal(plans.actions)
+    assert whole[1].shape == (9, L, A)
+    within = whole[1][plans.mask()]
+    torch.testing.assert_close(within.exp().sum(-1), torch.ones(len(within)))
+    taken = whole[1].gather(-1, plans.actions.long()[..., None])[..., 0].masked_fill(~plans.mask(), 0)
+    torch.testing.assert_close(taken, prior.action_log_probs(plans))
+    torch.testing.assert_close(taken.sum(1), prior.log_prob(plans.actions, plans.context, lengths))
+    if not end:
+        torch.testing.assert_close(whole[1], prior(plans.actions, plans.context).log_softmax(-1))
+    else:  # after the end nothing but it
+        steps = plans.actions[:, :-1] == 2
+        assert int(steps.sum()) == 6
+        assert (whole[1][:, 1:][steps][:, 2] == 0).all()
+        assert whole[1][:, 1:][steps][:, :2].isneginf().all()
+    monkeypatch.setattr(type(prior), "actions_at_once", 2 * L + 1)
+    parts = list(prior.forecasts(plans))
+    assert [len(part) for part, _ in parts] == [2, 2, 2, 2, 1]
+    assert torch.cat([part.actions for part, _ in parts]).equal(plans.actions)
+    torch.testing.assert_close(torch.cat([log_probs for _, log_probs in parts]), whole[1])
+    monkeypatch.setattr(type(prior), "actions_at_once", 1)  # never fewer than a plan
+    assert [len(part) for part, _ in prior.forecasts(plans)] == [1] * 9
+
+
+def test_forecasts_of_other_plans_are_refused():
+    prior = make("markov", "index a plan")
+    with refuses("4 actions", "3"):
+        next(iter(prior.forecasts(Plans(torch.zeros(2, 2).long(), 4, context=torch.zeros(2).long()))))
+    with refuses("context"):
+        next(iter(prior.forecasts(Plans(torch.zeros(2, 2).long(), A))))
+    assert list(prior.forecasts(Plans(torch.zeros(0, 2).long(), A, context=torch.zeros(0).long()))) == []
+
+
+@pytest.mark.parametrize(("kind", "sees", "window"), [case for case in ALL if case[2] in (None, 1, 3)])
+@torch.no_grad()
+def test_states_are_reordered_by_indexing(kind, sees, window):
+    prior = make(kind, sees, window)
+    plans, context, per = torch.randint(A, (5, L), generator=seeded(2)), draw_context(sees, 5, L), SEES[sees][1]
+    index = torch.tensor([3, 0, 0, 4, 1, 3])
+    _, states = steps(prior, plans, context, per)
+    for t in range(L - 1):
+        seen = context[:, t + 1] if per == "step" else None
+        logits, state = prior.step(plans[:, t], states[t], seen)
+        moved = None if seen is None else seen[index]
+        got, after = prior.step(plans[index, t], states[t][index], moved)
+        torch.testing.assert_close(got, logits[index], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(after, state[index], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "sees"), [("gru", s) for s in SEES] + [("transformer", s) for s in SEES])
+@pytest.mark.parametrize("window", [0, 1, 3])
+@torch.no_grad()
+def test_window(kind, sees, window):
+    """Past the window a prediction is that after the last `window` actions had opened a plan, and uses all of them."""
+    prior = make(kind, sees, window)
+    plans, context, per = torch.randint(A, (20, L), generator=seeded(3)), draw_context(sees, 20, L), SEES[sees][1]
+    forward = prior(plans, context)
+    for t in range(window, L):
+        last = slice(t - window, t + 1)
+        opening = prior(plans[:, last], context[:, last] if per == "step" else context)
+        torch.testing.assert_close(forward[:, t], opening[:, window], rtol=1e-4, atol=1e-5)
+    for age in range(1, L):
+        changed = plans.clone()
+        changed[:, L - 1 - age] = (changed[:, L - 1 - age] + 1) % A
+        differs = (prior(changed, context)[:, -1] - forward[:, -1]).abs().max() > 1e-4
+        assert differs == (age <= window)
+
+
+@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None and s != "nothing"])
+@torch.no_grad()
+def test_the_context_counts_from_when_it_is_seen(kind, sees):
+    prior, per = make(kind, sees), SEES[sees][1]
+    plans, context = torch.randint(A, (30, L), generator=seeded(4)), draw_context(sees, 30, L)
+    forward = prior(plans, context)
+    for t in [4] if per == "step" else [0]:
+        changed = context.clone()
+        here = changed[:, t] if per == "step" else changed
+        here.copy_((here + 1) % C)
+        other = prior(plans, changed)
+        torch.testing.assert_close(other[:, :t], forward[:, :t])
+        assert (other[:, t] - forward[:, t]).abs().max() > 1e-3
+        if per == "plan":
+            assert (other - forward).abs().amax((0, 2)).min() > 1e-3
+
+
+@pytest.mark.parametrize(("kind", "sees", "window"), [case for case in ALL if case[2] in (None, 0, 3)])
+def test_probabilities_of_all_plans_sum_to_one(kind, sees, window):
+    prior = make(kind, sees, window)
+    for length in (0, 1, 5):
+        context = draw_context(sees, 1, length)
+        probs = distribution(prior, length, None if context is None else context[0])
+        assert float(probs.sum()) == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "sees", "window"), [case for case in ALL if case[2] in (None, 3)])
+@pytest.mark.parametrize("size", [(0, 3), (0, 6), (4, 0), (0, 0), (1, 0)])
+@torch.no_grad()
+def test_empty_batches(kind, sees, window, size):
+    prior, context = make(kind, sees, window), draw_context(sees, *size)
+    plans = torch.zeros(size, dtype=torch.long)
+    assert prior(plans, context).shape == (*size, A)
+    assert prior.log_prob(plans, context).tolist() == [0.0] * size[0]
+    assert prior.sample(*size, context, generator=seeded(0)).shape == size
+
+
+BAD_CONTEXTS = [
+    ("nothing", torch.zeros(4).long(), "context"),
+    ("nothing", torch.zeros(4, 2), "context"),
+    ("index a plan", None, "context"),
+    ("index a plan", torch.tensor([0, 1, C, 0]), str(C)),
+    ("index a plan", torch.tensor([0, 1, -1, 0]), "-1"),
+    ("index a plan", torch.zeros(4, 2), "context"),
+    ("index a plan", torch.zeros(3).long(), "context"),
+    ("index a step", torch.tensor([[0, 1]] * 3 + [[C, 0]]), str(C)),
+    ("index a step", torch.zeros(4, 1).long(), "context"),
+    ("features a plan", None, "context"),
+    ("features a plan", torch.zeros(4, 3), "[4, 3]"),
+    ("features a plan", torch.zeros(4).long(), "context"),
+    ("features a plan", torch.tensor([[0, 1], [0, 1], [0, float("nan")], [0, 1]]), "nan"),
+    ("features a step", torch.zeros(4, 2, 3), "[4, 2, 3]"),
+]
+CALLS = {
+    "log_prob": lambda prior, plans, context: prior.log_prob(plans, context),
+    "sample": lambda prior, plans, context: prior.sample(*plans.shape, context),
+    "the sampler": lambda prior, plans, context: sample(prior, *plans.shape, context),
+    "fit": lambda prior, plans, context: prior.fit(Plans(plans, A, context=context)),
+}
+
+
+@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize(
+    ("kind", "sees", "context", "word"),
+    [(kind, *bad) for kind in SMALL for bad in BAD_CONTEXTS if (kind, bad[0], None) in ALL],
+)
+def test_refuses_a_context(call, kind, sees, context, word):
+    if call == "fit" and sees == "nothing":  # which leaves the context of the plans aside
+        assert make(kind, sees).training_plans(Plans(torch.zeros(4, 2).long(), A, context=context)).context is None
+        return
+    with refuses(word):
+        CALLS[call](make(kind, sees), torch.zeros(4, 2, dtype=torch.long), context)
+
+
+@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None and s != "nothing"])
+def test_refuses_a_world_that_shows_something_else(kind, sees):
+    """The world's six cells are neither below `num_contexts` = 4 nor features."""
+    world = random_world(0)
+    with refuses("context"):
+        sample_in_world(make(kind, sees), world, torch.arange(6), 50, 4, generator=seeded(0))
+
+
+@pytest.mark.parametrize("kind", SMALL)
+@pytest.mark.parametrize(
+    ("plans", "words"),
+    [
+        (torch.tensor([[0, 1], [A, 0]]), ["actions[1, 0]", str(A)]),
+        (torch.tensor([[0, -1]]), ["actions[0, 1]", "-1"]),
+        (torch.zeros(2, 2), ["actions", "float32"]),
+        (torch.zeros(2).long(), ["actions", "[2]"]),
+    ],
+)
+def test_refuses_plans(kind, plans, words):
+    prior = make(kind, "nothing")
+    for call in (prior.log_prob, prior.fit):
+        with refuses(*words):
+            call(plans)
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_refuses_plans_of_other_actions(kind):
+    with refuses(str(A), str(A + 1)):
+        make(kind, "nothing").fit(Plans(torch.zeros(4, 2).long(), A + 1))
+
+
+def test_many_actions():
+    """Above 256 actions nothing wraps around in a byte."""
+    plans = torch.tensor([[299, 5], [299, 5], [43, 260]] * 20)
+    prior = MarkovPrior(300, 1, smoothing=1e-3).fit(plans)
+    drawn = prior.sample(500, 2, generator=seeded(0))
+    assert drawn.dtype == torch.int64
+    assert set(map(tuple, drawn.tolist())) == {(299, 5), (43, 260)}
+
+
+def test_every_plan_is_numbered_as_written():
+    assert every_plan(2, 2).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]

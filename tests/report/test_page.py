@@ -1,0 +1,380 @@
+"""The page of results: escaped, self-contained, the same bytes each time, and legible figures of the right numbers."""
+
+import re
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+
+from neuroprior.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, colors, drawn, lines, short
+from neuroprior.report.figures import (
+    MOST_PLANS,
+    calibration_figure,
+    distribution_figure,
+    drift_figure,
+    lag_figure,
+    motif_figure,
+    order_figure,
+    score_figure,
+)
+from neuroprior.report.matrix_figures import (
+    MOST_STEPS,
+    OTHER,
+    STRIPS,
+    group_transition_figure,
+    raster_figure,
+    transition_figure,
+)
+from neuroprior.report.page import INK, PAPER, FigureBox, Page, Section, Table, clean, svg, write_page
+from tests.support.browser import check_in_browser
+
+HOSTILE = ["<b>\"&'", "</svg><script>alert(1)</script>", "$x$ $\\frac{$", "\x00\x1b\ud800", "http://evil.org", "_x"]
+MANY = [f"groom left forepaw while rearing {n}" for n in range(57)]
+MODELS = ["uniform", "markov-0", "markov-3", "context tree", "gru", "gru, context", "mixture of all"]
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+class Reader(HTMLParser):
+    """The tags of a page with their attributes, and the text between them."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+    def values(self, name: str) -> list[str]:
+        return [attributes[name] for _, attributes in self.tags if name in attributes]
+
+
+def page_of(name: str, boxes: list[FigureBox] = ()) -> Page:
+    """A page in which `name` stands wherever a text can."""
+    table = Table([name, "bits"], [[name, "1.5"], ["other", name]], name)
+    section = Section(name, [name, name], [table], [FigureBox(box.svg, name, name) for box in boxes])
+    return Page(name, name, name, {name: name, "names": [name]}, [section, Section("last")])
+
+
+def written(folder, page: Page) -> str:
+    write_page(folder / "page.html", page)
+    return (folder / "page.html").read_text(encoding="utf-8")
+
+
+def estimate(middle: float, half: float = 0.05) -> tuple[float, float, float]:
+    return middle, middle - half, middle + half
+
+
+def scores(models: list[str], context: bool) -> list[dict]:
+    return [
+        {"model": model, "sees": sees, "bits_per_action": 1 + n / 10, "low": 0.9 + n / 10, "high": 1.1 + n / 10}
+        for n, model in enumerate(models)
+        for sees in ("actions", "actions and context")[: 1 + context]
+    ]
+
+
+def matrix(names: list[str], seed: int = 0) -> np.ndarray:
+    probs = np.random.default_rng(seed).dirichlet(np.ones(len(names)), len(names))
+    probs[-1] = np.nan
+    return probs
+
+
+def sequences(names: list[str], number: int, length: int) -> np.ndarray:
+    actions = np.random.default_rng(1).integers(0, len(names), (number, length))
+    actions[0, length // 2 :] = -1
+    return actions
+
+
+def figures(names: list[str], models: list[str], groups: list[str], context: bool) -> dict[str, Figure]:
+    """Every figure, with values missing here and there."""
+    by_group = np.stack([matrix(names, seed) for seed in range(len(groups))])
+    missing = [{"model": "not scored", "sees": "actions", "bits_per_action": None, "low": None, "high": None}]
+    motifs = [
+        {"sequence": " > ".join(names[:6]), "ratio": ratio, "low": 0 if ratio == 0 else None, "high": 4, "count": 1200}
+        for ratio in (8.0, 0.5, 0.0, None, float("inf"))
+    ]
+    curve = [(0.1, 0.12, 0.1, 0.14, 900), (0.9, 0.85, None, None, 20), (None, None, None, None, 0)]
+    plans = [(group, n, None if n == 3 else 1 + n / 100) for group in groups for n in range(20)]
+    lags = [(lag, *estimate(0.5**lag, 0.01)) for lag in range(1, 9)]
+    held_out = {model: [(0, *estimate(1.5)), (1, *estimate(1.2)), (2, None, None, None)] for model in models}
+    return {
+        "score": score_figure(scores(models, context) + missing * (len(models) > 1)),
+        "lag": lag_figure({model: [*lags, (9, None, None, None)] for model in models}, [(1, 0.01), (9, None)]),
+        "one lag": lag_figure({models[0]: [(1, 0.0, -0.1, 0.1)]}),
+        "order": order_figure({"BIC": [(0, 1.5), (1, 1.3), (2, 1.4), (3, 40.0), (4, None)]}, held_out),
+        "calibration": calibration_figure(dict.fromkeys(models, curve)),
+        "motif": motif_figure(motifs),
+        "distribution": distribution_figure({"run length": ([0.5, None, 0.0, 0.1], [0.6, 0.4])}),
+        "drift": drift_figure(
+            [estimate(1), (None, None, None)], plans, [(group, *estimate(1)) for group in groups] + [("x", *[None] * 3)]
+        ),
+        "transition": transition_figure(matrix(names), names, names[0]),
+        "group": group_transition_figure(by_group, matrix(names), names, groups, by_group > 0.9),
+        "raster": raster_figure(sequences(names, 4, 30), sequences(names, 2, 500), names),
+    }
+
+
+CASES = {
+    "few": (["in", "left", "right", "out"], ["gru", "mixture"], ["a", "b"], True),
+    "one": (["L", "R"], ["markov-1"], ["only"], False),
+    "many": (MANY, MODELS, [f"session of animal {n}" for n in range(30)], False),
+    "hostile": (HOSTILE, HOSTILE[:3], HOSTILE[:3], True),
+}
+
+
+@pytest.fixture(scope="module")
+def drawings() -> dict[str, dict[str, str]]:
+    """The SVG of every figure in every case."""
+    return {case: {name: svg(figure) for name, figure in figures(*given).items()} for case, given in CASES.items()}
+
+
+@settings(max_examples=30, deadline=None)
+@given(name=st.one_of(st.text(max_size=30), st.sampled_from(HOSTILE)))
+def test_no_text_changes_what_the_page_is_made_of(name, tmp_path_factory):
+    """The same tags with the same names of attributes as with a harmless name, and the text to be read as it was."""
+    folder, name = tmp_path_factory.mktemp("page"), f"{name}~x~"
+    hostile, harmless = (Reader(written(folder, page_of(text))) for text in (name, "harmless"))
+    shape = [[(tag, list(attributes)) for tag, attributes in reader.tags] for reader in (hostile, harmless)]
+    assert shape[0] == shape[1]
+    assert [text.replace(clean(name), "harmless") for text in hostile.text] == harmless.text
+
+
+@settings(max_examples=30, deadline=None)
+@given(name=st.one_of(st.text(min_size=1, max_size=25), st.sampled_from(HOSTILE)))
+def test_names_stand_in_figures_as_they_are(name):
+    @drawn
+    def figure() -> Figure:
+        made = Figure(figsize=(2, 1))
+        made.text(0, 0, short(f"{name}.", 60))
+        return made
+
+    root = ElementTree.fromstring(svg(figure()))
+    assert [" ".join(text.text.split()) for text in root.iter(f"{SVG}text")] == [clean(f"{name}.")]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_figures_are_valid_and_follow_the_page(case, drawings):
+    """Valid XML; no black and no white, one of which would be lost on one of the pages; no text left out of letters."""
+    for name, text in drawings[case].items():
+        root = ElementTree.fromstring(text)
+        # What is black has no colour in the file at all.
+        shown = [one for group in root.iter(f"{SVG}g") for one in group if one.tag in (f"{SVG}path", f"{SVG}use")]
+        assert all(re.search("fill: |fill-opacity: 0;", one.get("style")) for one in shown), name
+        assert all("fill: currentColor" in one.get("style") for one in root.iter(f"{SVG}text")), name
+        tags = " ".join(re.findall(r"<[^>]*>", text))
+        assert "currentColor" in tags, name
+        assert not re.search(rf"{INK}|{PAPER}|#000000|#ffffff|: black|: white", tags), name
+        assert not re.search(r"<style|<metadata|<!--", text), name
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_pages_need_nothing_from_outside(case, drawings, tmp_path):
+    boxes = [FigureBox(text, "caption", "alt") for text in drawings[case].values()]
+    text = written(tmp_path, page_of("http://evil.org <img src=x>", [*boxes, boxes[0]]))
+    reader = Reader(text)
+    links = [link for name in ("src", "href", "xlink:href", "action", "data") for link in reader.values(name)]
+    assert len(links) > len(boxes)
+    assert all(link.startswith(("#", "data:")) for link in links)
+    opened = [value for _, tag in reader.tags for name, value in tag.items() if not name.startswith(("xmlns", "aria-"))]
+    assert not [value for value in opened if re.search(r"https?:|^//", value or "")]
+    assert all(place.startswith("#") for place in re.findall(r"url\(([^)]*)\)", text))
+    assert not {"script", "link", "img", "iframe"} & {tag for tag, of in reader.tags if of.get("rel") != "icon"}
+    assert "@import" not in text
+    ids = reader.values("id")
+    assert len(ids) == len(set(ids))
+    inside = [link[1:] for link in links if link[0] == "#"] + re.findall(r"url\(#([^)]*)\)", text)
+    assert set(inside) <= set(ids)
+
+
+def test_the_same_results_give_the_same_bytes(drawings, tmp_path):
+    again = {name: svg(figure) for name, figure in figures(*CASES["one"]).items()}
+    assert again == drawings["one"]
+    boxes = [FigureBox(text, "", "") for text in again.values()]
+    first, second = (written(tmp_path, page_of("x", boxes)) for _ in range(2))
+    assert first == second
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_page_leaves_the_settings_of_other_figures_alone():
+    before = dict(mpl.rcParams)
+    svg(score_figure(scores(["gru"], False)))
+    assert dict(mpl.rcParams) == before
+
+
+def test_tables():
+    assert Table(["a", "b", "c"], [["1", "2", "3"]]).align == "lrr"
+    with pytest.raises(ValueError, match=r"rows\[1\]: 2 cells are expected, one a heading, not 3"):
+        Table(["a", "b"], [["1", "2"], ["1", "2", "3"]])
+    with pytest.raises(ValueError, match="align: 2 letters l or r are expected, not 'lx'"):
+        Table(["a", "b"], [], align="lx")
+
+
+def test_contents_settings_and_places(tmp_path):
+    page = Page(
+        "t", "lead", "eval x --y", {"seed": 3}, [Section("one"), Section("two", tables=[Table(["a"], [["1"]])])]
+    )
+    text = written(tmp_path, page)
+    assert re.findall(r'<a href="#(.*?)">(.*?)</a>', text) == [("section-1", "one"), ("section-2", "two")]
+    assert re.findall(r'<h2 id="(.*?)">', text) == ["section-1", "section-2"]
+    assert re.search(r"<details.*eval x --y.*<dt>seed</dt><dd>3</dd>.*</details>", text, re.DOTALL)
+    with pytest.raises(ValueError, match="a directory; the name of a file is expected"):
+        write_page(tmp_path, page)
+
+
+def luminance(color: str) -> float:
+    """Relative luminance (WCAG 2.2, definitions)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(color)]
+    return float(np.dot([0.2126, 0.7152, 0.0722], linear))
+
+
+@pytest.mark.parametrize("paper", ["#ffffff", "#16181d"])
+def test_lines_are_seen_on_light_and_dark_pages(paper):
+    """At least 3 to 1, as graphics need (WCAG 2.2, 1.4.11)."""
+    for color in [*KINDS.values(), *MARKOV, *SPARE, MORE, FEWER]:
+        low, high = sorted([luminance(color) + 0.05, luminance(paper) + 0.05])
+        assert high / low >= 3, color
+
+
+def test_colors_are_those_of_the_kind_of_model():
+    names = [
+        "uniform",
+        "markov-0",
+        "markov-2, context",
+        "markov-12",
+        "Context tree",
+        "GRU",
+        "transformer",
+        "mixture: gru",
+    ]
+    expected = [KINDS["uniform"], MARKOV[0], MARKOV[2], MARKOV[-1]]
+    assert list(colors(names)) == expected + [KINDS[kind] for kind in ("tree", "gru", "transformer", "mixture")]
+    assert list(colors(["this", "gru", "that"])) == [SPARE[0], KINDS["gru"], SPARE[1]]
+    assert list(lines(["gru", "gru, context"])) == [(KINDS["gru"], "-"), (KINDS["gru"], "--")]
+
+
+def test_names_are_cut_in_the_middle():
+    assert short("groom left forepaw while rearing", 15) == "groom lef…aring"
+    assert short("a\n b\x00") == "a b\N{REPLACEMENT CHARACTER}"
+
+
+def test_scores_stand_where_they_are():
+    rows = scores(["gru", "markov-1", "markov-2", "transformer"], True)
+    rows.append({"model": "uniform", "sees": "actions", "bits_per_action": 9.0, "low": 9.0, "high": 9.0})
+    axes = score_figure(rows).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()][::-1] == [row["model"] for row in rows[::2]]
+    at = {(line.get_xdata()[0], line.get_marker()) for line in axes.lines if line.get_marker() in ("o", ">")}
+    edge = 1 + 5 * (1.2 - 1)
+    assert at == {(1.0, "o"), (1.1, "o"), (1.2, "o"), (1.3, "o"), (edge, ">")}
+    spans = sorted(tuple(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2)
+    assert spans == sorted((row["low"], row["high"]) for row in rows[:-1])
+    assert [text.get_text() for text in axes.texts][-1] == "1.000, 1.000"
+    unknown = score_figure(scores(["this", "that"], False)).axes[0]
+    assert [line.get_color() for line in unknown.lines if line.get_marker() == "o"] == SPARE[1::-1]
+
+
+def test_lags_are_on_a_linear_axis_unless_they_span_decades():
+    narrow = lag_figure({"counts": [(1, 0.5, 0.4, 0.6), (2, 0.4, 0.3, 0.5)]})
+    wide = lag_figure({"counts": [(1, 0.5, 0.4, 0.6), (2, -0.0001, -0.001, 0.001)]}, [(1, 0.001)])
+    assert [figure.axes[0].get_yscale() for figure in (narrow, wide)] == ["linear", "symlog"]
+    assert wide.axes[0].lines[0].get_xydata().tolist() == [[1, 0.5], [2, -0.0001]]
+    low, high = wide.axes[0].get_ylim()
+    assert low <= -0.001 < 0.6 <= high
+
+
+def test_the_least_of_every_criterion_is_ringed():
+    held_out = {"markov": [(0, *estimate(2)), (1, *estimate(1.5)), (2, *estimate(1.2)), (3, *estimate(1.3))]}
+    axes = order_figure({"BIC": [(0, 2.0), (1, 1.4), (2, 1.6), (3, 50.0)]}, held_out).axes[0]
+    assert [tuple(line.get_xydata()[0]) for line in axes.lines if line.get_markersize() == 13] == [(1, 1.4), (2, 1.2)]
+    assert axes.get_ylim()[0] < 1.2
+    assert 2 < axes.get_ylim()[1] < 50
+
+
+def test_cells_hold_their_probabilities():
+    probs = np.array([[0.25, 0.75], [np.nan, np.nan]])
+    axes = transition_figure(probs, ["a", "b"], "t").axes[0]
+    assert {(text.get_position(), text.get_text()) for text in axes.texts} == {((0, 0), "0.25"), ((1, 0), "0.75")}
+    assert [patch.get_xy() for patch in axes.patches if patch.get_hatch()] == [(-0.5, 0.5)]
+    opacity = axes.images[0].get_array()[..., 3]
+    assert opacity[0, 1] > opacity[0, 0] > opacity[1, 0] == 0
+    assert not transition_figure(matrix(MANY), MANY).axes[0].texts
+
+
+def test_the_groups_that_differ_most_are_drawn():
+    pooled = np.full((2, 2), 0.5)
+    by_group = pooled + np.arange(30)[:, None, None] * np.array([[1, -1], [-1, 1]]) / 100
+    significant = np.zeros_like(by_group, dtype=bool)
+    significant[3, 0, 1] = True
+    names = [f"g{n}" for n in range(30)]
+    figure = group_transition_figure(by_group, pooled, ["a", "b"], names, significant)
+    panels = [axes for axes in figure.axes if axes.get_title(loc="left")]
+    assert [axes.get_title(loc="left") for axes in panels] == ["g3", *names[19:]]
+    assert [axes.lines[0].get_xydata().tolist() for axes in panels] == [[[1, 0]]] + [[]] * 11
+    assert "12 of 30 groups" in figure.get_suptitle()
+    shown = panels[-1].images[0].get_array()
+    assert [to_hex(shown[0, b, :3]) for b in (0, 1)] == [MORE, FEWER]
+    with pytest.raises(ValueError, match="group_names: at least one is expected"):
+        group_transition_figure(np.empty((0, 2, 2)), pooled, ["a", "b"], [], np.empty((0, 2, 2)))
+
+
+def test_every_action_has_its_color():
+    actions = np.array([[0, 1, 1, -1]])
+    upper, lower = raster_figure(actions, actions[:, ::-1], ["a", "b"]).axes
+    strip = upper.images[0].get_array()
+    assert [to_hex(color[:3]) for color in strip[0, :3]] == [STRIPS[0], STRIPS[1], STRIPS[1]]
+    assert strip[0, 3, 3] == 0
+    assert lower.images[0].get_array()[0].tolist() == strip[0, ::-1].tolist()
+    often = np.concatenate([np.full(20, 56), np.arange(57)])[None]
+    figure = raster_figure(often, often, MANY)
+    strip = figure.axes[0].images[0].get_array()
+    assert to_hex(strip[0, 0, :3]) == STRIPS[10]
+    assert to_hex(strip[0, 40, :3]) == OTHER
+    assert [text.get_text() for text in figure.legends[0].texts][-1] == "46 other actions"
+    assert len(figure.legends[0].texts) == len(STRIPS)
+    long = raster_figure(np.zeros((1, 2500), int), actions, ["a", "b"])
+    assert long.axes[0].images[0].get_array().shape[1] == MOST_STEPS
+    assert f"the first {MOST_STEPS}" in long.axes[1].get_xlabel()
+
+
+def test_motifs_and_lengths_stand_where_they_are():
+    rows = [
+        {"sequence": "a > b", "ratio": 4.0, "low": 2.0, "high": 5.0, "count": 10},
+        {"sequence": "b > a", "ratio": 0.0, "low": 0.0, "high": 0.5, "count": 0},
+    ]
+    axes = motif_figure(rows).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["b > a", "a > b"]
+    marks = {line.get_marker(): line for line in axes.lines}
+    assert (marks["o"].get_xdata()[0], marks["o"].get_color()) == (4.0, MORE)
+    assert (marks["<"].get_xdata()[0] < 0.25, marks["<"].get_color()) == (True, FEWER)
+    real, generated = distribution_figure({"length": ([0.5, 0.0, 0.5], [1.0])}).axes[0].lines
+    assert (real.get_xydata().tolist(), generated.get_xydata().tolist()) == ([[1, 0.5], [3, 0.5]], [[1, 1]])
+
+
+def test_many_plans_are_thinned_and_groups_ranked():
+    plans = [("a", n, n / 1000) for n in range(50_000)]
+    figure = drift_figure([estimate(1)] * 10, plans, [("low", *estimate(1)), ("high", *estimate(2))])
+    within, between, below = figure.axes
+    assert [axes.get_title(loc="left") for axes in (within, below)] == ["within plans", "groups"]
+    assert len(between.lines[0].get_xdata()) == MOST_PLANS
+    assert np.allclose(between.lines[1].get_ydata(), between.lines[1].get_xdata() / 1000)
+    assert [label.get_text() for label in below.get_yticklabels()] == ["low", "high"]
+
+
+@pytest.mark.parametrize("make", [score_figure, lag_figure, calibration_figure, motif_figure, distribution_figure])
+def test_nothing_to_draw_is_an_error(make):
+    with pytest.raises(ValueError, match="at least one is expected"):
+        make([] if make in (score_figure, motif_figure) else {})
+
+
+def test_a_browser_shows_the_page_on_a_phone_and_a_desktop(drawings, tmp_path):
+    boxes = [FigureBox(text, "caption", "alt") for case in drawings.values() for text in case.values()]
+    check_in_browser(written(tmp_path, page_of("averylongnamewithoutanyspaces" * 4, boxes)), tmp_path)

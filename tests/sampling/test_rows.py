@@ -1,0 +1,60 @@
+"""Tests of memory: taken rows are those asked for, and room is given to nobody else."""
+
+import pytest
+import torch
+
+from neuroprior.sampling.rows import grown, rows_of, states_with_room
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32, torch.int64, torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("width", [(), (0,), (1,), (2,), (3,), (8,), (2, 4)], ids=str)
+def test_rows_are_those_asked_for(dtype, width):
+    values = torch.arange(7 * torch.Size(width).numel()).view(7, *width).to(dtype)
+    for row in (torch.tensor([6, 0, 0, 3]), torch.tensor([2], dtype=torch.int32), torch.tensor([], dtype=torch.long)):
+        taken = rows_of(values, row)
+        assert taken.dtype == dtype
+        assert taken.shape == (len(row), *width)
+        assert taken.equal(values[row.long()])
+
+
+def test_rows_of_parts_of_a_tensor():
+    values = torch.arange(80, dtype=torch.uint8).view(10, 8)
+    row = torch.tensor([4, 0, 4])
+    for part in (values[1:], values[:, 2:4], values[:, ::2], values.T):
+        assert rows_of(part, row).equal(part[row])
+
+
+def test_many_rows():
+    values = torch.rand(100, 3, dtype=torch.float64)
+    row = torch.randint(100, (300_000,), generator=torch.Generator().manual_seed(0))
+    assert rows_of(values, row).equal(values[row])
+
+
+def test_gradients_pass():
+    values = torch.rand(4, 2, requires_grad=True)
+    rows_of(values, torch.tensor([1, 1, 3])).sum().backward()
+    assert values.grad is not None
+    assert values.grad[:, 0].tolist() == [0, 2, 0, 1]
+
+
+def test_states_grow_where_there_is_room_and_nowhere_else():
+    state = states_with_room(torch.zeros(5, 1), 3, 2)
+    state[:] = torch.arange(15).view(5, 3)
+    after = grown(state, 5)
+    assert after is not None
+    assert after[:, :3].equal(state)
+    assert after.data_ptr() == state.data_ptr()
+    assert grown(state, 6) is None
+    for other in (state[1:], state[:, 1:], state[::2], state.clone(), torch.zeros(5, 8)[:, :3]):
+        assert grown(other, 4) is None
+
+
+def test_rows_of_states_with_room_have_room_of_their_own():
+    state = states_with_room(torch.zeros(3, 1), 2, 2)
+    state[:] = torch.arange(6).view(3, 2)
+    taken = rows_of(state, torch.tensor([2, 2]))
+    assert taken.tolist() == [[4, 5], [4, 5]]
+    after = grown(taken, 4)
+    assert after is not None
+    after.fill_(9)
+    assert state.tolist() == [[0, 1], [2, 3], [4, 5]]

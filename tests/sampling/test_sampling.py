@@ -1,0 +1,374 @@
+"""Sampling: every method has the prior's exact distribution, with contexts, temperatures and worlds."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuroprior import (
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    TabularWorld,
+    TransformerPrior,
+    UniformPrior,
+    World,
+    sample,
+    sample_in_world,
+)
+from neuroprior.sampling import ancestral as sampling
+from tests.support.sources import (
+    FALSE_ALARM,
+    TablePrior,
+    distribution,
+    every_plan,
+    fits,
+    in_world_distribution,
+    p_value,
+    plan_number,
+    random_world,
+    refuses,
+    seeded,
+)
+
+A = 3
+METHODS = ("ancestral", "tree", "auto")
+RANDOM_PLANS = torch.randint(A, (50, 3), generator=seeded(0)) * torch.randint(2, (50, 3), generator=seeded(1))
+PRIORS = {
+    "table": TablePrior.random(A, 4),
+    "uniform": UniformPrior(A),
+    "markov": MarkovPrior(A, 2).fit(RANDOM_PLANS),
+    "gru": GRUPrior(A, hidden_size=8, window=2).eval(),
+    "transformer": TransformerPrior(A, width=8, num_heads=2, window=2).eval(),
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", PRIORS)
+def test_samples_fit_log_prob(method, kind):
+    plans = PRIORS[kind].sample(60_000, 4, generator=seeded(0), method=method)
+    assert plans.shape == (60_000, 4)
+    assert plans.dtype == torch.uint8
+    assert fits(plans, distribution(PRIORS[kind], 4), A)
+
+
+@pytest.mark.parametrize(("method", "num"), [("auto", 700), ("ancestral", 40), ("tree", 40)])
+def test_small_samples_fit_too(method, num):
+    """700 plans: "auto" shares the first actions and draws the rest plan by plan."""
+    prior, generator = TablePrior.random(A, 5, seed=1), seeded(0)
+    plans = torch.cat([sample(prior, num, 5, generator=generator, method=method) for _ in range(70_000 // num // 2)])
+    assert fits(plans, distribution(prior, 5), A)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_order_is_random(method):
+    """Halves have the distribution of the whole, and neighbours are independent."""
+    prior = TablePrior.random(A, 4)
+    probs = distribution(prior, 4)
+    plans = sample(prior, 80_000, 4, generator=seeded(1), method=method)
+    assert fits(plans[:40_000], probs, A)
+    assert fits(plans[40_000:], probs, A)
+    number = plan_number(plans[:, :2], A).view(-1, 2)
+    first = probs.view(9, 9).sum(1)
+    assert p_value(number[:, 0] * 9 + number[:, 1], torch.outer(first, first).flatten()) > FALSE_ALARM
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("temperature", [0.3, 2.5])
+def test_temperature(method, temperature):
+    prior = PRIORS["table"]
+    plans = sample(prior, 60_000, 4, temperature=temperature, generator=seeded(2), method=method)
+    assert fits(plans, distribution(prior, 4, temperature=temperature), A)
+    assert not fits(plans, distribution(prior, 4), A)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("temperature", [1e-3, 1e-40])
+def test_a_low_temperature_takes_the_most_probable(method, temperature):
+    prior = TablePrior([torch.tensor([[[-300.0, -1.0, -2.0]]])])
+    plans = sample(prior, 1000, 1, temperature=temperature, generator=seeded(0), method=method)
+    assert plans.unique().tolist() == [1]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("never", [[0], [1], [2], [0, 1], [0, 2], [1, 2]])
+def test_impossible_actions_are_never_drawn(method, never):
+    prior = TablePrior.random(A, 3, seed=4)
+    for logits in prior.logits:
+        logits[..., never] = -torch.inf
+    plans = sample(prior, 100_000, 3, generator=seeded(5), method=method)
+    assert not set(plans.unique().tolist()) & set(never)
+    if len(never) == 1:
+        assert fits(plans, distribution(prior, 3).nan_to_num(0), A)
+
+
+@pytest.mark.parametrize("never", [[0], [2], [0, 1], [1, 2]])
+@pytest.mark.parametrize("uniform", [0.0, 1 - 2**-24])
+def test_nor_at_the_ends_of_the_uniform_distribution(never, uniform, monkeypatch):
+    """Where `torch.rand` gives its smallest or largest number."""
+    prior = TablePrior.random(A, 3, seed=4)
+    for logits in prior.logits:
+        logits[..., never] = -torch.inf
+    monkeypatch.setattr(torch, "rand", lambda size, dtype=None, **_: torch.full(size, uniform, dtype=dtype))
+    plans = sample(prior, 100, 3, generator=seeded(5), method="ancestral")
+    assert not set(plans.unique().tolist()) & set(never)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("num", [60_000, 90])
+def test_each_plan_has_the_distribution_of_its_context(method, num):
+    """In any order of the contexts, one of them seen rarely, one never."""
+    prior, generator = TablePrior.random(A, 3, num_contexts=4, seed=2), seeded(3)
+    context = torch.tensor([0, 2, 2, 0, 2, 3] * (num // 6))
+    context = context[torch.randperm(num, generator=generator)]
+    rounds = 60_000 // num
+    plans = torch.stack([sample(prior, num, 3, context, generator=generator, method=method) for _ in range(rounds)])
+    for c in (0, 2, 3):
+        here, probs = plans[:, context == c].flatten(0, 1), distribution(prior, 3, torch.tensor(c))
+        assert fits(here, probs, A)
+        assert fits(here[: len(here) // 2], probs, A)
+
+
+@pytest.mark.parametrize("kind", ["markov", "gru"])
+@pytest.mark.parametrize("per", ["plan", "step"])
+@pytest.mark.parametrize("features", [False, True])
+def test_contexts_seen_beforehand(kind, per, features):
+    if features and kind == "markov":
+        kind = "transformer"
+    generator = seeded(0)
+    table = torch.tensor([[0, 1, 1], [2, 0, 1]]) if per == "step" else torch.tensor([0, 2])
+    if features:
+        table = torch.nn.functional.one_hot(table, 3).float()
+    arguments = {"context_size": 3} if features else {"num_contexts": 3}
+    if kind == "markov":
+        seen = torch.randint(3, (90, 3) if per == "step" else (90,), generator=generator)
+        prior = MarkovPrior(A, 1, **arguments).fit(
+            Plans(torch.randint(A, (90, 3), generator=generator), A, context=seen)
+        )
+    else:
+        size = {"hidden_size": 8} if kind == "gru" else {"width": 8, "num_heads": 2}
+        prior = {"gru": GRUPrior, "transformer": TransformerPrior}[kind](A, **size, **arguments, window=1).eval()
+        with torch.no_grad():
+            prior.head.weight.mul_(5)
+            if not features:
+                prior.embedding.index.weight.mul_(30)  # contexts begin alike
+    which = torch.randint(2, (60_000,), generator=generator)
+    plans = prior.sample(60_000, 3, table[which], generator=generator)
+    for row in range(2):
+        assert fits(plans[which == row], distribution(prior, 3, table[row]), A)
+        assert not fits(plans[which == row], distribution(prior, 3, table[1 - row]), A)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("size", [(0, 4), (5, 0), (0, 0), (1, 1), (1, 4)])
+@pytest.mark.parametrize("contexts", [None, 2])
+def test_sizes(method, size, contexts):
+    context = None if contexts is None else torch.arange(size[0]) % 2
+    plans = sample(TablePrior.random(A, 4, contexts), *size, context, generator=seeded(0), method=method)
+    assert plans.shape == size
+    assert plans.dtype == torch.uint8
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("contexts", [None, 2])
+def test_same_seed_same_plans(method, contexts):
+    prior, context = TablePrior.random(A, 4, contexts), None if contexts is None else torch.arange(3000) % 2
+    drawn = []
+    for seed in (7, 7, 8):
+        torch.manual_seed(len(drawn))
+        before = torch.get_rng_state()
+        drawn.append(sample(prior, 3000, 4, context, generator=seeded(seed), method=method))
+        assert torch.equal(before, torch.get_rng_state())
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    fresh = [sample(prior, 3000, 4, context, method=method) for _ in range(2)]
+    assert not torch.equal(*fresh)
+
+
+@pytest.mark.parametrize("method", ["ancestral", "auto"])
+def test_batches_bound_memory_and_change_nothing_else(method):
+    prior, largest = TablePrior.random(A, 6), []
+    step = prior.step
+
+    def watched(action, state, context=None):
+        largest.append(len(action))
+        return step(action, state, context)
+
+    prior.step = watched
+    plans = sample(prior, 20_000, 6, generator=seeded(0), method=method, batch_size=999)
+    assert max(largest) <= (999 if method == "ancestral" else 20_000 // 8)
+    assert fits(plans, distribution(TablePrior.random(A, 6), 6), A)
+
+
+@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
+def test_plans_drawn_together_in_parts_are_the_same(kind, monkeypatch):
+    prior = kind(3, lags=2)
+
+    def draws():
+        return sample(prior, 50, 6, generator=seeded(0), method="ancestral")
+
+    whole = draws()
+    monkeypatch.setattr(sampling, "CACHED", 1)
+    monkeypatch.setattr(sampling, "FEWEST", 7)
+    assert torch.equal(draws(), whole)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_start_and_step_are_enough(method):
+    """Of a prior that is no `Prior`."""
+
+    class Plain:
+        num_actions, context_per, end, device = 3, None, None, torch.device("cpu")
+
+        def start(self, batch_size, context=None):
+            return torch.zeros(batch_size, 3), torch.zeros(batch_size, 1)
+
+        def step(self, action, state, context=None):
+            return torch.eye(3)[action].log(), state
+
+        def check_context_of(self, plans, num_plans=0, length=0):
+            pass
+
+    plans = sample(Plain(), 40, 4, generator=seeded(0), method=method)
+    assert (plans == plans[:, :1]).all()
+    assert len(plans[:, 0].unique()) == 3
+
+
+def test_a_tree_evaluates_each_prefix_once():
+    prior, seen = UniformPrior(A), []
+    step = prior.step
+    prior.step = lambda action, state, context=None: seen.append(len(action)) or step(action, state, context)
+    sample(prior, 1_000_000, 4, generator=seeded(0))
+    assert seen == [3, 9, 27]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    num=st.integers(-3, 4),
+    length=st.integers(-3, 4),
+    temperature=st.sampled_from([1.0, 0.0, -1.0, float("nan"), float("inf")]),
+    method=st.sampled_from([*METHODS, "beam", None]),
+    context=st.sampled_from([None, torch.zeros(5).long(), torch.zeros(4, 1).long()]),
+)
+def test_refuses(num, length, temperature, method, context):
+    prior = TablePrior.random(A, 4, None if context is None else 2)
+    bad = num < 0 or length < 0 or temperature != 1 or method not in METHODS or context is not None
+    if context is not None and num == 4 and context.dim() == 2 and length in (0, 1):
+        return
+    if bad:
+        with refuses():
+            sample(prior, num, length, context, temperature=temperature, method=method)
+    else:
+        assert sample(prior, num, length, method=method).shape == (num, length)
+
+
+def world_prior(per):
+    if per is None:
+        return PRIORS["markov"]
+    generator = seeded(11)
+    seen = torch.randint(6, (80, 4) if per == "step" else (80,), generator=generator)
+    return MarkovPrior(A, 1, num_contexts=6, smoothing=0.5).fit(
+        Plans(torch.randint(A, (80, 4), generator=generator), A, context=seen)
+    )
+
+
+@pytest.mark.parametrize("per", [None, "plan", "step"])
+@pytest.mark.parametrize("legal", [False, True])
+def test_in_world(per, legal):
+    world, prior, starts = random_world(3, "WSA", legal=legal), world_prior(per), torch.tensor([4, 9])
+    plans, rollout = sample_in_world(prior, world, starts, 30_000, 3, temperature=0.8, generator=seeded(0))
+    assert plans.shape == (2, 30_000, 3)
+    assert plans.dtype == torch.uint8
+    want = world.rollout(starts, plans)
+    assert torch.equal(rollout.final_state, want.final_state)
+    assert torch.equal(rollout.rewards, want.rewards)
+    for i in range(2):
+        probs = in_world_distribution(prior, world, int(starts[i]), 3, temperature=0.8)
+        assert (probs == 0).any() == legal
+        assert fits(plans[i], probs, A)
+        assert fits(plans[i, :10_000], probs, A)  # in random order, though they grew on one tree
+
+
+class CountingSteps(TabularWorld):
+    """Counts the steps that are taken in it."""
+
+    taken = 0
+
+    def step(self, state, action, generator=None):
+        self.taken += len(state)
+        return super().step(state, action, generator)
+
+
+@pytest.mark.parametrize("chance", [False, True])
+@pytest.mark.parametrize(("num_plans", "steps"), [(20_000, 2 * (3 + 9 + 27)), (17, 2 * (3 + 17 + 17))])
+def test_in_world_plans_that_begin_alike_are_tried_once(chance, num_plans, steps):
+    """With few plans only the first step is shared; where chance decides, none is."""
+    known = random_world(3)
+    world = CountingSteps(known.next_state, known.reward)
+    world.stochastic = chance
+    states = torch.tensor([4, 9])
+    plans, rollout = sample_in_world(
+        UniformPrior(A), world, states, num_plans, 3, generator=seeded(0), keep_states=True
+    )
+    assert world.taken == (2 * num_plans * 3 if chance else steps)
+    want = known.rollout(states, plans, keep_states=True)
+    for found, wanted in zip(rollout, want, strict=True):
+        assert torch.equal(found, wanted)
+
+
+def test_in_world_same_seed_and_sizes():
+    world, prior = random_world(3, legal=True), world_prior("step")
+    drawn = [sample_in_world(prior, world, torch.tensor([4, 9]), 500, 3, generator=seeded(s))[0] for s in (1, 1, 2)]
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+    for batch, num_plans, length in ((0, 3, 2), (2, 0, 2), (2, 3, 0)):
+        plans, rollout = sample_in_world(prior, world, torch.zeros(batch).long(), num_plans, length)
+        assert plans.shape == rollout.rewards.shape == (batch, num_plans, length)
+        assert rollout.final_state.shape == (batch, num_plans)
+        assert plans.dtype == torch.uint8
+
+
+class Line(World):
+    """States are points on a line, `[N, 1]` floating point, observed as features."""
+
+    num_actions = 2
+
+    def reset(self, batch_size, generator=None):
+        return torch.zeros(batch_size, 1)
+
+    def step(self, state, action, generator=None):
+        after = state + 2.0 * action[:, None] - 1
+        return after, after[:, 0]
+
+
+def test_in_a_world_of_features():
+    prior = GRUPrior(2, hidden_size=8, context_size=1).eval()
+    start = torch.tensor([[0.0], [3.0]])
+    plans, rollout = sample_in_world(prior, Line(), start, 20_000, 3, generator=seeded(0))
+    want = Line().rollout(start, plans)
+    assert torch.equal(rollout.final_state, want.final_state)
+    assert rollout.final_state.shape == (2, 20_000, 1)
+    assert torch.equal(rollout.rewards, want.rewards)
+    every = every_plan(2, 3)
+    for i in range(2):
+        before = torch.cat([torch.zeros(8, 1), (2.0 * every[:, :2] - 1).cumsum(1)], 1) + start[i]
+        with torch.no_grad():
+            probs = prior.log_prob(every, before[..., None]).exp()
+        assert fits(plans[i], probs, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"prior": UniformPrior(4)}, "4 actions"),
+        ({"num_plans": -1}, "-1"),
+        ({"length": -1}, "-1"),
+        ({"temperature": 0.0}, "temperature"),
+        ({"state": torch.tensor([12])}, "12"),
+        ({"state": torch.tensor([0.0])}, "float32"),
+    ],
+)
+def test_in_world_refuses(change, word):
+    arguments = {"prior": UniformPrior(3), "state": torch.tensor([0]), "num_plans": 2, "length": 2}
+    with refuses(word):
+        sample_in_world(world=random_world(0), **(arguments | change))

@@ -1,0 +1,383 @@
+"""The conformance suites: every prior and world of the library passes, and broken ones fail with a message."""
+
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuroprior import (
+    ContextTreePrior,
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    Prior,
+    TabularWorld,
+    TransformerPrior,
+    UniformPrior,
+    World,
+    cube,
+    egocentric,
+    four_rooms,
+    from_gymnasium,
+    gridworld,
+    maze,
+)
+from neuroprior.testing import check_prior, check_world
+from neuroprior.testing.chi_square import alike, chi_square
+from neuroprior.worlds import Rollout
+from tests.support.sources import chance_world
+
+
+def random_plans(num_actions: int, context: Tensor | None = None, length: int = 5) -> Plans:
+    generator = torch.Generator().manual_seed(3)
+    return Plans(torch.randint(num_actions, (60, length), generator=generator), num_actions, context=context)
+
+
+def index_context(*shape: int) -> Tensor:
+    return torch.randint(3, shape, generator=torch.Generator().manual_seed(4))
+
+
+PRIORS = {
+    "uniform": lambda: UniformPrior(4),
+    "uniform, one action": lambda: UniformPrior(1),
+    "uniform, 300 actions": lambda: UniformPrior(300),
+    "markov-0": lambda: MarkovPrior(4, 0).fit(random_plans(4)),
+    "markov-2": lambda: MarkovPrior(4, 2).fit(random_plans(4)),
+    "markov-3, lower": lambda: MarkovPrior(3, 3, initial="lower").fit(random_plans(3)),
+    "markov-2 untrained": lambda: MarkovPrior(4, 2),
+    "markov-2, context a plan": lambda: MarkovPrior(3, 2, num_contexts=4).fit(random_plans(3, index_context(60))),
+    "markov-2, context a step": lambda: MarkovPrior(3, 2, num_contexts=4).fit(random_plans(3, index_context(60, 5))),
+    "markov-3, witten-bell": lambda: MarkovPrior(4, 3, backoff="witten-bell").fit(random_plans(4)),
+    "markov-3, dirichlet, context a step": lambda: MarkovPrior(
+        3, 3, num_contexts=4, backoff="dirichlet", initial="lower"
+    ).fit(random_plans(3, index_context(60, 5))),
+    "context tree untrained": lambda: ContextTreePrior(4),
+    "context tree": lambda: ContextTreePrior(4, 3).fit(random_plans(4)),
+    "context tree, one action": lambda: ContextTreePrior(1, 2).fit(random_plans(1)),
+    "context tree, 300 actions": lambda: ContextTreePrior(300, 4).fit(random_plans(300)),
+    "context tree, context a plan": lambda: ContextTreePrior(3, num_contexts=4).fit(random_plans(3, index_context(60))),
+    "context tree, context a step": lambda: ContextTreePrior(3, 0, num_contexts=4).fit(
+        random_plans(3, index_context(60, 5))
+    ),
+    "gru untrained": lambda: GRUPrior(4),
+    "gru": lambda: GRUPrior(4).fit(random_plans(4, length=3), progress=False, max_steps=20),
+    "gru, two layers, index": lambda: GRUPrior(3, 16, 2, window=2, num_contexts=3),
+    "gru, features": lambda: GRUPrior(3, 16, window=1, context_size=2),
+    "transformer untrained": lambda: TransformerPrior(4),
+    "transformer": lambda: TransformerPrior(4).fit(random_plans(4, length=3), progress=False, max_steps=20),
+    "transformer, no window": lambda: TransformerPrior(3, 16, window=0),
+    "transformer, index": lambda: TransformerPrior(3, 16, window=2, num_contexts=3),
+    "transformer, features": lambda: TransformerPrior(3, 16, window=2, context_size=2),
+}
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_every_prior_conforms(name: str) -> None:
+    check_prior(PRIORS[name]())
+
+
+def legal_world() -> TabularWorld:
+    legal = torch.tensor([[True, True], [True, False], [False, True]])
+    return TabularWorld(torch.tensor([[1, 2], [0, 0], [2, 0]]), torch.rand(2, 3, 2), legal)
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        gridworld(5, 4, "wall", num_worlds=3),
+        gridworld(20, 20, "torus"),
+        gridworld(1, 1),
+        legal_world(),
+        cube(),
+        cube("quarter", scramble=3),
+        chance_world(0),
+        maze(7, 9, num_layouts=3, num_worlds=2),
+        four_rooms(egocentric=True, view=2, reward="goal"),
+        egocentric(gridworld(5, 5, "torus")),
+        from_gymnasium("Taxi-v4"),
+        from_gymnasium("FrozenLake-v1", starts="any"),
+        from_gymnasium("CartPole-v1", seeds=range(3)),
+    ],
+    ids=[
+        "walls",
+        "torus",
+        "one cell",
+        "legal",
+        "cube",
+        "cube, quarter turns",
+        "chance",
+        "maze",
+        "four rooms",
+        "egocentric",
+        "taxi",
+        "ice",
+        "cart and pole",
+    ],
+)
+def test_every_world_conforms(world: World) -> None:
+    check_world(world)
+
+
+class Broken(MarkovPrior):
+    """A right prior, to be broken in one place."""
+
+    def __init__(self, num_actions: int = 3, order: int = 2, **settings: object) -> None:
+        super().__init__(num_actions, order)
+        self.fit(random_plans(num_actions))
+
+
+class WrongStep(Broken):
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().step(action, state)
+        return logits.roll(1, -1), state
+
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        return torch.zeros(*plans.shape, self.num_actions)
+
+
+class WrongAdvance(Broken):
+    def advance(
+        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        logits, state = self.step(action, state, context)
+        return logits.roll(1, -1) if room else logits, state
+
+
+class HiddenMemory(Broken):
+    """Keeps what it knows of a row in itself, so that reordering the state does not reorder it."""
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = super().step(action, state)
+        return logits + torch.arange(len(action))[:, None] * torch.arange(self.num_actions) / 10, state
+
+
+class Unnormalised(Broken):
+    def log_prob(self, plans: Tensor, context: Tensor | None = None, lengths: Tensor | None = None) -> Tensor:
+        return super().log_prob(plans, context, lengths) + 0.1
+
+
+class WrongSamples(Broken):
+    """Says one distribution in `log_prob` and samples from another."""
+
+    def log_prob(self, plans: Tensor, context: Tensor | None = None, lengths: Tensor | None = None) -> Tensor:
+        return super().log_prob((plans.long() + 1) % self.num_actions)
+
+
+class GlobalRandomness(Broken):
+    def sample(self, num_plans: int, length: int, *args: object, **settings: object) -> Tensor:
+        return torch.randint(self.num_actions, (num_plans, length))
+
+
+class Forgetful(Broken):
+    """Saves too little to be made again."""
+
+    def __init__(self, num_actions: int = 3, bonus: float = 0.0, **settings: object) -> None:
+        super().__init__(num_actions)
+        self.log_probs[:, 0] += bonus
+        self.log_probs.sub_(self.log_probs.logsumexp(1, keepdim=True))
+
+    def state_dict(self, *args: object, **settings: object) -> dict[str, Tensor]:
+        return {}
+
+    def load_state_dict(self, *args: object, **settings: object) -> None:
+        pass
+
+
+class Unsavable(Broken):
+    """Its `config` is not what its constructor takes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (WrongStep, "stepping differs from forward"),
+        (WrongAdvance, "advance differs from step"),
+        (HiddenMemory, "stepping differs from forward|reordering the state"),
+        (Unnormalised, "sum to 1.1"),
+        (WrongSamples, "do not fit log_prob"),
+        (GlobalRandomness, "same seed gave other plans|global generator"),
+        (partial(Forgetful, bonus=1.0), "saved, loaded"),
+        (Unsavable, "cannot be saved and loaded"),
+    ],
+)
+def test_a_broken_prior_fails_with_a_message(broken: Callable[[], Prior], message: str) -> None:
+    with pytest.raises(AssertionError, match=message):
+        check_prior(broken())
+
+
+class Line(World):
+    """A right world without a table: a point on a line, to be broken in one place."""
+
+    num_actions = 2
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        return torch.rand(batch_size, 1, generator=generator)
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        after = state + (2.0 * action[:, None] - 1)
+        return after, -after[:, 0].abs()
+
+
+class Noisy(Line):
+    """With chance, which is allowed."""
+
+    stochastic = True
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        after, reward = super().step(state, action)
+        return after + torch.randn(after.shape, generator=generator), reward
+
+
+class InPlace(Line):
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        state += 2.0 * action[:, None] - 1
+        return state, -state[:, 0].abs()
+
+
+class IntegerReward(Line):
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        return state, action
+
+
+class MixedBatch(Line):
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        after, reward = super().step(state, action)
+        return after - after.mean(), reward
+
+
+class Careless(Line):
+    def rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None) -> Rollout:
+        total = (2.0 * plans - 1).cumsum(-1)
+        return Rollout(state[:, None] + total.sum(-1, keepdim=True), -(state[:, None] + total).abs())
+
+
+class Unchecked(Line):
+    def rollout(self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None) -> Rollout:
+        places = state[:, None] + (2.0 * plans - 1).cumsum(-1)
+        final = places[..., -1:] if plans.shape[-1] else state[:, None].expand(-1, plans.shape[1], -1)
+        return Rollout(final, -places.abs())
+
+
+class Unannounced(Noisy):
+    stochastic = False
+
+
+class Calm(Noisy):
+    """Chance in its rollouts is less than in its steps."""
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        final, rewards, states = super().rollout(state, plans, generator, keep_states)
+        return Rollout(final, 0.9 * rewards, states)
+
+
+class Lucky(TabularWorld):
+    """Each plan meets its own chance."""
+
+    def __init__(self) -> None:
+        world = chance_world(0)
+        super().__init__(world.next_state, world.reward, probability=world.probability)
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        return World.rollout(self, state, plans, generator, keep_states)
+
+
+class Biased(Lucky):
+    """In its rollouts an action that fails is tried again, one time in two."""
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        worse, better = (TabularWorld.rollout(self, state, plans, generator, keep_states) for _ in range(2))
+        again = torch.rand(len(state), generator=generator) < 0.5
+        pick = again[:, None] & (better.rewards[..., -1:] > worse.rewards[..., -1:]).any(-1)
+        final = torch.where(pick, better.final_state, worse.final_state)
+        return Rollout(final, torch.where(pick[..., None], better.rewards, worse.rewards))
+
+
+class Stuck(Line):
+    all_legal = False
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        return torch.zeros(len(state), 2, dtype=torch.bool)
+
+
+class Unsaid(Line):
+    def legal_actions(self, state: Tensor) -> Tensor:
+        return torch.tensor([True, False]).expand(len(state), 2)
+
+
+@pytest.mark.parametrize("world", [Line, Noisy])
+def test_worlds_of_ones_own_conform(world: type[World]) -> None:
+    check_world(world())
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (InPlace, "changed the state"),
+        (IntegerReward, "reward of torch.int64"),
+        (MixedBatch, "depends on its batch"),
+        (Careless, "rollout ends in other states"),
+        (Unchecked, "must raise ValueError"),
+        (Unannounced, "`stochastic` is False"),
+        (Calm, "rewards of rollout do not fit"),
+        (Lucky, "different chance"),
+        (Biased, "do not fit those of steps"),
+        (Stuck, "without any legal action"),
+        (Unsaid, "all_legal is True"),
+    ],
+)
+def test_a_broken_world_fails_with_a_message(broken: type[World], message: str) -> None:
+    with pytest.raises(AssertionError, match=message):
+        check_world(broken())
+
+
+def test_chi_square_is_scipys() -> None:
+    from scipy import stats
+
+    expected = torch.tensor([50.0, 30.0, 20.0, 100.0])
+    counts = torch.tensor([60.0, 25.0, 15.0, 100.0])
+    assert chi_square(counts, expected) == pytest.approx(stats.chisquare(counts, expected).pvalue)
+    # Two cells below five are taken together: 3 + 4 expected.
+    pooled = stats.chisquare([5.0, 60.0, 42.0], [7.0, 60.0, 40.0]).pvalue
+    assert chi_square(torch.tensor([1.0, 4, 60, 42]), torch.tensor([3.0, 4, 60, 40])) == pytest.approx(pooled)
+
+
+def test_alike_is_scipys_test_of_each_group() -> None:
+    from scipy import stats
+
+    generator = torch.Generator().manual_seed(0)
+    group = torch.arange(3).repeat_interleave(1000)
+    weights = torch.tensor([[5.0, 3, 2], [1, 1, 8], [0, 1, 0]])  # each number's middle rank is in a bin of its own
+    first, second = (weights[group].multinomial(1, generator=generator)[:, 0] for _ in range(2))
+    statistic = 0.0
+    for g in range(2):
+        table = torch.stack([part[group == g].bincount(minlength=3) for part in (first, second)])
+        statistic += stats.chi2_contingency(table, correction=False).statistic
+    assert alike(first, second, group) == pytest.approx(stats.chi2.sf(statistic, 4))
+    assert alike(first, torch.where(group == 2, 0, second), group) < 1e-50
+    assert alike(first[group == 2], first[group == 2], group[group == 2] - 2) == 1.0
+
+
+@pytest.mark.parametrize("continuous", [True, False])
+def test_alike_raises_false_alarms_as_often_as_it_says(continuous: bool) -> None:
+    from scipy import stats
+
+    generator = torch.Generator().manual_seed(1)
+    group = torch.arange(5).repeat_interleave(100)
+    p = []
+    for _ in range(300):
+        draws = torch.rand(2, 500, generator=generator)
+        draws = draws if continuous else (draws**3 * 6).floor()
+        p.append(alike(draws[0], draws[1], group))
+    assert stats.kstest(p, "uniform", alternative="greater").pvalue > 1e-6  # small p-values are no more frequent
+    assert sum(p) / 300 < 0.62  # and it is not blind

@@ -1,0 +1,154 @@
+"""Training in windows: what each batch holds, memory carried over, and priors that read on as they were trained."""
+
+import math
+
+import pytest
+import torch
+
+from neuroprior import GRUPrior, Plans, TransformerPrior
+from neuroprior.training import PlansModule, Settings, bits
+from neuroprior.training.batches import MOST_VALIDATION, Walk, Windows
+from tests.support.sources import refuses, seeded
+
+SMALL = [GRUPrior(3, 8, lags=4, seed=1), GRUPrior(3, 8, num_layers=2, lags=1), TransformerPrior(3, 16, lags=3, seed=1)]
+
+
+def long_plans(num_plans: int = 5, length: int = 37) -> Plans:
+    actions = torch.randint(3, (num_plans, length), generator=seeded(0))
+    lengths = torch.randint(1, length + 1, (num_plans,), generator=seeded(1))
+    return Plans(actions, 3, lengths=lengths, context=torch.arange(length).expand(num_plans, -1))
+
+
+@pytest.mark.parametrize(("window", "batch_size"), [(4, 3), (4, 100), (7, 1), (37, 2), (50, 9)])
+def test_a_pass_reads_every_action_once_and_in_order(window, batch_size):
+    plans = long_plans()
+    windows = PlansModule(plans, plans, Settings(batch_size=batch_size, window=window), seed=3).training
+    seen = []
+    for index in Walk(windows, windows.steps, 3, (0, 1)):
+        batch = windows[index]
+        for row in range(len(batch.actions)):
+            taken = batch.weight[row] > 0
+            place = batch.context[row][taken]
+            if len(place):
+                before = int(batch.before[row]) if batch.before is not None else 3
+                seen.append((batch.actions[row][taken].tolist(), place.tolist(), before))
+    total = sorted(len(actions) for actions, _, _ in seen)
+    assert sum(total) == int(plans.lengths.sum())
+    steps = torch.zeros(5, 37, dtype=torch.long)
+    for actions, place, before in seen:
+        assert place == list(range(place[0], place[0] + len(place)))
+        found = [
+            n
+            for n in range(5)
+            if plans.actions[n, place].tolist() == actions
+            and plans.lengths[n] > place[-1]
+            and before == (3 if place[0] == 0 else int(plans.actions[n, place[0] - 1]))
+            and steps[n, place].sum() == 0
+        ]
+        assert found
+        steps[found[0], place] = 1
+    assert torch.equal(steps.bool(), plans.mask())
+
+
+@pytest.mark.parametrize("parts", [2, 3, 8])
+def test_processes_share_each_batch(parts):
+    windows = Windows(long_plans(7), 4, 3)
+    whole = list(Walk(windows, 12, 0, (0, 1)))
+    shares = [list(Walk(windows, 12, 0, (n, parts))) for n in range(parts)]
+    for step, (pieces, number, goes_on, _) in enumerate(whole):
+        mine = [share[step] for share in shares]
+        assert all((one.number, one.goes_on) == (number, goes_on) for one in mine)
+        assert sorted(torch.cat([one.pieces for one in mine if one.counts]).tolist()) == sorted(pieces.tolist())
+        assert all(float(windows[one].weight.sum()) == 0 for one in mine if not one.counts)
+        assert all(len(one.pieces) for one in mine), "a process without anything to read would keep the others waiting"
+
+
+def test_an_epoch_depends_on_its_number_and_the_seed_alone():
+    windows = Windows(long_plans(9), 4, 2)
+
+    def epoch(number: int, seed: int = 0):
+        walk = Walk(windows, 10, seed, (0, 1))
+        walk.set_epoch(number)
+        return [(step.pieces.tolist(), step.number, step.goes_on) for step in walk]
+
+    assert epoch(3) == epoch(3) != epoch(4)
+    assert epoch(3) != epoch(3, seed=1)
+    assert not epoch(3)[0][2], "an epoch begins without memory, so that it can be begun anywhere"
+
+
+@pytest.mark.parametrize("prior", SMALL)
+def test_windows_with_memory_cost_what_the_whole_costs(prior):
+    prior.carry_over(40)
+    plans = long_plans()
+    lengths = torch.tensor([37, 33, 29, 36, 30])
+    windows = Windows(Plans(plans.actions, 3, lengths=lengths), 5, 100, least_windows=8)
+    assert windows.windows == 8, "pieces as long as the longest plan, so that memory goes all the way"
+    total, memory = 0.0, None
+    for index in Walk(windows, None, None, (0, 1)):
+        cost, _, memory = bits(prior, windows[index], memory)
+        total += float(cost.detach())
+    whole = -float(prior.log_prob(plans.actions, lengths=lengths).sum().detach()) / math.log(2)
+    assert total == pytest.approx(whole, rel=1e-5)
+
+
+@pytest.mark.parametrize("prior", SMALL)
+def test_stepping_equals_forward_far_past_the_window(prior):
+    prior.carry_over(5)
+    plans = torch.randint(3, (4, 40), generator=seeded(2))
+    logits, state = prior.start(4)
+    stepped = [logits]
+    for t in range(39):
+        logits, state = prior.step(plans[:, t], state)
+        stepped.append(logits)
+    assert torch.allclose(torch.stack(stepped, 1), prior(plans), atol=1e-5)
+    if isinstance(prior, TransformerPrior):
+        far = plans.clone()
+        far[:, :10] = (far[:, :10] + 1) % 3
+        # two layers of span 5 and three lags see no further than 13 inputs back
+        assert torch.allclose(prior(far)[:, 25:], prior(plans)[:, 25:], atol=1e-6)
+
+
+def test_memory_is_learned_to_be_used():
+    """A plan's bit comes again every fourth action; at the beginning of a window memory alone can tell it."""
+    bit = torch.randint(2, (400, 1), generator=seeded(0))
+    actions = torch.where(torch.arange(24) % 4 == 0, bit, 2)
+    prior = GRUPrior(3, 16, lags=1).fit(
+        Plans(actions, 3), window=12, batch_size=100, max_steps=300, progress=False, learning_rate=0.01
+    )
+    assert prior.window is None
+    again = prior.action_log_probs(Plans(actions, 3))[:, 12].detach()
+    assert float(again.mean()) > -0.1
+
+
+def test_a_window_of_its_own_does_not_go_with_long_plans():
+    with refuses("window"):
+        GRUPrior(3, 8, window=4).fit(torch.randint(3, (9, 30), generator=seeded(0)), window=10, progress=False)
+
+
+def test_validation_looks_at_no_more_than_it_must():
+    actions = torch.randint(2, (3, MOST_VALIDATION), generator=seeded(0))
+    data = PlansModule(Plans(actions[:, :9], 2), Plans(actions, 2), Settings(), 0)
+    assert len(data.validation.plans) == 1
+    # one long plan does not crowd out the short ones, and those without actions are left aside
+    lengths = torch.cat([torch.tensor([30_000]), torch.full((2000,), 10), torch.zeros(50, dtype=torch.long)])
+    many = Plans(torch.randint(2, (2051, 30_000), generator=seeded(1), dtype=torch.uint8), 2, lengths=lengths)
+    assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 2001
+
+
+@pytest.mark.parametrize(("num_plans", "length"), [(1, 10_000), (20, 1000), (100, 1000), (1, 100_000)])
+def test_memory_is_carried_by_default(num_plans, length):
+    plans = Plans(torch.randint(3, (num_plans, length), generator=seeded(0)), 3)
+    data = PlansModule(plans, plans, Settings(), 0)
+    for windows in (data.training, data.validation):
+        longest = -(-length // 128)
+        assert windows.windows >= min(8, longest)
+        share = sum(step.goes_on for step in Walk(windows, None, None, (0, 1))) / windows.steps
+        assert share >= 0.8
+
+
+def test_few_plans_are_looked_at_often():
+    plans = Plans(torch.randint(3, (200, 20), generator=seeded(0)), 3)
+    data = PlansModule(plans, plans, Settings(), 0)
+    assert (data.steps, data.epochs) == (10, 100)
+    data = PlansModule(plans, plans, Settings(check_every=40, max_steps=100), 0)
+    assert (data.steps, data.epochs) == (34, 3)

@@ -1,0 +1,178 @@
+"""Toy texts as tables, against the environments themselves; start states, ends; what is refused."""
+
+import subprocess
+import sys
+
+import gymnasium
+import pytest
+import torch
+
+from neuroprior import EpisodicWorld, from_gymnasium, oracle
+from neuroprior.testing import check_world
+from tests.support.environments import Corridor
+from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
+
+TOYS = {
+    "Taxi-v4": (501, 6, "south"),
+    "CliffWalking-v1": (48, 4, "up"),
+    "FrozenLake-v1": (16, 4, "left"),
+}
+
+
+def toy(name, **options):
+    if name == "FrozenLake-v1":
+        options = {"is_slippery": False, **options}
+    return gymnasium.make(name, **options).unwrapped, from_gymnasium(name, **options)
+
+
+@pytest.mark.parametrize("name", TOYS)
+def test_the_table_does_what_the_environment_does(name):
+    env, world = toy(name)
+    states, actions, first = TOYS[name]
+    assert isinstance(world, EpisodicWorld)
+    assert (world.num_states, world.num_actions, world.action_names[0]) == (states, actions, first)
+    assert not world.stochastic
+    env.action_space.seed(0)
+    state, ends = env.reset(seed=0)[0], 0
+    for _ in range(5000):
+        action = int(env.action_space.sample())
+        seen, reward, terminated, _, _ = env.step(action)
+        after, gained = world.step(torch.tensor([state]), torch.tensor([action]))
+        assert float(gained) == pytest.approx(reward)
+        assert bool(world.ended[after]) == terminated
+        if not terminated:
+            assert int(after) == seen
+        ends += terminated
+        state = env.reset()[0] if terminated else seen
+    assert ends > 0 or name == "CliffWalking-v1"
+
+
+@pytest.mark.parametrize("options", [{}, {"map_name": "8x8"}, {"success_rate": 0.8}])
+def test_slippery_ice_has_the_probabilities_of_the_environment(options):
+    env, world = toy("FrozenLake-v1", is_slippery=True, **options)
+    assert world.stochastic
+    over = {s for row in env.P.values() for outcomes in row.values() for _, s, _, end in outcomes if end}
+    assert over == set(world.ended.nonzero()[:, 0].tolist())
+    for state, row in env.P.items():
+        for action, outcomes in row.items():
+            due, found = {}, {}
+            for probability, after, reward, _ in outcomes:
+                due[after, float(reward)] = due.get((after, float(reward)), 0) + probability
+            for k, probability in enumerate(world.probability[state, action].tolist()):
+                key = int(world.next_state[state, action, k]), float(world.reward[0, state, action, k])
+                found[key] = found.get(key, 0) + probability
+            assert {key: p for key, p in found.items() if p > 0} == pytest.approx(due)
+
+
+def test_a_rainy_taxi_slips():
+    env, world = toy("Taxi-v4", is_rainy=True)
+    assert world.stochastic
+    state, action = env.encode(2, 2, 0, 1), 1
+    expected = sum(p * s for p, s, _, _ in env.P[state][action])
+    assert float((world.probability[state, action] * world.next_state[state, action]).sum()) == pytest.approx(expected)
+
+
+def test_starts():
+    env, world = toy("CliffWalking-v1")
+    assert world.reset(5).tolist() == [36] * 5
+    env, world = toy("Taxi-v4")
+    drawn = world.reset(30_000, seeded(0))
+    assert p_value(drawn, torch.cat([torch.as_tensor(env.initial_state_distrib), torch.zeros(1)])) > FALSE_ALARM
+    anywhere = from_gymnasium("FrozenLake-v1", starts="any").reset(20_000, seeded(1))
+    live = torch.tensor([0, 1, 2, 3, 4, 6, 8, 9, 10, 13, 14])
+    assert p_value(anywhere, torch.zeros(16).index_fill(0, live, 1.0)) > FALSE_ALARM
+    with_passenger = from_gymnasium("Taxi-v4", starts="any").starts
+    # The taxi, the passenger in it or at one of three corners: not where he wants to go, where the episode ends.
+    assert int((with_passenger > 0).sum()) == 25 * 4 * 4
+
+
+def test_the_best_walk_along_the_cliff_takes_thirteen_steps():
+    world = from_gymnasium("CliffWalking-v1")
+    start = world.reset(1)
+    assert [float(oracle(world, start, length, objective="return")) for length in (12, 13, 20)] == [-12, -13, -13]
+
+
+def test_layouts_and_moving_a_world():
+    world = from_gymnasium("Taxi-v4").to("cpu")
+    assert world.num_layouts == 1
+    assert world.layout(world.reset(7)).tolist() == [0] * 7
+
+
+@pytest.mark.parametrize("name", TOYS)
+def test_tables_conform(name):
+    check_world(from_gymnasium(name))
+    check_world(from_gymnasium(name, starts="any"))
+
+
+def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():
+    """From 1 the episode may end in 2, or go on from there."""
+
+    class Both(Corridor):
+        def __init__(self):
+            self.action_space = gymnasium.spaces.Discrete(2)
+            self.observation_space = gymnasium.spaces.Discrete(3)
+            self.initial_state_distrib = [1.0, 0.0, 0.0]
+            self.P = {
+                0: {0: [(1.0, 1, 0.0, False)], 1: [(1.0, 0, 0.0, False)]},
+                1: {0: [(1.0, 2, 5.0, True)], 1: [(0.5, 2, 1.0, False), (0.5, 0, 2.0, False)]},
+                2: {0: [(1.0, 0, 0.0, False)], 1: [(1.0, 1, 3.0, False)]},
+            }
+
+    world = from_gymnasium(Both())
+    assert world.ended.tolist() == [False, False, False, True]
+    assert world.next_state[1].tolist() == [[3, 0], [2, 0]]
+    assert world.probability[1].tolist() == [[1, 0], [0.5, 0.5]]
+    assert world.reward[0, 1].tolist() == [[5, 0], [1, 2]]
+    assert world.next_state[3].tolist() == [[3, 3], [3, 3]]
+    assert world.reward[0, 3].abs().sum() == 0
+    check_world(world)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: from_gymnasium("Nope-v0"), ["Nope-v0 cannot be made", "doesn't exist"]),
+        (lambda: from_gymnasium("FrozenLake-v1", colour="red"), ["cannot be made", "colour"]),
+        (lambda: from_gymnasium("Pendulum-v1"), ["actions of the space Box", "discrete actions are expected"]),
+        (lambda: from_gymnasium(3), ["a gymnasium.Env is expected, not int"]),
+        (lambda: from_gymnasium(Corridor(), colour="red"), ["colour: options make an environment from its name"]),
+        (lambda: from_gymnasium(Corridor(), method="table"), ['method="table"', "attribute P"]),
+        (lambda: from_gymnasium("Taxi-v4", fickle_passenger=True), ["fickle_passenger"]),
+        (lambda: from_gymnasium("Taxi-v4", method="guess"), ["method:", "'guess'"]),
+        (lambda: from_gymnasium("Taxi-v4", starts="all"), ["starts:", "'all'"]),
+        (lambda: from_gymnasium("Taxi-v4", seeds=[1, 2]), ["seeds: a table read from P has one layout"]),
+        (lambda: from_gymnasium("CartPole-v1", seeds=[]), ["seeds: one or more integers"]),
+        (lambda: from_gymnasium("CartPole-v1", seed=-1), ["seeds: one or more integers", "[-1]"]),
+        (lambda: from_gymnasium("CartPole-v1", starts="any"), ['starts: "any" needs a table']),
+        (lambda: from_gymnasium("CartPole-v1", horizon=0), ["max_states and horizon: at least 1"]),
+    ],
+)
+def test_refusals(call, words):
+    with refuses(*words):
+        call()
+
+
+def test_an_episodic_world_is_checked():
+    stay, good = torch.zeros(2, 1, dtype=torch.long), torch.tensor([True, False])
+
+    def make(ended, starts=(1.0, 1.0), reward=((0.0, 0.0),)):
+        return EpisodicWorld(stay, torch.tensor(reward), None, torch.tensor(starts), ended)
+
+    assert make(ended=good).ended.tolist() == [True, False]
+    with refuses("ended: every action must stay"):
+        make(ended=~good)
+    with refuses("starts: one entry for each of 2 states is expected, not 3"):
+        make(ended=good, starts=(1.0, 1.0, 1.0))
+    with refuses("starts: probabilities are expected"):
+        make(ended=good, starts=(0.0, 0.0))
+    two = make(ended=good, reward=((0.0, 0.0), (0.0, 0.0)), starts=(0.0, 1.0))
+    assert sorted(two.reset(100, seeded(0)).unique().tolist()) == [1, 3]
+
+
+def test_gymnasium_is_imported_only_where_it_is_needed(monkeypatch):
+    code = "import sys, neuroprior, neuroprior.testing; print('gymnasium' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with refuses("pip install 'neuroprior[gym]'", error=ImportError):
+        from_gymnasium("Taxi-v4")
