@@ -5,13 +5,13 @@ export PYTHONPATH :=
 
 .PHONY: paper mice mice-planner test check bench clean
 
-paper: .venv/programs
+paper: .venv/cli
 	$(BIN)/python -m eval paper
 
-mice: .venv/programs
+mice: .venv/cli
 	$(BIN)/python -m eval plans eval/data/labyrinth/plans.jsonl --skip 1 --max-steps 400 --out runs/mice
 
-mice-planner: .venv/programs
+mice-planner: .venv/cli
 	$(BIN)/python -m eval mice --out runs/mice-planner
 
 # One thread a process: two processes of two threads each wait for one another.

@@ -79,7 +79,9 @@ class JobRun(Generic[Job, Result]):
         try:
             result: Result = self._load(self.path(job))
         except ValueError as error:
-            raise ValueError(f"{self.path(job)}: damaged; delete it, and the same command does the job again") from error
+            raise ValueError(
+                f"{self.path(job)}: damaged; delete it, and the same command does the job again"
+            ) from error
         return result
 
     def do(

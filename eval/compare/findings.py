@@ -11,7 +11,7 @@ from eval.compare.figures import Estimate, Style, key_of, styles
 from eval.compare.pairs import BEST, points, question_of, shown_plans
 from eval.compare.rows import Cells, Rows
 from eval.compare.summary import summary_table
-from neuroprior.report.page import FigureBox, Section, Table, breakable, svg
+from neuroprior.report.page import FigureBox, Section, Table, breakable
 
 INTERVALS = "Intervals: 95 %, over seeds, each with worlds and priors of its own."
 
@@ -143,7 +143,7 @@ def _gap_boxes(comparison: Comparison, question: tuple[str, bool]) -> list[Figur
     number = shown_plans(comparison.num_plans)
     caption = f"Best neural minus best Markov, of {_priors(question)}: points of the oracle with {number:,} plans."
     alt = "; ".join(f"{row['world']} {points(row['difference'], True)}" for row in rows)
-    drawn = svg(figures.gap_figure(rows, ("Markov better", "neural better")))
+    drawn = figures.gap_figure(rows, ("Markov better", "neural better"))
     return [FigureBox(drawn, f"{caption} Hollow: may be chance. {INTERVALS}", alt)]
 
 
@@ -220,7 +220,7 @@ def _gain_boxes(comparison: Comparison, rows: Rows) -> Iterator[FigureBox]:
             estimates[row["first"]] = (100 * row["difference"], low, high)
     for (sees, grown), by_world in shown.items():
         how = f"{rows[0]['what']} (sees: {sees}{', grown' * grown})".capitalize()
-        drawn = svg(figures.dots_figure(by_world, comparison.style, "points of the oracle"))
+        drawn = figures.dots_figure(by_world, comparison.style, "points of the oracle")
         yield FigureBox(drawn, f"{how}: points of the oracle with {number:,} plans. {INTERVALS}", how)
 
 

@@ -13,7 +13,7 @@ from eval.compare.rows import growth_rows
 from neuroprior._files import versions, write_csv, write_json
 from neuroprior.analysis.statistics import paired_difference
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels, short
-from neuroprior.report.page import FigureBox, Page, Section, Table, svg, write_page
+from neuroprior.report.page import FigureBox, Page, Section, Table, write_page
 from neuroprior.report.study import printed
 
 Rows = Sequence[Mapping[str, Any]]
@@ -207,7 +207,7 @@ def _box(rows: Rows, world: str) -> FigureBox:
     alt = (
         f"Share of the oracle in {world} against rounds of growth and actions in a plan; the numbers are in the tables."
     )
-    return FigureBox(svg(growth_figure(rows)), caption, alt)
+    return FigureBox((growth_figure(rows)), caption, alt)
 
 
 def _named(world: str, table: Table) -> Table:

@@ -14,7 +14,7 @@ from eval.compare.sections import plus_minus
 from neuroprior._files import versions, write_csv, write_json
 from neuroprior.analysis.statistics import paired_difference
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
-from neuroprior.report.page import FigureBox, Page, Section, Table, svg, write_page
+from neuroprior.report.page import FigureBox, Page, Section, Table, write_page
 from neuroprior.report.study import printed
 
 PLAIN = "sampling"
@@ -255,4 +255,4 @@ def _boxes(rows: Rows, cells: Cells, worlds: Sequence[str]) -> Iterator[FigureBo
         own = [row for row in rows if row["world"] == world]
         alt = f"Share of the oracle in {world} against model steps, a line a planner; the numbers are in the tables."
         caption = f"{world}: {about[world]}. Bands: 95 % bootstrap intervals over seeds."
-        yield FigureBox(svg(planner_figure(own)), caption, alt)
+        yield FigureBox((planner_figure(own)), caption, alt)

@@ -12,7 +12,7 @@ from eval.compare.findings import Comparison, pair_table, times
 from eval.compare.pairs import shown_plans
 from eval.compare.rows import Rows
 from neuroprior.report.matrix_figures import transition_figure
-from neuroprior.report.page import FigureBox, Section, Table, breakable, svg
+from neuroprior.report.page import FigureBox, Section, Table, breakable
 
 
 def worlds_section(comparison: Comparison) -> Section:
@@ -51,7 +51,7 @@ def _share_section(comparison: Comparison, grown: bool, title: str) -> Section:
         rows = [row for row in rows if bool(row["rounds"]) == grown or row["prior"] in (None, "uniform")]
         if not any(row["prior"] for row in rows):
             continue
-        drawn = svg(figures.share_figure(rows, comparison.strong(rows), comparison.style))
+        drawn = figures.share_figure(rows, comparison.strong(rows), comparison.style)
         last = [row for row in rows if row["num_plans"] == shown_plans(comparison.num_plans)]
         alt = f"{world}: " + ", ".join(f"{row['prior']} {100 * row['oracle_share']:.0f} %" for row in last)
         boxes.append(FigureBox(drawn, "" if grown else f"{world}: {about[world]}.", alt))
@@ -77,7 +77,7 @@ def efficiency_section(comparison: Comparison) -> Section | None:
     most = max(row["most"] for row in learned)
     boxes = []
     if estimates:
-        drawn = svg(figures.dots_figure(estimates, comparison.style, "candidate plans needed", most))
+        drawn = figures.dots_figure(estimates, comparison.style, "candidate plans needed", most)
         caption = "Plans needed for what random search finds with the most; arrow: more than that. Medians over seeds."
         boxes = [FigureBox(drawn, caption, "plans needed by each prior in each world")]
     text = [f"How many plans from a prior find as much as {most:,} random ones. The numbers are in the tables below."]
@@ -128,7 +128,7 @@ def growth_section(growth: Rows) -> Section | None:
         ends = {row["prior"]: row["oracle_share"] for row in rows if row["round"] == last}
         chains = [prior for prior in ends if "markov" in prior]
         strong = [prior for prior in ends if prior not in chains or prior == max(chains, key=ends.__getitem__)]
-        drawn = svg(figures.growth_figure(rows, strong, style))
+        drawn = figures.growth_figure(rows, strong, style)
         alt = f"{world}: " + ", ".join(f"{prior} {100 * share:.0f} %" for prior, share in ends.items())
         boxes.append(FigureBox(drawn, "", alt))
     number = ", ".join(f"{one:,}" for one in sorted({row["num_plans"] for row in growth}))
@@ -151,7 +151,7 @@ def bits_section(comparison: Comparison) -> Section | None:
         own = [row for row in rows if row["world"] == world and row["prior"] != "uniform"]
         if own:
             alt = f"{world}: " + ", ".join(f"{key_of(r).label} {r['bits_per_action']:.3f}" for r in own)
-            boxes.append(FigureBox(svg(figures.bits_figure(own, comparison.style)), "", alt))
+            boxes.append(FigureBox((figures.bits_figure(own, comparison.style)), "", alt))
     text = [
         "What the held-out plans of the planner that tries all short ones cost under each prior: the fewer bits, the"
         " more of their structure it holds. Hollow: sees nothing; filled, below: sees the start, or each step. The"
@@ -189,7 +189,7 @@ def plans_section(comparison: Comparison) -> Section | None:
     for cell in comparison.cells:
         for prior in (cell.get("plans") or {"paths": ()})["paths"]:
             title = f"{cell['world']}: {prior}"
-            drawn = svg(figures.plans_figure(cell["plans"], prior, comparison.style[prior][0], title))
+            drawn = figures.plans_figure(cell["plans"], prior, comparison.style[prior][0], title)
             boxes.append(FigureBox(drawn, "", f"plans of {prior} in {cell['world']}"))
     if not boxes:
         return None
@@ -215,7 +215,7 @@ def transition_section(comparison: Comparison) -> Section | None:
                 seen = (sums > 0).sum(0)
                 mean = np.divide(matrices.sum(0), seen, out=np.full(matrices.shape[1:], np.nan), where=seen > 0)
                 names = own[0]["action_names"] or [str(action) for action in range(len(mean))]
-                drawn = svg(transition_figure(mean, names, f"{world}: {prior}", small=True))
+                drawn = transition_figure(mean, names, f"{world}: {prior}", small=True)
                 boxes.append(FigureBox(drawn, "", f"transition matrix of {prior} in {world}"))
     if not boxes:
         return None

@@ -15,7 +15,7 @@ from eval.live.run import FORESIGHT, PARTS
 from eval.paper.figures import save
 from neuroprior.analysis.statistics import paired_difference
 from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
-from neuroprior.report.page import FigureBox, Section, Table, svg
+from neuroprior.report.page import FigureBox, Section, Table
 
 Place = tuple[str, str, str, str, bool]
 """World, prior, what it sees, when it learns, whether the rest of the last plan is a candidate."""
@@ -210,4 +210,4 @@ def _box(cells: Cells, cell: Mapping[str, Any]) -> FigureBox:
         " with every season. Bands: 95 % bootstrap intervals over seeds."
     )
     alt = f"Food eaten in 100 steps in {cell['world']} against time, a line a prior; the numbers are in the tables."
-    return FigureBox(svg(live_figure(cells, cell["world"])), caption, alt)
+    return FigureBox((live_figure(cells, cell["world"])), caption, alt)

@@ -10,7 +10,7 @@ from neuroprior.analysis.comparison import unit_name
 from neuroprior.report import figures as plan_figures
 from neuroprior.report import matrix_figures, statistics
 from neuroprior.report.crossval import ACTIONS, CONTEXT
-from neuroprior.report.page import FigureBox, Section, Table, svg
+from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.report.scores import Model, leading
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def transition_section(report: "Report") -> tuple[Section, Rows] | None:
     names = statistics.action_names(report.plans)
     figures = [
         FigureBox(
-            svg(matrix_figures.transition_figure(test["probs"], names)),
+            (matrix_figures.transition_figure(test["probs"], names)),
             "The probability of each action (column) after each action (row).",
             "Transition matrix.",
         )
@@ -58,7 +58,7 @@ def transition_section(report: "Report") -> tuple[Section, Rows] | None:
         significant = test["significant"] & tested
         figures.append(
             FigureBox(
-                svg(
+                (
                     matrix_figures.group_transition_figure(
                         test["group_probs"], test["probs"], names, test["groups"], significant
                     )
@@ -93,7 +93,7 @@ def motif_section(report: "Report") -> tuple[Section, Rows] | None:
         tables.append(Table(("sequence", "count", "expected", "ratio", "95 % interval", "p"), cells, caption))
         figures.append(
             FigureBox(
-                svg(plan_figures.motif_figure(own)),
+                (plan_figures.motif_figure(own)),
                 f"How many times as often as expected{merged}.",
                 "Over-represented sequences: " + "; ".join(row["sequence"] for row in own[:5]),
             )
@@ -168,7 +168,7 @@ def _likeness_figures(report: "Report", model: Model, found: Sequence[Any]) -> l
     }
     boxes = [
         FigureBox(
-            svg(matrix_figures.raster_figure(*strips, statistics.action_names(report.plans))),
+            (matrix_figures.raster_figure(*strips, statistics.action_names(report.plans))),
             f"Held-out plans, and plans sampled from {model.label}.",
             "Real and generated sequences as strips of colour.",
         )
@@ -176,7 +176,7 @@ def _likeness_figures(report: "Report", model: Model, found: Sequence[Any]) -> l
     if lengths:
         boxes.append(
             FigureBox(
-                svg(plan_figures.distribution_figure({f"{name}, actions": pair for name, pair in lengths.items()})),
+                (plan_figures.distribution_figure({f"{name}, actions": pair for name, pair in lengths.items()})),
                 "Shares of run lengths and return times; the last class holds all that are longer.",
                 "Run lengths and return times, real and generated.",
             )
@@ -223,7 +223,7 @@ def drift_section(report: "Report") -> tuple[Section, Rows] | None:
         _trends(within, plans, groups),
     ]
     box = FigureBox(
-        svg(figure),
+        (figure),
         f"95 % intervals over {unit}; of groups, over the plans of each.",
         "Bits per action by place, plan and group.",
     )

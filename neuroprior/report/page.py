@@ -72,6 +72,7 @@ class Table:
         rows: of K cells each; the first cell names its row.
         caption: what the numbers are, and what their intervals go over.
         align: K letters, "l" (left) or "r" (right, for numbers); None: the first column left, the others right.
+        title: above it in the terminal; by default that of its section.
 
     Raises:
         ValueError: a row, or `align`, does not have as many columns as there are headings.
@@ -81,6 +82,7 @@ class Table:
     rows: Sequence[Sequence[str]]
     caption: str = ""
     align: str | None = None
+    title: str = ""
 
     def __post_init__(self) -> None:
         wide = len(self.headings)
@@ -98,12 +100,12 @@ class FigureBox:
     """A figure with its words.
 
     Attributes:
-        svg: as `svg` makes it.
+        figure: made with matplotlib's settings `STYLE`.
         caption: below the figure: what is seen, in which units, and what intervals go over.
         alt: what the figure says, for readers who do not see it.
     """
 
-    svg: str
+    figure: Figure
     caption: str
     alt: str
 
@@ -219,7 +221,7 @@ def _following(tag: str) -> str:
 def _drawing(box: FigureBox, prefix: str) -> Markup:
     """The SVG of a figure under ids of its own: matplotlib numbers those of every figure alike."""
     told = Markup('<svg role="img" aria-label="{}" ').format(clean(box.alt))
-    text = _in_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), box.svg)
+    text = _in_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), svg(box.figure))
     return Markup(text.replace("<svg ", told, 1))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from neuroprior.analysis.comparison import unit_name
 from neuroprior.report import figures as plan_figures
 from neuroprior.report import statistics
-from neuroprior.report.page import FigureBox, Section, Table, svg
+from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.report.scores import leading
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def score_section(report: "Report") -> tuple[Section, Rows]:
         " which favours it a little; differences are not corrected for the number of models.",
     ]
     figure = FigureBox(
-        svg(plan_figures.score_figure(report.rows)),
+        (plan_figures.score_figure(report.rows)),
         f"Bits per held-out action, 95 % intervals over {unit}.",
         "Bits per action of each model: " + ", ".join(f"{_named(r)} {r['bits_per_action']:.3f}" for r in report.rows),
     )
@@ -110,7 +110,7 @@ def lag_section(report: "Report") -> tuple[Section, Rows] | None:
         " counted; below 0 more is lost by splitting the counts than an older action tells.",
     ]
     figure = FigureBox(
-        svg(plan_figures.lag_figure(curves, floor)),
+        (plan_figures.lag_figure(curves, floor)),
         "Bits that the action k steps back gives. Expected by chance: below it is 95 % of what is none.",
         "Information by lag.",
     )
@@ -164,7 +164,7 @@ def order_section(report: "Report") -> tuple[Section, Rows] | None:
     )
     text = [_best_orders(rows, held_out)]
     figure = FigureBox(
-        svg(plan_figures.order_figure(criteria, curves)), "The least of each curve is ringed.", "Order selection."
+        (plan_figures.order_figure(criteria, curves)), "The least of each curve is ringed.", "Order selection."
     )
     return Section("Which order a Markov chain needs", text, [table], [figure]), {"orders": rows}
 
@@ -209,7 +209,7 @@ def calibration_section(report: "Report") -> tuple[Section, Rows] | None:
         " yes."
     ]
     figure = FigureBox(
-        svg(plan_figures.calibration_figure(curves)),
+        (plan_figures.calibration_figure(curves)),
         f"Forecast probability against the share taken; 95 % intervals over {unit_name(report.scored, report.mask)}.",
         "Calibration of " + ", ".join(curves),
     )

@@ -11,8 +11,7 @@ import pytest
 from eval.__main__ import main
 from neuroprior import Plans
 from neuroprior.plans import write_plans
-from neuroprior.report import behaviour_sections
-from neuroprior.report import score_sections as plan_sections
+from neuroprior.report import page
 
 QUICK = ("--models", "counts", "--max-steps", "3", "--processes", "1")
 
@@ -26,7 +25,7 @@ def report(plans: Plans, folder: Path, *more: str, name: str = "new.npz", drawn:
     write_plans(plans, folder / name)
     out = folder / "out"
     with pytest.MonkeyPatch.context() as patch:
-        for module in (plan_sections, behaviour_sections) * (not drawn):
+        for module in (page,) * (not drawn):
             patch.setattr(module, "svg", lambda figure: "<svg></svg>")
         assert main(["plans", str(folder / name), "--out", str(out), *QUICK, *more]) == 0
     results = json.loads((out / "results.json").read_text())
@@ -36,8 +35,8 @@ def report(plans: Plans, folder: Path, *more: str, name: str = "new.npz", drawn:
         assert row["low"] <= row["bits_per_action"] <= row["high"]
         assert row["sees"] in ("actions", "actions and context")
     assert min(row["more"] for row in results["rows"]) == 0
-    page = (out / "report.html").read_text()
-    assert not re.search(FROM_ELSEWHERE, page)
+    html = (out / "report.html").read_text()
+    assert not re.search(FROM_ELSEWHERE, html)
     return results
 
 

@@ -1,0 +1,131 @@
+"""A document of results: tables and figures, printed in the terminal and written as CSV, JSON and one HTML page.
+
+Needs pandas, matplotlib, jinja2 and rich (`neuroprior[report]`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import rich.table
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.text import Text
+
+from neuroprior._files import versions, write_json, written_whole
+from neuroprior.report.page import Page, Section, Table, write_page
+
+WIDEST = 24
+"""Letters in the first column beyond which it is folded in the terminal."""
+
+Column = str | Callable[[Any], str]
+
+
+@dataclass(frozen=True)
+class Document:
+    """Results with all that it takes to show them.
+
+    Attributes:
+        title: of the page.
+        lead: the finding in one or two plain sentences.
+        sections: in order; their tables are printed too.
+        frames: the tables of results, each written as `NAME.csv` and as a list of rows under `NAME` in `results.json`.
+        settings: how the results were made, by name.
+        command: the command line that makes them again.
+        results: further JSON values for `results.json`.
+    """
+
+    title: str
+    lead: str
+    sections: Sequence[Section]
+    frames: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    command: str = ""
+    results: Mapping[str, Any] = field(default_factory=dict)
+
+
+def publish(document: Document, folder: Path, console: Console | None = None) -> None:
+    """Print a document's tables and lead, and write `report.html`, `results.json` and a CSV file for each frame.
+
+    Args:
+        document: the document.
+        folder: where to write; made if it is not there.
+        console: where to print; None: standard output.
+
+    Raises:
+        OSError: the files cannot be written.
+    """
+    console = console or Console()
+    for section in document.sections:
+        for table in section.tables:
+            console.print(printed(table.title or section.title, table))
+    console.print(document.lead, highlight=False, markup=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_frames(folder, document.frames)
+    rows = {name: records(frame) for name, frame in document.frames.items()}
+    about = {"settings": dict(document.settings), "versions": versions()}
+    write_json(folder / "results.json", {**rows, **document.results, **about})
+    shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
+    write_page(folder / "report.html", Page(document.title, document.lead, document.command, shown, document.sections))
+    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
+    """Write each frame as `NAME.csv`; an empty one removes the file of an earlier run."""
+    for name, frame in frames.items():
+        path = folder / f"{name}.csv"
+        if frame.empty:
+            path.unlink(missing_ok=True)
+            continue
+        with written_whole(path) as file:
+            frame.to_csv(file, index=False, lineterminator="\n")
+
+
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a frame as JSON values; what is missing is None."""
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return [
+        {str(key): getattr(value, "item", lambda value=value: value)() for key, value in row.items()} for row in rows
+    ]
+
+
+def table(
+    frame: pd.DataFrame, columns: Mapping[str, Column], caption: str = "", title: str = "", align: str | None = None
+) -> Table:
+    """The text of a frame, as the terminal and the page show it.
+
+    Args:
+        frame: the results.
+        columns: what stands below each heading: the name of a column, perhaps with a format behind a colon
+            ("bits:.3f"; what is missing is left blank), or a function of the row.
+        caption: what the numbers are, and what their intervals are over.
+        title: above it; by default that of its section.
+        align: see `Table`.
+    """
+    rows = [[_cell(row, column) for column in columns.values()] for _, row in frame.iterrows()]
+    return Table(list(columns), rows, caption, align, title)
+
+
+def _cell(row: Any, column: Column) -> str:
+    if callable(column):
+        return column(row)
+    name, _, form = column.partition(":")
+    value = row[name]
+    missing = value is None or (isinstance(value, float) and value != value)
+    return "" if missing else format(value, form)
+
+
+def printed(title: str, table: Table) -> rich.table.Table:
+    """A table for a terminal of 80 columns."""
+    made = rich.table.Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=escape(title))
+    for heading, side in zip(table.headings, table.align or "", strict=True):
+        made.add_column(heading, justify="left" if side == "l" else "right", no_wrap=True)
+    if any(len(row[0]) > WIDEST for row in table.rows):
+        made.columns[0].no_wrap, made.columns[0].overflow = False, "fold"
+    for row in table.rows:
+        made.add_row(*map(Text, row))  # names are no markup
+    made.caption = escape(table.caption)
+    return made
