@@ -1,65 +1,26 @@
-"""Entry point: `python -m eval paper` and the other commands."""
+"""Entry point: `python -m eval paper` and the other experiments."""
 
 import sys
 from collections.abc import Sequence
-from typing import Any
 
-from neuroprior.cli.program import run_program
+from neuroprior.cli.program import Command, run_commands
+
+COMMANDS = {
+    "paper": Command("eval.paper.command:paper", "the paper's two simulations"),
+    "plans": Command("neuroprior.report.report:plans", "a report on a file of plans (also: neuroprior report)"),
+    "mice": Command("eval.mice.command:mice", "whether priors learned from mice in a labyrinth help a planner"),
+    "compare": Command("eval.compare.command:compare", "priors, or planners, compared in many worlds at equal budget"),
+    "grow": Command("eval.compare.growth:grow", "what priors gain from the horizon curriculum"),
+    "depth": Command("eval.compare.depth:depth", "how deep to plan"),
+    "live": Command("eval.live.command:live", "priors that learn online while the world changes"),
+    "quality": Command("eval.quality.command:quality", "how near priors come to sources of known entropy"),
+    "bench": Command("eval.bench.command:bench", "speed against plain code and other packages"),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; see `run_program`."""
-    return run_program(_run, arguments)
-
-
-def _run(arguments: Sequence[str]) -> None:
-    # Imported here, so that Ctrl-C is answered while the libraries load too.
-    from jsonargparse import ArgumentError, ArgumentParser
-
-    from eval.bench.command import LISTS as BENCH_LISTS
-    from eval.bench.command import bench
-    from eval.compare.command import LISTS as COMPARE_LISTS
-    from eval.compare.command import compare
-    from eval.compare.depth import LISTS as DEPTH_LISTS
-    from eval.compare.depth import depth
-    from eval.compare.growth import LISTS as GROW_LISTS
-    from eval.compare.growth import grow
-    from eval.live.command import LISTS as LIVE_LISTS
-    from eval.live.command import live
-    from eval.mice.command import LISTS as MICE_LISTS
-    from eval.mice.command import mice
-    from eval.paper.command import paper
-    from eval.quality.command import quality
-    from neuroprior.report.report import LISTS as PLANS_LISTS
-    from neuroprior.report.report import plans
-
-    about = "Compare behavioural priors. Dashes and underscores in option names are the same."
-    parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False, allow_abbrev=True)
-    commands = parser.add_subcommands()
-    by_name = {"paper": paper, "bench": bench, "plans": plans, "quality": quality, "mice": mice}
-    by_name |= {"compare": compare, "grow": grow, "live": live, "depth": depth}
-    # Lists are given as words, `--priors a b`, which functions cannot say.
-    numbers = {key: {"type": int, "default": [*some], "help": what} for key, (some, what) in MICE_LISTS.items()}
-    lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
-    lists |= {
-        "compare": COMPARE_LISTS,
-        "grow": GROW_LISTS,
-        "bench": BENCH_LISTS,
-        "live": LIVE_LISTS,
-        "depth": DEPTH_LISTS,
-    }
-    for name, command in by_name.items():
-        sub = ArgumentParser(description=(command.__doc__ or "").split("\n")[0], exit_on_error=False, allow_abbrev=True)
-        own = lists.get(name, {})
-        sub.add_function_arguments(command, as_group=False, as_positional=True, skip=set(own))
-        for option, how in own.items():
-            sub.add_argument(f"--{option}", nargs="+", **how)
-        commands.add_subcommand(name, sub)
-    try:
-        settings = parser.parse_args(list(arguments))
-    except ArgumentError as error:
-        raise ValueError(str(error)) from error
-    by_name[settings.subcommand](**settings[settings.subcommand].as_dict())
+    """Run an experiment; see `run_commands`."""
+    return run_commands("python -m eval", "Experiments with behavioural priors.", COMMANDS, arguments)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache, partial
@@ -180,7 +181,9 @@ def _unordered(
             except TerminatedWorkerError as error:
                 raise MemoryError("a process was killed, probably for want of memory; try --processes 1") from error
             finally:
-                results.close()
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", UserWarning)  # joblib remarks on the jobs that are given up
+                    results.close()
                 if not dask:
                     _stop_workers()
 

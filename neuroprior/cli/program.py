@@ -1,9 +1,155 @@
-"""What the programs share: bad input is one line and exit code 2, Ctrl-C one line and 130."""
+"""What the programs share: commands from functions, one line for bad input (exit code 2), one for Ctrl-C (130)."""
 
+import inspect
+import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from types import NoneType, UnionType
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+TYPES = {
+    "int": "an integer",
+    "PositiveInt": "an integer of at least 1",
+    "NonNegativeInt": "an integer of at least 0",
+    "float": "a number",
+    "PositiveFloat": "a number above 0",
+    "ClosedUnitInterval": "a number from 0 to 1",
+    "OpenUnitInterval": "a number between 0 and 1",
+    "bool": "true or false",
+    "str": "a text",
+}
+"""Types of options in words."""
+
+
+class Command(NamedTuple):
+    """A command of a program.
+
+    Attributes:
+        target: `module:function`, imported only when the command is given.
+        about: one line for the list of commands.
+        raw: the function parses its arguments itself: it is called with the list of them.
+    """
+
+    target: str
+    about: str
+    raw: bool = False
+
+    def load(self) -> Callable[..., Any]:
+        """Import the function."""
+        module, _, name = self.target.partition(":")
+        found: Callable[..., Any] = getattr(import_module(module), name)
+        return found
+
+
+def run_commands(
+    program: str, about: str, commands: Mapping[str, Command], arguments: Sequence[str] | None = None
+) -> int:
+    """Run one of several commands, each a function whose parameters are its options; see `run_program`.
+
+    Args:
+        program: its name, as a user types it.
+        about: what it is for.
+        commands: by name.
+        arguments: of the command line; None: those of the process.
+
+    Returns:
+        The exit code.
+    """
+
+    def run(given: Sequence[str]) -> None:
+        if not given or given[0] in ("-h", "--help"):
+            wide = max(map(len, commands))
+            lines = [f"  {name:{wide}}  {command.about}" for name, command in commands.items()]
+            print(f"usage: {program} COMMAND ...\n\n{about}\n\ncommands:")
+            print("\n".join(lines) + f"\n\n{program} COMMAND --help lists the options of a command.")
+            return
+        name, *options = given
+        if name not in commands:
+            raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
+        command = commands[name]
+        if command.raw:
+            command.load()(options)
+        else:
+            call(command.load(), f"{program} {name}", options)
+
+    return run_program(run, arguments)
+
+
+def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -> Any:
+    """Call a function with the arguments of a command line.
+
+    Each parameter is an option, and one without a default a positional argument. Its type hint says what may be given
+    (jsonargparse checks it), and the docstring what it means. A parameter that is a list takes several words:
+    `--worlds grid maze`.
+
+    Args:
+        function: with type hints and a docstring in Google style.
+        program: what a user types before the options.
+        arguments: what was typed behind it.
+
+    Returns:
+        What the function returns.
+
+    Raises:
+        ValueError: an argument is not known or not of its type.
+    """
+    from docstring_parser import parse
+    from jsonargparse import ArgumentError, ArgumentParser
+
+    described = parse(inspect.getdoc(function) or "")
+    texts = {entry.arg_name: " ".join((entry.description or "").split()) for entry in described.params}
+    parser = ArgumentParser(
+        prog=program, description=described.short_description or "", exit_on_error=False, allow_abbrev=True
+    )
+    hints = get_type_hints(function)
+    items = {name: found for name, hint in hints.items() if (found := _item_of(hint)) is not None}
+    parser.add_function_arguments(function, as_group=False, as_positional=True, skip=set(items))
+    for name, item in items.items():
+        parameter = inspect.signature(function).parameters[name]
+        default = parameter.default
+        default = list(default) if isinstance(default, list | tuple) else default
+        parser.add_argument(f"--{name}", type=item, nargs="+", default=default, help=texts.get(name, "").capitalize())
+    try:
+        settings = parser.parse_args(list(arguments))
+    except ArgumentError as error:
+        raise ValueError(_one_line(str(error), hints)) from error
+    return function(**settings.as_dict())
+
+
+def _item_of(hint: Any) -> Any:
+    """The type of the items of a list, or of a list that may be None; None for other types."""
+    options = [part for part in get_args(hint) if part is not NoneType]
+    if get_origin(hint) in (Union, UnionType) and len(options) == 1:
+        hint = options[0]
+    return get_args(hint)[0] if get_origin(hint) in (list, Sequence) else None
+
+
+def _one_line(message: str, hints: Mapping[str, Any]) -> str:
+    """What the parser objects to, in one line that begins with the option."""
+    line = " ".join(message.split())
+    found = re.match(r'Parser key "([^"]+)"(?: element \d+)?: (.*)', line)
+    if found is None or found[1] not in hints:
+        return line
+    given = re.search(r"(?:Got value: |Given value: |base 10: )(.*)$", found[2])
+    given = given or re.search(r"^Not of type \w+: (.*?) does not conform", found[2])
+    value = given[1].strip("'") if given else found[2]
+    return f"{found[1]}: {_expected(hints[found[1]])} is expected, not {value}"
+
+
+def _expected(hint: Any) -> str:
+    """A type in words."""
+    hint = _item_of(hint) or hint
+    parts = [part for part in get_args(hint) if part is not NoneType] if get_origin(hint) in (Union, UnionType) else []
+    if parts:
+        return " or ".join(map(_expected, parts))
+    if get_origin(hint) is Literal:
+        return f"one of {', '.join(map(str, get_args(hint)))}"
+    name = getattr(hint, "__name__", str(hint))
+    bounds = ", ".join(f"{sign} {bound}" for sign, bound in getattr(hint, "_restrictions", ()))
+    return TYPES.get(name, f"a number {bounds}" if bounds else name)
 
 
 def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None) -> int:
@@ -24,6 +170,10 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         return _fail(str(interrupted) or "interrupted; what was not yet written is lost", 130)
+    except BrokenPipeError:
+        # The reader of our output, such as `head`, has enough.
+        sys.stderr.close()
+        return 0
     except (ValueError, OSError, MemoryError, OverflowError, ImportError) as error:
         return _fail(f"error: {error}", 2)
     except RuntimeError as error:

@@ -1,0 +1,71 @@
+"""`neuroprior sample`: new plans from a saved prior."""
+
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from jsonargparse.typing import NonNegativeInt, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from neuroprior.plans import Plans, write_plans
+from neuroprior.priors import Prior, load
+
+
+def sample(
+    folder: str,
+    num_plans: PositiveInt = 100,  # type: ignore[valid-type]
+    length: PositiveInt = 20,  # type: ignore[valid-type]
+    context: str | None = None,
+    temperature: PositiveFloat = 1.0,  # type: ignore[valid-type]
+    seed: NonNegativeInt = 0,  # type: ignore[valid-type]
+    out: str | None = None,
+) -> None:
+    """Sample new plans from a saved prior, with the names of its actions.
+
+    Args:
+        folder: a saved prior, as `neuroprior fit` writes it.
+        num_plans: how many plans.
+        length: actions in a plan; a plan of a prior with an end symbol may be shorter.
+        context: for a prior with a context index: its name or number, which holds for the whole of each plan.
+        temperature: divides the logits; above 1 plans are more varied, below 1 more alike.
+        seed: of the random numbers: the same seed gives the same plans.
+        out: file to write, `.jsonl`, `.csv` or `.npz`; JSON lines on standard output by default.
+    """
+    prior = load(folder)
+    generator = torch.Generator().manual_seed(seed)
+    given = _context(prior, context, folder, num_plans)
+    actions = prior.sample(num_plans, length, given, temperature=temperature, generator=generator)
+    plans = Plans(actions, prior.num_actions, action_names=prior.action_names, end=prior.end)
+    if prior.end is not None:
+        plans = plans.without_end()
+    if out is not None:
+        write_plans(plans, out)
+        print(f"wrote {num_plans} plans to {out}")
+        return
+    with TemporaryDirectory() as place:
+        file = Path(place) / "plans.jsonl"
+        write_plans(plans, file)
+        sys.stdout.write(file.read_text(encoding="utf-8"))
+
+
+def _context(prior: Prior, name: str | None, folder: str, num_plans: int) -> Tensor | None:
+    """The context `[N]` of that name or number."""
+    if not prior.takes_context:
+        if name is not None:
+            raise ValueError(f"context: the prior in {folder} takes none")
+        return None
+    if prior.num_contexts is None:
+        raise ValueError(f"{folder}: its context are features; sample it from Python, with Prior.sample")
+    names = prior.context_names or ()
+    if name is None:
+        some = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
+        raise ValueError(f"context: the prior in {folder} takes one; give --context and a name or number ({some})")
+    if name in names:
+        index = names.index(name)
+    elif name.isdecimal() and int(name) < prior.num_contexts and not names:
+        index = int(name)
+    else:
+        some = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
+        raise ValueError(f"context: {name!r} is not known to the prior in {folder}; it knows {some}")
+    return torch.full((num_plans,), index, dtype=torch.long)

@@ -1,0 +1,166 @@
+"""Jobs: on cores or on a cluster, kept in files, found again only for the same question and the same code."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from neuroprior._jobs import JobRun, code_version
+from tests.support import jobs
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_results_come_in_the_order_of_the_jobs(processes: int, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    found = JobRun(jobs.square, tmp_path, {}).do([5, 2, 9, 4], processes=processes, title="squares")
+    assert [result["square"] for result in found] == [25, 4, 81, 16]
+    own = {result["process"] for result in found} == {os.getpid()}
+    assert own == (processes == 1)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4
+    assert lines[-1].startswith("squares: 4/4 ") and lines[-1].endswith(" 0:00:00 left)")
+
+
+def test_finished_jobs_are_not_done_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    traces = tmp_path / "traces"
+    traces.mkdir()
+    run = partial(jobs.counted, traces)
+    first = JobRun(run, tmp_path, {"a": 1}).do([1, 2], processes=1)
+    again = JobRun(run, tmp_path, {"a": 1}).do([2, 1, 3], processes=1, title="again")
+    assert [first[1], first[0]] == again[:2]
+    assert len(list(traces.iterdir())) == 3
+    assert "again: 2/3 were finished before" in capsys.readouterr().err
+    JobRun(run, tmp_path, {"a": 2}).do([1], processes=1)
+    assert len(list(traces.iterdir())) == 4  # something else was asked
+
+
+def test_other_code_does_not_find_old_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "eval_of_test.py").write_text("def run(job):\n    return {'found': 1}\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    how = [sys.executable, "-c"]
+    program = "from eval_of_test import run; from neuroprior._jobs import JobRun; from pathlib import Path;"
+    program += "print(JobRun(run, Path('results'), {}).do([1])[0]['found'])"
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}", "PYTHONDONTWRITEBYTECODE": "1"}
+
+    def found() -> str:
+        done = subprocess.run([*how, program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    assert found() == "1"
+    (tmp_path / "eval_of_test.py").write_text("def run(job):\n    return {'found': 2}\n")
+    assert found() == "2"
+
+
+def test_the_version_of_code_counts_what_it_imports() -> None:
+    # Both depend on `neuroprior.sampling`, only one on the report.
+    from neuroprior._threads import one_thread
+    from neuroprior.priors import MarkovPrior
+
+    assert code_version(MarkovPrior) != code_version(one_thread)
+    assert code_version(partial(jobs.square, 1)) == code_version(jobs.dies)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_job_that_fails_is_named_and_the_others_are_kept(processes: int, tmp_path: Path) -> None:
+    runs = JobRun(jobs.fails_at_three, tmp_path, {}, name=lambda job: f"number {job}")
+    with pytest.raises(ValueError, match=r"number 3: three is\nno good"):
+        runs.do([1, 2, 3], processes=processes)
+    assert runs.finished(1) or processes == 2
+    assert not runs.finished(3)
+
+
+def test_memory_that_runs_out_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MemoryError, match="1: out of memory"):
+        JobRun(jobs.out_of_memory, tmp_path, {}).do([1])
+    with pytest.raises(MemoryError, match="a process was killed"):
+        JobRun(jobs.dies, tmp_path, {}).do([1, 2], processes=2)
+
+
+def test_a_damaged_result_is_named(tmp_path: Path) -> None:
+    runs = JobRun(jobs.square, tmp_path, {})
+    runs.do([1])
+    runs.path(1).write_text("{")
+    with pytest.raises(ValueError, match=r"1\.json: damaged; delete it"):
+        runs.do([1])
+
+
+def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
+    program = "from tests.support.jobs import *; from neuroprior._jobs import JobRun; from pathlib import Path; import sys\n"
+    program += "try: JobRun(slow_square, Path(sys.argv[1]), {}).do(list(range(40)), processes=2)\n"
+    program += "except KeyboardInterrupt as error: sys.exit(str(error))"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path)],
+        cwd=ROOT,
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stderr is not None
+    process.stderr.readline()
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the program and to its workers
+    said = process.stderr.read()
+    assert process.wait(60) == 1
+    assert "finished jobs are kept in" in said
+    assert "Traceback" not in said
+    kept = list(tmp_path.glob("*/[0-9]*.json"))
+    assert 1 <= len(kept) < 40
+
+
+@pytest.fixture
+def cluster():
+    """A scheduler and two workers of Dask's, processes of their own: its address, and the workers."""
+    pytest.importorskip("distributed")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    started = []
+
+    def start(*words: str) -> subprocess.Popen:
+        program = [sys.executable, "-m", *words, "--no-dashboard"]
+        started.append(subprocess.Popen(program, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True))
+        return started[-1]
+
+    def wait_for(process: subprocess.Popen, word: str) -> str:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if word in line:
+                return line
+        raise AssertionError(f"{word!r} was not said")
+
+    scheduler = start("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+    address = wait_for(scheduler, "Scheduler at").split()[-1]
+    workers = [start("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny") for _ in range(2)]
+    for worker in workers:
+        wait_for(worker, "Registered to")
+    yield address, workers
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def test_a_cluster_does_the_jobs_though_a_worker_is_killed(cluster, tmp_path: Path) -> None:
+    address, workers = cluster
+    first = JobRun(jobs.square, tmp_path, {}).do(list(range(4)), dask=address)
+    assert os.getpid() not in {result["process"] for result in first}
+    # The address of a worker's process is known from a job; one of them is killed while it works.
+    runs = JobRun(jobs.slow_square, tmp_path, {})
+    kill = subprocess.Popen([sys.executable, "-c", f"import os, time; time.sleep(2); os.kill({workers[0].pid}, 9)"])
+    found = runs.do(list(range(20)), dask=address, title="squares")
+    kill.wait()
+    assert workers[0].wait(10) == -signal.SIGKILL
+    assert [result["square"] for result in found] == [number**2 for number in range(20)]
+    assert workers[1].pid in {result["process"] for result in found}
+
+
+def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    began = time.monotonic()
+    with pytest.raises(ValueError, match="no scheduler answers at tcp://127.0.0.1:1"):
+        JobRun(jobs.square, tmp_path, {}).do([1, 2], dask="tcp://127.0.0.1:1")
+    assert time.monotonic() - began < 60
