@@ -67,14 +67,18 @@ def test_impossible_shares(successes: int, trials: int) -> None:
 
 Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
 
-BOUNDED: list[tuple[str, Draw, float, float, float]] = [
-    # Values of a unit, their mean, and the least coverage of the nominal 95 % with 10 and with 20 units.
-    ("200 trials", lambda r, s: r.binomial(200, 0.9, s) / 200, 0.9, 0.94, 0.94),
-    ("200 trials, overdispersed", lambda r, s: r.binomial(200, r.beta(18, 2, s)) / 200, 0.9, 0.925, 0.93),
-    ("skewed", lambda r, s: r.beta(8, 2, s), 0.8, 0.93, 0.935),
-    ("at a bound", lambda r, s: r.beta(1, 9, s), 0.1, 0.905, 0.92),
-    ("two modes", lambda r, s: r.beta(0.5, 0.5, s), 0.5, 0.93, 0.94),
-    ("a third fails", lambda r, s: r.binomial(200, np.where(r.random(s) < 0.3, 0.7, 0.9)) / 200, 0.84, 0.92, 0.93),
+BOUNDED = [
+    # The values of units, their mean, and the least coverage of the nominal 95 % with 10 and with 20 units.
+    pytest.param(lambda r, s: r.binomial(200, 0.9, s) / 200, 0.9, 0.94, 0.94, id="200 trials"),
+    pytest.param(
+        lambda r, s: r.binomial(200, r.beta(18, 2, s)) / 200, 0.9, 0.925, 0.93, id="200 trials, overdispersed"
+    ),
+    pytest.param(lambda r, s: r.beta(8, 2, s), 0.8, 0.93, 0.935, id="skewed"),
+    pytest.param(lambda r, s: r.beta(1, 9, s), 0.1, 0.905, 0.92, id="at a bound"),
+    pytest.param(lambda r, s: r.beta(0.5, 0.5, s), 0.5, 0.93, 0.94, id="two modes"),
+    pytest.param(
+        lambda r, s: r.binomial(200, np.where(r.random(s) < 0.3, 0.7, 0.9)) / 200, 0.84, 0.92, 0.93, id="a third fails"
+    ),
 ]
 
 
@@ -89,11 +93,11 @@ def hits(draw: Draw, mean: float, units: int, repeats: int) -> int:
 
 @pytest.mark.parametrize("repeats", [4000, pytest.param(200_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("units", [10, 20])
-@pytest.mark.parametrize(("draw", "mean", "least_of_10", "least_of_20"), [row[1:] for row in BOUNDED])
+@pytest.mark.parametrize(("draw", "mean", "least_of_10", "least_of_20"), BOUNDED)
 def test_coverage_for_bounded_values(
     draw: Draw, mean: float, least_of_10: float, least_of_20: float, units: int, repeats: int
 ) -> None:
-    # A correct interval misses the quantile with a probability of 1e-6: 12 cases raise a false alarm once in 80,000 runs.
+    # A correct interval misses the quantile with a probability of 1e-6: in 12 cases that is once in 80,000 runs.
     least = least_of_10 if units == 10 else least_of_20
     assert hits(draw, mean, units, repeats) >= stats.binom.ppf(1e-6, repeats, least)
 

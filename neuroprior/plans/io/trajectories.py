@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neuroprior.plans.io.columns import LARGEST_INTEGER, Gathered, Integers, check_names
+from neuroprior.plans.io.columns import LARGEST_INTEGER, Integers, assembled, check_names
 from neuroprior.plans.plans import Plans, is_per_step
 
 
@@ -15,7 +15,7 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
 
     Args:
         trajectories: each a list of steps `(observation, action, reward, terminated, truncated, info)`, where the agent
-            saw the observation and then took the action (what follows the action is not used); or a dict or an object
+            made the observation and then took the action (what follows the action is not used); or a dict or an object
             with `actions [T]` and perhaps `observations`, T of them or T + 1, of which the last is dropped (such are
             the episodes of Minari).
         num_actions: A; actions are integers from 0 to A - 1.
@@ -33,23 +33,18 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     if observations not in ("context", None):
         raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")
     actions: list[Integers] = []
-    seen: list[NDArray[Any] | None] = []
+    observed: list[NDArray[Any] | None] = []
     for number, trajectory in enumerate(trajectories):
-        taken, observed = _parts(trajectory, f"trajectory {number}")
-        actions.append(_actions(taken, num_actions, f"trajectory {number}"))
+        place = f"trajectory {number}"
+        taken, seen = _parts(trajectory, place)
+        actions.append(_actions(taken, num_actions, place))
         if observations is not None:
-            length = len(actions[-1])
-            seen.append(None if observed is None else _observations(observed, length, f"trajectory {number}"))
+            observed.append(None if seen is None else _observations(seen, len(actions[-1]), place))
     if not actions:
         raise ValueError("trajectories: none are given")
-    return Gathered(
-        name="trajectories",
-        lengths=np.array([len(part) for part in actions]),
-        actions=np.concatenate(actions),
-        num_actions=num_actions,
-        context=_joined(seen),
-        per_step=True,
-    ).plans()
+    lengths = np.array([len(part) for part in actions])
+    context = _joined(observed)
+    return assembled("trajectories", lengths, np.concatenate(actions), num_actions, context=context, per_step=True)
 
 
 def to_trajectories(plans: Plans) -> list[dict[str, NDArray[Any]]]:
@@ -126,25 +121,24 @@ def _observations(values: Any, length: int, place: str) -> NDArray[Any]:
     return features
 
 
-def _joined(seen: list[NDArray[Any] | None]) -> NDArray[Any] | None:
+def _joined(observed: list[NDArray[Any] | None]) -> NDArray[Any] | None:
     """All observations end to end: `[S]` or `[S, C]`, or None where there are none."""
-    there = [i for i, part in enumerate(seen) if part is not None]
-    if not there:
+    parts = [(i, part) for i, part in enumerate(observed) if part is not None]
+    if not parts:
         return None
-    parts = [part for part in seen if part is not None]
-    if len(parts) < len(seen):
-        missing = next(i for i, part in enumerate(seen) if part is None)
-        raise ValueError(f"trajectory {missing}: no observations, which trajectory {there[0]} has")
-    # A trajectory without steps tells nothing of the kind of its observations.
-    kinds = [(i, part) for i, part in enumerate(parts) if len(part)] or [(0, parts[0])]
-    first = kinds[0][1]
-    for i, part in kinds:
+    if len(parts) < len(observed):
+        missing = next(i for i, part in enumerate(observed) if part is None)
+        raise ValueError(f"trajectory {missing}: no observations, which trajectory {parts[0][0]} has")
+    # Of a trajectory without steps the kind of its observations is not known.
+    parts = [(i, part) for i, part in parts if len(part)] or parts[:1]
+    number, first = parts[0]
+    for i, part in parts:
         if part.shape[1:] != first.shape[1:] or part.dtype != first.dtype:
             raise ValueError(
-                f"trajectory {i}: observations of another kind than trajectory {kinds[0][0]}: "
-                f"{_kind(part)}, not {_kind(first)}"
+                f"trajectory {i}: observations of another kind than trajectory {number}: {_kind(part)}, not"
+                f" {_kind(first)}"
             )
-    return np.concatenate([part for _, part in kinds])
+    return np.concatenate([part for _, part in parts])
 
 
 def _kind(part: NDArray[Any]) -> str:
