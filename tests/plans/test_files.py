@@ -15,7 +15,7 @@ from neuroprior.plans.io.columns import number_in
 
 NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
 SUFFIXES = (".npz", ".jsonl", ".csv", ".tsv")
-CONTEXTS = ("none", "index", "name", "index a step", "name a step", "features", "features a step")
+CONTEXTS = ("none", "index", "name", "index per step", "name per step", "features", "features per step")
 FLOATS = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
@@ -138,7 +138,7 @@ def test_the_layout_of_csv_follows_the_context(tmp_path, context, layout, column
     assert context is None or torch.equal(back.context, context)
 
 
-def test_a_context_a_plan_is_repeated_on_its_steps(tmp_path):
+def test_a_context_per_plan_is_repeated_on_its_steps(tmp_path):
     write_plans(Plans(torch.tensor([[0, 1]]), 2, context=torch.tensor([7])), tmp_path / "a.csv", layout="step")
     assert read_plans(tmp_path / "a.csv").context.tolist() == [[7, 7]]
 

@@ -25,26 +25,28 @@ def read_plans(
 ) -> Plans:
     """Plans of a file, by its suffix, or of a Minari dataset: `minari:` and its name, see `read_minari`.
 
-    - `.npz`: arrays named as the attributes of `Plans`; of them `actions [N, L]` is needed. Nothing is unpickled.
-    - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and perhaps `context` and
-      `group`; other keys are ignored. Context: an integer or a name; a list of them, one for each action; features of
-      the plan, a list of numbers (one with a decimal point in the file, else they are taken for integers); features of
-      each step, a list of lists. Of one kind in all plans. The first line may have, in place of `actions`, any of
-      `num_actions`, `action_names`, `context_names`, `group_names` and `end`.
+    - `.npz`: arrays named like the attributes of `Plans`; only `actions [N, L]` is required. Nothing is unpickled.
+    - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and optionally `context` and
+      `group`; other keys are ignored. A context is an integer or a name; a list of these, one for each action; features
+      of the plan, a list of numbers (at least one in the file with a decimal point, else all are taken for integers);
+      or features of each step, a list of lists; all plans of a file have the same kind. The first line may have, in
+      place of `actions`, any of `num_actions`, `action_names`, `context_names`, `group_names` and `end`.
     - `.csv`, `.tsv` (commas, semicolons or tabs) with one plan a row: columns `action_1`, `action_2`, ..., empty after
       a plan's end; or no header, and all cells are actions. Or with one step a row: columns `plan` and `action`; the
-      rows of a plan stand together, in the order of its steps. Either may have `context` (integers or names) or
-      `context_1`, `context_2`, ... (features), of the plan or of the step, and `group`, one a plan. Others are ignored.
+      rows of a plan stand together, in the order of its steps. Both may have `context` (integers or names) or
+      `context_1`, `context_2`, ... (features), of the plan or of the step, and `group`, the same on all rows of a plan.
+      Other columns are ignored.
 
-    Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if one is no number.
+    Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if any of them is not a
+    number.
 
     Args:
         path: the file or dataset.
-        num_actions: A, where the file does not say it; None there for the largest action + 1, or the number of names.
+        num_actions: A; None for what the file says, else the number of names, else the largest action + 1.
         action_names: A names in the order of their numbers; without them the names are sorted.
 
     Returns:
-        Plans of N plans, padded to the longest: context and group are int64, features float32 (`.npz`: as they are).
+        N plans, padded to the longest: context and group are int64, features float32 (`.npz`: as they are).
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -60,14 +62,14 @@ def read_plans(
 def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | None = None) -> None:
     """Write plans to a file, by its suffix: those that `read_plans` reads. An old file is replaced once it is whole.
 
-    `.npz` and `.jsonl` hold all that `Plans` do. CSV holds names where there are any, else numbers: give `num_actions`
-    or `action_names` when reading it; names of contexts and groups are then numbered in sorted order.
+    `.npz` and `.jsonl` keep everything. CSV keeps names where there are any, else numbers, but not the number of actions:
+    give `num_actions` or `action_names` when reading it. Names of contexts and groups are then numbered in sorted order.
 
     Args:
-        plans: one at least.
+        plans: at least one.
         path: the file.
-        layout: of a CSV file, one "plan" or one "step" a row; None for a step where the context is one a step, else a
-            plan. With "step", a context a plan is repeated on its rows and read back as one a step.
+        layout: of a CSV file, one "plan" or one "step" a row; None for a step a row if the context is per step, else a
+            plan a row. With "step", a context per plan is repeated on all its rows and read back as one per step.
 
     Raises:
         ValueError: the file cannot hold these plans; the message says why.

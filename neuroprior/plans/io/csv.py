@@ -176,7 +176,7 @@ class _Sheet:
         elif other := next((name for name in names if OTHER_WORDS.fullmatch(name)), None):
             raise ValueError(
                 f"{path}, line 1: looks like a header ({other!r}) without a column 'action' (or 'action_1', ...); name"
-                " the column of the actions 'action', and the one that tells which plan a row belongs to 'plan'"
+                " the column of the actions 'action', and the one that says to which plan a row belongs 'plan'"
             )
         self.columns = {name: i for i, name in enumerate(names)} if self.has_header else {}
 
@@ -287,7 +287,7 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
     per_step = is_per_step(plans.context)
     by_step = layout == "step" or (layout is None and per_step)
     if per_step and not by_step:
-        raise ValueError(f"{path}: a context a step cannot be written with one plan a row; use layout='step'")
+        raise ValueError(f"{path}: a context per step cannot be written with one plan a row; use layout='step'")
     if by_step and not lengths.all():
         raise ValueError(
             f"{path}: plan {int((lengths == 0).nonzero()[0])} has no actions, and no row with layout='step'"
@@ -299,11 +299,11 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
 
 def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
     """The rows of a CSV file, the header first; with one step a row, plans are numbered from 0."""
-    context, width, per_step = plans.context, plans.max_length, is_per_step(plans.context)
+    width, per_step = plans.max_length, is_per_step(plans.context)
     header = ["plan", "action"] if by_step else [f"action_{i + 1}" for i in range(width)]
-    if context is not None:
-        is_features = context.is_floating_point()
-        header += [f"context_{i + 1}" for i in range(context.shape[-1])] if is_features else ["context"]
+    if plans.context is not None:
+        features = plans.context.shape[-1] if plans.context.is_floating_point() else 0
+        header += [f"context_{i + 1}" for i in range(features)] or ["context"]
     yield header + ["group"] * (plans.group is not None)
     for start in range(0, len(plans), 2**14):
         some = plans[start : start + 2**14]
@@ -311,11 +311,15 @@ def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
         contexts = none if some.context is None else named(some.context.tolist(), plans.context_names)
         groups = none if some.group is None else [[group] for group in named(some.group.tolist(), plans.group_names)]
         actions, lengths = named(some.actions.tolist(), plans.action_names), some.mask().sum(1).tolist()
-        for i, (taken, length, seen, group) in enumerate(zip(actions, lengths, contexts, groups, strict=True), start):
+        for i, (taken, length, context, group) in enumerate(
+            zip(actions, lengths, contexts, groups, strict=True), start
+        ):
             if by_step:
-                yield from ([i, taken[t], *_as_list(seen[t] if per_step else seen), *group] for t in range(length))
+                yield from (
+                    [i, taken[t], *_as_list(context[t] if per_step else context), *group] for t in range(length)
+                )
             else:
-                yield [*taken[:length], *[""] * (width - length), *_as_list(seen), *group]
+                yield [*taken[:length], *[""] * (width - length), *_as_list(context), *group]
 
 
 def _as_list(value: Any) -> list[Any]:

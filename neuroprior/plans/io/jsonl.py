@@ -220,8 +220,8 @@ class _Contexts:
         """Append the context of one plan, None where it has none; ValueError if it is wrong or of another kind."""
         kind = _kind(value)
         before = self.kind or ("empty" if self.sizes else None)
-        alike = kind == before or ("empty" in (kind, before) and kind in LISTS and before in LISTS)
-        if before is not None and not alike:
+        fits = kind == before or ("empty" in (kind, before) and kind in LISTS and before in LISTS)
+        if before is not None and not fits:
             raise ValueError(f"context: {KINDS[kind]}, where the plans before have {KINDS[before]}")
         values = list(chain.from_iterable(value)) if kind == "rows" else value if kind in LISTS else [value]
         if kind == "rows":
@@ -247,7 +247,7 @@ class _Contexts:
     def finish(
         self, lengths: Integers, plan: Place, step: Place
     ) -> tuple[Integers | Floats | None, Names | None, bool]:
-        """The contexts `[N]`, `[N, C]`, `[S]` or `[S, C]`, their names, and whether there is one a step.
+        """The contexts `[N]`, `[N, C]`, `[S]` or `[S, C]`, their names, and whether they are per step.
 
         Args:
             lengths: `[N]`.

@@ -1,4 +1,4 @@
-"""Plans from trajectories as Gymnasium's environments give them, and plans as such trajectories."""
+"""Plans from trajectories in memory, as Gymnasium's environments return them, and back."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -19,11 +19,11 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
             with `actions [T]` and perhaps `observations`, T of them or T + 1, of which the last is dropped (such are
             the episodes of Minari).
         num_actions: A; actions are integers from 0 to A - 1.
-        observations: "context" for the observations as the context of each step: integers as indices, arrays as
-            features, flattened, float32. None to leave them out.
+        observations: "context" to make the observations the context per step: integers become indices, arrays features
+            (flattened, float32). None to leave them out.
 
     Returns:
-        Plans, padded to the longest trajectory. Without a context where no trajectory has observations.
+        Plans, padded to the longest trajectory; without a context if no trajectory has observations.
 
     Raises:
         ValueError: actions that are not integers, observations that are neither integers nor arrays of one shape, or a
@@ -48,7 +48,7 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
 
 
 def to_trajectories(plans: Plans) -> list[dict[str, NDArray[Any]]]:
-    """Each plan as a dict of `actions [T]`, int64, and `observations [T]` or `[T, C]` where it has a context a step."""
+    """Each plan as a dict of `actions [T]`, int64, and, of a context per step, `observations [T]` or `[T, C]`."""
     actions, lengths = plans.actions.long().cpu().numpy(), plans.mask().sum(1).tolist()
     context = plans.context if is_per_step(plans.context) else None
     found = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
@@ -84,7 +84,7 @@ def _actions(values: Any, num_actions: int, place: str) -> Integers:
         return np.zeros(0, np.int64)
     if actions.dtype.kind not in "iu" or actions.ndim != 1:
         raise ValueError(
-            f"{place}: actions are {actions.dtype} of shape {list(actions.shape)}; one integer a step is expected"
+            f"{place}: actions are {actions.dtype} of shape {list(actions.shape)}; one integer per step is expected"
             " (discrete actions)"
         )
     wrong = np.flatnonzero((actions < 0) | (actions >= num_actions))
@@ -149,7 +149,7 @@ def _array(values: Any, place: str) -> NDArray[Any]:
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{place}: one number or one array of a fixed shape a step is expected") from error
+        raise ValueError(f"{place}: one number or one array of a fixed shape per step is expected") from error
     if array.dtype.kind == "O":
-        raise ValueError(f"{place}: {array.dtype} values; a number or an array of numbers a step is expected")
+        raise ValueError(f"{place}: {array.dtype} values; a number or an array of numbers per step is expected")
     return array
