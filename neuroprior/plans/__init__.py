@@ -1,19 +1,30 @@
-"""Executed plans: the action sequences that were chosen before, from which a prior is learned; reading and writing."""
+"""Executed plans: the action sequences that were chosen before, from which a prior learns; reading, writing, folds."""
 
-from neuroprior.plans.io.files import read_plans, write_plans
-from neuroprior.plans.io.minari_datasets import read_minari, write_minari
-from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
+from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, divisible, folds, in_parts
+from neuroprior.plans.io import (
+    from_trajectories,
+    read_minari,
+    read_plans,
+    to_trajectories,
+    write_minari,
+    write_plans,
+)
 from neuroprior.plans.plans import Plans, action_dtype, all_plans, check_context, is_per_step
 
 __all__ = [
+    "BLOCKS",
+    "FEWEST_UNITS",
     "Plans",
     "action_dtype",
     "all_plans",
     "check_context",
+    "divisible",
+    "folds",
     "from_trajectories",
+    "in_parts",
+    "is_per_step",
     "read_minari",
     "read_plans",
-    "is_per_step",
     "to_trajectories",
     "write_minari",
     "write_plans",

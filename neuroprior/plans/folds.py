@@ -8,14 +8,14 @@ from torch import Tensor
 from neuroprior.plans.plans import Plans, is_per_step
 
 FEWEST_UNITS = 2
-"""Independent units without which there is no interval; below, a finer unit is taken."""
+"""Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""
 
 BLOCKS = 40
-"""Parts into which a single plan is cut."""
+"""Parts into which a single plan is cut, so that there are units for intervals and folds."""
 
 
 def divisible(plans: Plans) -> Plans:
-    """Plans as they can be split: of fewer than two groups, without them, so that each stands alone."""
+    """The same plans, without their group if they have fewer than two groups, so that they can be split."""
     few = plans.group is None or len(plans.group.unique()) < FEWEST_UNITS
     return replace(plans, group=None, group_names=None) if few else plans
 
@@ -23,15 +23,16 @@ def divisible(plans: Plans) -> Plans:
 def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:
     """Cross-validation over independent units: each action is held out once.
 
-    Groups stay together where there are two or more; else plans are drawn. Single plans are not cut: see `in_parts`.
+    Where there are two or more groups these are divided into folds, else plans are. A single plan is not cut; see
+    `in_parts`.
 
     Args:
         plans: N of them.
         number: of folds, at least 2 and at most the number of groups (of plans, where there are no two groups).
-        seed: draws which unit is in which fold.
+        seed: of the random division into folds.
 
     Returns:
-        For each fold the numbers of the plans to learn from and of those held out, int64, each in order.
+        For each fold the indices of the plans for training and of those held out, int64, ascending.
 
     Raises:
         ValueError: fewer than two folds, or fewer units than folds.

@@ -21,10 +21,10 @@ class Plans:
         num_actions: the number of actions, A; never guessed from the data.
         lengths: integers `[N]`, the number of actions of each plan; None where all have L.
         action_names: A names, or None.
-        context: what the agent saw: indices (integers) `[N]` a plan or `[N, L]` a step, or features (floating point)
-            `[N, C]` or `[N, L, C]`; None for nothing.
-        group: integers `[N]` (subject, session, world): plans of one group are never split between training and
-            validation; None where each plan stands alone.
+        context: what is known when actions are chosen, such as the agent's observations: indices (integers), one per
+            plan `[N]` or per step `[N, L]`, or features (floating point) `[N, C]` or `[N, L, C]`; None for no context.
+        group: integers `[N]` (subject, session, world): the plans of a group are not independent, and never split
+            between training and validation; None if each plan is independent.
         context_names: names of the context indices, numbered from 0, or None.
         group_names: names of the groups, numbered from 0, or None.
         end: the action that stands for the end of the plan (see `with_end`), or None. It may only be a plan's last.
@@ -74,7 +74,7 @@ class Plans:
         _check_names("context", self.context, self.context_names)
 
     def _check_end(self, actions: Tensor) -> None:
-        """Check that `end` is an action that closes plans; where lengths are not given, it tells them."""
+        """Check that `end` only closes plans; where lengths are not given, take them from it."""
         if not isinstance(self.end, int) or not 0 <= self.end < self.num_actions:
             raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {self.end!r}")
         position = torch.arange(1, actions.shape[1] + 1, device=actions.device)
@@ -122,11 +122,11 @@ class Plans:
     def with_end(self, name: str = "end") -> "Plans":
         """The same plans, each closed by one action more, number A, that stands for the end of the plan.
 
-        A prior that learns from them tells how long plans are, and samples plans that end by themselves. A context a
-        step is repeated for it.
+        A prior that learns from them predicts when plans end, and samples plans of unequal lengths. A context per step
+        is repeated for the added action.
 
         Args:
-            name: of that action, where actions have names.
+            name: of the added action, where actions have names.
 
         Raises:
             ValueError: the plans have such an action already.
@@ -140,7 +140,7 @@ class Plans:
             last = (lengths - 1).clamp(min=0)
             closing = context[torch.arange(len(self), device=context.device), last] if self.max_length else None
             if closing is None:
-                raise ValueError("context: plans without any action have no context a step to close with")
+                raise ValueError("context: plans without any action have no context per step to repeat")
             context = torch.cat([context, torch.zeros_like(context[:, :1])], 1)
             context[torch.arange(len(self), device=context.device), lengths] = closing
         names = None if self.action_names is None else (*self.action_names, name)
@@ -250,7 +250,7 @@ def check_context(context: Tensor, num_plans: int, length: int) -> None:
 
 
 def is_per_step(context: Tensor | None) -> bool:
-    """True for a context a step (`[N, L]`, `[N, L, C]`), False for none or one a plan (`[N]`, `[N, C]`)."""
+    """True for a context per step (`[N, L]`, `[N, L, C]`), False for none or one per plan (`[N]`, `[N, C]`)."""
     return context is not None and context.dim() == (2 if is_integer(context) else 3)
 
 

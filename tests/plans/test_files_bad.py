@@ -227,10 +227,9 @@ def test_an_array_alone_is_no_npz(tmp_path):
         read_plans(tmp_path / "b.npz")
 
 
-def test_one_long_plan_among_many_short_ones(tmp_path, monkeypatch):
-    monkeypatch.setattr("neuroprior.plans.io.columns.MOST_ENTRIES", 300)
-    lines = [OK] * 3 + [f'{{"actions": {[0] * 100}}}']
-    refused(tmp_path, "a.jsonl", "\n".join(lines), "plan 4 of 100 actions", "400 entries")
+def test_one_long_plan_among_many_short_ones(tmp_path):
+    lines = [f'{{"actions": {[0] * 2**16}}}'] + ['{"actions":[0]}'] * 2**17
+    refused(tmp_path, "a.jsonl", "\n".join(lines), "plan 1 of 65536 actions", f"{(2**17 + 1) * 2**16} entries")
 
 
 @pytest.mark.parametrize(

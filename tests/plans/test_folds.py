@@ -38,7 +38,7 @@ def test_folds(numbers, grouped, seed, data):
 def test_the_seed_draws_the_folds():
     plans = Plans(torch.zeros(30, 2).long(), 2)
     drawn = {tuple(folds(plans, 5, seed)[0][1].tolist()) for seed in range(20)}
-    assert len(drawn) > 15  # of 142,506; two alike among 20 have a probability of 0.001
+    assert len(drawn) > 15  # of 142,506; two equal ones among 20 have a probability of 0.001
     state = torch.get_rng_state()
     folds(plans, 5, 7)
     assert state.equal(torch.get_rng_state())
@@ -66,7 +66,7 @@ def test_no_plans_have_no_folds():
 
 
 def in_steps(length: int, kind: str, pad: int = 0) -> Plans:
-    """A single plan whose context tells the place of each action, with `pad` columns beyond its end."""
+    """A single plan whose context is the place of each action, with `pad` columns beyond its end."""
     actions = torch.arange(length + pad) % 5
     place = torch.arange(length + pad)
     context = {
@@ -87,7 +87,7 @@ def test_parts_make_the_plan_again(length, number, pad, kind):
     parts = in_parts(plan, number)
     sizes = parts.mask().sum(1)
     assert 1 <= len(parts) <= number
-    assert len(sizes[:-1].unique()) <= 1  # alike but for the last
+    assert len(sizes[:-1].unique()) <= 1  # equal but for the last
     assert 0 < int(sizes[-1]) <= int(sizes[0])
     mask = parts.mask()
     assert parts.actions[mask].tolist() == plan.actions[0, :length].tolist()

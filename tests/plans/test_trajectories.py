@@ -18,37 +18,37 @@ LENGTHS = torch.tensor([3, 1])
 
 
 def steps(actions, observations):
-    return [(seen, action, 0.5, False, False, {}) for seen, action in zip(observations, actions, strict=True)]
+    return [(observed, action, 0.5, False, False, {}) for observed, action in zip(observations, actions, strict=True)]
 
 
 @pytest.mark.parametrize("as_what", ["steps", "dict", "object", "one more"])
 @pytest.mark.parametrize("kind", ["index", "features", "picture"])
 def test_trajectories_become_plans(as_what, kind):
     rng = np.random.default_rng(0)
-    seen = {
+    observed = {
         "index": [np.array([4, 0, 7]), np.array([1])],
         "features": [rng.random((3, 2)), rng.random((1, 2))],
         "picture": [rng.integers(9, size=(3, 2, 2)), rng.integers(9, size=(1, 2, 2))],
     }[kind]
     taken = [[0, 2, 1], np.array([1], np.int32)]
     if as_what == "steps":
-        given_as = [steps(a, o) for a, o in zip(taken, seen, strict=True)]
+        given_as = [steps(a, o) for a, o in zip(taken, observed, strict=True)]
     elif as_what == "one more":
         given_as = [
-            {"actions": a, "observations": np.concatenate([o, o[:1]])} for a, o in zip(taken, seen, strict=True)
+            {"actions": a, "observations": np.concatenate([o, o[:1]])} for a, o in zip(taken, observed, strict=True)
         ]
     else:
-        given_as = [{"actions": a, "observations": o} for a, o in zip(taken, seen, strict=True)]
+        given_as = [{"actions": a, "observations": o} for a, o in zip(taken, observed, strict=True)]
         given_as = [SimpleNamespace(**one) for one in given_as] if as_what == "object" else given_as
     plans = from_trajectories(iter(given_as), 3)
     assert (plans.actions.tolist(), plans.lengths.tolist()) == (ACTIONS.tolist(), [3, 1])
-    for row, observed in enumerate(seen):
-        expected = torch.tensor(observed)
+    for row, one in enumerate(observed):
+        expected = torch.tensor(one)
         if kind == "index":
-            assert torch.equal(plans.context[row, : len(observed)], expected)
+            assert torch.equal(plans.context[row, : len(one)], expected)
         else:
             assert plans.context.dtype == torch.float32
-            assert torch.equal(plans.context[row, : len(observed)], expected.flatten(1).float())
+            assert torch.equal(plans.context[row, : len(one)], expected.flatten(1).float())
     assert from_trajectories(given_as, 3, observations=None).context is None
 
 
@@ -157,7 +157,7 @@ def minari(tmp_path, monkeypatch):
         {"context": torch.tensor([[0.5, 2], [1, 1]])},
         {"group": torch.tensor([1, 0]), "group_names": ("m1", "m2")},
     ],
-    ids=["actions", "names", "features", "index a plan", "features a plan", "groups"],
+    ids=["actions", "names", "features", "index per plan", "features per plan", "groups"],
 )
 def test_minari_there_and_back(minari, more):
     plans = Plans(ACTIONS, 3, LENGTHS, ("up", "down", "stay"), **more)

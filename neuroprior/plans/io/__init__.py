@@ -1,0 +1,103 @@
+"""Reading and writing plans: one function each for all kinds of files; datasets of Minari; trajectories in memory."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from neuroprior.plans.io.columns import check_names
+from neuroprior.plans.io.csv import read_csv, write_csv
+from neuroprior.plans.io.jsonl import read_jsonl, write_jsonl
+from neuroprior.plans.io.minari import read_minari, write_minari
+from neuroprior.plans.io.npz import read_npz, write_npz
+from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
+from neuroprior.plans.plans import Plans
+
+__all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
+
+MINARI = "minari:"
+"""Before the name of a Minari dataset, where a file may be given."""
+
+READERS = {".csv": read_csv, ".tsv": read_csv, ".jsonl": read_jsonl, ".npz": read_npz}
+
+
+def read_plans(
+    path: str | os.PathLike[str], *, num_actions: int | None = None, action_names: Sequence[str] | None = None
+) -> Plans:
+    """Plans of a file, by its suffix, or of a Minari dataset: `minari:` and its name, see `read_minari`.
+
+    - `.npz`: arrays named like the attributes of `Plans`; only `actions [N, L]` is required. Nothing is unpickled.
+    - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and optionally `context` and
+      `group`; other keys are ignored. A context is an integer or a name; a list of these, one for each action; features
+      of the plan, a list of numbers (at least one in the file with a decimal point, else all are taken for integers);
+      or features of each step, a list of lists; all plans of a file have the same kind. The first line may have, in
+      place of `actions`, any of `num_actions`, `action_names`, `context_names`, `group_names` and `end`.
+    - `.csv`, `.tsv` (commas, semicolons or tabs) with one plan a row: columns `action_1`, `action_2`, ..., empty after
+      a plan's end; or no header, and all cells are actions. Or with one step a row: columns `plan` and `action`; the
+      rows of a plan stand together, in the order of its steps. Both may have `context` (integers or names) or
+      `context_1`, `context_2`, ... (features), of the plan or of the step, and `group`, the same on all rows of a plan.
+      Other columns are ignored.
+
+    Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if any of them is not a
+    number.
+
+    Args:
+        path: the file or dataset.
+        num_actions: A; None for what the file says, else the number of names, else the largest action + 1.
+        action_names: A names in the order of their numbers; without them the names are sorted.
+
+    Returns:
+        N plans, padded to the longest: context and group are int64, features float32 (`.npz`: as they are).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: an argument or the file is wrong; the message names the file and the line or the array.
+    """
+    if isinstance(path, str) and path.startswith(MINARI):
+        return read_minari(path.removeprefix(MINARI))
+    place = Path(path)
+    names = check_names(num_actions, action_names)
+    return READERS[_suffix(place)](place, num_actions, names)
+
+
+def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | None = None) -> None:
+    """Write plans to a file, by its suffix: those that `read_plans` reads. An old file is replaced once it is whole.
+
+    `.npz` and `.jsonl` keep everything. CSV keeps names where there are any, else numbers, but not the number of actions:
+    give `num_actions` or `action_names` when reading it. Names of contexts and groups are then numbered in sorted order.
+
+    Args:
+        plans: at least one.
+        path: the file.
+        layout: of a CSV file, one "plan" or one "step" a row; None for a step a row if the context is per step, else a
+            plan a row. With "step", a context per plan is repeated on all its rows and read back as one per step.
+
+    Raises:
+        ValueError: the file cannot hold these plans; the message says why.
+        OSError: the file cannot be written.
+    """
+    place = Path(path)
+    suffix = _suffix(place)
+    if layout is not None and READERS[suffix] is not read_csv:
+        raise ValueError(f"layout: for CSV files only, not for {place}")
+    if not len(plans):
+        raise ValueError(f"{place}: no plans to write")
+    context = plans.context
+    if suffix != ".npz" and context is not None and context.is_floating_point():
+        if not context.shape[-1]:
+            raise ValueError(f"{place}: a context of no features; use None")
+        if not context.float().isfinite().all():
+            raise ValueError(f"{place}: features too large for the 32 bits in which they are read")
+    if READERS[suffix] is read_csv:
+        write_csv(plans, place, layout)
+    elif suffix == ".jsonl":
+        write_jsonl(plans, place)
+    else:
+        write_npz(plans, place)
+
+
+def _suffix(path: Path) -> str:
+    if path.suffix.lower() not in READERS:
+        raise ValueError(
+            f"{path}: a file of the kind {', '.join(READERS)} is expected, not {path.suffix or 'no suffix'!r}"
+        )
+    return path.suffix.lower()

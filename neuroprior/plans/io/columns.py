@@ -1,8 +1,10 @@
-"""What a file of plans holds, gathered block by block into numpy arrays and put together as `Plans`."""
+"""What the readers of files share: opening them, columns of numbers or names, and plans put together from columns."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -17,36 +19,81 @@ Place = Callable[[int], str]
 """Where an entry stands: its position among all the entries to "FILE, line N"."""
 
 MOST_ENTRIES = 2**33
+"""Entries of padded plans beyond which a file is refused."""
+
 LARGEST_INTEGER = 2**62
+BLOCK = 2**20
+"""Entries that a column holds as Python's integers or texts before they become an array."""
+
+
+def check_file(path: Path) -> None:
+    """Raise FileNotFoundError for no file, ValueError for a directory or an empty file."""
+    if path.is_dir():
+        raise ValueError(f"{path}: a directory; a file of plans is expected")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: an empty file; plans are expected")
+
+
+@contextmanager
+def open_text(path: Path) -> Iterator[IO[str]]:
+    """A UTF-8 file, with or without a byte order mark, opened for reading; line ends are left as they are.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a directory, an empty file or one that is not UTF-8; the message names the line and the byte.
+    """
+    check_file(path)
+    try:
+        with open(path, encoding="utf-8-sig", newline="") as file:
+            yield file
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}{_not_utf8(path)}; save the file as UTF-8") from None
+
+
+def _not_utf8(path: Path) -> str:
+    # The error counts bytes from the start of a buffer: the file is read again to find the line.
+    with open(path, "rb") as file:
+        for number, line in enumerate(file, 1):
+            try:
+                line.decode("utf-8")
+            except UnicodeDecodeError as error:
+                return f", line {number}: byte {error.start + 1} of the line is not UTF-8"
+    return ": not UTF-8"
 
 
 class Column(dict[str, int]):
-    """Actions, contexts or groups of a file: whole numbers, or texts, which are numbered as they appear.
+    """The actions, contexts or groups of a file: whole numbers, or texts, which are numbered as they appear.
 
-    It is the mapping from a text to its number, so that a block of cells is looked up at the speed of a dict.
+    The object is itself the mapping from a text to its number, so that texts are looked up at the speed of a dict.
 
     Args:
         what: "action", "context" or "group", for messages.
-        names: those there are, in the order of their numbers; None where the file tells.
-        count: how many there are, where that is known.
-        untyped: texts are cells of a CSV file: whole numbers where all of them can be read as such.
+        names: the possible names in the order of their numbers; None where the file decides.
+        count: how many different ones are possible, if known.
+        untyped: texts are cells of a CSV file: whole numbers if all of them can be read as such.
+        blank: an empty cell is allowed, and gets the number -1.
     """
 
-    def __init__(self, what: str, names: Names | None = None, count: int | None = None, untyped: bool = False) -> None:
+    def __init__(
+        self,
+        what: str,
+        names: Names | None = None,
+        count: int | None = None,
+        untyped: bool = False,
+        blank: bool = False,
+    ) -> None:
         super().__init__()
-        self.what = what
-        self.names = names
+        self.what, self.names, self.untyped, self.blank = what, names, untyped, blank
         self.count = len(names) if names is not None else count
-        self.untyped = untyped
-        self.blank: int | None = None
         self.labels: dict[str, int] = {}
+        self.waiting: list[Any] = []
         self.blocks: list[Integers] = []
 
     def __missing__(self, text: str) -> int:
-        """Number a text that was not seen before; ValueError (which does not know the line) for one that is none."""
+        """Number a new text; ValueError (which does not know the line) for one that is neither a number nor a name."""
         label = text.strip() if self.untyped else text
-        if self.untyped and not label and self.blank is not None:
-            number = self.blank
+        if self.blank and not label:
+            number = -1
         else:
             if self.untyped and label not in self.labels:
                 self._check(label)
@@ -67,12 +114,29 @@ class Column(dict[str, int]):
         """The numbers `[len(texts)]` of texts, in order of appearance."""
         return np.fromiter(map(self.__getitem__, texts), np.int64, len(texts))
 
-    def add(self, values: Integers | Sequence[int]) -> None:
-        """Add a block of numbers: whole numbers of the file, or what `look_up` gave."""
-        block = np.asarray(values, np.int64)
-        if block.size and block.min() >= 0:
-            block = block.astype(np.min_scalar_type(int(block.max())))
-        self.blocks.append(block)
+    def add(self, values: Sequence[int | str]) -> None:
+        """Append whole numbers or texts, the same kind in all calls."""
+        self.waiting.extend(values)
+        if len(self.waiting) >= BLOCK:
+            self._pack()
+
+    def add_numbers(self, numbers: Integers) -> None:
+        """Append a block of what `look_up` gave."""
+        if numbers.size and numbers.min() >= 0:
+            numbers = numbers.astype(np.min_scalar_type(int(numbers.max())))
+        self.blocks.append(numbers)
+
+    def _pack(self) -> None:
+        is_text = bool(self.waiting) and type(self.waiting[0]) is str
+        self.add_numbers(self.look_up(self.waiting) if is_text else np.array(self.waiting, np.int64))
+        self.waiting = []
+
+    def numbers(self) -> Integers:
+        """All entries in the order in which they were added; texts by their number in order of appearance."""
+        if self.waiting or not self.blocks:
+            self._pack()
+        self.blocks = [np.concatenate(self.blocks)]
+        return self.blocks[0]
 
     def finish(self, place: Place) -> tuple[Integers, Names | None]:
         """All numbers, in the order in which they were added, and the names that they stand for (None for none).
@@ -80,8 +144,7 @@ class Column(dict[str, int]):
         Raises:
             ValueError: an entry that is none of the names, negative or too large; the message says where.
         """
-        values: Integers = np.concatenate(self.blocks) if self.blocks else np.zeros(0, np.int64)
-        self.blocks = []
+        values = self.numbers()
         if not self.labels:
             return self._in_range(values, place), self.names
         labels = list(self.labels)
@@ -94,17 +157,16 @@ class Column(dict[str, int]):
         if wrong is not None:
             raise ValueError(f"{place(int((values == wrong[0]).argmax()))}: {wrong[1]}")
         rank = {name: number for number, name in enumerate(names)}
-        table = np.array([rank[label] for label in labels], np.min_scalar_type(len(names)))
-        return table[values], names
+        return np.array([rank[label] for label in labels], np.min_scalar_type(len(names)))[values], names
 
     def _wrong_label(self, labels: list[str], numbers: list[int | float | None]) -> tuple[int, str] | None:
-        """The number of the first text that is wrong among named ones, and what is wrong with it."""
+        """The number of the first text that is wrong among names, and what is wrong with it."""
         if self.names is not None:
             known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
             wrong = next((i for i, label in enumerate(labels) if label not in self.names), None)
             return None if wrong is None else (wrong, f"{self.what} {labels[wrong]!r} is none of {known}")
-        # One subject called 12b makes names of the other subjects' numbers; an action or a context among numbers that
-        # is none is rather a slip, and would reorder them all.
+        # One subject called 12b makes names of the other subjects' numbers; a name among numbers of actions or contexts
+        # is rather a slip, and would renumber them all.
         is_number = [number is not None for number in numbers]
         if self.what != "group" and any(is_number):
             wrong = is_number.index(not is_number[0])
@@ -117,10 +179,8 @@ class Column(dict[str, int]):
         return None
 
     def _in_range(self, values: Integers, place: Place) -> Integers:
-        if not values.size:
-            return values
         lowest, stop = (0 if self.what != "group" or self.names else -LARGEST_INTEGER), self.count or LARGEST_INTEGER
-        if values.min() < lowest or values.max() >= stop:
+        if values.size and (values.min() < lowest or values.max() >= stop):
             wrong = int(((values < lowest) | (values >= stop)).argmax())
             expected = f"0 to {stop - 1} are expected" if self.count else "0 or more is expected"
             raise ValueError(f"{place(wrong)}: {self.what} {values[wrong]} is out of range; {expected}")
@@ -128,7 +188,7 @@ class Column(dict[str, int]):
 
 
 def number_in(text: str, what: str = "action") -> int | float | None:
-    """The number that a cell holds: int if it is whole, float if not, None for a name.
+    """The number in a cell: int if it is whole, float if not, None for a name.
 
     What pandas and numpy make of whole numbers (1.0, 1e+00) is whole; a context with a decimal point is a feature.
     """
@@ -142,83 +202,101 @@ def number_in(text: str, what: str = "action") -> int | float | None:
     return int(value) if whole and value is not None else value
 
 
-def to_features(values: Iterable[float]) -> Floats:
-    """float32 of Python's floats; what is too large becomes infinite, without a warning."""
-    with np.errstate(over="ignore"):
-        return np.array(values, np.float64).astype(np.float32)
+def named(values: Any, names: Sequence[str] | None) -> Any:
+    """Numbers, in lists of any depth, replaced by their names where there are any: for writing."""
+    if names is None:
+        return values
+    return [named(value, names) for value in values] if isinstance(values, list) else names[values]
 
 
-@dataclass
-class Gathered:
-    """Plans end to end: S actions of N plans, with what belongs to them.
+def check_distinct(what: str, names: Sequence[str] | None) -> None:
+    """Raise ValueError where a name is there twice, so that a text would stand for two numbers."""
+    if names is not None and len(set(names)) < len(names):
+        raise ValueError(f"{what}: {next(n for n in names if list(names).count(n) > 1)!r} is there twice")
 
-    Attributes:
-        name: the file, for messages.
+
+def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> Names | None:
+    """The names as a tuple; ValueError for names, or a number of actions, that are impossible."""
+    if num_actions is not None and (type(num_actions) is not int or num_actions < 1):
+        raise ValueError(f"num_actions: an integer of at least 1 is expected, not {num_actions!r}")
+    if action_names is None:
+        return None
+    names = tuple(action_names)
+    if isinstance(action_names, str) or not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"action_names: a list of names is expected, not {action_names!r}")
+    check_distinct("action_names", names)
+    if num_actions not in (None, len(names)):
+        raise ValueError(f"action_names: {num_actions} are expected, not {len(names)}")
+    return names
+
+
+def assembled(
+    source: str,
+    lengths: Integers,
+    actions: Integers,
+    num_actions: int | None = None,
+    action_names: Names | None = None,
+    context: Integers | Floats | None = None,
+    per_step: bool = False,
+    context_names: Names | None = None,
+    group: Integers | None = None,
+    group_names: Names | None = None,
+    end: int | None = None,
+) -> Plans:
+    """`Plans` of N plans whose S actions stand end to end, padded to the longest.
+
+    Args:
+        source: the file, for messages.
         lengths: `[N]`.
         actions: `[S]`.
         num_actions: None for one more than the largest.
-        context: `[N]` or `[N, C]`, or, where `per_step`, `[S]` or `[S, C]`.
+        action_names: None for none.
+        context: `[N]` or `[N, C]`, or, if `per_step`, `[S]` or `[S, C]`.
+        per_step: see `context`.
+        context_names: None for none.
         group: `[N]`.
-    """
-
-    name: str
-    lengths: Integers
-    actions: Integers
-    num_actions: int | None = None
-    action_names: Names | None = None
-    context: Integers | Floats | None = None
-    per_step: bool = False
-    context_names: Names | None = None
-    group: Integers | None = None
-    group_names: Names | None = None
-    end: int | None = None
-
-    def plans(self) -> Plans:
-        """They as `Plans`, padded to the longest; ValueError names the file."""
-        num_actions = self.num_actions
-        if self.action_names is not None:
-            if num_actions not in (None, len(self.action_names)):
-                raise ValueError(
-                    f"{self.name}: {len(self.action_names)} names of {num_actions} actions; give action_names"
-                )
-            num_actions = len(self.action_names)
-        if num_actions is None and not len(self.actions):
-            raise ValueError(f"{self.name}: no plan has an action, so num_actions must be given")
-        num_actions = int(self.actions.max()) + 1 if num_actions is None else num_actions
-        dtype = torch.empty(0, dtype=action_dtype(num_actions)).numpy().dtype
-        longest = int(self.lengths.max()) if len(self.lengths) else 0
-        context = self.context
-        if context is not None:
-            context = context if context.dtype == np.float32 else context.astype(np.int64)
-            context = pad(context, self.lengths, self.name) if self.per_step else context
-        try:
-            return Plans(
-                torch.from_numpy(pad(self.actions.astype(dtype), self.lengths, self.name)),
-                num_actions,
-                None if self.end is None and (self.lengths == longest).all() else torch.from_numpy(self.lengths),
-                self.action_names,
-                None if context is None else torch.from_numpy(context),
-                None if self.group is None else torch.from_numpy(self.group.astype(np.int64)),
-                self.context_names,
-                self.group_names,
-                self.end,
-            )
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {error}") from error
-
-
-def pad(values: NDArray[Any], lengths: Integers, name: str) -> NDArray[Any]:
-    """`[N, L, ...]` of values `[S, ...]` that stand end to end, zero after the end of a plan.
+        group_names: None for none.
+        end: the end symbol.
 
     Raises:
-        ValueError: too many entries to pad: one long plan among many short ones.
+        ValueError: they are no `Plans`; the message names the source.
     """
+    if action_names is not None:
+        if num_actions not in (None, len(action_names)):
+            raise ValueError(f"{source}: {len(action_names)} names of {num_actions} actions; give action_names")
+        num_actions = len(action_names)
+    if num_actions is None and not len(actions):
+        raise ValueError(f"{source}: no plan has an action, so num_actions must be given")
+    num_actions = int(actions.max()) + 1 if num_actions is None else num_actions
+    dtype = torch.empty(0, dtype=action_dtype(num_actions)).numpy().dtype
+    longest = int(lengths.max()) if len(lengths) else 0
+    if context is not None:
+        context = context if context.dtype == np.float32 else context.astype(np.int64)
+        context = _padded(context, lengths, source) if per_step else context
+    try:
+        return Plans(
+            torch.from_numpy(_padded(actions.astype(dtype), lengths, source)),
+            num_actions,
+            None if end is None and (lengths == longest).all() else torch.from_numpy(lengths),
+            action_names,
+            None if context is None else torch.from_numpy(context),
+            None if group is None else torch.from_numpy(group.astype(np.int64)),
+            context_names,
+            group_names,
+            end,
+        )
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
+
+
+def _padded(values: NDArray[Any], lengths: Integers, source: str) -> NDArray[Any]:
+    """`[N, L, ...]` of values `[S, ...]`, zero after the end of a plan; ValueError if these are too many entries."""
     longest = int(lengths.max()) if len(lengths) else 0
     shape = (len(lengths), longest, *values.shape[1:])
     entries = len(lengths) * longest * int(np.prod(values.shape[1:]))
     if entries > MOST_ENTRIES:
         raise ValueError(
-            f"{name}: {len(lengths)} plans padded to the longest, plan {int(lengths.argmax()) + 1} of {longest} "
+            f"{source}: {len(lengths)} plans padded to the longest, plan {int(lengths.argmax()) + 1} of {longest} "
             f"actions, are {entries} entries, more than {MOST_ENTRIES}; cut long plans in pieces"
         )
     if len(values) == len(lengths) * longest:
@@ -228,23 +306,7 @@ def pad(values: NDArray[Any], lengths: Integers, name: str) -> NDArray[Any]:
     return padded
 
 
-def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> Names | None:
-    """The names as a tuple; ValueError where they or the number of actions cannot be."""
-    if num_actions is not None and (type(num_actions) is not int or num_actions < 1):
-        raise ValueError(f"num_actions: an integer of at least 1 is expected, not {num_actions!r}")
-    if action_names is None:
-        return None
-    names = tuple(action_names)
-    if isinstance(action_names, str) or not names or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"action_names: a list of names is expected, not {action_names!r}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"action_names: {next(n for n in names if names.count(n) > 1)!r} is there twice")
-    if num_actions not in (None, len(names)):
-        raise ValueError(f"action_names: {num_actions} are expected, not {len(names)}")
-    return names
-
-
-def renamed(plans: Plans, names: Names | None, place: str) -> Plans:
+def renamed(plans: Plans, names: Names | None, source: str) -> Plans:
     """The same plans with actions numbered as in `names`; those that have no names yet are given them.
 
     Raises:
@@ -255,11 +317,11 @@ def renamed(plans: Plans, names: Names | None, place: str) -> Plans:
     old = plans.action_names
     if old is None:
         if plans.num_actions != len(names):
-            raise ValueError(f"{place}: {plans.num_actions} actions, but {len(names)} names of actions are given")
+            raise ValueError(f"{source}: {plans.num_actions} actions, but {len(names)} names of actions are given")
         return replace(plans, action_names=names)
     unknown = next((name for name in old if name not in names), None)
     if unknown is not None:
-        raise ValueError(f"{place}: action {unknown!r} is none of {', '.join(names)}")
+        raise ValueError(f"{source}: action {unknown!r} is none of {', '.join(names)}")
     number = torch.tensor([names.index(name) for name in old])
     return replace(
         plans,

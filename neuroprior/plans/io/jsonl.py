@@ -1,22 +1,47 @@
 """Plans in JSON lines: one plan a line, `{"actions": [0, 2, 1], "context": 4, "group": "mouse 7"}`."""
 
 import json
+from array import array
 from bisect import bisect_right
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from neuroprior._files import written_whole
-from neuroprior.plans.io.columns import LARGEST_INTEGER, Column, Gathered, Integers, Names, check_names, renamed
-from neuroprior.plans.io.json_context import Contexts, shown
-from neuroprior.plans.io.opening import open_text
+from neuroprior.plans.io.columns import (
+    LARGEST_INTEGER,
+    Column,
+    Floats,
+    Integers,
+    Names,
+    Place,
+    assembled,
+    check_distinct,
+    check_names,
+    named,
+    open_text,
+    renamed,
+)
 from neuroprior.plans.plans import Plans, is_per_step
 
 HEADER = ("num_actions", "action_names", "context_names", "group_names", "end")
-BLOCK = 2**20
-"""Actions that wait as Python's integers before they become an array."""
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
+
+KINDS = {
+    "none": "no context",
+    "index": "an integer",
+    "name": "a name",
+    "numbers": "a list of numbers",
+    "names": "a list of names",
+    "rows": "a list of lists of numbers",
+    "empty": "an empty list",
+}
+"""Kinds of context of a plan, as messages call them."""
+
+LISTS = ("numbers", "names", "rows", "empty")
 
 
 def read_jsonl(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:
@@ -24,7 +49,6 @@ def read_jsonl(path: Path, num_actions: int | None, action_names: Names | None) 
     rows: _Rows | None = None
     with open_text(path) as file:
         for line, row in _objects(file, path):
-            place = f"{path}, line {line}"
             try:
                 if rows is None:
                     is_header = "actions" not in row and any(key in row for key in HEADER)
@@ -33,50 +57,31 @@ def read_jsonl(path: Path, num_actions: int | None, action_names: Names | None) 
                         continue
                 rows.add(line, row)
             except ValueError as error:
-                raise ValueError(f"{place}: {error}") from None
-    if rows is None or not rows.count:
+                raise ValueError(f"{path}, line {line}: {error}") from None
+    if rows is None or not rows.lines:
         raise ValueError(f'{path}: no plan; a line for each, with "actions", is expected')
     return rows.plans()
 
 
 def write_jsonl(plans: Plans, path: Path) -> None:
-    """Write a JSONL file, with a first line that tells what the others do not: `num_actions`, names, `end`."""
-    for what in ("action", "context", "group"):
-        check_distinct(plans, what)
+    """Write a JSONL file; its first line holds what the others do not: `num_actions`, names, `end`."""
+    for key in ("action_names", "context_names", "group_names"):
+        check_distinct(key, getattr(plans, key))
     header = {key: getattr(plans, key) for key in HEADER if getattr(plans, key) is not None}
-    per_step = is_per_step(plans.context)
     with written_whole(path) as file:
         file.write(json.dumps(header, ensure_ascii=False) + "\n")
         for start in range(0, len(plans), 2**14):
             some = plans[start : start + 2**14]
-            lengths = some.mask().sum(1).tolist()
-            columns = [_named(some.actions.tolist(), plans.action_names)]
-            keys = ["actions"]
+            columns = {"actions": named(some.actions.tolist(), plans.action_names)}
             if some.context is not None:
-                keys.append("context")
-                columns.append(_named(some.context.tolist(), plans.context_names))
+                columns["context"] = named(some.context.tolist(), plans.context_names)
             if some.group is not None:
-                keys.append("group")
-                columns.append(_named(some.group.tolist(), plans.group_names))
-            for length, values in zip(lengths, zip(*columns, strict=True), strict=True):
-                row = dict(zip(keys, values, strict=True))
-                row["actions"] = row["actions"][:length]
-                if per_step:
-                    row["context"] = row["context"][:length]
+                columns["group"] = named(some.group.tolist(), plans.group_names)
+            for length, *values in zip(some.mask().sum(1).tolist(), *columns.values(), strict=True):
+                row = dict(zip(columns, values, strict=True))
+                for key in ("actions", "context") if is_per_step(plans.context) else ("actions",):
+                    row[key] = row[key][:length]
                 file.write(json.dumps(row, ensure_ascii=False) + "\n")
-
-
-def check_distinct(plans: Plans, what: str) -> None:
-    """Raise ValueError where a name is there twice, so that a text could not tell which one is meant."""
-    names = getattr(plans, f"{what}_names")
-    if names is not None and len(set(names)) < len(names):
-        raise ValueError(f"{what}_names: {next(n for n in names if list(names).count(n) > 1)!r} is there twice")
-
-
-def _named(values: Any, names: Any) -> Any:
-    if names is None:
-        return values
-    return [_named(value, names) if isinstance(value, list) else names[value] for value in values]
 
 
 def _objects(file: Any, path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -97,7 +102,7 @@ def _objects(file: Any, path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
                 f"{path}, line {number}: not JSON (more after column {end}); one object a line is expected"
             )
         if type(row) is not dict:
-            raise ValueError(f'{path}, line {number}: {shown(row)} is no plan; {{"actions": [...]}} is expected')
+            raise ValueError(f'{path}, line {number}: {_short(row)} is no plan; {{"actions": [...]}} is expected')
         yield number, row
 
 
@@ -106,7 +111,7 @@ def _refuse_constant(text: str) -> NoReturn:
 
 
 class _Rows:
-    """The plans read so far, in arrays but for the last block."""
+    """The plans read so far, as columns."""
 
     def __init__(self, path: Path, header: dict[str, Any], num_actions: int | None, names: Names | None) -> None:
         self.path = path
@@ -118,97 +123,73 @@ class _Rows:
         check_names(self.num_actions, own if names is None else None)
         self.end = header.get("end")
         if self.end is not None and type(self.end) is not int:
-            raise ValueError(f"end: an action's number is expected, not {shown(self.end)}")
-        count = None if own is not None else self.num_actions
-        self.actions = Column("action", self.action_names, count)
-        self.group = Column("group", _header_names(header, "group_names"))
-        self.contexts = Contexts(_header_names(header, "context_names"))
+            raise ValueError(f"end: an action's number is expected, not {_short(self.end)}")
+        self.actions = Column("action", self.action_names, None if own is not None else self.num_actions)
+        self.groups = Column("group", _header_names(header, "group_names"))
+        self.contexts = _Contexts(_header_names(header, "context_names"))
         self.action_kind: type | None = None
         self.group_kind: type | None = None
-        self.count = 0
-        self.waiting: list[Any] = []
-        self.waiting_groups: list[Any] = []
-        self.lengths: list[Integers] = []
-        self.lines: list[Integers] = []
-        self.waiting_rows: list[tuple[int, int]] = []
+        self.lengths, self.lines = array("q"), array("q")
 
     def add(self, line: int, row: dict[str, Any]) -> None:
-        """Take up one plan; ValueError tells what is wrong with it."""
+        """Append one plan; ValueError says what is wrong with it."""
         actions = row.get("actions")
         if type(actions) is not list:
-            raise ValueError(f'"actions": a list is expected, not {shown(actions) if "actions" in row else "nothing"}')
+            raise ValueError(f'"actions": a list is expected, not {_short(actions) if "actions" in row else "nothing"}')
         kinds = set(map(type, actions))
         if self.action_kind is None and kinds:
             self.action_kind = type(actions[0])
-        if (kinds and kinds != {self.action_kind}) or self.action_kind not in (int, str, None):
-            self._refuse_action(actions)
+        if kinds and (kinds != {self.action_kind} or not kinds <= {int, str}):
+            wrong = next(a for a in actions if type(a) is not self.action_kind or type(a) not in (int, str))
+            mixed = "numbers and names of actions are mixed in the file"
+            raise ValueError(
+                f"action {_short(wrong)}: {mixed if type(wrong) in (int, str) else 'an integer or a name is expected'}"
+            )
         if actions and self.action_kind is int and not 0 <= min(actions) <= max(actions) < LARGEST_INTEGER:
             wrong = next(action for action in actions if not 0 <= action < LARGEST_INTEGER)
-            raise ValueError(f"action {shown(wrong)} is out of range; 0 or more is expected")
+            raise ValueError(f"action {_short(wrong)} is out of range; 0 or more is expected")
         group = row.get("group")
-        if not self.count:
+        if not self.lines:
             self.group_kind = type(group)
         if type(group) is not self.group_kind or self.group_kind not in (int, str, type(None)):
-            raise ValueError(f"group: {shown(group)}; an integer or a name in every plan, or in none, is expected")
-        if self.group_kind is int and not -LARGEST_INTEGER < group < LARGEST_INTEGER:  # type: ignore[operator]
-            raise ValueError(f"group: {shown(group)} is too large")
+            raise ValueError(f"group: {_short(group)}; an integer or a name in every plan, or in none, is expected")
+        if type(group) is int and not -LARGEST_INTEGER < group < LARGEST_INTEGER:
+            raise ValueError(f"group: {_short(group)} is too large")
         self.contexts.add(row.get("context"))
-        self.waiting.extend(actions)
-        self.waiting_groups.append(group)
-        self.waiting_rows.append((line, len(actions)))
-        self.count += 1
-        if len(self.waiting) + len(self.contexts.waiting) + 8 * len(self.waiting_rows) >= BLOCK:
-            self.flush()
-
-    def _refuse_action(self, actions: list[Any]) -> NoReturn:
-        wrong = next(
-            action for action in actions if type(action) is not self.action_kind or type(action) not in (int, str)
-        )
-        if type(wrong) in (int, str):
-            raise ValueError(f"action {shown(wrong)}: numbers and names of actions are mixed in the file")
-        raise ValueError(f"action {shown(wrong)}: an integer or a name is expected")
-
-    def flush(self) -> None:
-        """Turn the block that waits into arrays."""
-        is_text = self.action_kind is str
-        self.actions.add(self.actions.look_up(self.waiting) if is_text else self.waiting)
-        if self.group_kind is not type(None):
-            self.group.add(self.group.look_up(self.waiting_groups) if self.group_kind is str else self.waiting_groups)
-        rows = np.array(self.waiting_rows, np.int64).reshape(-1, 2)
-        self.lines.append(rows[:, 0].copy())
-        self.lengths.append(rows[:, 1].copy())
-        self.contexts.flush()
-        self.waiting, self.waiting_groups, self.waiting_rows = [], [], []
+        self.actions.add(actions)
+        if isinstance(group, int | str):
+            self.groups.add((group,))
+        self.lengths.append(len(actions))
+        self.lines.append(line)
 
     def plans(self) -> Plans:
         """All plans; ValueError names the line of what is wrong with one."""
-        self.flush()
-        lengths, lines = np.concatenate(self.lengths), np.concatenate(self.lines)
+        lengths = np.array(self.lengths)
         ends = np.cumsum(lengths)
 
         def plan(i: int) -> str:
-            return f"{self.path}, line {lines[i]}"
+            return f"{self.path}, line {self.lines[i]}"
 
         def step(i: int) -> str:
             return plan(bisect_right(ends, i))
 
         actions, names = self.actions.finish(step)
-        group, group_names = self.group.finish(plan)
+        group, group_names = self.groups.finish(plan)
         context, context_names, per_step = self.contexts.finish(lengths, plan, step)
-        gathered = Gathered(
-            name=str(self.path),
-            lengths=lengths,
-            actions=actions,
-            num_actions=self.num_actions,
-            action_names=names,
-            context=context,
-            per_step=per_step,
-            context_names=context_names,
-            group=None if self.group_kind is type(None) else group,
-            group_names=group_names,
-            end=self.end,
+        plans = assembled(
+            str(self.path),
+            lengths,
+            actions,
+            self.num_actions,
+            names,
+            context,
+            per_step,
+            context_names,
+            group if len(group) else None,
+            group_names,
+            self.end,
         )
-        return renamed(gathered.plans(), self.given_names, str(self.path))
+        return renamed(plans, self.given_names, str(self.path))
 
 
 def _header_names(header: dict[str, Any], key: str) -> Names | None:
@@ -216,7 +197,103 @@ def _header_names(header: dict[str, Any], key: str) -> Names | None:
     if names is None:
         return None
     if type(names) is not list or not names or not all(type(name) is str for name in names):
-        raise ValueError(f"{key}: a list of names is expected, not {shown(names)}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"{key}: {next(name for name in names if names.count(name) > 1)!r} is there twice")
+        raise ValueError(f"{key}: a list of names is expected, not {_short(names)}")
+    check_distinct(key, names)
     return tuple(names)
+
+
+class _Contexts:
+    """The contexts of the plans read so far; those of a file are all of one kind.
+
+    Args:
+        names: of the contexts, from the file's header.
+    """
+
+    def __init__(self, names: Names | None) -> None:
+        self.kind: str | None = None  # None until a plan shows it: an empty list does not
+        self.column = Column("context", names)
+        self.features: array[float] | None = None  # float32; None while there is neither a decimal point nor a row
+        self.width: int = -1
+        self.sizes = array("q")
+
+    def add(self, value: Any) -> None:
+        """Append the context of one plan, None where it has none; ValueError if it is wrong or of another kind."""
+        kind = _kind(value)
+        before = self.kind or ("empty" if self.sizes else None)
+        fits = kind == before or ("empty" in (kind, before) and kind in LISTS and before in LISTS)
+        if before is not None and not fits:
+            raise ValueError(f"context: {KINDS[kind]}, where the plans before have {KINDS[before]}")
+        values = list(chain.from_iterable(value)) if kind == "rows" else value if kind in LISTS else [value]
+        if kind == "rows":
+            self.width = len(value[0]) if self.width < 0 else self.width
+            for row in value:
+                if not row:
+                    raise ValueError("context: an empty list of features")
+                if len(row) != self.width:
+                    raise ValueError(f"context: {len(row)} features of a step, where those before have {self.width}")
+        is_float = kind == "rows" or (kind == "numbers" and float in map(type, values))
+        if kind in ("index", "numbers", "rows"):
+            _check_numbers(values, LARGEST_FLOAT if is_float else LARGEST_INTEGER)
+        if is_float and self.features is None:
+            # Whole numbers so far are features too.
+            self.features = array("f", () if kind == "rows" else self.column.numbers().tolist())
+        if self.features is not None:
+            self.features.extend(values)
+        elif kind != "none":
+            self.column.add(values)
+        self.kind = self.kind if kind == "empty" else kind
+        self.sizes.append(len(value) if kind in LISTS else 1)
+
+    def finish(
+        self, lengths: Integers, plan: Place, step: Place
+    ) -> tuple[Integers | Floats | None, Names | None, bool]:
+        """The contexts `[N]`, `[N, C]`, `[S]` or `[S, C]`, their names, and whether they are per step.
+
+        Args:
+            lengths: `[N]`.
+            plan: the place of a plan.
+            step: the place of a step.
+        """
+        if self.kind == "none":
+            return None, None, False
+        if self.kind in ("index", "name"):
+            return *self.column.finish(plan), False
+        sizes = np.array(self.sizes)
+        of_plans = self.kind == "numbers" and self.features is not None
+        wrong = np.flatnonzero(sizes != (sizes[0] if of_plans else lengths))
+        if wrong.size and of_plans:
+            i = int(wrong[0])
+            raise ValueError(f"{plan(i)}: context: {sizes[i]} features, where the first plan has {sizes[0]}")
+        if wrong.size:
+            i = int(wrong[0])
+            hint = "; features of a plan need a decimal point, as in 1.0" if self.kind == "numbers" else ""
+            raise ValueError(f"{plan(i)}: context: {sizes[i]} entries for {lengths[i]} actions{hint}")
+        if self.features is None:
+            return *self.column.finish(step), True
+        return np.array(self.features).reshape(-1, int(sizes[0]) if of_plans else self.width), None, not of_plans
+
+
+def _kind(value: Any) -> str:
+    """One of `KINDS`; numbers in lists are not checked."""
+    if value is None:
+        return "none"
+    if type(value) in (str, int):
+        return "name" if type(value) is str else "index"
+    if type(value) is not list:
+        raise ValueError(f"context: {_short(value)} is neither an integer, a name nor a list")
+    kinds = set(map(type, value))
+    return "empty" if not kinds else "names" if kinds == {str} else "rows" if kinds == {list} else "numbers"
+
+
+def _check_numbers(values: list[Any], largest: float) -> None:
+    if not set(map(type, values)) <= {int, float}:
+        wrong = next(value for value in values if type(value) not in (int, float))
+        raise ValueError(f"context: {_short(wrong)} is not a number, where numbers are expected")
+    if not -largest <= min(values) <= max(values) <= largest:
+        raise ValueError(f"context: {_short(max(values, key=abs))} is too large")
+
+
+def _short(value: Any) -> str:
+    """A value for a message, not longer than a part of a line."""
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:36]} ..."

@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._files import written_whole
-from neuroprior.plans.io.columns import Names, renamed
-from neuroprior.plans.io.opening import check_file
+from neuroprior.plans.io.columns import Names, check_file, renamed
 from neuroprior.plans.plans import Plans
 
 NUMBERS = ("actions", "lengths", "context", "group")

@@ -1,4 +1,4 @@
-"""Plans from trajectories as Gymnasium's environments give them, and plans as such trajectories."""
+"""Plans from trajectories in memory, as Gymnasium's environments return them, and back."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neuroprior.plans.io.columns import LARGEST_INTEGER, Gathered, Integers, check_names
+from neuroprior.plans.io.columns import LARGEST_INTEGER, Integers, assembled, check_names
 from neuroprior.plans.plans import Plans, is_per_step
 
 
@@ -15,15 +15,15 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
 
     Args:
         trajectories: each a list of steps `(observation, action, reward, terminated, truncated, info)`, where the agent
-            saw the observation and then took the action (what follows the action is not used); or a dict or an object
+            made the observation and then took the action (what follows the action is not used); or a dict or an object
             with `actions [T]` and perhaps `observations`, T of them or T + 1, of which the last is dropped (such are
             the episodes of Minari).
         num_actions: A; actions are integers from 0 to A - 1.
-        observations: "context" for the observations as the context of each step: integers as indices, arrays as
-            features, flattened, float32. None to leave them out.
+        observations: "context" to make the observations the context per step: integers become indices, arrays features
+            (flattened, float32). None to leave them out.
 
     Returns:
-        Plans, padded to the longest trajectory. Without a context where no trajectory has observations.
+        Plans, padded to the longest trajectory; without a context if no trajectory has observations.
 
     Raises:
         ValueError: actions that are not integers, observations that are neither integers nor arrays of one shape, or a
@@ -33,27 +33,22 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     if observations not in ("context", None):
         raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")
     actions: list[Integers] = []
-    seen: list[NDArray[Any] | None] = []
+    observed: list[NDArray[Any] | None] = []
     for number, trajectory in enumerate(trajectories):
-        taken, observed = _parts(trajectory, f"trajectory {number}")
-        actions.append(_actions(taken, num_actions, f"trajectory {number}"))
+        place = f"trajectory {number}"
+        taken, seen = _parts(trajectory, place)
+        actions.append(_actions(taken, num_actions, place))
         if observations is not None:
-            length = len(actions[-1])
-            seen.append(None if observed is None else _observations(observed, length, f"trajectory {number}"))
+            observed.append(None if seen is None else _observations(seen, len(actions[-1]), place))
     if not actions:
         raise ValueError("trajectories: none are given")
-    return Gathered(
-        name="trajectories",
-        lengths=np.array([len(part) for part in actions]),
-        actions=np.concatenate(actions),
-        num_actions=num_actions,
-        context=_joined(seen),
-        per_step=True,
-    ).plans()
+    lengths = np.array([len(part) for part in actions])
+    context = _joined(observed)
+    return assembled("trajectories", lengths, np.concatenate(actions), num_actions, context=context, per_step=True)
 
 
 def to_trajectories(plans: Plans) -> list[dict[str, NDArray[Any]]]:
-    """Each plan as a dict of `actions [T]`, int64, and `observations [T]` or `[T, C]` where it has a context a step."""
+    """Each plan as a dict of `actions [T]`, int64, and, of a context per step, `observations [T]` or `[T, C]`."""
     actions, lengths = plans.actions.long().cpu().numpy(), plans.mask().sum(1).tolist()
     context = plans.context if is_per_step(plans.context) else None
     found = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
@@ -89,7 +84,7 @@ def _actions(values: Any, num_actions: int, place: str) -> Integers:
         return np.zeros(0, np.int64)
     if actions.dtype.kind not in "iu" or actions.ndim != 1:
         raise ValueError(
-            f"{place}: actions are {actions.dtype} of shape {list(actions.shape)}; one integer a step is expected"
+            f"{place}: actions are {actions.dtype} of shape {list(actions.shape)}; one integer per step is expected"
             " (discrete actions)"
         )
     wrong = np.flatnonzero((actions < 0) | (actions >= num_actions))
@@ -126,25 +121,24 @@ def _observations(values: Any, length: int, place: str) -> NDArray[Any]:
     return features
 
 
-def _joined(seen: list[NDArray[Any] | None]) -> NDArray[Any] | None:
+def _joined(observed: list[NDArray[Any] | None]) -> NDArray[Any] | None:
     """All observations end to end: `[S]` or `[S, C]`, or None where there are none."""
-    there = [i for i, part in enumerate(seen) if part is not None]
-    if not there:
+    parts = [(i, part) for i, part in enumerate(observed) if part is not None]
+    if not parts:
         return None
-    parts = [part for part in seen if part is not None]
-    if len(parts) < len(seen):
-        missing = next(i for i, part in enumerate(seen) if part is None)
-        raise ValueError(f"trajectory {missing}: no observations, which trajectory {there[0]} has")
-    # A trajectory without steps tells nothing of the kind of its observations.
-    kinds = [(i, part) for i, part in enumerate(parts) if len(part)] or [(0, parts[0])]
-    first = kinds[0][1]
-    for i, part in kinds:
+    if len(parts) < len(observed):
+        missing = next(i for i, part in enumerate(observed) if part is None)
+        raise ValueError(f"trajectory {missing}: no observations, which trajectory {parts[0][0]} has")
+    # Of a trajectory without steps the kind of its observations is not known.
+    parts = [(i, part) for i, part in parts if len(part)] or parts[:1]
+    number, first = parts[0]
+    for i, part in parts:
         if part.shape[1:] != first.shape[1:] or part.dtype != first.dtype:
             raise ValueError(
-                f"trajectory {i}: observations of another kind than trajectory {kinds[0][0]}: "
-                f"{_kind(part)}, not {_kind(first)}"
+                f"trajectory {i}: observations of another kind than trajectory {number}: {_kind(part)}, not"
+                f" {_kind(first)}"
             )
-    return np.concatenate([part for _, part in kinds])
+    return np.concatenate([part for _, part in parts])
 
 
 def _kind(part: NDArray[Any]) -> str:
@@ -155,7 +149,7 @@ def _array(values: Any, place: str) -> NDArray[Any]:
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{place}: one number or one array of a fixed shape a step is expected") from error
+        raise ValueError(f"{place}: one number or one array of a fixed shape per step is expected") from error
     if array.dtype.kind == "O":
-        raise ValueError(f"{place}: {array.dtype} values; a number or an array of numbers a step is expected")
+        raise ValueError(f"{place}: {array.dtype} values; a number or an array of numbers per step is expected")
     return array

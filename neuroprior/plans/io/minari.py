@@ -15,22 +15,22 @@ from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
 from neuroprior.plans.plans import Plans, is_per_step
 
 OURS = "neuroprior"
-"""Key of what only Plans know, in a dataset's metadata."""
+"""Key of a dataset's metadata under which stands what Minari has no place for."""
 
 
 def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
-    """Plans of a local Minari dataset, one an episode. Nothing is downloaded.
+    """Plans of a local Minari dataset, one for each episode. Nothing is downloaded.
 
-    Observations of a Discrete space are indices a step, of a Box, MultiDiscrete or MultiBinary space features a step
-    (flattened, float32); numbers of spaces that start elsewhere are counted from 0. What `write_minari` wrote comes
-    back as it was.
+    Observations of a Discrete space become a context index per step, those of a Box, MultiDiscrete or MultiBinary space
+    features per step (flattened, float32). The values of Discrete spaces are renumbered from 0. What `write_minari`
+    wrote comes back as it was.
 
     Args:
         dataset_id: such as "minigrid/BabyAI-Pickup/optimal-v0", in `MINARI_DATASETS_PATH` or `~/.minari/datasets`.
-        observations: whether they are the context.
+        observations: whether the observations become the context.
 
     Raises:
-        FileNotFoundError: there is no such local dataset; the message tells how to get it.
+        FileNotFoundError: there is no such local dataset; the message says how to get it.
         ImportError: Minari is not installed.
         ValueError: actions that are not discrete, observations of a Dict, Tuple or Text space, or a damaged dataset.
     """
@@ -43,13 +43,13 @@ def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
             f"{dataset_id}: not among the local Minari datasets; `minari download {dataset_id}` gets a public one"
         ) from None
     with _one_line(dataset_id):
-        space, seen = dataset.action_space, dataset.observation_space
+        space, observed = dataset.action_space, dataset.observation_space
         if not isinstance(space, spaces.Discrete):
             raise ValueError(f"actions of the space {_shown(space)}; discrete actions are expected")
         known = (spaces.Discrete, spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)
-        if observations and not isinstance(seen, known):
-            raise ValueError(f"observations of the space {_shown(seen)}; read without, by observations=False")
-        first = int(seen.start) if isinstance(seen, spaces.Discrete) else 0
+        if observations and not isinstance(observed, known):
+            raise ValueError(f"observations of the space {_shown(observed)}; leave them out with observations=False")
+        first = int(observed.start) if isinstance(observed, spaces.Discrete) else 0
         episodes = [
             {
                 "actions": episode.actions - int(space.start),
@@ -64,13 +64,14 @@ def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
 
 
 def write_minari(plans: Plans, dataset_id: str) -> None:
-    """Write plans as a new local Minari dataset, one episode each, for thousands of plans rather than millions.
+    """Write plans as a new local Minari dataset, one episode each; for thousands of plans rather than millions.
 
-    The context is the observation (0 where there is none); after the last action the last one is repeated. Rewards are
-    0 and each episode is terminated at its end, for Plans know neither. Groups are metadata of the episodes ("group").
+    The context becomes the observation (0 where there is none), the last one repeated after the last action. As plans
+    have no rewards or terminations, rewards are 0 and each episode terminates at its end. Groups become metadata of the
+    episodes ("group").
 
     Args:
-        plans: one at least, each with an action at least.
+        plans: at least one, each with at least one action.
         dataset_id: such as "mice/open-field-v0", not there yet.
 
     Raises:
@@ -127,7 +128,7 @@ def _context_of_steps(plans: Plans) -> tuple[torch.Tensor, Any]:
 
 
 def _restored(plans: Plans, groups: list[Any], ours: dict[str, Any], observations: bool) -> Plans:
-    """Plans as they were written: with names, groups and `end`, and a context a plan where it was one."""
+    """Plans as they were written: with names, groups and `end`, and a context per plan where it was one."""
     context = plans.context
     if "context" in ours and ours["context"] != "step" and context is not None:
         context = context[:, 0] if ours["context"] == "plan" else None
@@ -158,7 +159,7 @@ def _one_line(dataset_id: str) -> Iterator[None]:
 
 @contextmanager
 def _whole(dataset_id: str) -> Iterator[None]:
-    """Leave no half of a dataset behind where writing it fails."""
+    """Remove what was written of a dataset if writing fails."""
     path = import_module("minari.storage.datasets_root_dir").get_dataset_path(dataset_id)
     was_there = path.exists()
     try:

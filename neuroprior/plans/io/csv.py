@@ -1,0 +1,326 @@
+"""Plans in CSV, one plan a row (`action_1`, `action_2`, ...) or one step a row (`plan`, `action`)."""
+
+import csv
+import math
+import re
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from neuroprior._files import written_whole
+from neuroprior.plans.io.columns import (
+    Column,
+    Floats,
+    Integers,
+    Names,
+    Place,
+    assembled,
+    check_distinct,
+    named,
+    number_in,
+    open_text,
+)
+from neuroprior.plans.plans import Plans, is_per_step
+
+ROWS_AT_ONCE = 2**10
+"""Rows that are parsed together; a few times faster than blocks that exceed the processor's cache."""
+
+DELIMITERS = (",", ";", "\t")
+OUR_WORDS = re.compile(r"plan|action(_1)?|context_1")
+OTHER_WORDS = re.compile(r"session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code")
+Row = list[str]
+T = TypeVar("T")
+
+
+def read_csv(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:
+    """Plans of a CSV file: see `read_plans`."""
+    sheet = _Sheet(path)
+    at = sheet.columns
+    action_columns = sheet.numbered("action") if sheet.has_header else list(range(sheet.width))
+    by_step = not action_columns
+    if by_step:
+        if not {"plan", "action"} <= at.keys():
+            raise ValueError(f"{path}, line 1: both columns 'plan' and 'action', or 'action_1', are expected")
+        action_columns = [at["action"]]
+    feature_columns = sheet.numbered("context")
+    if "context" in at and feature_columns:
+        raise ValueError(f"{path}, line 1: 'context' and 'context_1'; one of them is expected")
+    actions, plan_names = Column("action", action_names, num_actions, untyped=True, blank=not by_step), Column("plan")
+    others = {what: Column(what, untyped=True) for what in ("context", "group") if what in at}
+
+    def parse(rows: list[Row]) -> tuple[Integers, Integers, Floats | None, list[Integers]]:
+        flat, sizes = _actions(actions, action_columns, rows)
+        features = _features(rows, feature_columns) if feature_columns else None
+        return flat, sizes, features, [other.look_up([row[at[what]] for row in rows]) for what, other in others.items()]
+
+    all_sizes, all_features, all_lines, plan_of = [], [], [], []
+    for block_lines, rows in sheet.blocks():
+        flat, block_sizes, features, numbers = sheet.parse(parse, block_lines, rows)
+        actions.add_numbers(flat)
+        for other, block in zip(others.values(), numbers, strict=True):
+            other.add_numbers(block)
+        if features is not None:
+            all_features.append(features)
+        if by_step:
+            plan_of.append(plan_names.look_up([row[at["plan"]].strip() for row in rows]))
+        all_sizes.append(block_sizes)
+        all_lines.append(block_lines.astype(np.uint32))
+    sizes, lines = np.concatenate(all_sizes), np.concatenate(all_lines)
+    if not len(lines):
+        raise ValueError(f"{path}: a header and no {'step' if by_step else 'plan'} below it")
+    ends = np.cumsum(sizes)
+
+    def place(row: int) -> str:
+        return f"{path}, line {lines[row]}"
+
+    flat, names = actions.finish(lambda i: place(bisect_right(ends, i)))
+    found = {what: other.finish(place) for what, other in others.items()}
+    context, context_names = found.get("context", (np.concatenate(all_features) if all_features else None, None))
+    group, group_names = found.get("group", (None, None))
+    if by_step:
+        starts = _starts(np.concatenate(plan_of), list(plan_names), place)
+        sizes = np.diff(np.append(starts, len(lines)))
+        if group is not None:
+            wrong = np.flatnonzero(group != np.repeat(group[starts], sizes))
+            if wrong.size:
+                raise ValueError(f"{place(wrong[0])}: another group than on the plan's first row; a plan has one group")
+            group = group[starts]
+    return assembled(str(path), sizes, flat, num_actions, names, context, by_step, context_names, group, group_names)
+
+
+def _actions(actions: Column, columns: list[int], rows: list[Row]) -> tuple[Integers, Integers]:
+    """The actions of some rows end to end, and how many each row has."""
+    numbers = actions.look_up(_cells(rows, columns)).reshape(len(rows), len(columns))
+    there = numbers >= 0
+    sizes = there.sum(1)
+    gaps = there != (np.arange(len(columns)) < sizes[:, None])
+    if gaps.any():
+        first = int(there[int(gaps.any(1).argmax())].argmin()) + 1
+        raise ValueError(f"action {first} is empty, but not those after it; only the end of a plan may be empty")
+    return numbers[there], sizes
+
+
+def _features(rows: list[Row], columns: list[int]) -> Floats:
+    """The features `[rows, C]` of some columns; ValueError for what is not a finite number."""
+    texts = _cells(rows, columns)
+    with np.errstate(over="ignore"):
+        values = np.array([_float(text) for text in texts]).astype(np.float32)
+    wrong = np.flatnonzero(~np.isfinite(values))
+    if wrong.size:
+        raise ValueError(f"context {texts[wrong[0]]!r} is not a finite number")
+    return values.reshape(len(rows), len(columns))
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _starts(plan: Integers, names: list[str], place: Place) -> Integers:
+    """The rows on which a plan begins, from the number of each row's plan in order of appearance, and their names.
+
+    Raises:
+        ValueError: a plan without a name, or in two pieces.
+    """
+    if "" in names:
+        row = int((plan == names.index("")).argmax())
+        raise ValueError(f"{place(row)}: plan: an empty cell; the name or number of the plan is expected")
+    starts = np.flatnonzero(np.diff(plan, prepend=-1))
+    again = np.flatnonzero(plan[starts] != np.arange(len(starts)))
+    if again.size:
+        # Two pieces may be one plan in a file sorted by time, or two plans of subjects whose plans are each counted
+        # from 1: only the user can know.
+        row = int(starts[again[0]])
+        raise ValueError(
+            f"{place(row)}: plan {names[plan[row]]!r} goes on after another plan; sort the rows by plan, or give each"
+            " plan a name of its own"
+        )
+    return starts
+
+
+class _Sheet:
+    """A CSV file: its columns, and its rows in blocks.
+
+    Attributes:
+        path: the file.
+        has_header: whether the first row names the columns; else it is data.
+        columns: the position of each column by its name, in lower case; empty without a header.
+        width: the number of cells of every row.
+
+    Raises:
+        ValueError: an empty file, one that is not UTF-8 or not CSV, or a header with a column twice.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_text(path) as file:
+            sample = next((line for line in file if line.strip()), "")
+        self.delimiter = _delimiter(sample)
+        first = next((row for _, rows in self._all() for row in rows), None)
+        if first is None:
+            raise ValueError(f"{path}: no rows; plans are expected")
+        self.width = len(first)
+        names = _words(first)
+        self.has_header = any(OUR_WORDS.fullmatch(name) for name in names)
+        if self.has_header:
+            known = [name for name in names if re.fullmatch(r"plan|group|(action|context)(_\d+)?", name)]
+            twice = next((name for name in known if known.count(name) > 1), None)
+            if twice is not None:
+                raise ValueError(f"{path}, line 1: the column {twice!r} is there twice")
+        elif other := next((name for name in names if OTHER_WORDS.fullmatch(name)), None):
+            raise ValueError(
+                f"{path}, line 1: looks like a header ({other!r}) without a column 'action' (or 'action_1', ...); name"
+                " the column of the actions 'action', and the one that says to which plan a row belongs 'plan'"
+            )
+        self.columns = {name: i for i, name in enumerate(names)} if self.has_header else {}
+
+    def blocks(self) -> Iterator[tuple[Integers, list[Row]]]:
+        """The rows below the header, all of `width` cells, in blocks, with the line on which each ends."""
+        skip = int(self.has_header)
+        for lines, rows in self._all():
+            if len({len(row) for row in rows} - {self.width}):
+                wrong = next(i for i, row in enumerate(rows) if len(row) != self.width)
+                like = "header" if self.has_header else "first row"
+                raise ValueError(
+                    f"{self.path}, line {lines[wrong]}: {len(rows[wrong])} cells, where the {like} has {self.width}"
+                )
+            yield lines[skip:], rows[skip:]
+            skip = 0
+
+    def _all(self) -> Iterator[tuple[Integers, list[Row]]]:
+        """All rows but blank ones."""
+        with open_text(self.path) as file:
+            reader = csv.reader(file, delimiter=self.delimiter, strict=True)
+            while True:
+                start = reader.line_num
+                try:
+                    rows = list(islice(reader, ROWS_AT_ONCE))
+                except csv.Error as error:
+                    raise ValueError(f"{self.path}, line {reader.line_num}: not CSV ({error})") from None
+                if not rows:
+                    return
+                lines = np.arange(start + 1, start + len(rows) + 1)
+                if reader.line_num != start + len(rows):  # a quoted cell goes over several lines
+                    taken = [1 + sum(len(re.findall(r"\r\n|\r|\n", cell)) for cell in row) for row in rows]
+                    lines = start + np.cumsum(taken)
+                if not all(rows):
+                    lines = lines[[bool(row) for row in rows]]
+                    rows = [row for row in rows if row]
+                yield lines, rows
+
+    def parse(self, parse: Callable[[list[Row]], T], lines: Integers, rows: list[Row]) -> T:
+        """What `parse` makes of a block; if that fails, the message names the first line that is wrong."""
+        try:
+            return parse(rows)
+        except ValueError:
+            for line, row in zip(lines.tolist(), rows, strict=True):
+                try:
+                    parse([row])
+                except ValueError as error:
+                    raise ValueError(f"{self.path}, line {line}: {error}") from None
+            raise
+
+    def numbered(self, name: str) -> list[int]:
+        """The positions of the columns `name_1`, `name_2`, ...; ValueError where one between them is missing."""
+        found = {}
+        for column, i in self.columns.items():
+            if match := re.fullmatch(rf"{name}_(\d+)", column):
+                found[int(match[1])] = i
+        missing = next((number for number in range(1, len(found) + 1) if number not in found), None)
+        if missing is not None:
+            raise ValueError(f"{self.path}, line 1: columns up to {name}_{max(found)}, but {name}_{missing} is missing")
+        return [found[number] for number in range(1, len(found) + 1)]
+
+
+def _words(row: Row) -> list[str]:
+    return [cell.strip().lower() for cell in row]
+
+
+def _delimiter(line: str) -> str:
+    """The delimiter of a file by its first line: the one with which it is a header, else the most frequent one."""
+    rows: dict[str, Any] = {}
+    for delimiter in DELIMITERS:
+        try:
+            rows[delimiter] = next(csv.reader([line], delimiter=delimiter), [])
+        except csv.Error:
+            rows[delimiter] = []
+    words = {d: sum(bool(OUR_WORDS.fullmatch(name)) for name in _words(row)) for d, row in rows.items()}
+    return max(DELIMITERS, key=lambda d: (words[d], len(rows[d])))
+
+
+def _cells(rows: list[Row], columns: list[int]) -> list[str]:
+    """The cells of some columns, row by row."""
+    if columns == list(range(columns[0], columns[-1] + 1)):  # a slice is taken faster
+        part = slice(columns[0], columns[-1] + 1)
+        return [cell for row in rows for cell in row[part]]
+    return [row[i] for row in rows for i in columns]
+
+
+def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
+    """Write a CSV file; `.tsv` has tabs."""
+    if layout not in (None, "plan", "step"):
+        raise ValueError(f"layout: 'plan', 'step' or None is expected, not {layout!r}")
+    if plans.end is not None:
+        raise ValueError(
+            f"{path}: CSV cannot say that an action is the end symbol; write plans.without_end(), or JSONL"
+        )
+    lengths = plans.mask().sum(1)
+    if not lengths.any():
+        raise ValueError(f"{path}: CSV cannot hold plans of which none has an action")
+    for what in ("action", "context", "group"):
+        names = getattr(plans, f"{what}_names")
+        check_distinct(f"{what}_names", names)
+        for name in names or ():
+            if not name.strip() or name != name.strip() or "\n" in name or "\r" in name:
+                raise ValueError(
+                    f"{path}: {what}_names: CSV cannot hold {name!r}; names without line breaks and without space at"
+                    " either end are expected"
+                )
+            if what == "context" and number_in(name) is not None:
+                raise ValueError(f"{path}: {what}_names: CSV cannot hold {name!r}, which would be read as a number")
+    per_step = is_per_step(plans.context)
+    by_step = layout == "step" or (layout is None and per_step)
+    if per_step and not by_step:
+        raise ValueError(f"{path}: a context per step cannot be written with one plan a row; use layout='step'")
+    if by_step and not lengths.all():
+        raise ValueError(
+            f"{path}: plan {int((lengths == 0).nonzero()[0])} has no actions, and no row with layout='step'"
+        )
+    with written_whole(path) as file:
+        writer = csv.writer(file, delimiter="\t" if path.suffix.lower() == ".tsv" else ",", lineterminator="\n")
+        writer.writerows(_written(plans, by_step))
+
+
+def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
+    """The rows of a CSV file, the header first; with one step a row, plans are numbered from 0."""
+    width, per_step = plans.max_length, is_per_step(plans.context)
+    header = ["plan", "action"] if by_step else [f"action_{i + 1}" for i in range(width)]
+    if plans.context is not None:
+        features = plans.context.shape[-1] if plans.context.is_floating_point() else 0
+        header += [f"context_{i + 1}" for i in range(features)] or ["context"]
+    yield header + ["group"] * (plans.group is not None)
+    for start in range(0, len(plans), 2**14):
+        some = plans[start : start + 2**14]
+        none: list[list[Any]] = [[]] * len(some)
+        contexts = none if some.context is None else named(some.context.tolist(), plans.context_names)
+        groups = none if some.group is None else [[group] for group in named(some.group.tolist(), plans.group_names)]
+        actions, lengths = named(some.actions.tolist(), plans.action_names), some.mask().sum(1).tolist()
+        for i, (taken, length, context, group) in enumerate(
+            zip(actions, lengths, contexts, groups, strict=True), start
+        ):
+            if by_step:
+                yield from (
+                    [i, taken[t], *_as_list(context[t] if per_step else context), *group] for t in range(length)
+                )
+            else:
+                yield [*taken[:length], *[""] * (width - length), *_as_list(context), *group]
+
+
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
