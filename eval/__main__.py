@@ -30,8 +30,8 @@ def _run(arguments: Sequence[str]) -> None:
     from eval.mice.command import mice
     from eval.paper.command import paper
     from eval.quality.command import quality
-    from neuroprior.report.report import LISTS as PLANS_LISTS
-    from neuroprior.report.report import plans
+    from neuroprior.report.command import plans
+    from neuroprior.report.plan_report import INPUTS, MODELS
 
     about = "Compare behavioural priors. Dashes and underscores in option names are the same."
     parser = ArgumentParser(prog="python -m eval", description=about, exit_on_error=False, allow_abbrev=True)
@@ -40,7 +40,13 @@ def _run(arguments: Sequence[str]) -> None:
     by_name |= {"compare": compare, "grow": grow, "live": live, "depth": depth}
     # Lists are given as words, `--priors a b`, which functions cannot say.
     numbers = {key: {"type": int, "default": [*some], "help": what} for key, (some, what) in MICE_LISTS.items()}
-    lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": PLANS_LISTS}
+    of_plans: dict[str, dict[str, Any]] = {
+        "priors": {},
+        "models": {"default": [*MODELS[:4]], "choices": MODELS},
+        "inputs": {"default": [*INPUTS], "choices": INPUTS},
+        "action_names": {},
+    }
+    lists: dict[str, dict[str, dict[str, Any]]] = {"mice": numbers, "plans": of_plans}
     lists |= {
         "compare": COMPARE_LISTS,
         "grow": GROW_LISTS,
