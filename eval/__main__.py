@@ -7,7 +7,7 @@ from neuroprior.cli.program import Command, run_commands
 
 COMMANDS = {
     "paper": Command("eval.paper.command:paper", "the paper's two simulations"),
-    "plans": Command("neuroprior.report.report:plans", "a report on a file of plans (also: neuroprior report)"),
+    "plans": Command("neuroprior.report.command:plans", "a report on a file of plans (also: neuroprior report)"),
     "mice": Command("eval.mice.command:mice", "whether priors learned from mice in a labyrinth help a planner"),
     "compare": Command("eval.compare.command:compare", "priors, or planners, compared in many worlds at equal budget"),
     "grow": Command("eval.compare.growth:grow", "what priors gain from the horizon curriculum"),

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior import Plans, Prior, load
-from neuroprior.report.saved_priors import numbers
+from neuroprior.report.scores import numbers
 
 
 class Renumbered(Prior):

@@ -11,7 +11,7 @@ from eval.compare.figures import Estimate, key_of, styles
 from eval.compare.findings import Comparison, pair_table, times
 from eval.compare.pairs import shown_plans
 from eval.compare.rows import Rows
-from neuroprior.report.matrix_figures import transition_figure
+from neuroprior.report.figures import transition_figure
 from neuroprior.report.page import FigureBox, Section, Table, breakable
 
 

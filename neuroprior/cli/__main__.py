@@ -7,7 +7,7 @@ from neuroprior.cli.program import Command, run_commands
 
 COMMANDS = {
     "fit": Command("neuroprior.cli.fit:fit", "train a prior on executed plans and save it", raw=True),
-    "report": Command("neuroprior.report.report:plans", "report on a file of plans: structure, models, figures"),
+    "report": Command("neuroprior.report.command:plans", "report on a file of plans: structure, models, figures"),
     "score": Command("neuroprior.cli.score:score", "log-likelihood and bits per action of plans under a saved prior"),
     "sample": Command("neuroprior.cli.sample:sample", "new plans from a saved prior"),
     "example": Command("neuroprior.cli.example:example", "write a small file of plans to try the other commands on"),

@@ -1,0 +1,44 @@
+"""Reports: tables and figures of results, printed, written as CSV and JSON, and shown on one HTML page.
+
+`report(plans)` makes the report on executed plans: which models predict them best, how far back they reach, what is
+typical of them. Each of its figures is a function of its own, and `Document` and `publish` serve other reports.
+
+Needs pandas, matplotlib, jinja2, joblib and rich (`pip install 'neuroprior[report]'`).
+"""
+
+from neuroprior.report.document import Document, publish, table
+from neuroprior.report.figures import (
+    calibration_figure,
+    distribution_figure,
+    drift_figure,
+    group_transition_figure,
+    lag_figure,
+    motif_figure,
+    order_figure,
+    raster_figure,
+    score_figure,
+    transition_figure,
+)
+from neuroprior.report.page import FigureBox, Section, Table
+from neuroprior.report.plan_report import Report, report
+
+__all__ = [
+    "Document",
+    "FigureBox",
+    "Report",
+    "Section",
+    "Table",
+    "calibration_figure",
+    "distribution_figure",
+    "drift_figure",
+    "group_transition_figure",
+    "lag_figure",
+    "motif_figure",
+    "order_figure",
+    "publish",
+    "raster_figure",
+    "report",
+    "score_figure",
+    "table",
+    "transition_figure",
+]

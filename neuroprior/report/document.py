@@ -18,9 +18,6 @@ from rich.text import Text
 from neuroprior._files import versions, write_json, written_whole
 from neuroprior.report.page import Page, Section, Table, write_page
 
-WIDEST = 24
-"""Letters in the first column beyond which it is folded in the terminal."""
-
 Column = str | Callable[[Any], str]
 
 
@@ -36,6 +33,7 @@ class Document:
         settings: how the results were made, by name.
         command: the command line that makes them again.
         results: further JSON values for `results.json`.
+        keys: the keys of frames in `results.json` where they are not the names of the CSV files.
     """
 
     title: str
@@ -45,10 +43,11 @@ class Document:
     settings: Mapping[str, Any] = field(default_factory=dict)
     command: str = ""
     results: Mapping[str, Any] = field(default_factory=dict)
+    keys: Mapping[str, str] = field(default_factory=dict)
 
 
 def publish(document: Document, folder: Path, console: Console | None = None) -> None:
-    """Print a document's tables and lead, and write `report.html`, `results.json` and a CSV file for each frame.
+    """Print a document's tables and lead, and write its files; see `write_document`.
 
     Args:
         document: the document.
@@ -59,18 +58,36 @@ def publish(document: Document, folder: Path, console: Console | None = None) ->
         OSError: the files cannot be written.
     """
     console = console or Console()
+    show(document, console)
+    write_document(document, folder)
+    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def show(document: Document, console: Console) -> None:
+    """Print a document's tables and lead."""
     for section in document.sections:
         for table in section.tables:
             console.print(printed(table.title or section.title, table))
     console.print(document.lead, highlight=False, markup=False)
+
+
+def write_document(document: Document, folder: Path) -> None:
+    """Write `report.html`, `results.json` and a CSV file for each frame to a folder, which is made if it is not there.
+
+    Raises:
+        OSError: the files cannot be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     write_frames(folder, document.frames)
-    rows = {name: records(frame) for name, frame in document.frames.items()}
-    about = {"settings": dict(document.settings), "versions": versions()}
-    write_json(folder / "results.json", {**rows, **document.results, **about})
+    write_json(folder / "results.json", results_of(document))
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
     write_page(folder / "report.html", Page(document.title, document.lead, document.command, shown, document.sections))
-    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def results_of(document: Document) -> dict[str, Any]:
+    """What `results.json` holds: the rows of each frame, further results, settings and versions."""
+    rows = {document.keys.get(name, name): records(frame) for name, frame in document.frames.items()}
+    return {**rows, **document.results, "settings": dict(document.settings), "versions": versions()}
 
 
 def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
@@ -114,17 +131,14 @@ def _cell(row: Any, column: Column) -> str:
         return column(row)
     name, _, form = column.partition(":")
     value = row[name]
-    missing = value is None or (isinstance(value, float) and value != value)
-    return "" if missing else format(value, form)
+    return "" if pd.isna(value) else format(value, form)
 
 
 def printed(title: str, table: Table) -> rich.table.Table:
-    """A table for a terminal of 80 columns."""
+    """A table for a terminal of 80 columns: names are folded where there is no room, numbers are not."""
     made = rich.table.Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=escape(title))
     for heading, side in zip(table.headings, table.align or "", strict=True):
-        made.add_column(heading, justify="left" if side == "l" else "right", no_wrap=True)
-    if any(len(row[0]) > WIDEST for row in table.rows):
-        made.columns[0].no_wrap, made.columns[0].overflow = False, "fold"
+        made.add_column(heading, justify="left" if side == "l" else "right", no_wrap=side == "r", overflow="fold")
     for row in table.rows:
         made.add_row(*map(Text, row))  # names are no markup
     made.caption = escape(table.caption)

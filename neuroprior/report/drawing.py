@@ -1,7 +1,7 @@
 """How the figures of a page are drawn: colours by kind of model, dots with intervals, lines with bands."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from functools import wraps
 from typing import Any, ParamSpec
 from warnings import catch_warnings, filterwarnings
@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neuroprior.report.page import PAPER, STYLE, clean
 
@@ -63,7 +63,7 @@ def drawn(make: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def colors(names: Sequence[str]) -> Iterator[str]:
-    """A colour for each model, by its kind; names that tell no kind get spare colours in turn."""
+    """A colour for each model, by its kind; names of no known kind get spare colours in turn."""
     spare = 0
     for name in names:
         color = _kind(name.lower())
@@ -73,10 +73,10 @@ def colors(names: Sequence[str]) -> Iterator[str]:
 
 def lines(names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """A colour and a style of line for each model; models of one colour differ in style."""
-    seen: Counter[str] = Counter()
+    drawn_before: Counter[str] = Counter()
     for color in colors(names):
-        yield color, ("-", "--", ":", "-.")[seen[color] % 4]
-        seen[color] += 1
+        yield color, ("-", "--", ":", "-.")[drawn_before[color] % 4]
+        drawn_before[color] += 1
 
 
 def _kind(name: str) -> str | None:
@@ -116,15 +116,15 @@ def expect_some(name: str, values: Sized) -> None:
         raise ValueError(f"{name}: at least one is expected; without any there is no figure")
 
 
-def floats(values: Sequence[Number]) -> Array:
-    """Numbers as an array, float64; None becomes NaN."""
+def floats(values: Iterable[Any]) -> Array:
+    """Numbers, or rows of them, as an array, float64; None becomes NaN."""
     return np.array(list(values), dtype=np.float64)
 
 
 def dot(
     axes: Axes,
     at: float,
-    estimate: Sequence[Number],
+    estimate: Iterable[Any],
     color: str,
     hollow: bool = False,
     limits: tuple[float, float] = (-np.inf, np.inf),
@@ -142,14 +142,14 @@ def dot(
     axes.plot(mean, at, "o", color=color, mfc=PAPER if hollow else color, ms=6.5, mew=1.6)
 
 
-def band(axes: Axes, rows: Sequence[tuple[float, Number, Number, Number]], color: str, name: str, line: str) -> None:
+def band(axes: Axes, rows: Iterable[Iterable[Any]], color: str, name: str, line: str) -> None:
     """A line through the means of (place, mean, low, high) with a band between low and high."""
-    place, mean, low, high = floats([value for row in rows for value in row]).reshape(-1, 4).T
+    place, mean, low, high = floats(rows).reshape(-1, 4).T
     axes.fill_between(place, low, high, color=color, alpha=0.2, lw=0)
     axes.plot(place, mean, line, color=color, marker="o", ms=4, lw=1.8, label=name)
 
 
-def names_down(axes: Axes, names: Sequence[str], places: Sequence[float] | None = None) -> None:
+def names_down(axes: Axes, names: Sequence[str], places: ArrayLike | None = None) -> None:
     """Rows with names down the left side, with a line across at each."""
     at = np.arange(len(names)) if places is None else np.asarray(places)
     axes.set_yticks(at, names)

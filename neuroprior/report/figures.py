@@ -1,19 +1,24 @@
-"""Figures of a report on plans: scores, how far back structure reaches, orders, calibration, sequences, drift."""
+"""The figures of a report on plans. Each takes a table of the report, as pandas frame, or arrays, and stands alone."""
 
 from collections.abc import Mapping, Sequence
 from textwrap import wrap
-from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator
+from numpy.typing import ArrayLike
 
 from neuroprior.report.drawing import (
     FEWER,
     MORE,
     PLAIN,
     WIDTH,
+    Array,
     Number,
     at_edges,
     band,
@@ -38,55 +43,97 @@ MOST_PLANS = 1000
 MOST_GROUPS = 40
 """Groups drawn as a row each; of more, evenly spaced ones between the lowest and the highest."""
 
+NUMBERED = 8
+"""Actions up to which the cells of a matrix hold their numbers."""
+
+MOST_NAMES = 60
+"""Actions up to which each has its name beside the matrix; of more, every second or third one has."""
+
+MOST_PANELS = 12
+"""Groups drawn: of more, those that differ most."""
+
+MOST_STEPS = 400
+"""Actions of a sequence that are drawn, from its first."""
+
+STRIPS = [
+    "#3b82d6",
+    "#e08a1e",
+    "#2fa35f",
+    "#cf4a4a",
+    "#8e6bd1",
+    "#b8a42a",
+    "#d773b0",
+    "#29a3a3",
+    "#8f5f42",
+    "#93c94e",
+    "#4b4fb8",
+    "#8d97a8",
+]
+"""Colours of actions in strips; of more actions, the most frequent ones have a colour and the others a common grey."""
+
+OTHER = "#7d838c"
+
 DIGITS = FuncFormatter(lambda value, _: f"{value:g}")
 """Numbers on a logarithmic axis in plain digits: matplotlib's own are formulas."""
 
+DEEPEST = 0.8
+"""Opacity of the deepest colour: black text in light and white text in dark stay legible on it."""
+
+GAMMA = 0.7
+"""Power of a value that gives its opacity: below 1, so that small values are visible."""
+
+
+def model_names(frame: pd.DataFrame) -> pd.Series:
+    """The names of models with their input, from the columns `model` and `sees`."""
+    return frame["model"] + frame["sees"].map(lambda sees: ", with context" if "context" in sees else "")
+
+
+def lag_names(lags: pd.DataFrame) -> pd.Series:
+    """The name of the curve of each row of the table `lags`."""
+    return ("gain, " + model_names(lags)).where(lags["what"] == "gain", lags["what"])
+
 
 @drawn
-def score_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+def score_figure(scores: pd.DataFrame) -> Figure:
     """Bits per action of each model with its interval, the best at the top.
 
-    A model that is far worse than most is an arrow at the edge, so that the others can be told apart; all values stand
+    A model that is far worse than most is an arrow at the edge, so that the others can be compared; all values stand
     at the right.
 
     Args:
-        rows: `model`, `sees` ("actions" or "actions and context"), `bits_per_action`, `low`, `high`; a model may have
-            a row for each of the two it sees.
+        scores: the table `plans` of a report: `model`, `sees` (its input: "actions" or "actions and context"),
+            `bits_per_action`, `low`, `high`; a model may have a row for each input.
 
     Raises:
         ValueError: there are none.
     """
-    expect_some("rows", rows)
-    taken: dict[str, dict[bool, list[Number]]] = {}
-    for row in rows:
-        estimate = [row["bits_per_action"], row["low"], row["high"]]
-        taken.setdefault(row["model"], {})["context" in row["sees"]] = estimate
-    best = {
-        model: min((e[0] for e in ways.values() if e[0] is not None), default=np.inf) for model, ways in taken.items()
-    }
-    models = sorted(taken, key=lambda model: -best[model])
+    expect_some("scores", scores)
+    scores = scores.assign(with_context=scores["sees"].str.contains("context"))
+    best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
+    models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
-    both = len({sees for ways in taken.values() for sees in ways}) > 1
-    limit = _edge([best[model] for model in models])
-    color = dict(zip(taken, colors(list(taken)), strict=True))
+    both = scores["with_context"].nunique() > 1
+    limit = _edge(best.dropna().to_numpy())
+    color = dict(zip(best.index, colors(list(best.index)), strict=True))
     for y, model in enumerate(models):
-        ways = taken[model]
-        for sees, estimate in ways.items():
-            at = y + (0 if len(ways) < 2 else -0.17 if sees else 0.17)
-            dot(axes, at, estimate, color[model], hollow=both and not sees, limits=(-np.inf, limit))
-        told = ", ".join("" if ways[sees][0] is None else f"{ways[sees][0]:.3f}" for sees in sorted(ways))
-        axes.text(1.03, y, told, transform=axes.get_yaxis_transform(), va="center")
+        own = scores[scores["model"] == model].sort_values("with_context")
+        for row in own.itertuples():
+            at = y + (0 if len(own) < 2 else -0.17 if row.with_context else 0.17)
+            estimate = (row.bits_per_action, row.low, row.high)
+            dot(axes, at, estimate, color[model], hollow=both and not row.with_context, limits=(-np.inf, limit))
+        values = ", ".join("" if np.isnan(bits) else f"{bits:.3f}" for bits in floats(own["bits_per_action"]))
+        axes.text(1.03, y, values, transform=axes.get_yaxis_transform(), va="center")
     names_down(axes, [short(model, 36) for model in models])
     axes.set_xlabel("bits per action (less is better)")
     axes.set_xlim(right=limit if np.isfinite(limit) else None)
     if both:
-        legend(figure, [marker(INK, True, "sees actions"), marker(INK, False, "sees actions and context")])
+        legend(figure, [marker(INK, True, "actions"), marker(INK, False, "actions and context")])
     return figure
 
 
-def _edge(bits: Sequence[float]) -> float:
-    """Where the axis of the scores ends: far beyond the middle one; infinite where none is so far."""
-    finite = np.array([value for value in bits if np.isfinite(value)])
+def _edge(bits: Array) -> float:
+    """Where the axis of the scores ends: far beyond the median; infinite where no score is so far."""
+    finite = bits[np.isfinite(bits)]
     if len(finite) < 3:
         return float("inf")
     far = finite.min() + 5 * (np.median(finite) - finite.min())
@@ -94,35 +141,34 @@ def _edge(bits: Sequence[float]) -> float:
 
 
 @drawn
-def lag_figure(
-    information: Mapping[str, Sequence[tuple[int, Number, Number, Number]]],
-    floor: Sequence[tuple[int, Number]] | None = None,
-) -> Figure:
-    """Bits that the action k steps back gives, one line with its band a name.
+def lag_figure(lags: pd.DataFrame) -> Figure:
+    """Bits that the action k steps back gives, a line with its band for each model and for mutual information.
 
     Where the values span decades the axis is logarithmic above, and linear around 0, where estimates are negative too.
 
     Args:
-        information: by name, (lag, bits, low, high).
-        floor: (lag, bits): what is expected by chance.
+        lags: the table `lags` of a report: `what` ("mutual information" or "gain"), `model`, `sees`, `lag`, `bits`,
+            `low`, `high`, and `chance`, the 95 % quantile of what independent actions would give, or missing.
 
     Raises:
         ValueError: there are none.
     """
-    expect_some("information", information)
+    expect_some("lags", lags)
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
-    chance = floats([bits for _, bits in floor or []])
-    sizes = [abs(row[1]) for rows in information.values() for row in rows if row[1]]
-    largest = max(sizes, default=0.0)
-    small = np.abs(chance) if floor else [min(sizes, default=1.0)]
+    sizes = np.abs(floats(lags["bits"]))
+    sizes = sizes[sizes > 0]
+    floor = lags[lags["chance"].notna()]
+    largest = sizes.max(initial=0)
+    small = np.abs(floats(floor["chance"])) if len(floor) else [min(sizes, default=1.0)]
     linear = 10 ** np.round(np.log10(np.nanmax([largest / 100, *small, 1e-9])))
     if largest > 30 * linear:
         axes.set_yscale("symlog", linthresh=linear, linscale=0.6)
         axes.yaxis.set_major_formatter(DIGITS)
-    for name, (color, line) in zip(information, lines(list(information)), strict=True):
-        band(axes, information[name], color, short(name, 40), line)
-    if floor:
-        axes.plot([lag for lag, _ in floor], chance, "--", color=INK, alpha=0.7, lw=1.2, label="expected by chance")
+    curves = dict(iter(lags.groupby(lag_names(lags), sort=False)))
+    for (name, own), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
+        band(axes, own[["lag", "bits", "low", "high"]].to_numpy(), color, short(name, 40), line)
+    if len(floor):
+        axes.plot(floor["lag"], floor["chance"], "--", color=INK, alpha=0.7, lw=1.2, label="independent actions")
     axes.axhline(0, color=INK, lw=0.8)
     whole_numbers(axes, "steps back", "bits")
     legend(figure, axes.get_legend_handles_labels()[0])
@@ -130,58 +176,68 @@ def lag_figure(
 
 
 @drawn
-def order_figure(
-    criteria: Mapping[str, Sequence[tuple[int, Number]]],
-    held_out: Mapping[str, Sequence[tuple[int, Number, Number, Number]]],
-) -> Figure:
+def order_figure(orders: pd.DataFrame, scores: pd.DataFrame) -> Figure:
     """Information criteria and held-out bits against the order of the chain; the least of each is ringed.
 
     Args:
-        criteria: by name (BIC, AIC), (order, half the criterion in bits per action): on the scale of the others.
-        held_out: by name, (order, bits per action, low, high).
+        orders: the table `orders` of a report: `order`, `sees`, `bic_bits` and `aic_bits`: half the criterion in bits
+            per action, on the scale of the held-out bits.
+        scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
     """
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
-    for number, (name, pairs) in enumerate(criteria.items()):
-        rows = [(order, bits, None, None) for order, bits in pairs]
-        band(axes, rows, INK, clean(name), ("--", ":", "-.")[number % 3])
-    for name, (color, line) in zip(held_out, lines(list(held_out)), strict=True):
-        band(axes, held_out[name], color, short(name, 40), line)
+    styles = iter(("--", ":", "-.", "--"))
+    for sees, own in orders.groupby("sees", sort=False):
+        for criterion in ("BIC", "AIC"):
+            rows = own.assign(none=None)[["order", f"{criterion.lower()}_bits", "none", "none"]]
+            band(axes, rows.to_numpy(), INK, criterion + ", with context" * ("context" in str(sees)), next(styles))
+    chains = chain_scores(scores)
+    curves = {f"held out, {sees}": own for sees, own in chains.groupby("sees", sort=False)}
+    for (name, own), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
+        band(axes, own[["order", "bits_per_action", "low", "high"]].to_numpy(), color, name, line)
     lows, tops = [], []
     for curve in [curve for curve in axes.lines if np.isfinite(curve.get_ydata()).any()]:
-        orders, bits = curve.get_data()
+        order, bits = np.asarray(curve.get_data(), dtype=np.float64)
         least = int(np.nanargmin(bits))
-        axes.plot(orders[least], bits[least], "o", ms=13, mfc="none", mec=curve.get_color(), mew=1.3)
+        axes.plot(order[least], bits[least], "o", ms=13, mfc="none", mec=curve.get_color(), mew=1.3)
         lows.append(bits[least])
         tops.append(max(np.nanmax(bits[: least + 1]), 1.05 * bits[least]))
     if lows:
         # A criterion climbs without end with the number of parameters; that it leaves the figure says enough.
         reach = 1.2 * (max(tops) - min(lows))
         axes.set_ylim(min(lows) - 0.1 * reach, min(axes.get_ylim()[1], min(lows) + reach))
-    whole_numbers(axes, "order: actions seen", "bits per action")
+    whole_numbers(axes, "order", "bits per action")
     legend(figure, axes.get_legend_handles_labels()[0])
     return figure
 
 
+def chain_scores(scores: pd.DataFrame) -> pd.DataFrame:
+    """The rows of Markov chains in the table `plans` of a report, with their `order`, ascending."""
+    order = scores["model"].str.extract(r"^markov-(\d+)$")[0]
+    return scores[order.notna()].assign(order=order.dropna().astype(int)).sort_values("order", kind="stable")
+
+
 @drawn
-def calibration_figure(curves: Mapping[str, Sequence[tuple[Number, Number, Number, Number, int]]]) -> Figure:
-    """How often actions came against how probable they were said to be: a panel a model; the diagonal is calibrated.
+def calibration_figure(calibration: pd.DataFrame) -> Figure:
+    """The share of actions that were taken against the forecast probability, a panel a model; the diagonal is right.
 
     Args:
-        curves: by model, (mean forecast, share taken, low, high, number of forecasts) a bin; larger points hold more.
+        calibration: the table of a report: `model`, `sees`, `forecast` (the mean of a bin), `taken` (the share),
+            `low`, `high`, and `number` of forecasts; larger points hold more.
 
     Raises:
         ValueError: there are none.
     """
-    expect_some("curves", curves)
+    expect_some("calibration", calibration)
+    curves = dict(iter(calibration.groupby(model_names(calibration), sort=False)))
     across = min(len(curves), 3)
     down = -(-len(curves) // across)
     figure, cells = panels(down, across, (2.45 * across + 0.15, 2.65 * down + 0.3))
-    for axes, name, color in zip(cells, curves, colors(list(curves)), strict=False):
-        forecast, share, low, high, number = floats([v for row in curves[name] for v in row]).reshape(-1, 5).T
-        size = 8 + 70 * np.sqrt(number / max(number.max(initial=0), 1))
+    for axes, (name, own), color in zip(cells, curves.items(), colors(list(curves)), strict=False):
+        number = floats(own["number"])
         axes.plot([0, 1], [0, 1], color=INK, lw=0.8, alpha=0.6)
-        axes.vlines(forecast, low, high, color=color, lw=1.8)
-        axes.scatter(forecast, share, s=size, color=color, lw=0, zorder=3)
+        axes.vlines(floats(own["forecast"]), floats(own["low"]), floats(own["high"]), color=color, lw=1.8)
+        size = 8 + 70 * np.sqrt(number / max(number.max(initial=0), 1))
+        axes.scatter(floats(own["forecast"]), floats(own["taken"]), s=size, color=color, lw=0, zorder=3)
         axes.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", title=short(name))
         axes.set(xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
         axes.grid()
@@ -190,28 +246,103 @@ def calibration_figure(curves: Mapping[str, Sequence[tuple[Number, Number, Numbe
 
 
 @drawn
-def motif_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+def transition_figure(matrix: ArrayLike, names: Sequence[str], title: str = "", small: bool = False) -> Figure:
+    """A transition matrix as a heat map; actions that nothing followed (NaN) are hatched.
+
+    Args:
+        matrix: `[A, A]`, probabilities, from row to column.
+        names: A of them.
+        title: above the matrix.
+        small: to stand beside others, 3 inches wide and without a scale.
+    """
+    probs = np.asarray(matrix, dtype=np.float64)
+    numbered = len(probs) <= NUMBERED
+    side = 1.6 + (0.62 * len(probs) if numbered else min(max(0.125 * len(probs), 4.4), 7.4))
+    figure, (axes,) = panels(1, 1, (3.0, 3.0) if small else (side + 0.9, side))
+    top = 1.0 if numbered else float(np.nanmax(probs, initial=0)) or 1.0
+    _cells(axes, probs / top, PLAIN)
+    for a, b in np.argwhere(np.isfinite(probs)) if numbered else []:
+        axes.text(b, a, f"{probs[a, b]:.2f}", ha="center", va="center", fontsize=7.5 if small else 9)
+    _named(axes, names, 7.5 if small or len(probs) > 20 else 10)
+    axes.set(xlabel="next action", ylabel="last action", title=clean(title))
+    if not small:
+        _scale(axes, 0, top, PLAIN, "probability")
+    return figure
+
+
+@drawn
+def group_transition_figure(
+    matrices: ArrayLike,
+    pooled: ArrayLike,
+    names: Sequence[str],
+    group_names: Sequence[str],
+    significant: ArrayLike,
+) -> Figure:
+    """How each group's transition probabilities differ from the pooled ones; significant cells have a dot.
+
+    At most `MOST_PANELS` groups are drawn: those with the most significant cells, and among these the largest
+    differences; the figure says so.
+
+    Args:
+        matrices: `[G, A, A]`, probabilities; rows of NaN are hatched.
+        pooled: `[A, A]`.
+        names: A of them.
+        group_names: G of them.
+        significant: `[G, A, A]` bool.
+
+    Raises:
+        ValueError: there are no groups.
+    """
+    expect_some("group_names", group_names)
+    gaps = np.asarray(matrices, dtype=np.float64) - np.asarray(pooled, dtype=np.float64)
+    marked = np.asarray(significant, dtype=bool)
+    weight = np.nan_to_num(np.abs(gaps)).sum((1, 2)) / np.maximum(np.isfinite(gaps).sum((1, 2)), 1)
+    chosen = np.sort(np.lexsort((-weight, -marked.sum((1, 2))))[:MOST_PANELS])
+    across = min(len(chosen), 4 if len(chosen) > 6 else 3)
+    down = -(-len(chosen) // across)
+    side = (WIDTH if across > 1 else 4.5) / max(across, 2)
+    figure, cells = panels(down, across, (side * across + 0.9, side * down + 0.9))
+    top = float(np.nan_to_num(np.abs(gaps[chosen])).max(initial=0)) or 1.0
+    for number, (axes, group) in enumerate(zip(cells, chosen, strict=False)):
+        _cells(axes, gaps[group] / top, MORE)
+        a, b = np.nonzero(marked[group])
+        axes.plot(b, a, "o", ms=min(5, 45 / len(names)), color=INK, mew=0)
+        axes.set_title(short(group_names[group], 22 if across < 4 else 17), fontsize=9)
+        if len(names) <= 12:
+            _named(axes, names, 8, left=number % across == 0, below=number >= len(chosen) - across)
+        else:
+            axes.set(xticks=[], yticks=[])
+    at_edges(cells, len(chosen), across, "next action", "last action")
+    if len(chosen) < len(gaps):
+        figure.suptitle(f"{len(chosen)} of {len(gaps)} groups: those that differ most", fontsize=10, x=0.01, ha="left")
+    _scale(cells[: len(chosen)], -top, top, MORE, "difference in probability")
+    return figure
+
+
+@drawn
+def motif_figure(motifs: pd.DataFrame) -> Figure:
     """How much more, or less, often sequences occur than expected, on an axis in powers of two.
 
     Args:
-        rows: `sequence` (text), `ratio` (observed by expected), `low`, `high`, `count`; drawn from the top down.
+        motifs: rows of the table of a report: `sequence` (text), `ratio` (observed by expected), `low`, `high`,
+            `count`; drawn from the top down.
 
     Raises:
         ValueError: there are none.
     """
-    expect_some("rows", rows)
-    names = ["\n".join(wrap(clean(row["sequence"]), 36, max_lines=4, placeholder=" …")) for row in rows][::-1]
+    expect_some("motifs", motifs)
+    names = ["\n".join(wrap(clean(name), 36, max_lines=4, placeholder=" …")) for name in motifs["sequence"]][::-1]
     heights = np.array([0.5 + 0.5 * (1 + name.count("\n")) for name in names])
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.3 * max(heights.sum(), 2)))
-    ratios = floats([row["ratio"] for row in rows])
-    told = ratios[np.isfinite(ratios) & (ratios > 0)]
-    reach = 2 ** max(1.25 * float(np.abs(np.log2(told)).max(initial=0)), 1.0)
+    ratios = floats(motifs["ratio"])
+    known = ratios[np.isfinite(ratios) & (ratios > 0)]
+    reach = 2 ** max(1.25 * float(np.abs(np.log2(known)).max(initial=0)), 1.0)
     axes.axvline(1, color=INK, lw=0.8, alpha=0.6)
     places = np.cumsum(heights) - heights / 2
-    for row, at in zip(reversed(rows), places, strict=True):
-        estimate = [row["ratio"], row["low"], row["high"]]
-        dot(axes, at, estimate, FEWER if (row["ratio"] or 0) < 1 else MORE, limits=(1 / reach, reach))
-        axes.text(1.03, at, f"{row['count']:,}", transform=axes.get_yaxis_transform(), va="center")
+    estimates = floats(motifs[["ratio", "low", "high"]].to_numpy())
+    for at, estimate, count in zip(places, estimates[::-1], motifs["count"][::-1], strict=True):
+        dot(axes, at, estimate, FEWER if estimate[0] < 1 else MORE, limits=(1 / reach, reach))
+        axes.text(1.03, at, f"{count:,}", transform=axes.get_yaxis_transform(), va="center")
     axes.text(1.03, 1, "count", transform=axes.transAxes, va="bottom")
     axes.set_xscale("log", base=2)
     axes.set_xlim(0.9 / reach, reach / 0.9)
@@ -220,6 +351,44 @@ def motif_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     names_down(axes, names, places)
     axes.set_ylim(0, heights.sum())
     axes.set_xlabel("times as often as expected")
+    return figure
+
+
+@drawn
+def raster_figure(real: ArrayLike, generated: ArrayLike, names: Sequence[str]) -> Figure:
+    """Sequences as strips of colour, one colour an action: real ones above, generated ones below.
+
+    Args:
+        real: `[n, T]`, action numbers; negative ones stand for no action. The first `MOST_STEPS` are drawn.
+        generated: `[m, T']`, likewise.
+        names: of the actions, by number.
+    """
+    both = [np.asarray(actions, dtype=np.int64)[:, :MOST_STEPS] for actions in (real, generated)]
+    count = sum(np.bincount(actions[actions >= 0], minlength=len(names)) for actions in both)
+    most = len(STRIPS) if len(names) <= len(STRIPS) else len(STRIPS) - 1
+    kept = np.sort(np.argsort(-count, kind="stable")[:most])
+    palette = np.array([(*to_rgb(OTHER), 0.45)] * len(names) + [(0, 0, 0, 0)])
+    palette[kept, :3], palette[kept, 3] = [to_rgb(color) for color in STRIPS[: len(kept)]], 1
+    keys = [Patch(color=STRIPS[place], label=short(names[action])) for place, action in enumerate(kept)]
+    if len(kept) < len(names):
+        keys.append(Patch(color=OTHER, alpha=0.45, lw=0, label=f"{len(names) - len(kept)} other actions"))
+    columns = 6 if max(len(str(key.get_label())) for key in keys) <= 10 else 3
+    heights = [0.16 * max(len(actions), 1) + 0.25 for actions in both]
+    size = (WIDTH, sum(heights) + 0.7 + 0.22 * -(-len(keys) // columns))
+    longest = max(actions.shape[1] for actions in both)
+    figure, cells = panels(2, 1, size, sharex=True, height_ratios=heights)
+    for axes, actions, title in zip(cells, both, ("real", "generated"), strict=True):
+        strips = np.repeat(palette[np.where(actions < 0, len(names), actions)], 5, axis=0)
+        # A gap between the strips of two sequences.
+        strips[4::5, :, 3] = 0
+        extent = (0.5, actions.shape[1] + 0.5, len(actions) - 0.5, -0.5)
+        axes.imshow(strips, aspect="auto", interpolation="none", extent=extent)
+        axes.set(yticks=[], xlim=(0.5, longest + 0.5))
+        axes.set_title(title, loc="left")
+        axes.spines[:].set_visible(False)
+    cut = max(np.shape(real)[1], np.shape(generated)[1]) > MOST_STEPS
+    cells[1].set_xlabel("action of the sequence" + f" (the first {MOST_STEPS})" * cut)
+    figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
     return figure
 
 
@@ -252,48 +421,47 @@ def distribution_figure(distributions: Mapping[str, tuple[Sequence[Number], Sequ
 
 
 @drawn
-def drift_figure(
-    positions: Sequence[tuple[Number, Number, Number]],
-    plans: Sequence[tuple[str, int, Number]],
-    groups: Sequence[tuple[str, Number, Number, Number]],
-) -> Figure:
+def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
     """Bits per action within plans, from plan to plan, and from group to group: three panels.
 
     Args:
-        positions: (mean, low, high) of each of the equal parts of the plans, from the first to the last.
-        plans: (group, index in its group, bits per action); at most `MOST_PLANS` are drawn.
-        groups: (name, mean, low, high); the one that costs most at the top, at most `MOST_GROUPS` of them.
+        drift: the table of a report: `what`, `name`, `bits`, `low`, `high`. Where `what` is "place", the equal parts of
+            the plans from the first to the last; where it is "group", the groups, of which at most `MOST_GROUPS` are
+            drawn, the one that takes the most bits at the top.
+        plans: `index` of a plan in its group, `bits` per action; at most `MOST_PLANS` are drawn.
     """
-    ranked = sorted((row for row in groups if row[1] is not None), key=lambda row: row[1] or 0)
-    ranked = [ranked[place] for place in _evenly(len(ranked), MOST_GROUPS)]
+    parts, groups = (drift[drift["what"] == what] for what in ("place", "group"))
+    ranked = groups[groups["bits"].notna()].sort_values("bits", kind="stable")
+    ranked = ranked.iloc[_evenly(len(ranked), MOST_GROUPS)]
     low = 0.9 + 0.24 * max(len(ranked), 2)
     figure = Figure(figsize=(WIDTH, 3.1 + low), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=[3.1, low])
-    (within, between), below = upper.subplots(1, 2), lower.subplots()
-    band(within, [(100 * (n + 0.5) / len(positions), *row) for n, row in enumerate(positions)], PLAIN, "", "-")
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[3.1, low])[:, 0]
+    within, between = upper.subplots(1, 2)
+    below = lower.subplots()
+    place = 100 * (np.arange(len(parts)) + 0.5) / max(len(parts), 1)
+    band(within, parts.assign(place=place)[["place", "bits", "low", "high"]].to_numpy(), PLAIN, "", "-")
     within.set(xlim=(0, 100), xlabel="place in the plan, %", ylabel="bits per action", title="within plans")
     within.grid(axis="y")
-    _cloud(between, plans)
-    for at, (_, *estimate) in enumerate(ranked):
-        dot(below, at, estimate, PLAIN)
-    names_down(below, [short(row[0]) for row in ranked])
+    _cloud(between, floats(plans["index"]), floats(plans["bits"]))
+    for at, row in enumerate(ranked.itertuples()):
+        dot(below, at, (row.bits, row.low, row.high), PLAIN)
+    names_down(below, [short(name) for name in ranked["name"]])
     of_all = f" ({len(ranked)} of {len(groups)})" if len(ranked) < len(groups) else ""
     below.set(xlabel="bits per action", title="groups" + of_all)
     return figure
 
 
-def _cloud(axes: Axes, plans: Sequence[tuple[str, int, Number]]) -> None:
+def _cloud(axes: Axes, index: Array, bits: Array) -> None:
     """Bits of each plan against its place in its group, and the means of neighbouring places."""
-    index, bits = floats([row[1] for row in plans]), floats([row[2] for row in plans])
-    some = _evenly(len(plans), MOST_PLANS)
+    some = _evenly(len(index), MOST_PLANS)
     axes.plot(index[some], bits[some], "o", ms=3.5, mew=0, color=INK, alpha=0.3)
-    told = np.isfinite(bits)
-    places = np.unique(index[told])
+    known = np.isfinite(bits)
+    places = np.unique(index[known])
     parts = np.array_split(places, min(20, len(places))) if len(places) else []
-    means = [bits[told & (index >= part[0]) & (index <= part[-1])].mean() for part in parts]
+    means = [bits[known & (index >= part[0]) & (index <= part[-1])].mean() for part in parts]
     axes.plot([part.mean() for part in parts], means, color=MORE, lw=2.2)
     whole_numbers(axes, "number of the plan in its group", "")
-    of_all = f" ({len(some):,} of {len(plans):,} drawn)" if len(some) < len(plans) else ""
+    of_all = f" ({len(some):,} of {len(index):,} drawn)" if len(some) < len(index) else ""
     axes.set_title("from plan to plan" + of_all)
 
 
@@ -301,3 +469,42 @@ def _evenly(number: int, most: int) -> list[int]:
     """At most `most` of `number` places, evenly spaced from the first to the last."""
     places: list[int] = np.unique(np.linspace(0, number - 1, min(number, most)).round().astype(int)).tolist()
     return places
+
+
+def _shades(values: Array, more: str) -> Array:
+    """Colours `[..., 4]` of values from -1 to 1: the page shows through where they are small or NaN."""
+    known = np.nan_to_num(np.clip(values, -1, 1))
+    hues = np.array([to_rgb(FEWER), to_rgb(more)])
+    return np.concatenate([hues[(known > 0).astype(int)], DEEPEST * np.abs(known)[..., None] ** GAMMA], -1)
+
+
+def _cells(axes: Axes, values: Array, more: str) -> None:
+    """A matrix of values from -1 to 1, whose unknown rows are hatched."""
+    axes.imshow(_shades(values, more), interpolation="none")
+    for row in np.flatnonzero(np.isnan(values).all(1)):
+        place = (-0.5, row - 0.5)
+        axes.add_patch(Rectangle(place, values.shape[1], 1, fill=False, hatch="////", ec=INK, lw=0, alpha=0.35))
+    for spine in axes.spines.values():
+        spine.set(visible=True, alpha=0.3)
+
+
+def _named(axes: Axes, names: Sequence[str], size: float, left: bool = True, below: bool = True) -> None:
+    """Names of actions down the left side and below; some of them where they are many."""
+    some = range(0, len(names), -(-len(names) // MOST_NAMES))
+    shown = [short(names[place], 24) for place in some]
+    turned = 0 if max(map(len, shown)) <= 5 and len(shown) <= NUMBERED else 90
+    axes.set_xticks(some, shown if below else [""] * len(shown), rotation=turned, fontsize=size)
+    axes.set_yticks(some, shown if left else [""] * len(shown), fontsize=size)
+    axes.tick_params(length=0 if len(some) == len(names) else 2)
+
+
+def _scale(axes: Axes | list[Axes], low: float, high: float, more: str, label: str) -> None:
+    """The scale of the colours of `axes`, beside them."""
+    first = axes if isinstance(axes, Axes) else axes[0]
+    bar = first.figure.colorbar(ScalarMappable(Normalize(low, high)), ax=axes, shrink=0.6, aspect=16, label=label)
+    # Of its own, matplotlib draws hundreds of cells, with seams where they are not opaque.
+    assert bar.solids is not None
+    bar.solids.remove()
+    steps = np.linspace(low, high, 128)[::-1, None]
+    bar.ax.imshow(_shades(steps / high, more), extent=(0, 1, low, high), aspect="auto", interpolation="none")
+    bar.outline.set(edgecolor=INK, alpha=0.3)

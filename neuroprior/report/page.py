@@ -22,7 +22,7 @@ INK = "#0a0b0c"
 PAPER = "#f3f4f5"
 """Drawn with this colour, an area of a figure takes that of the page's background."""
 
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "axes.axisbelow": True,
     "axes.edgecolor": INK,
     "axes.facecolor": "none",
@@ -101,13 +101,15 @@ class FigureBox:
 
     Attributes:
         figure: made with matplotlib's settings `STYLE`.
-        caption: below the figure: what is seen, in which units, and what intervals go over.
-        alt: what the figure says, for readers who do not see it.
+        caption: below the figure: what it shows, in which units, and what intervals go over.
+        alt: what the figure says, for readers who cannot see it.
+        name: by which programs find it.
     """
 
     figure: Figure
     caption: str
     alt: str
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -220,9 +222,9 @@ def _following(tag: str) -> str:
 
 def _drawing(box: FigureBox, prefix: str) -> Markup:
     """The SVG of a figure under ids of its own: matplotlib numbers those of every figure alike."""
-    told = Markup('<svg role="img" aria-label="{}" ').format(clean(box.alt))
+    labelled = Markup('<svg role="img" aria-label="{}" ').format(clean(box.alt))
     text = _in_tags(lambda tag: re.sub(r'( id="|href="#|url\(#)', rf"\g<1>{prefix}", tag), svg(box.figure))
-    return Markup(text.replace("<svg ", told, 1))
+    return Markup(text.replace("<svg ", labelled, 1))
 
 
 def _in_tags(change: Any, text: str) -> str:

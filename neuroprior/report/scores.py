@@ -1,157 +1,278 @@
-"""Models and what held-out actions cost them: the rows of the main table, calibration, and the choice of the best."""
+"""Models scored on held-out plans: by cross-validation, or saved priors on plans that they have not learned from."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from math import log
+from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
+import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
+from neuroprior._files import written_whole
+from neuroprior._jobs import JobRun
 from neuroprior.analysis import Reliability
-from neuroprior.analysis.comparison import ORDERS, Score, score_bits
+from neuroprior.analysis.comparison import ORDERS, Score, score_bits, unit_name, units
 from neuroprior.plans import Plans
-from neuroprior.report.crossval import ACTIONS, CONTEXT, Array, Job, Study
-from neuroprior.report.fits import COUNTED
+from neuroprior.priors import Prior
+from neuroprior.report import fits
+from neuroprior.report.fits import ACTIONS, CONTEXT, COUNTED, KINDS, Arrays, Design, Job, counted, split
+
+ORDERED = ["uniform", *(f"markov-{order}" for order in ORDERS)]
+ORDERED += ["context tree", "gru", "transformer", "gru-large", "stacked", "mixture"]
+"""The models of a cross-validation in the order of the main table."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
     """A model that was scored on held-out plans.
 
     Attributes:
         name: such as "markov-3".
-        sees: `ACTIONS` or `CONTEXT`.
+        inputs: `ACTIONS` or `CONTEXT`.
         how: its settings in each fold, the distinct ones.
-        load: what was kept of it, see `neuroprior.report.fits.Outcome`: of all held-out plans, in the order of the file; None for
-            nothing.
+        bits: `[N, L]`, float32: those of each held-out action (and of the ends, where it predicts these too).
+        score: their sums by independent unit.
+        calibration: its forecasts against what happened; None where nothing was scored.
+        generated: `[g, L]`: plans sampled from it in the place of held-out plans; None where it has none.
     """
 
     name: str
-    sees: str
+    inputs: str
     how: str
-    load: Callable[[str], Array | None]
+    bits: Tensor
+    score: Score
+    calibration: Reliability | None
+    generated: Tensor | None = None
 
     @property
     def label(self) -> str:
-        """Of figures."""
-        return self.name + ", sees context" * (self.sees == CONTEXT)
+        """Its name with its input, in figures and sentences."""
+        return self.name + ", with context" * (self.inputs == CONTEXT)
 
-    def bits(self) -> Tensor:
-        """`[N, L]`, float32: what each held-out action cost."""
-        found = self.load("bits")
-        assert found is not None
-        return torch.from_numpy(found)
-
-    def calibration(self) -> Reliability | None:
-        """Its forecasts against what happened."""
-        sums = self.load("calibration")
-        return None if sums is None else Reliability(torch.from_numpy(sums))
+    @property
+    def cost(self) -> float:
+        """Bits per action."""
+        return self.score.bits_per_action().mean
 
 
-def models_of(study: Study, jobs: Sequence[Job]) -> list[Model]:
-    """The models of a finished cross-validation, in the order of the main table."""
-    by_kind: dict[tuple[str, str], list[Job]] = {}
-    for job in jobs:
-        if job.kind != "lags":
-            by_kind.setdefault((job.kind, job.sees), []).append(job)
-    found = []
-    for (_, sees), some in by_kind.items():
-        some.sort(key=lambda job: job.fold)
-        how = [study.models(job) for job in some]
-        for name in how[0]:
-            # A chain may be too large for its tables in some folds.
-            if all(name in models for models in how):
-                settings = ", ".join(dict.fromkeys(models[name] for models in how if models[name]))
-                found.append(Model(name, sees, settings, _loader(study, some, name)))
-    chains = [f"markov-{order}" for order in ORDERS]
-    place = ["uniform", *chains, "context tree", "gru", "transformer", "gru-large", "stacked", "mixture"]
-    return sorted(found, key=lambda model: (model.sees == CONTEXT, place.index(model.name)))
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """All that a report is made of.
+
+    Attributes:
+        plans: those that are described.
+        scored: those on which models were scored, N of them.
+        mask: `[N, L]` bool: their actions that count.
+        models: in the order of the main table.
+        reference: the model that the others are compared with, and its name in the report.
+        sampled: the plans in whose place plans were sampled.
+        gains: the information by lag that models give.
+        settings: how it was made.
+    """
+
+    plans: Plans
+    scored: Plans
+    mask: Tensor
+    models: Sequence[Model]
+    reference: tuple[Model, str]
+    sampled: Plans
+    gains: pd.DataFrame
+    settings: dict[str, Any]
+
+    @property
+    def unit(self) -> str:
+        """What intervals go over."""
+        return unit_name(self.scored, self.mask)
+
+    @property
+    def best(self) -> Model:
+        """The model that takes the fewest bits."""
+        return min(self.models, key=lambda model: model.cost)
+
+    def leading(self, inputs: str) -> list[Model]:
+        """The models of figures, of those with this input: the best chain, and all that are no chains."""
+        same = [model for model in self.models if model.inputs == inputs]
+        chains = [model for model in same if model.name.removeprefix("markov-").isdecimal()]
+        chosen = [min(chains, key=lambda model: model.cost)] if chains else []
+        return chosen + [model for model in same if model not in chains and model.name != "uniform"]
+
+    def table(self) -> pd.DataFrame:
+        """A row a model: bits, nats and perplexity with intervals, and the paired difference from the reference."""
+        rows = []
+        for model in self.models:
+            bits, low, high, _ = model.score.bits_per_action()
+            row = {"model": model.name, "sees": model.inputs, "bits_per_action": bits, "low": low, "high": high}
+            for end, value in (("_per_action", bits), ("_low", low), ("_high", high)):
+                row["nats" + end] = value * log(2)
+            for end, value in (("", bits), ("_low", low), ("_high", high)):
+                row["perplexity" + end] = 2**value
+            reference = self.reference[0].score
+            # Where one predicts the ends of plans too and the other does not, there is no difference.
+            same = len(model.score.bits) == len(reference.bits) and model.score.actions.equal(reference.actions)
+            gap = model.score.minus(reference) if same else (None,) * 4
+            rows.append(row | dict(zip(("more", "more_low", "more_high", "p_value"), gap, strict=True)))
+        return pd.DataFrame(rows).assign(how=[model.how for model in self.models])
 
 
-def _loader(study: Study, jobs: Sequence[Job], name: str) -> Callable[[str], Array | None]:
-    def load(what: str) -> Array | None:
-        found = [study.array(job, name, what) for job in jobs]
-        if what == "generated":
-            return found[0]
-        whole = [array for array in found if array is not None]
-        if not whole:
-            return None
-        if what == "calibration":
-            return sum(whole[1:], start=whole[0])
-        bits = torch.zeros(study.scored.actions.shape)
-        for job, array in zip(jobs, whole, strict=True):
-            bits[study.split(job.fold)[1]] = torch.from_numpy(array)
-        return bits.numpy()
-
-    return load
+def cross_validation(folder: Path, plans: Plans, test: Plans | None, design: Design) -> JobRun[Job, Arrays]:
+    """The jobs of a cross-validation, whose results are kept below `folder` by the plans and the design."""
+    asked = {"plans": _digest(plans), "test": None if test is None else _digest(test), **asdict(design)}
+    run = partial(fits.fit_and_score, plans, test, design)
+    return JobRun(run, folder / "folds", asked, save=_save, load=_load, suffix=".npz")
 
 
-def score_rows(scores: Sequence[Score], models: Sequence[Model]) -> list[dict[str, Any]]:
-    """The rows of the main table: what each model takes, and how much more than the best of them."""
-    best = min(scores, key=lambda one: one.bits_per_action().mean)
-    return [score_row(one, best) | {"how": model.how} for one, model in zip(scores, models, strict=True)]
+def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Job]:
+    """What there is to do: the slowest first, so that no process is left alone with one at the end."""
+    kinds, inputs = set(kinds), list(inputs)
+    return [
+        Job(fold, kind, each)
+        for kind in KINDS
+        if kind in kinds
+        for fold in range(1 if kind == "lags" else design.folds)
+        for each in reversed(inputs)
+    ]
 
 
-def score_row(one: Score, reference: Score) -> dict[str, Any]:
-    """One row: bits, nats and perplexity with intervals, and the paired difference from the reference."""
-    taken = one.bits_per_action()
-    row = {
-        "model": one.model,
-        "sees": one.sees,
-        "bits_per_action": taken.mean,
-        "low": taken.low,
-        "high": taken.high,
-        "nats_per_action": taken.mean * log(2),
-        "nats_low": taken.low * log(2),
-        "nats_high": taken.high * log(2),
-        "perplexity": 2**taken.mean,
-        "perplexity_low": 2**taken.low,
-        "perplexity_high": 2**taken.high,
-    }
-    if len(one.bits) != len(reference.bits) or not one.actions.equal(reference.actions):
-        # One tells the ends of plans too, the other does not.
-        return row | dict.fromkeys(("more", "more_low", "more_high", "p_value"))
-    gap = one.minus(reference)
-    return row | {"more": gap.mean, "more_low": gap.low, "more_high": gap.high, "p_value": gap.p_value}
-
-
-def scores_of(models: Sequence[Model], scored: Plans, mask: Tensor) -> list[Score]:
-    """What each model paid for the held-out actions that count."""
-    return [score_bits(model.name, model.sees, model.bits(), scored, mask) for model in models]
-
-
-def leading(models: Sequence[Model], scores: Sequence[Score], sees: str) -> list[Model]:
-    """The models of figures, of those that see this: the best chain, and all that are no chains."""
-    cost = {id(model): one.bits_per_action().mean for model, one in zip(models, scores, strict=True)}
-    same = [model for model in models if model.sees == sees]
-    chains = [model for model in same if model.name.removeprefix("markov-").isdecimal()]
-    chosen = [min(chains, key=lambda model: cost[id(model)])] if chains else []
-    return chosen + [model for model in same if model not in chains and model.name != "uniform"]
-
-
-def step_rows(study: Study, jobs: Sequence[Job]) -> list[dict[str, Any]]:
-    """What the action k steps back still tells beyond the nearer ones: by counts and by a neural prior."""
-    rows = []
-    for job in jobs:
-        if job.kind != "lags":
+def evaluate(plans: Plans, test: Plans | None, design: Design, todo: Sequence[Job], found: list[Arrays]) -> Evaluation:
+    """The results of finished jobs, put together."""
+    scored = plans if test is None else test
+    mask = counted(scored, design.skip, design.cut)
+    held_out = [split(plans, test, design, fold)[1] for fold in range(design.folds)]
+    models, gains = [], []
+    results: dict[tuple[str, str], list[Arrays]] = {}
+    for job, arrays in zip(todo, found, strict=True):
+        results.setdefault((job.kind, job.inputs), []).append(arrays)
+    for (kind, inputs), by_fold in results.items():
+        if kind == "lags":
+            gains += _gains(by_fold[0], inputs)
             continue
-        for name in sorted(study.models(job), key=lambda name: name != COUNTED):
-            bits, actions = (torch.from_numpy(study.array(job, name, what)) for what in ("bits", "actions"))
-            scores = [Score(name, job.sees, b, a) for b, a in zip(bits, actions, strict=True)]
-            for lag in range(1, len(scores)):
-                gain = scores[lag - 1].minus(scores[lag])
-                rows.append(
-                    {
-                        "what": "gain",
-                        "model": name,
-                        "sees": job.sees,
-                        "lag": lag,
-                        "bits": gain.mean,
-                        "low": gain.low,
-                        "high": gain.high,
-                        "chance": None,
-                        "units": len(scores[lag].actions),
-                    }
+        for name in [key.removesuffix("/how") for key in by_fold[0] if key.endswith("/how")]:
+            # A chain may be too large for its tables in some folds.
+            if not all(f"{name}/how" in arrays for arrays in by_fold):
+                continue
+            how = dict.fromkeys(str(arrays[f"{name}/how"]) for arrays in by_fold)
+            bits = torch.zeros(scored.actions.shape)
+            for index, arrays in zip(held_out, by_fold, strict=True):
+                bits[index] = torch.from_numpy(arrays[f"{name}/bits"])
+            sums = [arrays[f"{name}/calibration"] for arrays in by_fold if f"{name}/calibration" in arrays]
+            generated = by_fold[0].get(f"{name}/generated")
+            models.append(
+                Model(
+                    name,
+                    inputs,
+                    ", ".join(filter(None, how)),
+                    bits,
+                    score_bits(name, inputs, bits, scored, mask),
+                    Reliability(torch.from_numpy(sum(sums[1:], start=sums[0]))) if sums else None,
+                    None if generated is None else torch.from_numpy(generated),
                 )
-    return sorted(rows, key=lambda row: row["sees"] != ACTIONS)
+            )
+    models.sort(key=lambda model: (model.inputs == CONTEXT, ORDERED.index(model.name)))
+    best = min(models, key=lambda model: model.cost)
+    table = pd.DataFrame(gains).sort_values("sees", kind="stable") if gains else pd.DataFrame()
+    reference = best, f"{best.name} ({best.inputs})"
+    return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design))
+
+
+def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
+    """What the action k steps back adds to the nearer ones: by counts and by a neural prior."""
+    rows = []
+    for name in (COUNTED, "gru"):
+        if f"{name}/bits" not in arrays:
+            continue
+        pairs = zip(*(torch.from_numpy(arrays[f"{name}/{what}"]) for what in ("bits", "actions")), strict=True)
+        scores = [Score(name, inputs, bits, actions) for bits, actions in pairs]
+        for lag in range(1, len(scores)):
+            bits, low, high, _ = scores[lag - 1].minus(scores[lag])
+            row = {"what": "gain", "model": name, "sees": inputs, "lag": lag, "bits": bits, "low": low, "high": high}
+            rows.append(row | {"chance": None, "units": len(scores[lag].actions)})
+    return rows
+
+
+def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Evaluation:
+    """Fitted priors, scored on plans whose actions and contexts they know by name, else by number.
+
+    Raises:
+        ValueError: a prior does not know these actions or contexts; the message has its name.
+    """
+    models = [_saved(name, prior, plans, skip) for name, prior in priors.items()]
+    mask = counted(plans, skip)
+    settings = {"priors": ", ".join(priors), "skip": skip, "unit": unit_name(plans, mask)}
+    return Evaluation(plans, plans, mask, models, (models[0], models[0].name), plans, pd.DataFrame(), settings)
+
+
+def _saved(name: str, prior: Prior, plans: Plans, skip: int) -> Model:
+    known = prior.num_actions - (prior.end is not None)
+    if plans.num_actions > known:
+        raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")
+    names = learned_names(prior)
+    actions = plans.actions
+    if names is not None and plans.action_names is not None:
+        number = numbers(names, plans.action_names, f"{name}: does not know the action", "; it knows")
+        actions = number[actions.long()]
+    plans = replace(plans, actions=actions, num_actions=known, action_names=None)
+    if prior.context_names is not None and plans.context_names is not None and plans.context is not None:
+        number = numbers(prior.context_names, plans.context_names, f"{name}: does not know the context", "; it knows")
+        plans = replace(plans, context=number[plans.context.long()], context_names=None)
+    inputs = CONTEXT if prior.takes_context else ACTIONS
+    if not prior.takes_context:
+        plans = replace(plans, context=None, context_names=None)
+    plans = plans if prior.end is None else plans.with_end()
+    mask = counted(plans, skip)
+    try:
+        arrays = fits.score_arrays(prior, plans, mask, units(plans, mask))
+        bits = torch.from_numpy(arrays["bits"])
+        score = score_bits(name, inputs, bits, plans, mask)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    sums = arrays.get("calibration")
+    calibration = None if sums is None else Reliability(torch.from_numpy(sums))
+    return Model(name, inputs, type(prior).__name__, bits, score, calibration)
+
+
+def learned_names(prior: Prior) -> list[str] | None:
+    """The names of the actions that a prior has learned, without that of its end symbol; None for numbers."""
+    return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
+
+
+def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:
+    """The number under which each of the names is known.
+
+    Raises:
+        ValueError: a name is not known; it stands between `before` and `after`, and those that are follow.
+    """
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(known)}")
+    return torch.tensor([known.index(name) for name in names])
+
+
+def _digest(plans: Plans) -> str:
+    """A digest of all that plans hold."""
+    digest = hashlib.sha256()
+    for name, value in vars(plans).items():
+        if isinstance(value, Tensor):
+            digest.update(
+                f"{name} {value.dtype} {[*value.shape]}".encode() + value.cpu().contiguous().numpy().tobytes()
+            )
+        else:
+            digest.update(f"{name} {value!r}".encode())
+    return digest.hexdigest()
+
+
+def _save(path: Path, arrays: Arrays) -> None:
+    with written_whole(path, "wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def _load(path: Path) -> Arrays:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except (BadZipFile, EOFError, KeyError) as error:
+        raise ValueError(str(error)) from error

@@ -1,0 +1,283 @@
+"""The report on plans: which models predict them best, how far back they reach, what is typical of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+
+from neuroprior._jobs import Progress
+from neuroprior.plans import Plans, read_plans
+from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
+from neuroprior.priors import Prior, load
+from neuroprior.report.document import Document, write_document
+from neuroprior.report.fits import ACTIONS, CONTEXT, Design, counted
+from neuroprior.report.scores import (
+    Evaluation,
+    cross_validation,
+    evaluate,
+    evaluate_saved,
+    jobs,
+    learned_names,
+    numbers,
+)
+from neuroprior.report.sections import SECTIONS, describe
+
+ModelName = Literal["counts", "gru", "transformer", "stacked", "gru-large", "mixture"]
+InputName = Literal["actions", "context"]
+
+MODELS: tuple[ModelName, ...] = ("counts", "gru", "transformer", "stacked", "gru-large", "mixture")
+INPUTS: tuple[InputName, ...] = ("actions", "context")
+
+MOST_ACTIONS = 10_000
+"""Kinds of actions beyond which they are thought to be names that look like numbers."""
+
+CSV = (".csv", ".tsv")
+"""Files whose actions may be numbers without names."""
+
+FOLDS = 5
+"""Where they are not given; fewer where there are fewer groups."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report on plans.
+
+    Attributes:
+        document: all that is printed and written.
+    """
+
+    document: Document
+
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """The tables of results by name: that of models is "plans"; those without rows are left out."""
+        return {name: frame for name, frame in self.document.frames.items() if len(frame)}
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """The figures by name, such as "scores", "lags" and "transitions"."""
+        return {box.name: box.figure for section in self.document.sections for box in section.figures}
+
+
+def report(
+    plans: Plans | str | Path,
+    *,
+    out: str | Path | None = None,
+    priors: Mapping[str, Prior] | Sequence[str] | None = None,
+    test: Plans | str | Path | None = None,
+    folds: int | None = None,
+    models: Sequence[ModelName] = MODELS[:4],
+    inputs: Sequence[InputName] = INPUTS,
+    skip: int = 0,
+    max_steps: int = 1000,
+    patience: float = 0.25,
+    num_actions: int | None = None,
+    action_names: Sequence[str] | None = None,
+    seed: int = 0,
+    processes: int | None = None,
+    dask: str | None = None,
+    sections: Sequence[str] = tuple(SECTIONS),
+    command: str = "",
+) -> Report:
+    """Report on plans: which models predict them best, how far back they reach, what is typical of them.
+
+    Args:
+        plans: the plans, or their file: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
+        out: folder for `report.html`, `results.json`, tables as CSV, and the finished fits of a cross-validation, with
+            which an interrupted one goes on; None: nothing is written.
+        priors: score these fitted priors only, given by name or by their folders; the first is the reference.
+        test: learn from the plans and score on these, or on those of this file, in place of cross-validation.
+        folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
+        models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
+            weighs the forecasts of counts), gru-large (256 wide, with dropout), mixture (of stacked and gru-large);
+            the last two are slow, and left out by default.
+        inputs: of the models: past actions alone, the context as well where the plans have one, or each in turn.
+        skip: actions at the beginning of each plan that do not count in scores.
+        max_steps: gradient steps of a neural prior.
+        patience: share of these steps without improvement after which training stops; 1 trains to the end.
+        num_actions: number of actions, where a file does not say.
+        action_names: names of the actions in the order of their numbers, where a file does not say.
+        seed: draws the folds and everything in training.
+        processes: how many models are fitted at a time; all cores by default.
+        dask: address of a Dask scheduler whose workers fit the models; None: this machine.
+        sections: which to make, of `neuroprior.report.sections.SECTIONS`; all by default.
+        command: the command line that makes the report again, for the page.
+
+    Raises:
+        ValueError: an argument is out of range, or the plans cannot be learned from or scored.
+        OSError: a file cannot be read or written.
+    """
+    for name, given, known in (
+        ("models", models, MODELS),
+        ("inputs", inputs, INPUTS),
+        ("sections", sections, SECTIONS),
+    ):
+        if not given or set(given) - set(known):
+            raise ValueError(f"{name}: some of {', '.join(known)} are expected, not {', '.join(given) or 'none'}")
+    _check(skip, max_steps, patience, seed, processes)
+    file = "" if isinstance(plans, Plans) else str(plans)
+    if priors is not None:
+        if test is not None or folds is not None:
+            raise ValueError("priors: they are scored on the plans as they are; leave test and folds out")
+        if not priors:
+            raise ValueError("priors: at least one is expected")
+        loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
+        names = action_names or (learned_names(next(iter(loaded.values()))) if file[-4:].lower() in CSV else None)
+        found = evaluate_saved(loaded, _read(plans, num_actions, names), skip)
+    else:
+        whole, empty = _with_actions(plans, num_actions, action_names)
+        other, cut = None, False
+        if test is not None:
+            if not isinstance(test, Plans) and file and Path(test).resolve() == Path(file).resolve():
+                raise ValueError("test: the very plans that are learned from; give others, or leave it out")
+            if folds is not None:
+                raise ValueError("folds: with test plans nothing is held out of the others; leave folds out")
+            other, empty = _with_actions(test, num_actions, action_names)
+            other = _numbered_alike(whole, other, "test" if isinstance(test, Plans) else str(test))
+        whole, other = _contexts_from_0(whole, other)
+        learned, cut = _in_parts(whole)
+        if other is not None:
+            other, cut = _in_parts(other)
+        number = 1 if other is not None else _folds(file or "plans", learned, folds)
+        design = Design(number, seed, skip, max_steps, patience, cut=cut)
+        kinds = [*models, *(["lags"] if "lags" in sections else [])]
+        given = [ACTIONS] * ("actions" in inputs) + [CONTEXT] * ("context" in inputs and learned.context is not None)
+        if not given:
+            raise ValueError("inputs: the plans have no context; leave context out")
+        left = int(counted(learned if other is None else other, skip, cut).sum())
+        if left < FEWEST_UNITS:
+            raise ValueError(f"skip: {left} actions are left to score after the first {skip} of each plan")
+        with TemporaryDirectory() as temporary:
+            run = cross_validation(Path(out or temporary), learned, other, design)
+            todo = jobs(design, kinds, given)
+            results = run.do(todo, processes=processes, dask=dask, title="fits")
+        found = evaluate(learned, other, design, todo, results)
+        settings: dict[str, Any] = {"models": ", ".join(kinds)} | found.settings
+        settings |= {"plans without actions, left out": empty} if empty else {}
+        settings |= {} if test is None else {"test": str(test) if not isinstance(test, Plans) else "plans"}
+        found = replace(found, plans=whole, settings=settings)
+    made = Report(_document(found, sections, file, command))
+    if out is not None:
+        write_document(made.document, Path(out))
+    return made
+
+
+def _document(found: Evaluation, sections: Sequence[str], file: str, command: str) -> Document:
+    parts = []
+    with Progress("report", len(sections), len(sections)) as progress:
+        for section in SECTIONS:
+            if section in sections:
+                parts.append(SECTIONS[section](found))
+                progress.advance(section)
+    made = [part for part in parts if part is not None]
+    bits, low, high, _ = found.best.score.bits_per_action()
+    return Document(
+        title=f"Plans in {Path(file).name}" if file else "Plans",
+        lead=f"The best model, {found.best.label}, takes {bits:.3f} bits per action"
+        f" (95 % interval {low:.3f} to {high:.3f} over {found.unit}).",
+        sections=[part.section for part in made],
+        frames={name: frame for part in made for name, frame in part.frames.items()},
+        settings=found.settings,
+        command=command,
+        results={
+            "reference": found.reference[1],
+            "unit": found.unit,
+            "file": {"name": file} | describe(found.plans),
+        },
+        keys={"plans": "rows"},
+    )
+
+
+def _check(skip: int, max_steps: int, patience: float, seed: int, processes: int | None) -> None:
+    """Raise ValueError, naming the argument, unless these can be."""
+    if skip < 0 or max_steps < 1:
+        raise ValueError(f"skip and max_steps: at least 0 and 1 are expected, not {skip} and {max_steps}")
+    if not 0 < patience <= 1:
+        raise ValueError(f"patience: a share of the steps, above 0 and at most 1, is expected, not {patience}")
+    if not 0 <= seed < 2**50:
+        raise ValueError(f"seed: an integer from 0 to 2**50 - 1 is expected, not {seed}")
+    if processes is not None and processes < 1:
+        raise ValueError(f"processes: at least 1 is expected, not {processes}")
+
+
+def _read(plans: Plans | str | Path, num_actions: int | None, names: Sequence[str] | None) -> Plans:
+    """The plans, without an end symbol."""
+    if not isinstance(plans, Plans):
+        plans = read_plans(plans, num_actions=num_actions, action_names=names)
+    elif num_actions is not None or names is not None:
+        raise ValueError("num_actions, action_names: for files only; plans have their own")
+    return plans if plans.end is None else plans.without_end()
+
+
+def _with_actions(plans: Plans | str | Path, num_actions: int | None, names: Sequence[str] | None) -> tuple[Plans, int]:
+    """The plans that have actions, and how many have none: these are of no use to models."""
+    read, file = _read(plans, num_actions, names), "plans" if isinstance(plans, Plans) else plans
+    if read.num_actions > MOST_ACTIONS:
+        raise ValueError(
+            f"{file}: action numbers go up to {read.num_actions - 1}; number the actions from 0, or write names"
+        )
+    some = read.mask().any(1)
+    if not bool(some.any()):
+        raise ValueError(f"{file}: no plan has an action")
+    return read[some], int((~some).sum())
+
+
+def _in_parts(plans: Plans) -> tuple[Plans, bool]:
+    """The plans, a single one cut into consecutive parts; and whether it was."""
+    if len(plans) > 1:
+        return plans, False
+    return in_parts(plans, min(BLOCKS, max(int(plans.mask().sum()) // 2, 1))), True
+
+
+def _folds(name: str, plans: Plans, folds: int | None) -> int:
+    """How many; by default no more than there are units."""
+    groups = 0 if plans.group is None else len(plans.group.unique())
+    units = groups if groups > 1 else len(plans)
+    if units < 2:
+        raise ValueError(f"{name}: at least two plans, or a single long one, are needed for cross-validation")
+    number = min(FOLDS, units) if folds is None else folds
+    if number < 2:  # which a `Design` takes for test plans
+        raise ValueError(f"folds: at least 2 are expected, not {number}")
+    return number
+
+
+def _contexts_from_0(plans: Plans, test: Plans | None) -> tuple[Plans, Plans | None]:
+    """The plans with the contexts that occur numbered from 0, where they have no names: gaps make no model larger."""
+    contexts = [some.context for some in (plans, test) if some is not None and some.context is not None]
+    named = plans.context_names is not None or (test is not None and test.context_names is not None)
+    if not contexts or named or contexts[0].is_floating_point():
+        return plans, test
+    present = torch.cat([context.flatten().long() for context in contexts]).unique()
+    if int(present[0]) < 0:
+        raise ValueError(f"context: numbers from 0 are expected, not {int(present[0])}")
+    new = [torch.searchsorted(present, context.long().contiguous()) for context in contexts]
+    return replace(plans, context=new[0]), None if test is None else replace(test, context=new[-1])
+
+
+def _numbered_alike(plans: Plans, test: Plans, name: str) -> Plans:
+    """The test plans with actions and contexts numbered as in those that are learned from."""
+    if _kind_of_context(plans) != _kind_of_context(test):
+        of_test, of_plans = _kind_of_context(test), _kind_of_context(plans)
+        raise ValueError(f"{name}: {of_test}, but {of_plans} in the plans to learn from")
+    elsewhere = " is not in the plans to learn from; they have"
+    if plans.action_names is not None and test.action_names is not None:
+        number = numbers(plans.action_names, test.action_names, f"{name}: the action", elsewhere)
+        test = replace(test, actions=number[test.actions.long()], num_actions=plans.num_actions, action_names=None)
+    if test.num_actions > plans.num_actions:
+        raise ValueError(f"{name}: {test.num_actions} actions, but {plans.num_actions} in the plans to learn from")
+    test = replace(test, num_actions=plans.num_actions, action_names=plans.action_names)
+    if plans.context_names is not None and test.context_names is not None and test.context is not None:
+        number = numbers(plans.context_names, test.context_names, f"{name}: the context", elsewhere)
+        test = replace(test, context=number[test.context.long()], context_names=plans.context_names)
+    return test
+
+
+def _kind_of_context(plans: Plans) -> str:
+    if plans.context is None:
+        return "no context"
+    return f"{plans.context.shape[-1]} features" if plans.context.is_floating_point() else "context indices"

@@ -1,0 +1,524 @@
+"""The sections of a report on plans: each makes its tables, as pandas frames and as text, and its figures."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from math import log
+from typing import Any, NamedTuple
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from neuroprior.analysis import (
+    action_drift,
+    by_group,
+    by_plan,
+    by_position,
+    likeness,
+    motifs,
+    mutual_information,
+    order_selection,
+    transitions,
+)
+from neuroprior.analysis.comparison import unit_name
+from neuroprior.plans import Plans, is_per_step
+from neuroprior.priors import learn_macros
+from neuroprior.report import figures
+from neuroprior.report.document import Column, table
+from neuroprior.report.fits import ACTIONS, CONTEXT
+from neuroprior.report.page import FigureBox, Section
+from neuroprior.report.scores import Evaluation, Model
+
+MOST_ORDER, MOST_LAG = 6, 20
+
+LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
+"""Lags in the table."""
+
+LISTED = 12
+"""Over-represented sequences, and actions in the table of drift."""
+
+DRAWN = 12
+"""Sequences drawn, real and generated."""
+
+MOST_MACROS = 16
+
+SIGNIFICANT = 0.05
+
+MANY_REPEATS = 0.2
+"""Share of actions that repeat the last one beyond which over-represented sequences are also sought without them."""
+
+ENOUGH_UNITS, LEAST = 5, 1e-9
+"""Units below which no gain is marked as significant, and bits below which a gain is 0 but for rounding."""
+
+
+class Part(NamedTuple):
+    """A section, and its tables of results by name."""
+
+    section: Section
+    frames: dict[str, pd.DataFrame]
+
+
+def file_section(found: Evaluation) -> Part:
+    """What is in the file."""
+    columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
+    columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "sees"}
+    shown = table(pd.DataFrame([describe(found.plans)]), columns, align="r" * len(columns))
+    return Part(Section("Plans", tables=[shown]), {})
+
+
+def describe(plans: Plans) -> dict[str, Any]:
+    """How many plans there are, of which lengths, with which context."""
+    lengths = plans.mask().sum(1)
+    context = "nothing"
+    if plans.context is not None:
+        kind = "features" if plans.context.is_floating_point() else f"{_num_contexts(plans)} contexts"
+        context = f"{kind}, {'at each step' if is_per_step(plans.context) else 'once a plan'}"
+    return {
+        "plans": len(plans),
+        "actions": int(lengths.sum()),
+        "shortest": int(lengths.min()),
+        "longest": int(lengths.max()),
+        "kinds of actions": plans.num_actions,
+        "groups": 0 if plans.group is None else len(plans.group.unique()),
+        "sees": context,
+    }
+
+
+def score_section(found: Evaluation) -> Part:
+    """The main table."""
+    scores = found.table()
+    more = scores["more_high"] - scores["more"]
+    columns: Mapping[str, Column] = {
+        "model": "model",
+        "input": _input,
+        "nats": "nats_per_action:.4f",
+        "bits per\naction": lambda row: f"{row.bits_per_action:.4f}±{row.high - row.bits_per_action:.4f}",
+        "perpl.": "perplexity:.3f",
+        "more bits": lambda row: "" if pd.isna(row.more) else f"{row.more:+.4f}±{more[row.name]:.4f}",
+    }
+    caption = (
+        f"On held-out actions. ±: 95 % intervals over {found.unit}. more bits: the difference from"
+        f" {found.reference[1]}, paired."
+    )
+    text = [
+        "The bits of each model for actions that it has not learned from: the fewer, the more of the structure it"
+        " predicts; a nat is 1.44 bits. Perplexity (perpl.) is the number of equally likely actions that would take as"
+        " many bits.",
+        "Order, back-off and smoothing of count-based models were chosen within the training plans. A difference whose"
+        " interval holds 0 is not significant. The reference is the best of all models on the same plans, which favours"
+        " it a little; differences are not corrected for the number of models.",
+    ]
+    caption_of_figure = f"Bits per held-out action, 95 % intervals over {found.unit}."
+    best = found.best
+    alt = f"Bits per action of each model, the fewest {best.cost:.3f} of {best.label}."
+    box = FigureBox(figures.score_figure(scores), caption_of_figure, alt, "scores")
+    return Part(
+        Section("Held-out scores", text, [table(scores, columns, caption, align="llrrrr")], [box]), {"plans": scores}
+    )
+
+
+def lag_section(found: Evaluation) -> Part | None:
+    """How far back structure reaches."""
+    skip = found.settings["skip"]
+    lags = found.gains
+    if int(found.plans.mask()[:, max(skip, 1) :].sum()) >= 2:
+        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles()))
+        information = information.assign(what="mutual information", model="counts", sees=ACTIONS, units=None)
+        lags = pd.concat([information, lags], ignore_index=True) if len(lags) else information
+        lags = lags[["what", "model", "sees", "lag", "bits", "low", "high", "chance", "units"]]
+    if not len(lags):
+        return None
+    lags = lags.assign(units=lags["units"].astype("Int64"))
+    above = (lags["units"].fillna(ENOUGH_UNITS) >= ENOUGH_UNITS) & (lags["low"] >= LEAST)
+    cells = lags["bits"].map("{:.4f}".format) + above.map({True: "*", False: " "})
+    names = figures.lag_names(lags)
+    wide = lags.assign(cell=cells, curve=names).pivot(index="lag", columns="curve", values="cell")[names.unique()]
+    wide = wide[wide.index.isin(LISTED_LAGS)].reset_index()
+    columns = {name.replace(", ", "\n").replace("with context", "+ context"): name for name in wide.columns}
+    over = f"{unit_name(found.plans)} (gain: {unit_name(found.sampled)} of the first fold, if there are {ENOUGH_UNITS})"
+    text = [
+        "Mutual information: of two actions k steps apart, whatever lies between. Gain: how much the action k steps"
+        " back improves predictions beyond all nearer ones, in held-out plans of the first fold: a model that knows k"
+        " actions against one that knows k - 1, on the same actions (a Markov chain of that order with back-off; a"
+        " GRU that was trained on pieces of plans).",
+        "Where the gain of the chain ends before that of the GRU, longer histories matter but occur too seldom to be"
+        " counted; below 0, splitting the counts loses more than the older action adds.",
+    ]
+    caption = (
+        "Bits that the action k steps back adds. Dashed: the 95 % quantile of the mutual information of independent"
+        " actions."
+    )
+    box = FigureBox(figures.lag_figure(lags), caption, "Information by lag.", "lags")
+    shown = table(wide, columns, f"Bits. *: above 0, by the 95 % interval of that lag over {over}.")
+    return Part(Section("Information by lag", text, [shown], [box]), {"lags": lags})
+
+
+def order_section(found: Evaluation) -> Part | None:
+    """Which order a Markov chain needs."""
+    plans = found.plans
+    lengths = plans.mask().sum(1)
+    if int(lengths.max()) < 2 or plans.num_actions < 2:
+        return None
+    # All orders are fitted on the same actions: those with as many before them as the highest order takes.
+    most = min(MOST_ORDER, max(int(lengths.double().median()) // 2, 1), int(lengths.max()) - 1)
+    number = _num_contexts(plans)
+    fitted = {ACTIONS: order_selection(plans, most)}
+    if number is not None:
+        fitted[CONTEXT] = order_selection(plans, most, number)
+    orders = pd.concat([pd.DataFrame(own).assign(sees=sees) for sees, own in fitted.items()], ignore_index=True)
+    orders = orders[["sees", *orders.columns.drop("sees")]]
+    scale = 2 * log(2) * orders["num_actions_scored"].clip(lower=1)
+    orders = orders.assign(bic_bits=orders["bic"] / scale, aic_bits=orders["aic"] / scale)
+    scores = found.table()
+    held_out = figures.chain_scores(scores)[["order", "sees", "bits_per_action"]]
+    both = orders.merge(held_out, how="left", on=["order", "sees"])
+    criteria = {"BIC": "bic_bits", "AIC": "aic_bits", "held out": "bits_per_action"}
+    columns: dict[str, Column] = {"order": "order", "input": _input, "parameters": "num_parameters:,"}
+    for heading, name in criteria.items():
+        least = both[name] == both.groupby("sees")[name].transform("min")
+        both[heading] = both[name].map("{:.4f}".format, na_action="ignore") + least.map({True: "*", False: " "})
+        columns[heading] = heading
+    caption = (
+        "Bits per action, the least of each input with a star; the information criteria are halved, so that they stand"
+        " on the same scale."
+    )
+    text = [
+        "The information criteria judge plans that were learned from, and count a parameter for each action after each"
+        " history that occurred. Held-out chains back off to shorter histories where a history is rare."
+    ]
+    shown = table(both, columns, caption, align="llrrrr")
+    figure = figures.order_figure(orders, scores)
+    box = FigureBox(figure, "The least of each curve is ringed.", "Order selection.", "orders")
+    return Part(Section("Markov order", text, [shown], [box]), {"orders": orders})
+
+
+def calibration_section(found: Evaluation) -> Part | None:
+    """Whether forecast probabilities are the shares of actions taken."""
+    rows, errors = [], []
+    for model in found.leading(found.best.inputs) or found.models:
+        if model.calibration is None:
+            continue
+        errors.append({"model": model.label, "error": 100 * model.calibration.expected_calibration_error})
+        for one in model.calibration.bins:
+            taken = {"taken": one.taken.mean, "low": one.taken.low, "high": one.taken.high}
+            row = {"model": model.name, "sees": model.inputs, "forecast": one.forecast}
+            rows.append(row | taken | {"number": one.number})
+    if not rows:
+        return None
+    calibration = pd.DataFrame(rows)
+    columns = {"model": "model", "expected calibration error, %": "error:.2f"}
+    shown = table(pd.DataFrame(errors), columns, "Mean distance of forecast probability and share taken.")
+    text = ["Of the actions with a forecast probability of about 0.3, were 0.3 taken? Points on the diagonal: yes."]
+    caption = f"Forecast probability against the share taken; 95 % intervals over {found.unit}."
+    box = FigureBox(figures.calibration_figure(calibration), caption, "Calibration of the models.", "calibration")
+    return Part(Section("Calibration", text, [shown], [box]), {"calibration": calibration})
+
+
+def transition_section(found: Evaluation) -> Part | None:
+    """Transition probabilities, overall and in each group."""
+    plans = found.plans
+    if int(plans.mask().sum(1).max()) < 2:
+        return None
+    result = transitions(plans, generator=_shuffles())
+    names, tested = action_names(plans), result.test == "permutation"
+    groups = group_names(plans, result.groups) if plans.group is not None else []
+    probs, each = result.probs(), result.group_probs()
+    of_groups = zip(groups, result.group_counts, each, result.cell_p_values, strict=False)
+    rows = [
+        {
+            "group": group,
+            "from": names[a],
+            "to": names[b],
+            "count": int(counts[a, b]),
+            "probability": float(matrix[a, b]),
+            "p_value": float(p_values[a, b]) if tested and p_values is not None else None,
+        }
+        for group, counts, matrix, p_values in [("all", result.counts, probs, None), *of_groups]
+        for a, b in counts.nonzero().tolist()
+    ]
+    frames = {"transitions": pd.DataFrame(rows), "transition_test": pd.DataFrame()}
+    text, tables = ["The probability of each action after each other one, within plans."], []
+    caption = "The probability of each action (column) after each action (row)."
+    boxes = [FigureBox(figures.transition_figure(probs, names), caption, "Transition matrix.", "transitions")]
+    if len(groups) > 1:
+        row = {"groups": len(groups), "test": result.test, "permutations": result.permutations}
+        test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value if tested else None}])
+        text.append(
+            "That groups have the same transitions is tested by permuting plans between them, where they have enough."
+            " Marked cells differ at p < 0.05, corrected for all."
+        )
+        columns = {"groups": "groups", "permutations": "permutations:,", "p": "p_value:.2g"}
+        tables.append(
+            table(test, columns, "Whether groups have the same transitions (p: blank if not tested).", align="rrr")
+        )
+        significant = (result.cell_p_values < SIGNIFICANT) & tested
+        figure = figures.group_transition_figure(each, probs, names, groups, significant)
+        caption = "Each group's transition probabilities less those of all."
+        boxes.append(FigureBox(figure, caption, "Differences of the groups' transitions.", "group_transitions"))
+        frames["transition_test"] = test
+    return Part(Section("Transitions", text, tables, boxes), frames)
+
+
+def motif_section(found: Evaluation) -> Part | None:
+    """Over-represented sequences."""
+    plans, names = found.plans, action_names(found.plans)
+    again = (plans.actions[:, 1:] == plans.actions[:, :-1])[plans.mask()[:, 1:]].double().mean()
+    rows = [
+        {"repeats": "merged" if merged else "kept", "sequence": " ".join(names[action] for action in one.actions)}
+        | {key: value for key, value in asdict(one).items() if key != "actions"}
+        for merged in ((False, True) if float(again) > MANY_REPEATS else (False,))
+        for one in motifs(plans, top=LISTED, collapse_repeats=merged)
+        if one.corrected < SIGNIFICANT
+    ]
+    frame = pd.DataFrame(rows)
+    columns: Mapping[str, Column] = {
+        "sequence": "sequence",
+        "count": "count:,",
+        "expected": "expected:,.1f",
+        "ratio": "ratio:.2f",
+        "95 % interval": lambda row: f"{row.low:.2f} to {row.high:.2f}",
+        "p": lambda row: _p(row.corrected),
+    }
+    tables, boxes = [], []
+    for repeats, own in frame.groupby("repeats", sort=False) if rows else []:
+        merged = ", repeats of an action merged" * (repeats == "merged")
+        caption = f"Against a chain of order n - 2{merged}. p: Fisher's exact test, corrected for all sequences (Holm)."
+        tables.append(table(own, columns, caption))
+        alt = "Over-represented sequences: " + "; ".join(own["sequence"][:5])
+        figure = figures.motif_figure(own)
+        boxes.append(
+            FigureBox(figure, f"Times as often as expected{merged}.", alt, "motifs" + "_merged" * bool(merged))
+        )
+    text = [
+        "Sequences of three to six actions that occur more (or less) often than their parts predict: than under a chain"
+        " fitted to how often the sequence without its first, and without its last action occurs. All plans are taken"
+        " to be of one chain: where groups differ, sequences of some of them are over-represented, too. One such"
+        " sequence makes others over-represented that share its beginning.",
+        *([] if rows else ["There are none (p < 0.05, corrected for all sequences)."]),
+    ]
+    return Part(Section("Over-represented sequences", text, tables, boxes), {"motifs": frame})
+
+
+def macro_section(found: Evaluation) -> Part | None:
+    """Sequences that could be taken as one action; None where none makes the code of the plans shorter."""
+    plans, names = found.plans, action_names(found.plans)
+    macros, _ = learn_macros(plans, MOST_MACROS, "compression")
+    if not macros:
+        return None
+    rows = [
+        {
+            "macro": " ".join(names[action] for action in macro.actions),
+            "actions": len(macro.actions),
+            "count": macro.count,
+            "gain_bits": macro.gain,
+        }
+        for macro in macros
+    ]
+    counts = plans.actions[plans.mask()].long().bincount().double()
+    before = float(-torch.special.xlogy(counts, counts / counts.sum()).sum()) / log(2)
+    frame = pd.DataFrame(rows)
+    frame["bits_per_action"] = (before - frame["gain_bits"].cumsum()) / float(counts.sum())
+    text = [
+        "Sequences that could be taken as one action. Repeatedly, the two successive actions (or macro-actions) are"
+        " joined that shorten the code of the plans most, in which each is coded by its frequency, and which includes"
+        " what macro-actions stand for. Earlier ones may be parts of later ones."
+    ]
+    none = pd.DataFrame([{"macro": "none", "bits_per_action": before / float(counts.sum())}])
+    shown = pd.concat([none, frame]).astype({"count": "Int64"})
+    columns = {
+        "macro-action": "macro",
+        "count": "count:,",
+        "gain": "gain_bits:,.0f",
+        "bits per action": "bits_per_action:.3f",
+    }
+    caption = (
+        "In the order in which they were found. count: how often each was put in then; gain: bits saved then; bits per"
+        " action: of the code with all macro-actions up to that one."
+    )
+    return Part(Section("Macro-actions", text, [table(shown, columns, caption)]), {"macros": frame})
+
+
+def likeness_section(found: Evaluation) -> Part | None:
+    """Sequences sampled from the models beside real ones."""
+    # Where plans come in groups there is no test: plans of one subject are more alike than those of a model of all
+    # subjects, however good, and the first fold holds too few groups to shuffle these.
+    tested = unit_name(found.scored) != "groups"
+    rows: list[dict[str, Any]] = []
+    shown: tuple[Model, Plans, list[Any]] | None = None
+    for model in sorted(found.leading(CONTEXT) + found.leading(ACTIONS), key=lambda model: model.cost):
+        if model.generated is None:
+            continue
+        real = found.sampled[: len(model.generated)]
+        real = Plans(real.actions, real.num_actions, real.lengths)
+        results = likeness(real, Plans(model.generated, real.num_actions, real.lengths), generator=_shuffles())
+        if results and shown is None:
+            shown = model, real, results
+        rows += [
+            {"model": model.name, "sees": model.inputs, "statistic": one.statistic}
+            | {"distance": one.distance, "chance": one.chance}
+            | {"p_value": one.p_value if tested else None, "corrected": one.corrected if tested else None}
+            for one in results
+        ]
+    if shown is None:
+        return None
+    best, real, results = shown
+    frame = pd.DataFrame(rows)
+    stars = (frame["corrected"] < SIGNIFICANT).map({True: "*", False: ""})
+    cells = frame.assign(cell=frame["distance"].map("{:.3f}".format) + stars)
+    statistics = [one.statistic for one in results]
+    order = frame[["model", "sees"]].drop_duplicates()
+    wide = cells.pivot(index=["model", "sees"], columns="statistic", values="cell").reset_index()
+    wide = order.merge(wide, on=["model", "sees"])
+    wide.loc[len(wide)] = {"model": "same source", "sees": ""} | {one.statistic: f"{one.chance:.3f}" for one in results}
+    test = (
+        "*: p < 0.05, permutation test over plans, corrected."
+        if tested
+        else "Not tested: plans of one group are not independent."
+    )
+    caption = (
+        f"Total variation between the distributions in generated and in held-out real plans (0: the same). {test}"
+        " same source: the distance of two such sets from one source, were all plans independent."
+    )
+    columns: dict[str, Column] = {
+        "model": "model",
+        "input": _input,
+        **{name.replace(" ", "\n"): name for name in statistics},
+    }
+    text = [
+        "From each model of the first fold a plan was sampled for each held-out plan, as long as that. Generated and"
+        " real plans are compared by sequences of actions (n-grams), by how long an action is repeated, and by how"
+        " long it takes to return. The figures show the model with the fewest bits."
+    ]
+    assert best.generated is not None
+    beyond = ~real[:DRAWN].mask()
+    above, below = (some[:DRAWN].long().masked_fill(beyond, -1) for some in (real.actions, best.generated))
+    caption_of_figure = f"Held-out plans, and plans sampled from {best.label}."
+    figure = figures.raster_figure(above, below, action_names(found.plans))
+    boxes = [FigureBox(figure, caption_of_figure, "Real and generated sequences as strips of colour.", "raster")]
+    lengths = {
+        f"{one.statistic}, actions": (one.real.tolist(), one.generated.tolist())
+        for one in results
+        if len(one.classes[0]) == 1 and "gram" not in one.statistic
+    }
+    if lengths:
+        caption_of_figure = "Shares of run lengths and return times; the last class holds all that are longer."
+        alt = "Run lengths and return times, real and generated."
+        boxes.append(FigureBox(figures.distribution_figure(lengths), caption_of_figure, alt, "distributions"))
+    shown_table = table(wide, columns, caption, align="ll" + "r" * len(statistics))
+    return Part(Section("Generated sequences", text, [shown_table], boxes), {"likeness": frame})
+
+
+def drift_section(found: Evaluation) -> Part | None:
+    """Whether plans get easier or harder to predict, within and between them."""
+    # The best model whose bits are those of the plans' own actions; of one that predicts ends, too, there are more.
+    ranked = sorted(found.models, key=lambda model: model.cost)
+    model = next((one for one in ranked if one.bits.shape == found.scored.actions.shape), None)
+    if model is None or int(found.mask.sum(1).max()) < 2:
+        return None
+    given = found.scored, model.bits, found.mask
+    within, plans, groups = by_position(*given), by_plan(*given), by_group(*given)
+    numbers = list(groups.groups)
+    names = dict(zip(numbers, group_names(found.scored, torch.tensor(numbers)), strict=True))
+    rows = [("place", f"part {n} of {len(within.parts)}", *one) for n, one in enumerate(within.parts, 1)]
+    rows += [("group", names[number], *one) for number, one in groups.groups.items()]
+    drift = pd.DataFrame(rows, columns=["what", "name", "bits", "low", "high"])
+    own = pd.DataFrame({"group": plans.group.tolist(), "bits": plans.bits.tolist()})
+    own = own.assign(index=own.groupby("group").cumcount() + 1)
+    tests: list[dict[str, Any]] = []
+    if within.trend is not None:
+        tests.append({"test": "change over a plan, bits"} | within.trend._asdict())
+    if plans.trend is not None:
+        tests.append({"test": f"rank correlation from {plans.item[:-1]} to {plans.item[:-1]}"} | plans.trend._asdict())
+    if groups.p_value is not None:
+        tests.append({"test": "groups are alike (Kruskal and Wallis)", "p_value": groups.p_value})
+    tests_frame = pd.DataFrame(tests, columns=["test", "mean", "low", "high", "p_value"])
+    text = [
+        "Bits per held-out action of the best model: where behaviour changes, plans get harder (or easier) to predict.",
+        *(["The only plan was cut into consecutive parts, which stand for plans."] * bool(found.settings.get("cut"))),
+    ]
+    tables = []
+    if tests:
+        columns: Mapping[str, Column] = {
+            "test": "test",
+            "estimate": "mean:+.3f",
+            "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
+            "p": "p_value:.2g",
+        }
+        tables.append(table(tests_frame, columns, f"Bits of {model.label}; intervals over {found.unit}."))
+    caption = f"Bits per action of {model.label}. 95 % intervals over {found.unit}; of groups, over the plans of each."
+    box = FigureBox(figures.drift_figure(drift, own), caption, "Bits per action by place, plan and group.", "drift")
+    actions = _action_drift(found.plans)
+    if len(actions):
+        most = actions.assign(size=-actions["change"].abs()).sort_values(["corrected", "size"], kind="stable")[:LISTED]
+        columns = {
+            "action": "action",
+            "first": lambda row: f"{100 * row.first_half:.2f}",
+            "second": lambda row: f"{100 * row.second_half:.2f}",
+            "change": lambda row: f"{100 * row.change:+.2f} ± {100 * (row.high - row.change):.2f}",
+            "p": lambda row: _p(row.corrected),
+        }
+        caption = "Share of all actions, %, in the first and in the second half of the plans. p: corrected (Holm)."
+        tables.append(table(most, columns, caption))
+    frames = {"drift": drift, "drift_tests": tests_frame, "action_drift": actions}
+    return Part(Section("Drift", text, tables, [box]), frames)
+
+
+def _action_drift(plans: Plans) -> pd.DataFrame:
+    """How the share of each action changes from the first to the second half of the plans."""
+    try:
+        found = action_drift(plans)
+    except ValueError:
+        return pd.DataFrame()  # too few plans with two halves
+    names = action_names(plans)
+    rows = [
+        {"action": names[one.action], "first_half": one.first, "second_half": one.second, "change": one.change.mean}
+        | {"low": one.change.low, "high": one.change.high, "p_value": one.change.p_value, "corrected": one.corrected}
+        for one in found
+    ]
+    return pd.DataFrame(rows)
+
+
+SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
+    "file": file_section,
+    "scores": score_section,
+    "lags": lag_section,
+    "orders": order_section,
+    "calibration": calibration_section,
+    "transitions": transition_section,
+    "motifs": motif_section,
+    "macros": macro_section,
+    "likeness": likeness_section,
+    "drift": drift_section,
+}
+"""By name, in the order of the page."""
+
+
+def action_names(plans: Plans) -> list[str]:
+    """Names of the actions; their numbers where they have none."""
+    return list(plans.action_names or map(str, range(plans.num_actions)))
+
+
+def group_names(plans: Plans, groups: Tensor) -> list[str]:
+    """Names of these groups; their numbers where they have none."""
+    return [plans.group_names[g] if plans.group_names else f"group {g}" for g in groups.tolist()]
+
+
+def _num_contexts(plans: Plans) -> int | None:
+    """The number of context indices; None without."""
+    if plans.context is None or plans.context.is_floating_point() or not plans.context.numel():
+        return None
+    return int(plans.context.max()) + 1
+
+
+def _shuffles() -> torch.Generator:
+    """What permutation tests draw from: the same file gives the same report."""
+    return torch.Generator().manual_seed(0)
+
+
+def _input(row: Any) -> str:
+    """The input of a model, short enough for a terminal."""
+    return str(row["sees"]).replace(" and ", ", ")
+
+
+def _p(value: float) -> str:
+    return f"{value:.1g}" if value else "<1e-300"
