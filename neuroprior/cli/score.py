@@ -6,14 +6,14 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from neuroprior.analysis.comparison import score_bits, unit_name
-from neuroprior.plans import Plans
+from neuroprior.analysis.comparison import action_bits, score_bits, unit_name
+from neuroprior.plans import Plans, read_plans
 from neuroprior.priors import load
+from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.report.document import printed, table, write_frames
-from neuroprior.report.saved_priors import action_bits_of, read_for
 
 MOST_ROWS = 20
-"""Groups that are printed; the CSV file has all."""
+"""Rows that are printed; the CSV files have all."""
 
 
 def score(
@@ -25,7 +25,7 @@ def score(
 ) -> None:
     """Score plans under a saved prior: log-likelihood and bits per action, of each plan and each group.
 
-    Plans that the prior has learned from score better than new ones: score plans that it has not met.
+    A prior predicts the plans that it has learned from better than new ones: score plans that it was not fitted on.
 
     Args:
         folder: a saved prior, as `neuroprior fit` writes it.
@@ -35,37 +35,41 @@ def score(
         out: folder for `plans.csv` and `groups.csv`.
     """
     prior = load(folder)
-    plans = read_for(file, {folder: prior}, num_actions, action_names)
-    scored, bits = action_bits_of(folder, prior, plans)
-    lengths = scored.mask().sum(1)
-    groups = [""] * len(plans) if plans.group is None else _names(plans)
-    frame = pd.DataFrame({"plan": range(len(plans)), "group": groups, "actions": lengths.tolist()})
-    frame["log_likelihood"] = (-log(2) * bits.sum(1)).tolist()
-    by_group = frame.groupby("group", sort=False, as_index=False)
-    groups_frame = by_group.agg(plans=("plan", "size"), actions=("actions", "sum"), log_likelihood=("log_likelihood", "sum"))
-    for rows in (frame, groups_frame):
-        rows["bits_per_action"] = -rows["log_likelihood"] / log(2) / rows["actions"].where(rows["actions"] > 0)
-    whole = score_bits(folder, "", bits, scored).bits_per_action()
+    # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
+    names = action_names or (learned_names(prior) if file.lower().endswith((".csv", ".tsv")) else None)
+    plans = read_plans(file, num_actions=num_actions, action_names=names)
+    plans = match_plans(plans if plans.end is None else plans.without_end(), prior, folder)
+    bits = action_bits(prior, plans)
+    own = {"plan": range(len(plans)), "group": group_names(plans), "actions": plans.mask().sum(1).tolist()}
+    scores = pd.DataFrame(own | {"log_likelihood": (-log(2) * bits.sum(1)).tolist()})
+    groups = scores.groupby("group", sort=False, as_index=False).agg(
+        plans=("plan", "size"), actions=("actions", "sum"), log_likelihood=("log_likelihood", "sum")
+    )
+    for frame in (scores, groups):
+        frame["bits_per_action"] = -frame["log_likelihood"] / log(2) / frame["actions"].where(frame["actions"] > 0)
+    first, frame = (
+        ({"plan": "plan"}, scores) if plans.group is None else ({"group": "group", "plans": "plans:,"}, groups)
+    )
+    columns = {
+        "actions": "actions:,",
+        "log-likelihood (nats)": "log_likelihood:.2f",
+        "bits per action": "bits_per_action:.4f",
+    }
+    caption = f"the first {MOST_ROWS} of {len(frame):,}; all are in the CSV file" if len(frame) > MOST_ROWS else ""
     console = Console()
-    columns = {"group": "group", "plans": "plans:,", "actions": "actions:,", "log-likelihood, nats": "log_likelihood:.2f"}
-    columns["bits per action"] = "bits_per_action:.4f"
-    shown = groups_frame.head(MOST_ROWS)
-    caption = f"the first {MOST_ROWS} of {len(groups_frame)} groups" if len(groups_frame) > MOST_ROWS else ""
-    if plans.group is None:
-        shown, caption, columns = frame.head(MOST_ROWS), f"the first {MOST_ROWS} of {len(frame)} plans", {"plan": "plan"} | {
-            name: column for name, column in columns.items() if name not in ("group", "plans")
-        }
-    console.print(printed(f"{file} under {folder}", table(shown, columns, caption if len(shown) < len(frame) else "")))
-    line = f"{whole.mean:.4f} bits per action, 95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(scored)}"
-    console.print(line, highlight=False)
+    console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | columns, caption)))
+    whole = score_bits(folder, "", bits, plans).bits_per_action()
+    interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
+    console.print(f"{whole.mean:.4f} bits per action, {interval}", highlight=False)
     place = Path(out)
     place.mkdir(parents=True, exist_ok=True)
-    write_frames(place, {"plans": frame, "groups": groups_frame})
+    write_frames(place, {"plans": scores, "groups": groups})
     console.print(f"tables: {place / 'plans.csv'}, {place / 'groups.csv'}", highlight=False, soft_wrap=True)
 
 
-def _names(plans: Plans) -> list[str]:
-    """The name of each plan's group."""
-    assert plans.group is not None
+def group_names(plans: Plans) -> list[str]:
+    """The name of each plan's group; empty where there are no groups."""
+    if plans.group is None:
+        return [""] * len(plans)
     names = plans.group_names
     return [str(group) if names is None else names[group] for group in plans.group.tolist()]

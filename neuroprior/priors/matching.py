@@ -1,0 +1,56 @@
+"""Plans in the numbers of a fitted prior: actions and contexts are matched by name."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import Plans
+from neuroprior.priors.prior import Prior
+
+
+def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
+    """Plans as a prior that was fitted elsewhere can score them.
+
+    Actions and contexts are renumbered by their names, where both the plans and the prior have names; the context is
+    left out for a prior without one, and an end symbol is added for a prior that has one.
+
+    Args:
+        plans: N plans without an end symbol.
+        prior: the prior.
+        name: of the prior, for messages.
+
+    Raises:
+        ValueError: the prior does not know one of the actions or contexts.
+    """
+    known = prior.num_actions - (prior.end is not None)
+    if plans.num_actions > known:
+        raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")
+    names, actions = learned_names(prior), plans.actions
+    if names is not None and plans.action_names is not None:
+        number = numbers(names, plans.action_names, f"{name}: does not know the action", "; it knows")
+        actions = number[actions.long()]
+    plans = replace(plans, actions=actions, num_actions=known, action_names=None)
+    if prior.context_names is not None and plans.context_names is not None and plans.context is not None:
+        number = numbers(prior.context_names, plans.context_names, f"{name}: does not know the context", "; it knows")
+        plans = replace(plans, context=number[plans.context.long()], context_names=None)
+    if not prior.takes_context:
+        plans = replace(plans, context=None, context_names=None)
+    return plans if prior.end is None else plans.with_end()
+
+
+def learned_names(prior: Prior) -> list[str] | None:
+    """The names of the actions that a prior has learned, without that of its end symbol; None for numbers."""
+    return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
+
+
+def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:
+    """The number under which each of the names is known, int64.
+
+    Raises:
+        ValueError: a name is not known; it stands between `before` and `after`, and those that are follow.
+    """
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(known)}")
+    return torch.tensor([known.index(name) for name in names])
