@@ -15,7 +15,7 @@ from neuroprior.analysis import Reliability, pieces, reliability
 from neuroprior.analysis.comparison import Score, action_bits, rivals, score_bits
 from neuroprior.plans import is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible
-from neuroprior.priors.counts.histories import TooLargeError
+from neuroprior.priors.counts import TooLargeError
 from neuroprior.sampling.ancestral import sample, sample_in_world
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
         return  # their experts count
     how = _training(design) | NEURAL[MIXED[0] if kind == "mixture" else kind][1]
     prior = _made(kind, learned.num_actions, seed=seed, **sizes)
-    yield kind, "", prior.fit(learned, torch.Generator().manual_seed(seed), **how)
+    yield kind, "", prior.fit(learned, generator=torch.Generator().manual_seed(seed), **how)
 
 
 def _made(kind: str, num_actions: int, **how: Any) -> Any:
