@@ -15,7 +15,7 @@ def _run(arguments: Sequence[str]) -> None:
     # Imported here, so that Ctrl-C is answered while the libraries load too.
     from neuroprior.cli.fit import run
 
-    run(list(arguments))
+    run(list(arguments), "python -m train")
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ class TrainingRace:
         def train(batch_size: int, learning_rate: float, steps: int) -> Prior:
             how = {"batch_size": batch_size, "learning_rate": learning_rate, "max_steps": steps}
             prior, generator = GRUPrior(self.source.num_actions, lags=1), torch.Generator().manual_seed(0)
-            return prior.fit(self.plans, generator, progress=False, **how)
+            return prior.fit(self.plans, generator=generator, progress=False, **how)
 
         return self._quickest(train)
 

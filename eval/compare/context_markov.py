@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -72,12 +72,13 @@ class ContextMarkov(Prior):
         self.blind, self.chain = MarkovPrior(num_actions, order), MarkovPrior(num_actions, order, num_contexts=1)
         self.sights = Sights(torch.zeros(1, dtype=torch.long))
 
-    def fit(self, plans: Plans | Tensor) -> Self:
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Choose what to see, number it and count; returns self.
 
         Raises:
             ValueError: plans that a Markov prior cannot learn from, or that do not show what this one sees.
         """
+        self.check_settings(settings)
         plans = self.training_plans(plans)
         best: Sequence[int] | None = None
         if self.near:

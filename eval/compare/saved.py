@@ -1,7 +1,7 @@
 """Saved priors for a world: the actions that a prior has learned are told by their names from those of the world."""
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -38,7 +38,7 @@ class Renumbered(Prior):
         assert isinstance(logits, Tensor)
         return logits[..., self._number]
 
-    def fit(self, plans: Plans | Tensor) -> Self:
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Not possible: a saved prior is taken as it is.
 
         Raises:

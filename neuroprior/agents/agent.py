@@ -15,8 +15,8 @@ from neuroprior.planners.execution import Change, follow, joined
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior, UniformPrior
-from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.neural.neural import NeuralPrior
+from neuroprior.priors.counts import HistoryPrior
+from neuroprior.priors.neural import NeuralPrior
 from neuroprior.worlds.world import World
 
 

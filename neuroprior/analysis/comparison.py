@@ -11,8 +11,7 @@ from neuroprior.analysis.statistics import Difference, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.priors import ContextTreePrior, MarkovPrior, Prior, UniformPrior
-from neuroprior.priors.counts.backoff import Backoff
-from neuroprior.priors.counts.histories import TooLargeError
+from neuroprior.priors.counts import Backoff, TooLargeError
 
 ORDERS = range(7)
 """Markov orders that a prior is compared with."""

@@ -1,7 +1,7 @@
-"""The command line of `python -m train`, by LightningCLI's conventions, and the order of what a run does."""
+"""The command `fit`: trains a prior as a recipe says, by LightningCLI's conventions, and compares it with baselines."""
 
 import sys
-from math import ceil
+from dataclasses import asdict
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -9,30 +9,35 @@ from typing import Any
 import torch
 import yaml
 from jsonargparse import ArgumentError
-from lightning import Callback, Trainer
-from lightning.pytorch.callbacks import RichProgressBar
+from lightning import Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from neuroprior._files import write_whole
-from neuroprior.cli.fit_data import PlansData
-from neuroprior.cli.fit_model import PriorModel
+from neuroprior.cli.fit_recipe import PlansData, PriorModel, recipe_path, recipes
 from neuroprior.cli.fit_report import report
 from neuroprior.plans import write_plans
-from neuroprior.training import few_threads, quiet
-from neuroprior.training.fitting import Stopping, WholeCheckpoints, checkpoints_and_stopping, take_best
+from neuroprior.priors.neural import NeuralPrior
+from neuroprior.training import make_trainer, quiet, run_training
 
-USAGE = """python -m train fit --config train/gru.yaml [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
-       python -m train fit --resume FOLDER"""
+USAGE = """{0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
+       {0} fit --resume FOLDER"""
 CONFIG, PLANS = "run.yaml", "plans.npz"
-STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
+STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
+"""What a checkpoint must hold for a training to go on from it."""
+
+NETWORKS_ALONE = {"devices": 1, "num_nodes": 1, "precision": "32-true", "accumulate_grad_batches": 1, "max_time": None}
+"""Options of the trainer, with their defaults, that do not reach the networks inside other priors."""
 
 
-def run(arguments: list[str]) -> None:
-    """Train as the arguments say.
+def run(arguments: list[str], program: str = "neuroprior") -> None:
+    """Run the command.
+
+    Args:
+        arguments: `fit`, and its options.
+        program: what precedes them, for usage and messages.
 
     Raises:
         ValueError: an argument, a file or a training that went wrong.
@@ -41,77 +46,16 @@ def run(arguments: list[str]) -> None:
     """
     with quiet():
         try:
-            TrainCLI(arguments)
-        except ArgumentError as error:
-            raise ValueError(str(error)) from error
-        except MisconfigurationException as error:
+            FitCLI(arguments, program)
+        except (ArgumentError, MisconfigurationException) as error:
             raise ValueError(str(error)) from error
 
 
-def make_trainer(
-    folder: str = "",
-    max_steps: int = 1000,
-    patience: int = 400,
-    accelerator: str = "auto",
-    devices: int | str | list[int] = 1,
-    num_nodes: int = 1,
-    strategy: str = "auto",
-    precision: str | int = "32-true",
-    gradient_clip_val: float = 1.0,
-    accumulate_grad_batches: int = 1,
-    max_time: str | None = None,
-    enable_progress_bar: bool = True,
-    callbacks: list[Callback] | None = None,
-) -> Trainer:
-    """Lightning's trainer, with the logs and checkpoints of a run.
+class FitCLI(LightningCLI):
+    """LightningCLI with `fit` alone, and with the options `--out` and `--resume`."""
 
-    Args:
-        folder: of the run.
-        max_steps: gradient steps at most, about; the learning rate falls to 0 over them.
-        patience: steps without better validation bits after which training stops.
-        accelerator: "cpu", "gpu", or "auto".
-        devices: number of devices, or their numbers.
-        num_nodes: machines.
-        strategy: "ddp" for several devices (processes, on a CPU).
-        precision: "bf16-mixed" on a GPU that has it.
-        gradient_clip_val: the largest norm of a gradient.
-        accumulate_grad_batches: batches for one step of the optimiser.
-        max_time: stop after so much time, DD:HH:MM:SS.
-        enable_progress_bar: show it.
-        callbacks: further callbacks of Lightning's.
-    """
-    for name, number in (("patience", patience), ("accumulate_grad_batches", accumulate_grad_batches)):
-        if number < 1:
-            raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
-    del max_steps  # it and patience are turned into looks when the data are there: see `instantiate_trainer`
-    own: list[Callback] = checkpoints_and_stopping(Path(folder) / "checkpoints", patience)
-    bar: list[Callback] = [RichProgressBar()] if enable_progress_bar and sys.stdout.isatty() else []
-    return Trainer(
-        max_epochs=-1,
-        accelerator=accelerator,
-        devices=devices,
-        num_nodes=num_nodes,
-        strategy=strategy,
-        precision=precision,  # type: ignore[arg-type]
-        gradient_clip_val=gradient_clip_val,
-        accumulate_grad_batches=accumulate_grad_batches,
-        max_time=max_time,
-        enable_progress_bar=bool(bar),
-        callbacks=[*own, *bar, *(callbacks or [])],
-        logger=[CSVLogger(folder, "logs"), TensorBoardLogger(folder, "tensorboard", "")],
-        plugins=[WholeCheckpoints()],
-        num_sanity_val_steps=0,
-        log_every_n_steps=10,
-        use_distributed_sampler=False,
-        enable_model_summary=False,
-        default_root_dir=folder,
-    )
-
-
-class TrainCLI(LightningCLI):
-    """`fit` alone, with `--out` and `--resume`."""
-
-    def __init__(self, arguments: list[str]) -> None:
+    def __init__(self, arguments: list[str], program: str) -> None:
+        self.program = program
         super().__init__(
             PriorModel,
             PlansData,
@@ -121,16 +65,16 @@ class TrainCLI(LightningCLI):
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,
             parser_kwargs={
-                "prog": "python -m train",
-                "description": "Train prior models.",
+                "prog": program,
+                "description": "Train priors.",
                 "exit_on_error": False,
                 "fit": {
-                    "usage": USAGE,
+                    "usage": USAGE.format(program),
                     "description": "Train a prior on executed plans, and compare it with count-based ones.",
                     "exit_on_error": False,
                 },
             },
-            args=_with_saved_config(arguments),
+            args=_with_saved_config(_with_paths(arguments), program),
         )
 
     @staticmethod
@@ -138,7 +82,7 @@ class TrainCLI(LightningCLI):
         return {"fit": {"model", "train_dataloaders", "val_dataloaders", "datamodule", "ckpt_path", "weights_only"}}
 
     def add_default_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        parser.add_argument("--seed_everything", type=int, default=0, help="Seed of all that is drawn at random.")
+        parser.add_argument("--seed_everything", type=int, default=0, help="Seed of all random numbers.")
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         parser.add_argument("--out", type=str, default="runs/prior", help="Folder of the run; made, must be new.")
@@ -152,6 +96,7 @@ class TrainCLI(LightningCLI):
         parser.link_arguments(("out", "resume"), "trainer.folder", compute_fn=lambda out, resume: resume or out)
         parser.link_arguments("trainer.max_steps", "data.max_steps")
         parser.link_arguments("data", "model.data", apply_on="instantiate")
+        parser.link_arguments("data.steps", "trainer.validate_every", apply_on="instantiate")
 
     def before_instantiate_classes(self) -> None:
         fit = self.config.fit
@@ -168,29 +113,47 @@ class TrainCLI(LightningCLI):
             self.folder.mkdir(parents=True, exist_ok=True)
 
     def instantiate_trainer(self, **more: Any) -> Trainer:
-        """The trainer, told how many looks at the validation plans its steps are."""
-        trainer = super().instantiate_trainer(**more)
-        trainer.fit_loop.max_epochs = self.datamodule.epochs
-        for callback in trainer.callbacks:
-            if isinstance(callback, Stopping):
-                callback.patience = ceil(callback.patience / self.datamodule.steps)
-        return trainer
+        """The trainer; its progress bar is for terminals."""
+        bar = self.config.fit.trainer.enable_progress_bar and sys.stdout.isatty()
+        return super().instantiate_trainer(enable_progress_bar=bar, **more)
 
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
-        self._check_checkpoints(model, datamodule)
+        neural = isinstance(model.prior, NeuralPrior)
+        settings = {} if neural else self._settings(model, datamodule)
+        if neural:
+            self._check_checkpoints(model, datamodule)
         if self.trainer.is_global_zero:
             self._keep(datamodule)
-        if model.is_neural:
+        if neural:
             self._train(model, datamodule)
         else:
-            model.prior.fit(datamodule.learned_from)
+            generator = torch.Generator().manual_seed(datamodule.seed)
+            model.prior.fit(datamodule.learned_from, generator=generator, **settings)
         if self.trainer.is_global_zero:
             report(self.folder, model, datamodule)
 
+    def _settings(self, model: PriorModel, data: PlansData) -> dict[str, Any]:
+        """The settings of the recipe that the `fit` of a prior takes which trains networks inside, or none."""
+        prior, trainer = model.prior, self.config.fit.trainer
+        if not prior.fit_settings:
+            return {}
+        for name, default in NETWORKS_ALONE.items():
+            if trainer[name] != default:
+                raise ValueError(f"trainer.{name}: a {type(prior).__name__} is trained with {default} alone")
+        prior.to(self.trainer.strategy.root_device)
+        settings = asdict(data.settings) | {
+            "learning_rate": model.learning_rate,
+            "weight_decay": model.weight_decay,
+            "gradient_clip": trainer.gradient_clip_val,
+            "patience": trainer.patience,
+            "progress": trainer.enable_progress_bar and sys.stdout.isatty(),
+        }
+        return {name: settings[name] for name in prior.fit_settings}
+
     def _check_checkpoints(self, model: PriorModel, data: PlansData) -> None:
         last = self.folder / LAST
-        if not model.is_neural or not last.exists():
+        if not last.exists():
             return
         epoch = _check(last, model)["epoch"]
         _check(self.folder / BEST, model)
@@ -211,21 +174,15 @@ class TrainCLI(LightningCLI):
         write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
 
     def _train(self, model: PriorModel, data: PlansData) -> None:
-        model.prior.prepare(data.learned_from, data.window)
+        model.prior.prepare(data.learned_from, data.settings.window)
         last = self.folder / LAST
         try:
-            with few_threads(model.prior, data):
-                self.trainer.fit(model, datamodule=data, ckpt_path=last if last.exists() else None, weights_only=True)
-        except SystemExit as interrupted:
-            # Lightning turns Ctrl-C into this.
-            if not self.trainer.interrupted or not self.trainer.is_global_zero:
-                raise
+            run_training(self.trainer, model, data, last if last.exists() else None)
+        except KeyboardInterrupt as interrupted:
             saved = f"saved up to step {model.curve[-1]['step']}" if model.curve else "nothing to save yet"
             raise KeyboardInterrupt(
-                f"interrupted; {saved}; go on with: python -m train fit --resume {self.folder}"
+                f"interrupted; {saved}; go on with: {self.program} fit --resume {self.folder}"
             ) from interrupted
-        if self.trainer.is_global_zero:
-            take_best(self.trainer, model)
 
 
 def _check(checkpoint: Path, model: PriorModel) -> dict[str, Any]:
@@ -245,13 +202,28 @@ def _check(checkpoint: Path, model: PriorModel) -> dict[str, Any]:
     return saved
 
 
-def _with_saved_config(arguments: list[str]) -> list[str]:
+def _with_paths(arguments: list[str]) -> list[str]:
+    """The arguments, with the paths of recipes that are given by name."""
+    out: list[str] = []
+    for argument in arguments:
+        if out and out[-1] in ("--config", "-c"):
+            argument = recipe_path(argument)
+        elif argument.startswith("--config="):
+            argument = f"--config={recipe_path(argument.removeprefix('--config='))}"
+        out.append(argument)
+    return out
+
+
+def _with_saved_config(arguments: list[str], program: str) -> list[str]:
     """The arguments, and before them those that a run to be resumed was started with."""
     folder, others = _resumed(arguments)
     if folder is None:
         sources = ("--config", "-c", "--model", "--help", "-h", "--print_config")
         if arguments[:1] == ["fit"] and not any(argument.startswith(sources) for argument in arguments):
-            raise ValueError("fit: give --config train/gru.yaml, or another recipe, or --resume and a run's folder")
+            raise ValueError(
+                f"{program} fit: give --config and a recipe ({', '.join(recipes())}, or a file), or --resume and the"
+                " folder of a run"
+            )
         return arguments
     place = Path(folder)
     if not (place / CONFIG).exists():

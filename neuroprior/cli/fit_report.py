@@ -1,48 +1,55 @@
-"""The end of a run: the prior is saved, and compared with count-based ones on the held-out plans."""
+"""The end of a run of `fit`: the prior is saved, and compared with baselines on the held-out plans."""
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
+import pandas as pd
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
 
-from neuroprior import save
-from neuroprior._files import versions, write_csv, write_json
+from neuroprior._files import versions, write_json, write_whole
 from neuroprior.analysis.comparison import Score, rivals, score, unit_name
-from neuroprior.cli.fit_data import PlansData
-from neuroprior.cli.fit_figures import learning_curve
-from neuroprior.cli.fit_model import PriorModel
+from neuroprior.cli.fit_recipe import PlansData, PriorModel
+from neuroprior.priors import save
+from neuroprior.report.document import printed, records, table, write_frames
 
 
 def report(folder: Path, model: PriorModel, data: PlansData) -> None:
-    """Save the model, compare it, print the table, and write `metrics.json`, `metrics.csv` and the learning curve."""
+    """Save the prior, compare it with baselines, and print the table.
+
+    Writes the prior's files, `metrics.json`, `metrics.csv` and, for a network, the learning curve.
+
+    Args:
+        folder: of the run.
+        model: with the fitted prior.
+        data: its plans.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
     console = Console()
     prior, name = model.prior.cpu().eval(), type(model.prior).__name__
     save(prior, folder)
     trained = score(name, prior, data.held_out)
-    rows, chosen = [], None
-    with console.status("fitting count-based priors") as status:
-        contexts = data.num_contexts if prior.takes_context else None
-        tell = lambda what: status.update(f"fitting {what}")  # noqa: E731
-        for rival in rivals(data.learned_from, data.chosen_on, contexts, tell):
-            more = {"how": rival.how, "validation_bits": rival.validation_bits}
-            if rival.prior is None:
-                rows.append(dict.fromkeys(_row(trained, trained), None) | {"model": rival.model} | more)
-                continue
-            one = score(rival.model, rival.prior, data.held_out)
-            rows.append(_row(one, trained) | more)
-            if chosen is None or rival.validation_bits < chosen[0]:
-                chosen = rival.validation_bits, one
-    assert chosen is not None
-    best = chosen[1]
-    rows.append(_row(trained, trained) | {"how": "", "validation_bits": None})
-    console.print(_table(rows, best.model, data))
-    console.print(_sentence(trained, best), highlight=False)
+    rows = []
+    contexts = data.num_contexts if prior.takes_context else None
+    with console.status("fitting baselines") as status:
+        show = lambda what: status.update(f"fitting {what}")  # noqa: E731
+        for baseline in rivals(data.learned_from, data.chosen_on, contexts, show):
+            one = None if baseline.prior is None else score(baseline.model, baseline.prior, data.held_out)
+            row = _row(trained, trained) if one is None else _row(one, trained)
+            if one is None:  # its tables would be too large
+                row = dict.fromkeys(row, None) | {"model": baseline.model}
+            rows.append(row | {"how": baseline.how, "validation_bits": baseline.validation_bits})
+    frame = pd.DataFrame([*rows, _row(trained, trained) | {"how": "", "validation_bits": None}])
+    best = frame.loc[frame.validation_bits.astype(float).idxmin()]
+    console.print(_table(frame, best.model, data))
     write_json(
         folder / "metrics.json",
         {
-            "rows": rows,
+            "rows": records(frame),
             "chosen": best.model,
             "unit": unit_name(data.held_out),
             "plans": {
@@ -54,12 +61,38 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
             "versions": versions(),
         },
     )
-    write_csv(folder / "metrics.csv", rows)
+    write_frames(folder, {"metrics": frame})
     if model.curve:
-        learning_curve(folder / "learning_curve.png", name, model.curve, best.model, chosen[0])
-    console.print(
-        f"saved in {folder}; neuroprior.load({str(folder)!r}) gives the prior back", highlight=False, soft_wrap=True
-    )
+        figure = learning_curve(name, pd.DataFrame(model.curve), best.model, best.validation_bits)
+        content = BytesIO()
+        figure.savefig(content, format="png", dpi=150)
+        write_whole(folder / "learning_curve.png", content.getvalue())
+    console.print(f"saved in {folder}; in Python: neuroprior.load({str(folder)!r})", highlight=False, soft_wrap=True)
+
+
+def learning_curve(name: str, curve: pd.DataFrame, baseline: str, baseline_bits: float) -> Figure:
+    """Bits per action on the training and the validation plans against steps, with the best baseline as a line.
+
+    The weights that were kept are marked.
+
+    Args:
+        name: the prior's.
+        curve: of `PriorModule`: columns step, train_bits and validation_bits.
+        baseline: name of the best baseline.
+        baseline_bits: its bits per action on the validation plans.
+    """
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.plot(curve.step, curve.train_bits, color="#9aa5b1", label="training plans", marker=".")
+    axes.plot(curve.step, curve.validation_bits, color="#0b6e99", label="validation plans", marker="o")
+    axes.axhline(baseline_bits, color="#c7522a", linestyle="--", label=f"{baseline}, validation plans")
+    kept = curve.loc[curve.validation_bits.idxmin()]
+    axes.plot(kept.step, kept.validation_bits, "o", ms=13, mfc="none", color="#0b6e99", label="kept")
+    axes.set(xlabel="step", ylabel="bits per action", title=f"Learning curve, {name}")
+    axes.legend(frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
 
 
 def _row(one: Score, trained: Score) -> dict[str, Any]:
@@ -77,44 +110,32 @@ def _row(one: Score, trained: Score) -> dict[str, Any]:
     }
 
 
-def _table(rows: list[dict[str, Any]], chosen: str, data: PlansData) -> Table:
+def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
+    """The table for the terminal; the best baseline is marked."""
     actions, unit = int(data.held_out.mask().sum()), unit_name(data.held_out)
-    table = Table(
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-        title=f"Bits per action on {len(data.held_out):,} held-out plans ({actions:,} actions)",
-        caption=f"± : 95 % interval over {unit}. more: bits more than the trained prior takes, paired by {unit}.\n"
-        "*: the fewest bits on the validation plans, on which order and back-off were chosen.",
+    trained = frame.index[-1]
+
+    def how(row: Any) -> str:
+        return ", ".join(part for part in (row.how, "context" * ("context" in str(row.sees))) if part)
+
+    def bits(row: Any) -> str:
+        known = not pd.isna(row.bits_per_action)
+        return f"{row.bits_per_action:.4f} ± {row.high - row.bits_per_action:.4f}" if known else ""
+
+    def difference(row: Any) -> str:
+        if row.name == trained or pd.isna(row.bits_per_action):
+            return ""
+        return f"{row.more_than_trained:+.4f} ± {row.more_high - row.more_than_trained:.4f}"
+
+    columns = {
+        "model": lambda row: row.model + "*" * (row.model == chosen),
+        "settings": how,
+        "bits per action": bits,
+        "difference": difference,
+    }
+    caption = (
+        f"± : 95 % interval over {unit}. difference: from {frame.model[trained]}, paired by {unit}.\n"
+        "*: the best baseline on the validation plans, on which settings were chosen."
     )
-    for number, heading in enumerate(("model", "how", "bits per action", "more")):
-        table.add_column(heading, justify="left" if number < 2 else "right", no_wrap=number != 1)
-    for row in rows:
-        if row is rows[-1]:
-            table.add_section()
-        if row["bits_per_action"] is None:
-            table.add_row(row["model"], row["how"])
-            continue
-        more = "" if row is rows[-1] else _plus_minus(row, "more_than_trained", "more_high", "+.4f")
-        how = ", ".join(part for part in (row["how"], "sees context" * ("context" in row["sees"])) if part)
-        name = row["model"] + "*" * (row["model"] == chosen)
-        table.add_row(name, how, _plus_minus(row, "bits_per_action", "high", ".4f"), more)
-    return table
-
-
-def _plus_minus(row: dict[str, Any], mean: str, high: str, form: str) -> str:
-    return f"{row[mean]:{form}} ± {row[high] - row[mean]:.4f}"
-
-
-def _sentence(trained: Score, best: Score) -> str:
-    gap = best.minus(trained)
-    what = f"{trained.model} and the best count-based prior, {best.model},"
-    # What rounds to nothing is nothing, however narrow the interval.
-    if gap.low <= 0 <= gap.high or abs(gap.mean) < 0.00005:
-        return f"{what} cannot be told apart ({gap.mean:+.4f} bits an action, {gap.low:+.4f} to {gap.high:+.4f})."
-    better = "takes fewer bits than" if gap.mean > 0 else "takes more bits than"
-    low, high = sorted((abs(gap.low), abs(gap.high)))
-    return (
-        f"{trained.model} {better} the best count-based prior, {best.model}:"
-        f" {abs(gap.mean):.4f} an action ({low:.4f} to {high:.4f})."
-    )
+    title = f"Bits per action on {len(data.held_out):,} held-out plans ({actions:,} actions)"
+    return printed(title, table(frame, columns, caption, align="llrr"))

@@ -1,13 +1,10 @@
-"""Priors: distributions over action sequences that samplers step through."""
+"""Priors: distributions over action sequences, learned from plans, that samplers step through."""
 
-from neuroprior.priors.counts.context_tree import ContextTreePrior, Leaf
-from neuroprior.priors.counts.markov import MarkovPrior
-from neuroprior.priors.ensembles.mixture import MixturePrior
-from neuroprior.priors.ensembles.stacked import StackedPrior
-from neuroprior.priors.macros.macro_prior import MacroPrior
-from neuroprior.priors.macros.macros import Macro, learn_macros
-from neuroprior.priors.neural.gru import GRUPrior
-from neuroprior.priors.neural.transformer import TransformerPrior
+from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
+from neuroprior.priors.ensembles import MixturePrior, StackedPrior
+from neuroprior.priors.fitting import fit
+from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
+from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
 from neuroprior.priors.uniform import UniformPrior
@@ -24,6 +21,7 @@ __all__ = [
     "StackedPrior",
     "TransformerPrior",
     "UniformPrior",
+    "fit",
     "learn_macros",
     "load",
     "save",

@@ -1,7 +1,8 @@
 """The interface of a prior: a distribution over action sequences that is also a small state machine."""
 
+import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
 
@@ -17,23 +18,24 @@ from neuroprior.sampling.draws import after_end
 class Prior(nn.Module, ABC):
     """A distribution over sequences of A actions, numbered from 0.
 
-    Samplers, beams and trees need `start` and `step` alone. Their `state` is ONE tensor whose first dimension is the
-    batch, so reordering or branching is `state[index]`; its other dimensions are the prior's own affair. Rows of one
-    state have seen the same number of actions.
+    A subclass writes `start`, `step` and `fit`. Samplers and planners use `num_actions`, `start` and `step` alone.
+    `state` is ONE tensor whose first dimension is the batch, so reordering or branching is `state[index]`; its other
+    dimensions are up to the prior. The rows of one state have the same number of actions behind them.
 
-    `context` is what the agent sees: indices below `num_contexts` or features of size `context_size`, never both. It is
-    given once (`[N]`, `[N, C]`: seen at the start and remembered) or anew before each action (`[N, L]`, `[N, L, C]`).
+    `context` is the observation that actions depend on: indices below `num_contexts` or features of size
+    `context_size`, never both. It is given once per plan (`[N]`, `[N, C]`: that of the start) or before each action
+    (`[N, L]`, `[N, L, C]`).
 
     Args:
         num_actions: A.
-        num_contexts: number of context indices, for a prior that sees an index.
-        context_size: C, for a prior that sees features.
+        num_contexts: number of context indices, for a prior that takes an index.
+        context_size: C, for a prior that takes features.
 
     Attributes:
         context_per: "plan" or "step", as it was in the plans that the prior learned from ("step" before that); None
             for a prior without context.
         end: the action that ends a plan, as it was in the plans that the prior learned from (see `Plans.with_end`), or
-            None. After it `log_prob` and samples have nothing but it.
+            None. After it, it has probability 1 in `log_prob` and in samples.
         action_names, context_names: names of the actions and contexts, as they were in these plans, or None.
 
     Raises:
@@ -44,7 +46,7 @@ class Prior(nn.Module, ABC):
     """Every subclass by name; `load` finds a folder's class here."""
 
     actions_at_once: ClassVar[int] = 2**21
-    """Actions that `log_prob` scores together; bounds memory."""
+    """Actions that `log_prob` scores together; bounds the memory that it takes."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -56,7 +58,7 @@ class Prior(nn.Module, ABC):
         required = {name: size for name, size in sizes.items() if size is not None or name == "num_actions"}
         check_sizes(**required)
         if num_contexts is not None and context_size is not None:
-            raise ValueError("num_contexts and context_size: a prior sees an index or features, not both")
+            raise ValueError("num_contexts and context_size: a prior takes an index or features, not both")
         self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
         self.end: int | None = None
@@ -66,8 +68,12 @@ class Prior(nn.Module, ABC):
 
     @property
     def takes_context(self) -> bool:
-        """True for a prior that sees something."""
+        """True for a prior whose predictions depend on a context."""
         return self.num_contexts is not None or self.context_size is not None
+
+    def __repr__(self) -> str:
+        """The class with its constructor's arguments; priors made of priors show these in the same way."""
+        return _call(type(self), self.config)
 
     @property
     def device(self) -> torch.device:
@@ -78,7 +84,7 @@ class Prior(nn.Module, ABC):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The constructor's arguments that make this prior again (JSON values); subclasses add their own."""
+        """The constructor's arguments that make a prior like this one (JSON values); subclasses add their own."""
         contexts = {"num_contexts": self.num_contexts, "context_size": self.context_size}
         return {"num_actions": self.num_actions} | {name: size for name, size in contexts.items() if size is not None}
 
@@ -88,11 +94,16 @@ class Prior(nn.Module, ABC):
         names = {"action_names": self.action_names, "context_names": self.context_names}
         return {"context_per": self.context_per, "end": self.end} | names
 
+    @property
+    def fit_settings(self) -> tuple[str, ...]:
+        """The names of the settings that `fit` takes: none for a prior that counts, those of a training otherwise."""
+        return ()
+
     def restore(self, learned: dict[str, Any]) -> None:
         """Take over what `learned` gave when the prior was saved.
 
         Raises:
-            ValueError: a value that cannot be.
+            ValueError: a value is not one that this prior could have learned.
         """
         context_per = learned["context_per"]
         if context_per not in (("plan", "step") if self.takes_context else (None,)):
@@ -111,7 +122,7 @@ class Prior(nn.Module, ABC):
 
         Args:
             batch_size: N.
-            context: `[N]` or `[N, C]`: what is seen there; None for nothing.
+            context: `[N]` or `[N, C]`: that of the first action; None for a prior without context.
 
         Returns:
             Logits `[N, A]` of the first action, and the state `[N, ...]`.
@@ -124,7 +135,7 @@ class Prior(nn.Module, ABC):
         Args:
             action: integers `[N]`.
             state: as `start` or `step` returned it.
-            context: `[N]` or `[N, C]`: what is seen now; None: what was seen last.
+            context: `[N]` or `[N, C]`: that of the next action; None: the last one goes on.
 
         Returns:
             Logits `[N, A]` of the next action, and the next state.
@@ -133,17 +144,29 @@ class Prior(nn.Module, ABC):
     def advance(
         self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
     ) -> tuple[Tensor, Tensor]:
-        """As `step`, for callers that need the old state no more: it may be written over.
+        """As `step`, for callers that no longer need the old state: it may be overwritten.
 
         Args:
             action, state, context: see `step`.
-            room: so many further steps are to come, for which memory may be taken at once.
+            room: number of further steps to come, for which memory may be allocated at once.
         """
         return self.step(action, state, context)
 
     @abstractmethod
-    def fit(self, plans: Plans | Tensor) -> Self:
-        """Learn from executed plans; returns self. A tensor `[N, L]` is taken as plans without context."""
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+        """Learn from executed plans.
+
+        Args:
+            plans: `Plans`, or integers `[N, L]` for plans without context.
+            generator: source of randomness, where learning needs one; priors that count need none.
+            settings: those of `fit_settings`. Implementations call `check_settings`.
+
+        Returns:
+            The prior itself.
+
+        Raises:
+            ValueError: plans that this prior cannot learn from, or a setting that it does not have.
+        """
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         """The logits of each action given those before it.
@@ -164,29 +187,29 @@ class Prior(nn.Module, ABC):
         for t in range(length):
             out.append(logits)
             if t + 1 < length:
-                seen = context[:, t + 1] if context is not None and per_step else None
-                logits, state = self.step(plans[:, t].long(), state, seen)
+                now = context[:, t + 1] if context is not None and per_step else None
+                logits, state = self.step(plans[:, t].long(), state, now)
         return torch.stack(out, 1)
 
-    def log_prob(self, plans: Tensor, context: Tensor | None = None, lengths: Tensor | None = None) -> Tensor:
+    def log_prob(self, plans: Plans | Tensor) -> Tensor:
         """The log-probability of plans.
 
         Args:
-            plans: integers `[N, L]`.
-            context: None, one a plan or one a step.
-            lengths: `[N]`, where plans end before L; None where all have L actions.
+            plans: `Plans`, or integers `[N, L]` for plans without context.
 
         Returns:
             `[N]`, nats.
 
         Raises:
-            ValueError: a shape, dtype or value is wrong.
+            ValueError: other actions or another context than this prior's.
         """
-        data = Plans(plans, self.num_actions, lengths, context=context)
-        return self.action_log_probs(data).sum(-1)
+        return self.action_log_probs(plans).sum(-1)
 
-    def action_log_probs(self, plans: Plans) -> Tensor:
+    def action_log_probs(self, plans: Plans | Tensor) -> Tensor:
         """The log-probability of each action given those before it.
+
+        Args:
+            plans: `Plans`, or integers `[N, L]` for plans without context.
 
         Returns:
             `[N, L]`, nats; 0 beyond a plan's end.
@@ -194,6 +217,7 @@ class Prior(nn.Module, ABC):
         Raises:
             ValueError: other actions or another context than this prior's.
         """
+        plans = self._as_plans(plans)
         if plans.actions.numel() == 0:
             self._check_scored(plans)
             return torch.zeros(plans.actions.shape, device=self.device)
@@ -204,11 +228,11 @@ class Prior(nn.Module, ABC):
         return torch.cat(parts)
 
     def forecasts(self, plans: Plans) -> Iterator[tuple[Plans, Tensor]]:
-        """What the prior expects before each action, given those before it, some plans at a time.
+        """The log-probabilities of every action at each step, given the actions before it, some plans at a time.
 
         Yields:
-            Some of the plans, in order, and the log-probabilities `[n, L, A]` (nats) of every action at each of their
-            steps; beyond a plan's end they mean nothing.
+            Some of the plans, in order, and the log-probabilities `[n, L, A]` (nats) of all actions at each of their
+            steps; beyond a plan's end they have no meaning.
 
         Raises:
             ValueError: other actions or another context than this prior's.
@@ -221,6 +245,9 @@ class Prior(nn.Module, ABC):
             if self.end is not None:
                 logits = torch.cat([logits[:, :1], after_end(logits[:, 1:], part.actions[:, :-1].long(), self.end)], 1)
             yield part, torch.log_softmax(logits, -1)
+
+    def _as_plans(self, plans: Plans | Tensor) -> Plans:
+        return plans if isinstance(plans, Plans) else Plans(torch.as_tensor(plans), self.num_actions)
 
     def _check_scored(self, plans: Plans) -> None:
         if plans.num_actions != self.num_actions:
@@ -247,14 +274,14 @@ class Prior(nn.Module, ABC):
         )
 
     def check_context_of(self, plans: Plans | Tensor | None, num_plans: int = 0, length: int = 0) -> None:
-        """Raise ValueError unless the context of `plans` (or one given alone) is of the kind that this prior sees."""
+        """Raise ValueError unless the context of `plans` (or one given alone) is of the kind that this prior takes."""
         context = plans.context if isinstance(plans, Plans) else plans
         if context is None:
             if self.takes_context:
-                raise ValueError("context: this prior sees a context, and none was given")
+                raise ValueError("context: this prior takes a context, and none was given")
             return
         if not self.takes_context:
-            raise ValueError("context: this prior sees none (make it with num_contexts= or context_size=)")
+            raise ValueError("context: this prior takes none (make it with num_contexts= or context_size=)")
         if not isinstance(plans, Plans):
             steps = context.shape[1] if is_per_step(context) else length
             check_context(context, num_plans, steps)
@@ -269,15 +296,14 @@ class Prior(nn.Module, ABC):
             )
 
     def training_plans(self, plans: Plans | Tensor) -> Plans:
-        """`plans` as `Plans` that this prior can learn from; notes whether their context is a plan's or a step's.
+        """`plans` as `Plans` that this prior can learn from; keeps their names, end and kind of context.
 
-        A prior without context leaves that of the plans aside.
+        A prior without context ignores that of the plans.
 
         Raises:
-            ValueError: another number of actions, or a context of another kind than this prior sees.
+            ValueError: another number of actions, or a context of another kind than this prior takes.
         """
-        if not isinstance(plans, Plans):
-            plans = Plans(torch.as_tensor(plans), self.num_actions)
+        plans = self._as_plans(plans)
         if plans.num_actions != self.num_actions:
             raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
         self.end = plans.end
@@ -291,9 +317,31 @@ class Prior(nn.Module, ABC):
             self.context_names = tuple(plans.context_names)
         return plans
 
+    def check_settings(self, settings: Mapping[str, Any]) -> None:
+        """Raise ValueError unless `fit` takes all of these settings."""
+        known = self.fit_settings
+        for name in settings:
+            if name not in known:
+                raise ValueError(
+                    f"{name}: not a setting of {type(self).__name__}.fit, which takes {', '.join(known) or 'none'}"
+                )
+
+
+def _call(kind: type[Prior], config: Mapping[str, Any]) -> str:
+    """A call of the constructor with these arguments, in the order of its parameters."""
+    order = list(inspect.signature(kind).parameters)
+    names = sorted(config, key=lambda name: order.index(name) if name in order else len(order))
+    return f"{kind.__name__}({', '.join(f'{name}={_argument(config[name])}' for name in names)})"
+
+
+def _argument(value: Any) -> str:
+    if isinstance(value, Mapping) and set(value) == {"prior", "config"}:
+        return _call(Prior.known[value["prior"]], value["config"])
+    return f"[{', '.join(map(_argument, value))}]" if isinstance(value, list) else repr(value)
+
 
 def _names(what: str, learned: dict[str, Any], most: int) -> tuple[str, ...] | None:
-    """The names that were saved, at most so many of them."""
+    """The saved names, at most `most` of them."""
     names = learned[what]
     if names is None:
         return None

@@ -23,7 +23,7 @@ VERSION = 1
 def save(prior: Prior, folder: str | os.PathLike[str]) -> Path:
     """Save a prior to a folder, made if need be: `model.safetensors` (weights or counts) and `config.json`.
 
-    Both files are written beside their places and moved there when they are whole.
+    Both files are written under temporary names and renamed when they are whole.
 
     Args:
         prior: any `Prior` whose `config` gives its constructor's arguments.
@@ -72,7 +72,7 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
     digest = hashlib.sha256(data).hexdigest()
     unfinished = folder / ".config.json.partial"
     if digest != config["sha256"] and unfinished.exists():
-        # A save was cut off between its two moves: the new model is in place, its configuration still waits.
+        # A save was cut off between its two renames: the new weights are in place, their configuration is not yet.
         config = _read_config(unfinished)
     if digest != config["sha256"]:
         raise ValueError(f"{folder / 'model.safetensors'}: truncated, changed or of another model than config.json")
@@ -85,7 +85,9 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
     try:
         prior.load_state_dict(read_tensors(data))
     except (SafetensorError, RuntimeError) as error:
-        raise ValueError(f"{folder / 'model.safetensors'}: does not fit the prior that config.json tells of") from error
+        raise ValueError(
+            f"{folder / 'model.safetensors'}: does not fit the prior that config.json describes"
+        ) from error
     try:
         return prior.to(device).eval()
     except (RuntimeError, AssertionError) as error:

@@ -1,6 +1,6 @@
 """The uniform prior: every action equally probable; sampling from it is random search."""
 
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -27,7 +27,12 @@ class UniformPrior(Prior):
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return self.start(len(action))
 
-    def fit(self, plans: Plans | Tensor) -> Self:
-        """Nothing to learn; checks `plans` and returns self."""
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+        """Check `plans`, of which there is nothing to learn; returns self.
+
+        Raises:
+            ValueError: plans of other actions, or any setting.
+        """
+        self.check_settings(settings)
         self.training_plans(plans)
         return self

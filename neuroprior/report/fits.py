@@ -16,7 +16,7 @@ from neuroprior.analysis.comparison import Score, action_bits, rivals, score_bit
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
 from neuroprior.priors import GRUPrior, MarkovPrior, MixturePrior, Prior, StackedPrior, TransformerPrior
-from neuroprior.priors.counts.histories import TooLargeError
+from neuroprior.priors.counts import TooLargeError
 from neuroprior.sampling.ancestral import sample, sample_in_world
 from neuroprior.worlds import TabularWorld
 

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior.plans import all_plans, is_per_step
+from neuroprior.plans import Plans, all_plans, is_per_step
 from neuroprior.priors import Prior, load, save
 from neuroprior.sampling.ancestral import sample
 from neuroprior.testing.chi_square import chi_square
@@ -110,7 +110,8 @@ def _at(context: Tensor | None, t: int) -> Tensor | None:
 
 def _all_log_probs(prior: Prior, length: int, context: Tensor | None) -> Tensor:
     plans = all_plans(prior.num_actions, length).to(prior.device)
-    return prior.log_prob(plans, None if context is None else context.expand(len(plans), *context.shape[1:])).detach()
+    context = None if context is None else context.expand(len(plans), *context.shape[1:])
+    return prior.log_prob(Plans(plans, prior.num_actions, context=context)).detach()
 
 
 def _check_total(prior: Prior, context: Tensor | None, length: int) -> None:
@@ -159,7 +160,7 @@ def _check_copies(prior: Prior, length: int, generator: torch.Generator) -> None
     """A saved and loaded copy, and one on the GPU where there is one, say the same."""
     context = _random_context(prior, "plan" if prior.takes_context else None, 64, length, generator)
     plans = torch.randint(prior.num_actions, (64, length), generator=generator).to(prior.device)
-    want = prior.log_prob(plans, context).cpu()
+    want = prior.log_prob(Plans(plans, prior.num_actions, context=context)).cpu()
     with tempfile.TemporaryDirectory() as folder:
         try:
             copy = load(save(prior, folder))
@@ -168,7 +169,8 @@ def _check_copies(prior: Prior, length: int, generator: torch.Generator) -> None
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     for device in devices:
         copy.to(device)
-        got = copy.log_prob(plans.to(device), None if context is None else context.to(device))
+        there = None if context is None else context.to(device)
+        got = copy.log_prob(Plans(plans.to(device), prior.num_actions, context=there))
         require(got.device.type == device, f"log_prob on {device} came back on {got.device}")
         # what is impossible for both is no difference
         gap = float((got.cpu() - want).abs().masked_fill(got.cpu() == want, 0).max())

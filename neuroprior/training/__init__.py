@@ -1,8 +1,8 @@
-"""Training of priors with Lightning: settings, modules and `train`; knows a prior only by how it reads plans."""
+"""Training of priors with Lightning: settings, data, module, and one trainer for `fit` and the command line."""
 
 from neuroprior.training.batches import Batch, PlansModule
-from neuroprior.training.fitting import few_threads, quiet, train
 from neuroprior.training.module import PriorModule, bits
 from neuroprior.training.settings import Settings
+from neuroprior.training.trainer import make_trainer, quiet, run_training, train
 
-__all__ = ["Batch", "PlansModule", "PriorModule", "Settings", "bits", "few_threads", "quiet", "train"]
+__all__ = ["Batch", "PlansModule", "PriorModule", "Settings", "bits", "make_trainer", "quiet", "run_training", "train"]

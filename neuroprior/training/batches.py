@@ -1,4 +1,4 @@
-"""What training steps read: plans in batches, long plans window by window, in an order that the seed alone decides."""
+"""Batches of plans for training; long plans window by window; in an order that depends on the seed alone."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -15,10 +15,10 @@ MOST_DISTINCT = 1024
 """Distinct plans that one training step takes together, each weighted by its number."""
 
 MOST_VALIDATION = 2**16
-"""Actions that are looked at in each validation, about."""
+"""Actions in each validation, about."""
 
 LEAST_WINDOWS = 8
-"""Windows through which memory is carried over in training, where plans are as long; twice as many in validation."""
+"""Windows through which the hidden state is carried in training, for plans as long; twice as many in validation."""
 
 
 class Batch(NamedTuple):
@@ -26,32 +26,32 @@ class Batch(NamedTuple):
 
     Attributes:
         actions: `[N, T]`.
-        weight: `[N, T]`, how much each action counts; 0 beyond a plan's end.
+        weight: `[N, T]`, of each action in the loss; 0 beyond a plan's end.
         context: `[N]`, `[N, C]`, `[N, T]`, `[N, T, C]` or None.
-        before: `[N]`, the action before the window, `num_actions` for none; None where all are whole plans.
-        goes_on: whether the rows go on with those of the batch before, whose memory is carried over.
+        previous: `[N]`, the action before the window, `num_actions` for none; None where all are whole plans.
+        continues: whether the rows continue those of the batch before, so that the hidden state is carried over.
     """
 
     actions: Tensor
     weight: Tensor
     context: Tensor | None
-    before: Tensor | None
-    goes_on: bool
+    previous: Tensor | None
+    continues: bool
 
 
 class Step(NamedTuple):
-    """What a batch is made of.
+    """The windows that make up a batch.
 
     Attributes:
         pieces: `[N]`, numbers of pieces of plans.
-        number: of the window of each of them.
-        goes_on: whether it goes on with the batch before.
-        counts: False where the actions are read for nothing.
+        number: of the window in each of these pieces.
+        continues: whether it continues the batch before.
+        counts: False where the actions have weight 0.
     """
 
     pieces: Tensor
     number: int
-    goes_on: bool
+    continues: bool
     counts: bool = True
 
 
@@ -61,14 +61,14 @@ class PlansModule(lightning.LightningDataModule):
     Where at most `MOST_DISTINCT` plans are distinct, and few enough of them, each step takes them all, each weighted by
     its number: the exact gradient. Otherwise steps take batches of plans.
 
-    An epoch is what lies between two looks at the validation plans. Its batches depend on the seed and on its number
-    alone, so that a training that is resumed after an epoch goes on as if it had never stopped. With several processes
-    each takes its part of a batch.
+    An epoch is what lies between two validations. Its batches depend on the seed and on its number alone, so that a
+    training that is resumed after an epoch goes on as if it had never stopped. With several processes each takes its
+    part of a batch.
 
     Args:
         training: plans to learn from.
         validation: plans for early stopping; of more than `MOST_VALIDATION` actions some plans are drawn.
-        settings: size of batches and windows, and how often to look.
+        settings: size of batches and windows, and how often to validate.
         seed: draws the order.
 
     Attributes:
@@ -101,7 +101,7 @@ class PlansModule(lightning.LightningDataModule):
 class Windows(Dataset[Batch]):
     """Plans cut into pieces of `windows` windows; equal plans are merged into one row where few are distinct.
 
-    Pieces are walked through together, `group_size` at a time; `groups` such walks take all of them.
+    `group_size` pieces are read side by side, window after window; `groups` such groups hold all pieces.
     """
 
     def __init__(self, plans: Plans, window: int, batch_size: int, least_windows: int = 1) -> None:
@@ -131,7 +131,7 @@ class Windows(Dataset[Batch]):
 
     def __getitem__(self, index: Step) -> Batch:
         """The batch of a step."""
-        pieces, number, goes_on, counts = index
+        pieces, number, continues, counts = index
         plans, device = self.plans, self.plans.actions.device
         plan, first = self.plan[pieces].to(device), (self.first[pieces] + number * self.window).to(device)
         place = first[:, None] + torch.arange(self.window, device=device)
@@ -143,18 +143,18 @@ class Windows(Dataset[Batch]):
         context = plans.context
         if context is not None:
             context = context[plan[:, None], place] if is_per_step(context) else context[plan]
-        before = None
+        previous = None
         if self.window < plans.max_length:
             last = plans.actions[plan, (first - 1).clamp(0, plans.max_length - 1)].long()
-            before = torch.where(first > 0, last, plans.num_actions)
-        return Batch(plans.actions[plan[:, None], place], weight, context, before, goes_on)
+            previous = torch.where(first > 0, last, plans.num_actions)
+        return Batch(plans.actions[plan[:, None], place], weight, context, previous, continues)
 
 
 class Walk(Sampler[Step]):
     """The order of the batches of one epoch.
 
     Args:
-        windows: what is walked through.
+        windows: what is read.
         steps: batches an epoch, in an endless stream of shuffled passes; None: one pass in order.
         seed: draws the passes.
         part: this process's number and the number of processes: of each batch it takes every so-many-th piece.
@@ -164,7 +164,7 @@ class Walk(Sampler[Step]):
         self.windows, self.steps, self.seed, self.part, self.epoch = windows, steps, seed, part, 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Lightning tells the number of the epoch that comes."""
+        """Set the number of the next epoch; Lightning calls this."""
         self.epoch = epoch
 
     def __len__(self) -> int:
@@ -184,7 +184,7 @@ class Walk(Sampler[Step]):
             size = self.windows.group_size
             pieces = order[group * size : (group + 1) * size]
             mine = pieces[self.part[0] :: self.part[1]]
-            # A process without a piece reads one of the others' for nothing: all must take part in every step.
+            # A process without a piece reads one of the others' with weight 0: all must take part in every step.
             yield Step(mine if len(mine) else pieces[:1], number, number > 0 and step > start, len(mine) > 0)
 
 
@@ -200,7 +200,7 @@ def _some(plans: Plans, seed: int) -> Plans:
 
 
 def _piece_size(lengths: Tensor, window: int, batch_size: int, least: int) -> int:
-    """Windows a piece: long enough to carry memory far, short enough to fill batches and to leave few windows empty."""
+    """Windows a piece: enough to carry the hidden state far, few enough to fill batches and to leave few empty."""
     needed = (lengths + window - 1).div(window, rounding_mode="floor").clamp(min=1)
     total = int(needed.sum())
     size = min(int(needed.max()), max(least, -(-total // batch_size)))

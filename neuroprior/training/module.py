@@ -15,7 +15,7 @@ class PriorModule(lightning.LightningModule):
 
     Args:
         prior: any module with `forward(plans, context) -> logits [N, L, A]`; for plans longer than a window it needs
-            `read_on` too, see `NeuralPrior`.
+            `forward_from` too, see `NeuralPrior`.
         learning_rate: of AdamW, after the first tenth of the steps; it falls to 0 with half a cosine.
         weight_decay: of AdamW.
         seed: of dropout.
@@ -38,20 +38,20 @@ class PriorModule(lightning.LightningModule):
             raise ValueError(f"weight_decay: must not be negative, not {weight_decay}")
         self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
         self.curve: list[dict[str, float]] = []
-        self._memory: Tensor | None = None
+        self._hidden: Tensor | None = None
 
     def on_train_epoch_start(self) -> None:
         self.prior.train()
         self._totals = torch.zeros(2, device=self.device)  # on the device: a step should not wait for it
 
     def training_step(self, batch: Batch, batch_index: int) -> Tensor:
-        # Dropout begins anew in each step, so that a resumed training draws the same.
+        # Dropout is seeded anew in each step, so that a resumed training draws the same.
         seed = hash((self.seed, self.current_epoch, batch_index, self.global_rank)) % 2**63
         if self.device.type == "cpu":
             torch.default_generator.manual_seed(seed)  # `torch.manual_seed` takes far longer: it minds all accelerators
         else:
             torch.manual_seed(seed)
-        total, weight, self._memory = bits(self.prior, batch, self._memory)
+        total, weight, self._hidden = bits(self.prior, batch, self._hidden)
         loss = total / weight.clamp(min=1)
         # Gradients are averaged over processes: each part must count by its share of the actions.
         if self.trainer.world_size > 1:
@@ -62,18 +62,19 @@ class PriorModule(lightning.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.prior.eval()
-        self._memory, self._seen = None, torch.zeros(2, dtype=torch.double)
+        self._hidden, self._held_out = None, torch.zeros(2, dtype=torch.double)
 
     def validation_step(self, batch: Batch, batch_index: int) -> None:
-        total, weight, self._memory = bits(self.prior, batch, self._memory)
-        self._seen += torch.stack([total, weight]).cpu()  # not every device has float64
+        total, weight, self._hidden = bits(self.prior, batch, self._hidden)
+        self._held_out += torch.stack([total, weight]).cpu()  # not every device has float64
 
     def on_validation_epoch_end(self) -> None:
-        self._memory = None
-        seen, totals = self._seen, self._totals
+        self._hidden = None
+        validation, totals = self._held_out, self._totals
         if self.trainer.world_size > 1:
-            seen, totals = self._over_processes(seen.float().to(self.device)), self._over_processes(totals)
-        held_out = float(seen[0] / seen[1].clamp(min=1))
+            validation = self._over_processes(validation.float().to(self.device))
+            totals = self._over_processes(totals)
+        held_out = float(validation[0] / validation[1].clamp(min=1))
         self.log("validation_bits", held_out, prog_bar=True, rank_zero_only=True)
         rate = self.trainer.optimizers[0].param_groups[0]["lr"]
         self.log("learning_rate", rate, rank_zero_only=True)
@@ -105,28 +106,29 @@ class PriorModule(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def bits(prior: nn.Module, batch: Batch, memory: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
-    """What a prior pays for the actions of a batch.
+def bits(prior: nn.Module, batch: Batch, hidden: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The loss of a prior on a batch.
 
     Args:
         prior: the prior.
         batch: what is read.
-        memory: of the batch before, used where this one goes on with it.
+        hidden: the hidden state after the batch before, used where this batch continues it.
 
     Returns:
-        The weighted sum of bits, the sum of the weights, and the memory for the next batch (None for whole plans).
+        The weighted sum of bits, the sum of the weights, and the hidden state for the next batch (None for whole
+        plans).
     """
-    if batch.before is None:
+    if batch.previous is None:
         logits = prior(batch.actions, batch.context)
     else:
-        read_on: Any = prior.read_on
-        logits, memory = read_on(batch.actions, batch.context, batch.before, memory if batch.goes_on else None)
-        memory = None if memory is None else memory.detach()
+        forward_from: Any = prior.forward_from
+        logits, hidden = forward_from(batch.actions, batch.context, batch.previous, hidden if batch.continues else None)
+        hidden = None if hidden is None else hidden.detach()
     log_probs = torch.log_softmax(logits.float(), -1)
     taken = log_probs.gather(-1, batch.actions.long()[..., None])[..., 0]
-    return -(taken * batch.weight).sum() / log(2), batch.weight.sum(), memory
+    return -(taken * batch.weight).sum() / log(2), batch.weight.sum(), hidden
 
 
 def _rate(done: float) -> float:
-    """Share of the learning rate after a share `done` of the steps: a linear rise over a tenth, then half a cosine."""
+    """The factor on the learning rate after a share `done` of the steps: linear warm-up over a tenth, half a cosine."""
     return min((done + 1e-3) / 0.1, 0.5 * (1 + cos(pi * min(done, 1.0))))

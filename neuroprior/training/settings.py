@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from math import ceil
 
 FEWEST_STEPS, MOST_STEPS = 10, 100
-"""Steps between two looks at the held-out plans, where they are not given."""
+"""The least and the most steps between two validations, where these are not given."""
 
 
 @dataclass(frozen=True)
@@ -14,15 +14,15 @@ class Settings:
     Attributes:
         max_steps: gradient steps; the learning rate falls to 0 over them.
         batch_size: plans (pieces of plans, where they are longer than a window) a step.
-        window: actions that one step reads of a plan. Longer plans are read window by window, in order, with the
-            prior's memory carried over.
+        window: actions that one step reads of a plan. Longer plans are read window by window, in order, with the hidden
+            state carried over (truncated backpropagation through time).
         learning_rate: of AdamW, after the first tenth of the steps.
         weight_decay: of AdamW.
         gradient_clip: the largest norm of a gradient.
         validation: share of plans (of groups, where there are any) held out for early stopping.
-        check_every: steps between two looks at the held-out plans; None: two passes through the plans, but at least
-            `FEWEST_STEPS` and at most `MOST_STEPS`, so that few plans are not learned by heart before the first look.
-        patience: steps without improvement after which training stops.
+        check_every: steps between two validations (on the held-out plans); None: two passes through the plans, but at
+            least `FEWEST_STEPS` and at most `MOST_STEPS`, so that small data sets are not overfitted before the first.
+        patience: steps without a lower validation loss after which training stops.
         progress: show a progress bar.
 
     Raises:
@@ -53,11 +53,11 @@ class Settings:
             raise ValueError(f"weight_decay: must not be negative, not {self.weight_decay}")
 
     def epochs(self, steps_a_pass: int) -> tuple[int, int]:
-        """How many looks at the held-out plans, if training is not stopped early, and the steps before each.
+        """The number of validations, if training is not stopped early, and the steps before each.
 
         Args:
             steps_a_pass: steps that take all plans once.
         """
         wanted = self.check_every or min(max(2 * steps_a_pass, FEWEST_STEPS), MOST_STEPS)
-        looks = ceil(self.max_steps / wanted)
-        return looks, ceil(self.max_steps / looks)
+        validations = ceil(self.max_steps / wanted)
+        return validations, ceil(self.max_steps / validations)

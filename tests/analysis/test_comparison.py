@@ -23,7 +23,7 @@ from neuroprior.analysis.comparison import (
 )
 from neuroprior.analysis.statistics import mean_interval, paired_difference, ratio_difference
 from neuroprior.plans.folds import BLOCKS
-from neuroprior.priors.counts import histories
+from neuroprior.priors.counts import HistoryPrior
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
@@ -128,7 +128,7 @@ def test_score_is_what_log_prob_says(kind, per):
         prior = make(3, 2, num_contexts=contexts).fit(plans)
     found = score("it", prior, plans)
     keep = plans.lengths > 0
-    bits = -prior.log_prob(plans.actions, seen, plans.lengths).detach().double()[keep] / math.log(2)
+    bits = -prior.log_prob(plans).detach().double()[keep] / math.log(2)
     assert found.model == "it"
     assert found.sees == ("actions" if per is None else "actions and context")
     torch.testing.assert_close(found.bits, bits, rtol=1e-5, atol=1e-6)
@@ -244,8 +244,8 @@ def sources(matters: bool, num: int = 400, seed: int = 0) -> Plans:
 
 
 def bits(prior, plans: Plans) -> float:
-    seen = plans.context if prior.takes_context else None
-    return float(-prior.log_prob(plans.actions, seen, plans.lengths).double().sum() / plans.lengths.sum() / math.log(2))
+    plans = plans if prior.takes_context else replace(plans, context=None)
+    return float(-prior.log_prob(plans).double().sum() / plans.lengths.sum() / math.log(2))
 
 
 @pytest.mark.parametrize("num_contexts", [None, 2])
@@ -327,7 +327,7 @@ def test_rivals_that_always_see():
 def test_rivals_that_are_too_large(monkeypatch):
     """They have no prior, and those that are small enough go on; so do those that see no context."""
     training, validation = sources(True), sources(True, 100, seed=3)
-    monkeypatch.setattr(histories, "MAX_TABLE_BYTES", 4 * 3 * 2 * 60)
+    monkeypatch.setattr(HistoryPrior, "max_table_bytes", 4 * 3 * 2 * 60)
     found = {rival.model: rival for rival in rivals(training, validation)}
     assert len(found) == len(ORDERS) + 2
     for name in ("uniform", "markov-0", "markov-1", "markov-2"):
@@ -335,7 +335,7 @@ def test_rivals_that_are_too_large(monkeypatch):
     for name in ("markov-4", "markov-5", "markov-6", "context tree"):
         assert (found[name].how, found[name].prior, found[name].validation_bits) == ("too large", None, math.inf), name
     # 1 + 3 histories and 1 opening fit, but not as often as there are contexts.
-    monkeypatch.setattr(histories, "MAX_TABLE_BYTES", 4 * 3 * (5 + 6))
+    monkeypatch.setattr(HistoryPrior, "max_table_bytes", 4 * 3 * (5 + 6))
     alone = {rival.model: rival for rival in rivals(training, validation, 2)}
     assert alone["markov-1"].prior is not None
     assert alone["markov-1"].prior.num_contexts is None

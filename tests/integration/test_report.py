@@ -52,7 +52,7 @@ def evaluate(file: Path, folders: list[str], out: Path, *more: str) -> list[dict
 
 def cost(prior: Prior, plans: Plans) -> float:
     """Bits per action, without the program."""
-    bits = -prior.log_prob(plans.actions, plans.context, plans.lengths).detach().double().sum() / math.log(2)
+    bits = -prior.log_prob(plans).detach().double().sum() / math.log(2)
     return float(bits / plans.mask().sum())
 
 

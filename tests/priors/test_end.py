@@ -56,7 +56,7 @@ def test_what_comes_after_the_end_costs_nothing():
     short = torch.tensor([[0, 1, 2]])
     padded = torch.tensor([[0, 1, 2, 2, 2]])
     assert torch.equal(prior.log_prob(short), prior.log_prob(padded))
-    assert torch.equal(prior.log_prob(short), prior.log_prob(torch.tensor([[0, 1, 2, 0]]), lengths=torch.tensor([3])))
+    assert torch.equal(prior.log_prob(short), prior.log_prob(Plans(torch.tensor([[0, 1, 2, 0]]), 3, torch.tensor([3]))))
 
 
 def test_a_planner_says_that_it_cannot_end_plans():

@@ -81,19 +81,19 @@ def test_stepping_is_forward(kind, sees, window):
     again, _ = steps(prior, plans, context, per, explicit=True)
     torch.testing.assert_close(again, stepped)
     taken = forward.log_softmax(-1).gather(-1, plans[..., None])[..., 0]
-    torch.testing.assert_close(prior.log_prob(plans, context), taken.sum(1))
+    torch.testing.assert_close(prior.log_prob(Plans(plans, A, context=context)), taken.sum(1))
     lengths = torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
     shorter = torch.stack([row[:n].sum() for row, n in zip(taken, lengths, strict=True)])
-    torch.testing.assert_close(prior.log_prob(plans, context, lengths), shorter)
+    torch.testing.assert_close(prior.log_prob(Plans(plans, A, lengths, context=context)), shorter)
 
 
 @pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None])
 def test_log_prob_in_parts(kind, sees, monkeypatch):
     prior, context = make(kind, sees), draw_context(sees, 9, L)
     plans, lengths = torch.randint(A, (9, L), generator=seeded(1)), torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
-    whole = prior.log_prob(plans, context, lengths)
+    whole = prior.log_prob(Plans(plans, A, lengths, context=context))
     monkeypatch.setattr(type(prior), "actions_at_once", 2 * L)
-    torch.testing.assert_close(prior.log_prob(plans, context, lengths), whole)
+    torch.testing.assert_close(prior.log_prob(Plans(plans, A, lengths, context=context)), whole)
 
 
 @pytest.mark.parametrize("end", [False, True])
@@ -115,7 +115,7 @@ def test_forecasts(kind, sees, end, monkeypatch):
     torch.testing.assert_close(within.exp().sum(-1), torch.ones(len(within)))
     taken = whole[1].gather(-1, plans.actions.long()[..., None])[..., 0].masked_fill(~plans.mask(), 0)
     torch.testing.assert_close(taken, prior.action_log_probs(plans))
-    torch.testing.assert_close(taken.sum(1), prior.log_prob(plans.actions, plans.context, lengths))
+    torch.testing.assert_close(taken.sum(1), prior.log_prob(plans))
     if not end:
         torch.testing.assert_close(whole[1], prior(plans.actions, plans.context).log_softmax(-1))
     else:  # after the end nothing but it
@@ -209,7 +209,7 @@ def test_empty_batches(kind, sees, window, size):
     prior, context = make(kind, sees, window), draw_context(sees, *size)
     plans = torch.zeros(size, dtype=torch.long)
     assert prior(plans, context).shape == (*size, A)
-    assert prior.log_prob(plans, context).tolist() == [0.0] * size[0]
+    assert prior.log_prob(Plans(plans, A, context=context)).tolist() == [0.0] * size[0]
     assert prior.sample(*size, context, generator=seeded(0)).shape == size
 
 
@@ -230,7 +230,7 @@ BAD_CONTEXTS = [
     ("features a step", torch.zeros(4, 2, 3), "[4, 2, 3]"),
 ]
 CALLS = {
-    "log_prob": lambda prior, plans, context: prior.log_prob(plans, context),
+    "log_prob": lambda prior, plans, context: prior.log_prob(Plans(plans, A, context=context)),
     "sample": lambda prior, plans, context: prior.sample(*plans.shape, context),
     "the sampler": lambda prior, plans, context: sample(prior, *plans.shape, context),
     "fit": lambda prior, plans, context: prior.fit(Plans(plans, A, context=context)),

@@ -108,10 +108,7 @@ def by_hand(model: str, learned: Plans, held: Plans, seed: int, contexts: int | 
     else:
         order = int(model.removeprefix("markov-"))
         tried = [MarkovPrior(3, order, s, num_contexts=contexts, backoff=b) for b, s in BACKOFFS_TRIED]
-    cost = [
-        -float(p.fit(training).log_prob(validation.actions, validation.context, validation.lengths).sum())
-        for p in tried
-    ]
+    cost = [-float(p.fit(training).log_prob(validation).sum()) for p in tried]
     best = tried[cost.index(min(cost))].fit(learned)
     return -best.action_log_probs(held).double() / math.log(2)
 

@@ -353,7 +353,7 @@ def test_in_a_world_of_features():
     for i in range(2):
         before = torch.cat([torch.zeros(8, 1), (2.0 * every[:, :2] - 1).cumsum(1)], 1) + start[i]
         with torch.no_grad():
-            probs = prior.log_prob(every, before[..., None]).exp()
+            probs = prior.log_prob(Plans(every, 2, context=before[..., None])).exp()
         assert fits(plans[i], probs, 2)
 
 

@@ -157,7 +157,7 @@ class TablePrior(Prior):
         depth = int(state[0, 1]) if len(state) else 0
         return self.logits[depth][state[:, 2], state[:, 0]], state
 
-    def fit(self, plans: Any) -> "TablePrior":
+    def fit(self, plans: Any, *, generator: torch.Generator | None = None, **settings: Any) -> "TablePrior":
         raise NotImplementedError
 
 

@@ -154,15 +154,16 @@ class HiddenMemory(Broken):
 
 
 class Unnormalised(Broken):
-    def log_prob(self, plans: Tensor, context: Tensor | None = None, lengths: Tensor | None = None) -> Tensor:
-        return super().log_prob(plans, context, lengths) + 0.1
+    def log_prob(self, plans: Plans | Tensor) -> Tensor:
+        return super().log_prob(plans) + 0.1
 
 
 class WrongSamples(Broken):
     """Says one distribution in `log_prob` and samples from another."""
 
-    def log_prob(self, plans: Tensor, context: Tensor | None = None, lengths: Tensor | None = None) -> Tensor:
-        return super().log_prob((plans.long() + 1) % self.num_actions)
+    def log_prob(self, plans: Plans | Tensor) -> Tensor:
+        actions = plans.actions if isinstance(plans, Plans) else plans
+        return super().log_prob((actions.long() + 1) % self.num_actions)
 
 
 class GlobalRandomness(Broken):

@@ -30,7 +30,7 @@ def test_a_pass_reads_every_action_once_and_in_order(window, batch_size):
             taken = batch.weight[row] > 0
             place = batch.context[row][taken]
             if len(place):
-                before = int(batch.before[row]) if batch.before is not None else 3
+                before = int(batch.previous[row]) if batch.previous is not None else 3
                 seen.append((batch.actions[row][taken].tolist(), place.tolist(), before))
     total = sorted(len(actions) for actions, _, _ in seen)
     assert sum(total) == int(plans.lengths.sum())
@@ -55,9 +55,9 @@ def test_processes_share_each_batch(parts):
     windows = Windows(long_plans(7), 4, 3)
     whole = list(Walk(windows, 12, 0, (0, 1)))
     shares = [list(Walk(windows, 12, 0, (n, parts))) for n in range(parts)]
-    for step, (pieces, number, goes_on, _) in enumerate(whole):
+    for step, (pieces, number, continues, _) in enumerate(whole):
         mine = [share[step] for share in shares]
-        assert all((one.number, one.goes_on) == (number, goes_on) for one in mine)
+        assert all((one.number, one.continues) == (number, continues) for one in mine)
         assert sorted(torch.cat([one.pieces for one in mine if one.counts]).tolist()) == sorted(pieces.tolist())
         assert all(float(windows[one].weight.sum()) == 0 for one in mine if not one.counts)
         assert all(len(one.pieces) for one in mine), "a process without anything to read would keep the others waiting"
@@ -69,7 +69,7 @@ def test_an_epoch_depends_on_its_number_and_the_seed_alone():
     def epoch(number: int, seed: int = 0):
         walk = Walk(windows, 10, seed, (0, 1))
         walk.set_epoch(number)
-        return [(step.pieces.tolist(), step.number, step.goes_on) for step in walk]
+        return [(step.pieces.tolist(), step.number, step.continues) for step in walk]
 
     assert epoch(3) == epoch(3) != epoch(4)
     assert epoch(3) != epoch(3, seed=1)
@@ -78,7 +78,7 @@ def test_an_epoch_depends_on_its_number_and_the_seed_alone():
 
 @pytest.mark.parametrize("prior", SMALL)
 def test_windows_with_memory_cost_what_the_whole_costs(prior):
-    prior.carry_over(40)
+    prior.set_training_window(40)
     plans = long_plans()
     lengths = torch.tensor([37, 33, 29, 36, 30])
     windows = Windows(Plans(plans.actions, 3, lengths=lengths), 5, 100, least_windows=8)
@@ -87,13 +87,13 @@ def test_windows_with_memory_cost_what_the_whole_costs(prior):
     for index in Walk(windows, None, None, (0, 1)):
         cost, _, memory = bits(prior, windows[index], memory)
         total += float(cost.detach())
-    whole = -float(prior.log_prob(plans.actions, lengths=lengths).sum().detach()) / math.log(2)
+    whole = -float(prior.log_prob(Plans(plans.actions, 3, lengths)).sum().detach()) / math.log(2)
     assert total == pytest.approx(whole, rel=1e-5)
 
 
 @pytest.mark.parametrize("prior", SMALL)
 def test_stepping_equals_forward_far_past_the_window(prior):
-    prior.carry_over(5)
+    prior.set_training_window(5)
     plans = torch.randint(3, (4, 40), generator=seeded(2))
     logits, state = prior.start(4)
     stepped = [logits]
@@ -142,7 +142,7 @@ def test_memory_is_carried_by_default(num_plans, length):
     for windows in (data.training, data.validation):
         longest = -(-length // 128)
         assert windows.windows >= min(8, longest)
-        share = sum(step.goes_on for step in Walk(windows, None, None, (0, 1))) / windows.steps
+        share = sum(step.continues for step in Walk(windows, None, None, (0, 1))) / windows.steps
         assert share >= 0.8
 
 

@@ -1,5 +1,6 @@
 """Variable-order Markov priors: context tree weighting, the average over all trees of histories that may matter."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -7,25 +8,24 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
-from neuroprior.priors.counts.histories import Counts, Tree
+from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.counts.weighting import Weighting, histories_of
 
 _PAIRS = ("pair_row", "pair_action", "pair_count")
 
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
-    """A history that tells all about the next action, in the tree of `ContextTreePrior.map_tree`."""
+    """A leaf of the tree of `ContextTreePrior.map_tree`: given this history, nothing further back matters."""
 
     history: tuple[int, ...]
     """The last actions, the oldest first."""
     opening: bool
-    """True: these are all the actions since the plan began."""
+    """True where these are all the actions since the plan began."""
     context: int | None
-    """Seen now; None where it does not matter."""
+    """That of the next action; None where it does not matter."""
     count: int
-    """How many actions of the training plans followed it."""
+    """How many actions followed it in the training plans."""
     probs: Tensor
     """`[A]`, float64: of the next action."""
 
@@ -48,24 +48,25 @@ class ContextTreePrior(HistoryPrior):
     is of `depth` actions or is a plan's whole past. The probability of the next action is exactly the average over all
     trees and all their parameters after training (float32); it does not change as a plan goes on.
 
-    With a context index the context seen now is nearer than the last action: either it does not matter, with
-    probability beta, and no action does; or each context has a tree of its own.
+    With a context index the present context comes before the last action: either it does not matter, with probability
+    beta, and then no action does; or each context has a tree of its own.
 
     Args:
         num_actions: A.
-        depth: >= 0, the most past actions that may matter. Deeper trees cost memory and time, but no accuracy.
+        depth: >= 0, the most past actions that may matter. Deeper trees cost memory and time, not accuracy.
         beta: between 0 and 1. None: 1 - 1 / A (1 / 2 for one action), so that a history's tree is expected to branch
             at one history of each length. (The papers' 1 / 2 for two actions; for more, theirs, 1 - 2 ** (1 - A), soon
             rounds to 1.)
         alpha: > 0, the pseudo-count of an action in a leaf, averaged over actions. None: of A * alpha = 1/4, 1/2, 1, 2,
             ..., 64 the one under which the training plans are most probable (climbing from 2).
-        base: how these pseudo-counts are spread. "frequencies": as the actions of all training plans are, those never
-            taken by the Witten-Bell rule; "uniform": evenly. "uniform" and alpha = 1 / 2 give the papers'
-            Krichevsky-Trofimov estimator; where many actions are taken unevenly, "frequencies" predicts far better.
-        num_contexts: number of context indices, where the prior sees one.
+        base: how these pseudo-counts are distributed over the actions. "frequencies": as in all training plans, with
+            Witten-Bell smoothing for actions that were never taken; "uniform": evenly. "uniform" and alpha = 1 / 2 give
+            the papers' Krichevsky-Trofimov estimator; where actions are very unevenly frequent, "frequencies" predicts
+            far better.
+        num_contexts: number of context indices, for a prior that takes an index.
 
     Attributes:
-        pseudo_counts: `[A]`, float64: of each action in a leaf, as `alpha` and `base` say or `fit` found.
+        pseudo_counts: `[A]`, float64: of each action in a leaf, as given by `alpha` and `base` or found by `fit`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -109,15 +110,15 @@ class ContextTreePrior(HistoryPrior):
     def log_evidence(self) -> float:
         """The log-probability, in nats, of all actions of the training plans, averaged over all trees and parameters.
 
-        Of two depths, betas or alphas the better one makes it higher. 0 before `fit`.
+        The higher, the better the depth, beta and alpha describe the plans. 0 before `fit`.
         """
         return self._weighting(*self._learned()).evidence(self.pseudo_counts)
 
     def map_tree(self) -> list[Leaf]:
-        """The most probable tree after training: those of its leaves that occurred, the shortest first.
+        """The most probable tree after training: its leaves that occurred in the plans, the shortest first.
 
-        (The BCT algorithm of Kontoyiannis et al. 2022.) Of equally probable trees the smallest. Empty before
-        `fit`.
+        This is the BCT algorithm of Kontoyiannis et al. 2022. Of equally probable trees it is the smallest. Empty
+        before `fit`.
         """
         tree, counts = self._learned()
         num, contexts = len(counts.row_code), self.num_contexts or 1
@@ -127,11 +128,11 @@ class ContextTreePrior(HistoryPrior):
         rows = weighting.best_leaves(self.pseudo_counts)
         n = weighting.counts_of(rows)
         code = torch.cat([counts.row_code, counts.row_code.new_zeros(1)])[rows]
-        node, seen = code.div(contexts, rounding_mode="floor"), (code % contexts).tolist()
-        context = [None if self.num_contexts is None or row == num else c for row, c in zip(rows, seen, strict=True)]
+        node, index = code.div(contexts, rounding_mode="floor"), (code % contexts).tolist()
+        context = [None if self.num_contexts is None or row == num else c for row, c in zip(rows, index, strict=True)]
         probs = (n + self.pseudo_counts) / (n.sum(1, keepdim=True) + self.pseudo_counts.sum())
         opening = (node >= tree.bounds[self.depth + 1]).tolist()
-        columns = (histories_of(tree, node, self.depth), opening, context, n.sum(1).long().tolist(), probs.cpu())
+        columns = (_histories_of(tree, node, self.depth), opening, context, n.sum(1).long().tolist(), probs.cpu())
         leaves = [Leaf(*leaf) for leaf in zip(*columns, strict=True)]
         return sorted(leaves, key=lambda leaf: (len(leaf.history), leaf.opening, leaf.history, leaf.context or 0))
 
@@ -146,7 +147,7 @@ class ContextTreePrior(HistoryPrior):
     def estimate(self, tree: Tree, counts: Counts) -> Tensor:
         return self._weighting(tree, counts).predict(self.pseudo_counts)
 
-    def _choose(self, weighting: Weighting) -> Tensor:
+    def _choose(self, weighting: "Weighting") -> Tensor:
         """The pseudo-counts of a leaf."""
         counts, actions = weighting.pooled, self.num_actions
         base = torch.full_like(counts, 1 / actions)
@@ -179,7 +180,7 @@ class ContextTreePrior(HistoryPrior):
             and bool((self.pseudo_counts > 0).all() & self.pseudo_counts.isfinite().all())
         )
 
-    def _weighting(self, tree: Tree, counts: Counts) -> Weighting:
+    def _weighting(self, tree: Tree, counts: Counts) -> "Weighting":
         return Weighting(tree, counts, self.num_contexts, self.num_actions, self.depth, self.beta)
 
     def _learned(self) -> tuple[Tree, Counts]:
@@ -190,3 +191,145 @@ class ContextTreePrior(HistoryPrior):
 
 def _extremes(values: Tensor) -> list[int]:
     return [int(values.min()), int(values.max())] if len(values) else []
+
+
+class Weighting:
+    """The recursion of `ContextTreePrior` over the rows of `counts`, in logarithms and float64.
+
+    Results `[R + 1]` have one number a row; the last is that of all contexts together, the root of a tree with
+    contexts. `pseudo [A]`: the pseudo-counts of a leaf.
+
+    Args:
+        tree, counts: of `count_histories`.
+        num_contexts: number of contexts counted apart, or None.
+        num_actions: A.
+        depth: the most actions of a history.
+        beta: the probability that nothing further back matters.
+    """
+
+    def __init__(
+        self, tree: Tree, counts: Counts, num_contexts: int | None, num_actions: int, depth: int, beta: float
+    ) -> None:
+        self.counts, self.depth, self.num_actions = counts, depth, num_actions
+        self.takes_context, self.contexts, self.beta = num_contexts is not None, num_contexts or 1, beta
+        self.num = len(counts.row_code)
+        self.parent = parent_rows(tree, counts, self.contexts)
+        self.ends = level_bounds(tree, counts, self.contexts)
+        self.blocks = list(row_blocks(tree, counts, self.contexts, num_actions))
+        self.pooled = counts.pooled(self.contexts, num_actions, counts.count).double()
+        self.total = torch.cat([counts.total().double(), self.pooled.sum()[None]])
+        self.root = self.num if self.takes_context or self.num == 0 else 0
+
+    def leaf_evidence(self, pseudo: Tensor) -> Tensor:
+        """`[R + 1]`: the log-probability of all that followed each row if it is a leaf (Dirichlet-multinomial)."""
+        at, whole = pseudo.lgamma(), pseudo.sum()
+        out = whole.lgamma() - (self.total + whole).lgamma()
+        action = self.counts.action
+        out[: self.num].index_add_(0, self.counts.row, (self.counts.count + pseudo[action]).lgamma_().sub_(at[action]))
+        out[self.num] += ((self.pooled + pseudo).lgamma() - at).sum()
+        return out
+
+    def weigh(self, pseudo: Tensor, best: bool = False) -> tuple[Tensor, Tensor]:
+        """The log-probabilities of what followed each row, with the prior probabilities of trees.
+
+        Returns:
+            `[R + 1]`: with the row as a leaf; and `[R + 1]`: summed over all trees below it (`best`: for the best one).
+        """
+        leaf, absent = self.leaf_evidence(pseudo), self.absent()
+        whole, parts = leaf.clone(), torch.zeros_like(leaf)
+        missing = torch.full_like(leaf, self.num_actions)
+        missing[self.num] = self.contexts
+        for level in range(len(self.ends) - 2, -2, -1):
+            here = slice(self.ends[level], self.ends[level + 1]) if level >= 0 else slice(self.num, self.num + 1)
+            if level < self.depth:
+                leaf[here] += math.log(self.beta)
+                branch = parts[here] + math.log1p(-self.beta)
+                if best:
+                    branch += missing[here] * absent[level + 1]
+                whole[here] = torch.maximum(leaf[here], branch) if best else torch.logaddexp(leaf[here], branch)
+            if level >= 0:
+                parts.index_add_(0, self.parent[here], whole[here])
+                # A beginning has no tree below it, so only missing actions cost something.
+                if best and level <= self.depth:
+                    missing.index_add_(0, self.parent[here], -torch.ones_like(whole[here]))
+        return leaf, whole
+
+    def evidence(self, pseudo: Tensor) -> float:
+        """The log-probability of all that was counted."""
+        return float(self.weigh(pseudo)[1][self.root])
+
+    def predict(self, pseudo: Tensor) -> Tensor:
+        """`[R + 1, A]`, float32: log-probabilities of the next action after the history of each row.
+
+        The row is the longest history that occurred.
+        """
+        leaf, whole = self.weigh(pseudo)
+        stop = (leaf - whole).exp()  # the posterior probability that nothing further back matters
+        base = pseudo / pseudo.sum()
+        table = torch.zeros(self.num + 1, self.num_actions, device=base.device)
+        rest = torch.ones_like(stop)  # the posterior probability that something further back than the row matters
+        if self.takes_context:
+            table[-1] = stop[-1] * _mean(self.pooled, pseudo)
+            rest[-1] -= stop[-1]
+        for _, first, until in self.blocks:
+            here, up = slice(first, until), self.parent[first:until]
+            mean = _mean(self.counts.dense(first, until, self.num_actions, self.counts.count), pseudo)
+            table[here] = table[up] + mean.mul_((rest[up] * stop[here])[:, None])
+            rest[here] = rest[up] * (1 - stop[here])
+        # Histories further back than the longest that occurred have no counts: their leaves have the mean `base`.
+        for first in range(0, self.num + 1, max(2**22 // self.num_actions, 1)):
+            here = slice(first, first + max(2**22 // self.num_actions, 1))
+            table[here] = (table[here] + rest[here, None] * base).log()
+        return table
+
+    def best_leaves(self, pseudo: Tensor) -> Tensor:
+        """The rows, ascending, that are leaves of the best tree; of equally good trees, of the smallest."""
+        leaf, whole = self.weigh(pseudo, best=True)
+        ends = leaf >= whole - 1e-12 * whole.abs()
+        ends[-1] &= self.takes_context
+        reached = torch.ones_like(ends)
+        for _, first, until in self.blocks:
+            up = self.parent[first:until]
+            reached[first:until] = reached[up] & ~ends[up]
+        return (reached & ends).nonzero()[:, 0]
+
+    def counts_of(self, rows: Tensor) -> Tensor:
+        """`[n, A]`, float64: what followed `rows [n]`."""
+        place = torch.full((self.num + 1,), -1, device=rows.device)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        here = place[self.counts.row] >= 0
+        n = torch.zeros(len(rows), self.num_actions, dtype=torch.double, device=rows.device)
+        n[place[self.counts.row[here]], self.counts.action[here]] = self.counts.count[here].double()
+        n[rows == self.num] = self.pooled
+        return n
+
+    def absent(self) -> list[float]:
+        """The log-probability of the best tree below a history of 0, 1, ..., depth actions that did not occur."""
+        out = [0.0]
+        for _ in range(self.depth):
+            out.append(max(math.log(self.beta), math.log1p(-self.beta) + self.num_actions * out[-1]))
+        return out[::-1]
+
+
+def _mean(n: Tensor, pseudo: Tensor) -> Tensor:
+    """The posterior mean `[..., A]` of a leaf's distribution after counts `n [..., A]`."""
+    return (n + pseudo).div_(n.sum(-1, keepdim=True) + pseudo.sum())
+
+
+def _histories_of(tree: Tree, nodes: Tensor, depth: int) -> list[tuple[int, ...]]:
+    """The actions of each of `nodes [n]`, the oldest first."""
+    before, last = torch.zeros_like(tree.parent), torch.full_like(tree.parent, -1)
+    for level in range(1, len(tree.bounds) - 1):
+        if level == depth + 1:
+            continue  # the beginning of a plan, before any action
+        first, until = tree.bounds[level - 1 : level + 1]
+        to = tree.next_node[first:until].long()
+        # On the level above, only the history without its last action leads to a history.
+        node, action = ((to >= until) & (to < tree.bounds[level + 1])).nonzero().unbind(1)
+        before[to[node, action]], last[to[node, action]] = node + first, action
+    actions: list[Tensor] = []
+    while bool((last[nodes] >= 0).any()):
+        actions.insert(0, last[nodes])
+        nodes = before[nodes]
+    rows = torch.stack(actions, 1).tolist() if actions else [[] for _ in nodes]
+    return [tuple(action for action in row if action >= 0) for row in rows]

@@ -1,4 +1,8 @@
-"""The tree of the histories in plans, counted chunk by chunk: what Markov priors and context trees are made of."""
+"""The tree of the histories in plans and what followed each: the counts behind Markov priors and context trees.
+
+Counting goes through the plans once, some at a time, and counts each action after its longest history only; the counts
+after shorter histories are sums of these.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,26 +12,27 @@ import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.priors.counts.grams import few_grams, grams
-from neuroprior.priors.counts.tally import Tally, merge, number
 
 ACTIONS_AT_ONCE = 2**18
 """Actions that are counted together; small enough for a processor's cache."""
 
 MAX_TABLE_BYTES = 2**31
-"""The tables of a prior may take this much; beyond it `fit` raises."""
+"""The most memory that the tables of a prior may take."""
+
+MOST_NGRAMS = 2**16
+"""Possible n-grams of actions up to which a table of all of them is counted first."""
 
 
 class TooLargeError(ValueError):
-    """Tables over the limit of `MAX_TABLE_BYTES`."""
+    """The tables of a prior would take too much memory."""
 
 
 class Tree(NamedTuple):
     """The histories that occurred, as a state machine.
 
     Node 0 is the empty history; then come the histories of 1, 2, ..., `depth` actions, wherever in a plan they stood;
-    then the openings: the whole past of 0, 1, ..., `depth` - 1 actions since a plan began. A node's parent comes before
-    it: the history without its oldest action; of an opening, the same actions wherever they stood.
+    then the openings: all 0, 1, ..., `depth` - 1 actions since the beginning of a plan. The parent of a history is the
+    history without its oldest action; of an opening, the same actions wherever they stood. Parents come first.
     """
 
     next_node: Tensor  # int32 [M, A]: the longest history of the tree after one more action
@@ -43,16 +48,16 @@ class Tree(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """What followed the histories of a tree; a row is a pair of a node and a context that occurred, in that order.
+    """How often each action followed each history of a tree.
 
-    Only what occurred is here: P triples of a row, an action and how often it followed.
+    Only what occurred is stored: R rows, each a node with a context, and P entries, each a row with an action.
     """
 
     row_code: Tensor  # int64 [R]: node * contexts + context of each row, ascending
     row: Tensor  # int64 [P], ascending
     action: Tensor  # int64 [P], ascending within a row
     count: Tensor  # int64 [P]
-    kinds: Tensor  # int64 [P]: after how many histories longer by an action or a beginning; of the longest: the count
+    kinds: Tensor  # int64 [P]: after how many different histories longer by one symbol; for the longest: the count
 
     @staticmethod
     def empty(device: torch.device) -> "Counts":
@@ -64,7 +69,7 @@ class Counts:
         return torch.zeros_like(self.row_code).index_add_(0, self.row, self.count)
 
     def pooled(self, contexts: int, num_actions: int, values: Tensor) -> Tensor:
-        """`[A]`: the sums of `values [P]` over all contexts after the empty history."""
+        """`[A]`: the sums of `values [P]` after the empty history, over all contexts."""
         first = int(torch.searchsorted(self.row_code, contexts))
         until = int(torch.searchsorted(self.row, first))
         sums = torch.zeros(num_actions, dtype=values.dtype, device=values.device)
@@ -78,15 +83,15 @@ class Counts:
         return table
 
 
-def rows_above(tree: Tree, counts: Counts, contexts: int) -> Tensor:
-    """`[R]`: the row of each row's parent in the same context; R above the empty history."""
+def parent_rows(tree: Tree, counts: Counts, contexts: int) -> Tensor:
+    """`[R]`: the row of each row's parent in the same context; R for the empty history."""
     node = counts.row_code.div(contexts, rounding_mode="floor")
-    above = torch.searchsorted(counts.row_code, tree.parent[node] * contexts + counts.row_code % contexts)
-    return above.masked_fill_(node == 0, len(node))
+    parent = torch.searchsorted(counts.row_code, tree.parent[node] * contexts + counts.row_code % contexts)
+    return parent.masked_fill_(node == 0, len(node))
 
 
-def row_ends(tree: Tree, counts: Counts, contexts: int) -> list[int]:
-    """Each level's rows are those from entry i to entry i + 1, less one."""
+def level_bounds(tree: Tree, counts: Counts, contexts: int) -> list[int]:
+    """The rows of level i are those from entry i to entry i + 1, less one."""
     bounds = torch.tensor(tree.bounds, device=counts.row.device)
     return torch.searchsorted(counts.row_code, bounds * contexts).tolist()
 
@@ -94,18 +99,26 @@ def row_ends(tree: Tree, counts: Counts, contexts: int) -> list[int]:
 def row_blocks(tree: Tree, counts: Counts, contexts: int, num_actions: int) -> Iterator[tuple[int, int, int]]:
     """Blocks of rows to compute together: the level, the first row and the one after the last; parents come first."""
     size = max(2**22 // num_actions, 1)
-    ends = row_ends(tree, counts, contexts)
+    ends = level_bounds(tree, counts, contexts)
     for level in range(len(ends) - 1):
         for first in range(ends[level], ends[level + 1], size):
             yield level, first, min(first + size, ends[level + 1])
 
 
 def count_histories(
-    plans: Plans, depth: int, num_contexts: int | None, openings: bool, device: torch.device
+    plans: Plans,
+    depth: int,
+    num_contexts: int | None,
+    openings: bool,
+    device: torch.device,
+    *,
+    max_bytes: int = MAX_TABLE_BYTES,
+    at_once: int = ACTIONS_AT_ONCE,
+    by_ngrams: bool | None = None,
 ) -> tuple[Tree, Counts]:
     """The histories of up to `depth` actions in `plans`, and what followed them.
 
-    The plans are read once, some at a time; beside them and the tree this takes memory for one such part alone.
+    Beside the plans and the tree this takes memory for one part of the plans alone.
 
     Args:
         plans: with context indices where `num_contexts` is given.
@@ -113,16 +126,23 @@ def count_histories(
         num_contexts: number of contexts that are counted apart; None: one.
         openings: False leaves openings out, and the tree starts in the empty history.
         device: where to count.
+        max_bytes: the most memory that the tables may take.
+        at_once: actions that are counted together.
+        by_ngrams: count the n-grams of `depth` + 1 actions in a table first, and each that occurs once; only for plans
+            of one length, counted without context. None: where there are few enough.
 
     Raises:
-        TooLargeError: the tables would be larger than `MAX_TABLE_BYTES`.
+        TooLargeError: the tables would be larger than `max_bytes`.
     """
-    histories = _Histories(plans.num_actions, depth, num_contexts or 1, device)
-    size = max(ACTIONS_AT_ONCE // max(plans.max_length, 1), 1)
-    if num_contexts is None and plans.lengths is None and few_grams(plans, depth):
-        actions = plans.actions
-        histories.add(*grams(actions[:, :depth], depth, plans.num_actions, size, device))
-        histories.add(*grams(actions, depth + 1, plans.num_actions, size, device), begins=False)
+    histories = _Histories(plans.num_actions, depth, num_contexts or 1, device, max_bytes)
+    size = max(at_once // max(plans.max_length, 1), 1)
+    if by_ngrams is None:
+        number = plans.num_actions ** (depth + 1)
+        few = 0 < depth < plans.max_length and number <= min(MOST_NGRAMS, plans.actions.numel() // 4)
+        by_ngrams = few and num_contexts is None and plans.lengths is None
+    if by_ngrams:
+        histories.add(*_ngrams(plans.actions[:, :depth], depth, plans.num_actions, size, device))
+        histories.add(*_ngrams(plans.actions, depth + 1, plans.num_actions, size, device), begins=False)
         return histories.finish(openings)
     for at in range(0, len(plans), size):
         part = plans[at : at + size]
@@ -137,29 +157,72 @@ def count_histories(
     return histories.finish(openings)
 
 
+def _ngrams(actions: Tensor, length: int, num_actions: int, size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The n-grams of `length` actions in `actions [N, L]` `[n, length]`, and how often each occurs `[n]`.
+
+    `size` plans are read at a time.
+    """
+    times = torch.zeros(num_actions**length, dtype=torch.long, device=device)
+    last = actions.shape[1] - length + 1
+    for part in actions.split(size):
+        part = part.to(device)
+        code = part[:, :last].to(torch.int32, copy=True)
+        for place in range(1, length):
+            code = code.mul_(num_actions).add_(part[:, place : place + last])
+        times += code.flatten().bincount(minlength=len(times))
+    codes = times.nonzero()[:, 0]
+    base = num_actions ** torch.arange(length - 1, -1, -1, device=device)
+    return codes[:, None] // base % num_actions, times[codes]
+
+
+class _Tally:
+    """How often each of some integer codes occurred, where most codes that are possible never do."""
+
+    def __init__(self, device: torch.device) -> None:
+        none = torch.zeros(0, dtype=torch.long, device=device)
+        self.parts = [(none, none)]
+        self.size = self.merged = 0
+
+    def add(self, codes: Tensor, below: int, times: Tensor | None = None) -> None:
+        """Count `codes [n]`, all below `below`, each `times [n]` (None: once)."""
+        if times is not None:
+            distinct, counts, _ = _merge([(codes, times)])
+        elif below <= 4 * len(codes) + 2**16:
+            table = codes.bincount()
+            distinct = table.nonzero()[:, 0]
+            counts = table[distinct]
+        else:
+            distinct, counts = torch.unique(codes, return_counts=True)
+        self.parts.append((distinct, counts))
+        self.size += len(distinct)
+        if self.size > 2 * self.merged + 2**20:
+            distinct, counts, _ = _merge(self.parts)
+            self.parts, self.size, self.merged = [(distinct, counts)], len(distinct), len(distinct)
+
+
 class _Level:
-    """Histories of one length: numbered from 0 in the order in which they were met."""
+    """Histories of one length, numbered from 0 in the order in which they first occurred."""
 
     def __init__(self, num_actions: int, device: torch.device, size: int = 0) -> None:
         self.follow = torch.full((size, num_actions), -1, dtype=torch.int32, device=device)
         self.parent = torch.zeros(size, dtype=torch.long, device=device)
-        self.tally = Tally(device)
+        self.tally = _Tally(device)
 
     def __len__(self) -> int:
         return len(self.parent)
 
-    def grow(self, parent: Tensor, last: bool) -> None:
+    def extend(self, parent: Tensor, last: bool) -> None:
         self.parent = torch.cat([self.parent, parent])
         if not last:
             self.follow = torch.cat([self.follow, self.follow.new_full((len(parent), self.follow.shape[1]), -1)])
 
 
 class _Histories:
-    """Counts at the longest history of each action alone; `finish` sums them up for the shorter ones."""
+    """Counts each action after its longest history; `finish` adds up those of the shorter ones."""
 
-    def __init__(self, num_actions: int, depth: int, contexts: int, device: torch.device) -> None:
-        self.num_actions, self.contexts = num_actions, contexts
-        # In this order: what follows histories of t actions, and what followed t actions at the beginning of a plan.
+    def __init__(self, num_actions: int, depth: int, contexts: int, device: torch.device, max_bytes: int) -> None:
+        self.num_actions, self.contexts, self.max_bytes = num_actions, contexts, max_bytes
+        # Level t has the histories of t actions; opening t, the beginnings of plans with t actions.
         self.levels = [_Level(num_actions, device, int(t == 0)) for t in range(depth + 1)]
         self.openings = [_Level(num_actions, device, int(t == 0)) for t in range(depth)]
 
@@ -171,10 +234,10 @@ class _Histories:
         context: Tensor | None = None,
         begins: bool = True,
     ) -> None:
-        """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), seen with `context [n, L]`.
+        """Count `actions [n, L]` (int64) where `here [n, L]` is True (None: everywhere), in contexts `context [n, L]`.
 
-        Each row counts `times [n]` (None: once), if it has at most `depth` + 1 actions, all of them there; `begins`
-        says whether rows are the beginnings of plans.
+        With `times [n]` each row counts so often; it then has at most `depth` + 1 actions. `begins` says whether rows
+        are the beginnings of plans.
         """
         length, depth = actions.shape[1], len(self.openings)
         node, opening = torch.zeros_like(actions), torch.zeros_like(actions[:, :1])
@@ -210,37 +273,37 @@ class _Histories:
     def _go(
         self, levels: list[_Level], t: int, node: Tensor, actions: Tensor, parent: Tensor, here: Tensor | None
     ) -> Tensor:
-        """The nodes of level t + 1 after `actions` in the nodes of level t; those not yet there are made."""
+        """The nodes of level t + 1 that `actions` lead to from nodes of level t; new ones are added."""
         level, below = levels[t], levels[t + 1]
         codes = node * self.num_actions + actions
         found = level.follow.view(-1)[codes]
         new = found < 0 if here is None else (found < 0) & here
         if bool(new.any()):
-            distinct, rank = number(codes[new], level.follow.numel())
+            distinct, rank = _ranked(codes[new], level.follow.numel())
             self._check_size(len(distinct))
             level.follow.view(-1)[distinct] = torch.arange(
                 len(below), len(below) + len(distinct), dtype=torch.int32, device=codes.device
             )
-            above = torch.empty_like(distinct)
-            above[rank] = parent[new]
-            below.grow(above, last=t + 2 == len(levels))
+            parents = torch.empty_like(distinct)
+            parents[rank] = parent[new]
+            below.extend(parents, last=t + 2 == len(levels))
             found = level.follow.view(-1)[codes]
-        # Past the end of a plan there may be no node; what is there is never counted.
+        # Beyond the end of a plan there may be no node; nothing is counted there.
         return found.long() if here is None else found.long().clamp_(min=0)
 
     def _check_size(self, more: int, rows: int | None = None) -> None:
         nodes = more + sum(len(level) for level in (*self.levels, *self.openings))
         rows = nodes if rows is None else rows
         size = 4 * self.num_actions * (nodes + rows)
-        if size > MAX_TABLE_BYTES:
+        if size > self.max_bytes:
             raise TooLargeError(
                 f"plans: tables of {max(nodes, rows):,} histories x {self.num_actions} actions, or more, need"
-                f" {size / 1e9:.1f} GB, over the limit of {MAX_TABLE_BYTES / 1e9:.1f} GB;"
+                f" {size / 1e9:.1f} GB, over the limit of {self.max_bytes / 1e9:.1f} GB;"
                 f" with histories of fewer than {len(self.openings)} actions they would be smaller"
             )
 
     def finish(self, openings: bool) -> tuple[Tree, Counts]:
-        """The tree and its counts; nothing can be added any more."""
+        """The tree and its counts; after this nothing can be added."""
         if not any(level.tally.size for level in (self.levels[-1], *self.openings)):
             device = self.levels[0].parent.device
             return Tree.empty(self.num_actions, device), Counts.empty(device)
@@ -257,19 +320,19 @@ class _Histories:
         return self._tree(keep, bounds, openings), Counts(row_code, row, codes % self.num_actions, count, kinds)
 
     def _sum_up(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Codes (node * contexts + context) * A + action, counts and kinds of each level; then of the openings."""
+        """For each level, then for the openings: codes (node * contexts + context) * A + action, counts and kinds."""
         below = self.contexts * self.num_actions
 
         def lift(level: _Level, codes: Tensor) -> Tensor:
             return level.parent[codes.div(below, rounding_mode="floor")] * below + codes % below
 
-        first = [merge(level.tally.parts) for level in self.openings]
-        codes, count, _ = merge(self.levels[-1].tally.parts)
+        first = [_merge(level.tally.parts) for level in self.openings]
+        codes, count, _ = _merge(self.levels[-1].tally.parts)
         out = [(codes, count, count)]
         for t in range(len(self.openings) - 1, -1, -1):
             longer = lift(self.levels[t + 1], out[0][0]), out[0][1]
             begun = lift(self.openings[t], first[t][0]), first[t][1]
-            out.insert(0, merge([longer, begun]))
+            out.insert(0, _merge([longer, begun]))
         return [*out, *((codes, count, count) for codes, count, _ in first)]
 
     def _tree(self, keep: list[_Level], bounds: list[int], openings: bool) -> Tree:
@@ -279,7 +342,7 @@ class _Histories:
         for i, level in enumerate(keep):
             # Openings have their parents among the histories of as many actions.
             parent = level.parent + (bounds[max(i - 1, 0)] if i <= depth else bounds[i - depth - 1])
-            # Where no longer history occurred, one more action leads where it leads from the shorter one.
+            # Where the longer history did not occur, an action leads where it leads from the parent.
             rows = next_node[parent]
             if len(level.follow) and i + 1 < len(keep):
                 rows = torch.where(level.follow >= 0, level.follow + bounds[i + 1], rows)
@@ -288,3 +351,20 @@ class _Histories:
             parents.append(parent)
         start = bounds[depth + 1] if openings and depth else 0
         return Tree(next_node, torch.cat(parents), start, bounds)
+
+
+def _ranked(codes: Tensor, below: int) -> tuple[Tensor, Tensor]:
+    """The distinct codes, all below `below`, in ascending order, and the rank of each code among them."""
+    if below > 4 * len(codes) + 2**16:
+        distinct, rank = torch.unique(codes, return_inverse=True)
+        return distinct, rank
+    present = torch.zeros(below, dtype=torch.bool, device=codes.device)
+    present[codes] = True
+    return present.nonzero()[:, 0], (present.cumsum(0) - 1)[codes]
+
+
+def _merge(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+    """The distinct codes of all parts in ascending order, the sum of their counts, and how often each was listed."""
+    codes, counts = (torch.cat(values) for values in zip(*parts, strict=True))
+    distinct, rank, places = torch.unique(codes, return_inverse=True, return_counts=True)
+    return distinct, torch.zeros_like(distinct).index_add_(0, rank, counts), places

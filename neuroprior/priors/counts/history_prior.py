@@ -1,32 +1,28 @@
-"""What priors over the tree of histories share: the state machine, its tables, counting and reading them back."""
+"""The base of priors that count: a state machine over the histories that occurred, with tables of probabilities."""
 
 from abc import abstractmethod
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.priors.counts.histories import Counts, Tree, count_histories
+from neuroprior.priors.counts.histories import MAX_TABLE_BYTES, Counts, Tree, count_histories
 from neuroprior.priors.prior import Prior
 
 _TABLES = ("next_node", "parent", "start_node", "row_code", "log_probs")
 
 
-PART = 256
-"""Actions of a long plan that are walked through one after the other."""
-
-
 class HistoryPrior(Prior):
-    """A prior whose next action depends on the longest history, of those that occurred, that ends the plan so far.
+    """A prior whose next action depends on the longest of the histories that occurred in training.
 
-    The histories are the nodes of a tree, and the state is the number of that history (times `num_contexts`, plus the
-    context seen last), int64 `[N]`: `step` is two gathers, for any depth.
+    The histories are the nodes of a tree, and the state is the number of the history (times `num_contexts`, plus the
+    last context), int64 `[N]`: `step` is two gathers, for any depth. A subclass writes `estimate`.
 
     Args:
         num_actions: A.
         depth: >= 0, the most past actions that count.
-        num_contexts: number of context indices, where the prior sees one.
+        num_contexts: number of context indices, for a prior that takes an index.
 
     Raises:
         ValueError: an argument is out of range.
@@ -42,7 +38,13 @@ class HistoryPrior(Prior):
     """The names of the buffers whose sizes depend on what was learned."""
 
     openings = True
-    """Whether the whole past since a plan's beginning is a history of its own."""
+    """Whether all actions since a plan's beginning are a history of their own."""
+
+    max_table_bytes: ClassVar[int] = MAX_TABLE_BYTES
+    """The most memory that the tables may take; `fit` raises beyond it."""
+
+    chunk_length: ClassVar[int] = 256
+    """Actions of a long plan that `forward` walks through one after the other."""
 
     def __init__(self, num_actions: int, depth: int, num_contexts: int | None = None) -> None:
         super().__init__(num_actions, num_contexts)
@@ -61,23 +63,23 @@ class HistoryPrior(Prior):
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         num, length = plans.shape
         node = self._nodes(plans.long())
-        seen = torch.zeros_like(node)
+        each = torch.zeros_like(node)
         if context is not None:
-            seen = context.long() if is_per_step(context) else context.long()[:, None].expand(num, length)
-        return self.log_probs[self._row(node.flatten(), seen.flatten())].view(num, length, self.num_actions)
+            each = context.long() if is_per_step(context) else context.long()[:, None].expand(num, length)
+        return self.log_probs[self._row(node.flatten(), each.flatten())].view(num, length, self.num_actions)
 
     def _nodes(self, actions: Tensor) -> Tensor:
         """The node before each action of `actions [N, L]`."""
         num, length = actions.shape
-        part = max(PART, self._depth)  # so that a part reaches back to no more than the one before it
-        if num and length > 2 * (part + self._depth):
-            # A node depends on the last `depth` actions alone, so the parts of long plans are walked through side by
+        chunk = max(self.chunk_length, self._depth)  # so that a chunk depends on itself and the one before it alone
+        if num and length > 2 * (chunk + self._depth):
+            # A node depends on the last `depth` actions alone, so the chunks of long plans are walked through side by
             # side, each from that many actions before it.
-            first = self._walk(actions[:, :part], self.start_node.long().expand(num))
-            padded = nn.functional.pad(actions[:, part - self._depth :], (0, -(length - part) % part))
-            parts = padded.unfold(1, part + self._depth, part).flatten(0, 1)
-            late = self._walk(parts, torch.zeros_like(parts[:, 0]))[:, self._depth :]
-            return torch.cat([first, late.reshape(num, -1)[:, : length - part]], 1)
+            first = self._walk(actions[:, :chunk], self.start_node.long().expand(num))
+            padded = nn.functional.pad(actions[:, chunk - self._depth :], (0, -(length - chunk) % chunk))
+            chunks = padded.unfold(1, chunk + self._depth, chunk).flatten(0, 1)
+            late = self._walk(chunks, torch.zeros_like(chunks[:, 0]))[:, self._depth :]
+            return torch.cat([first, late.reshape(num, -1)[:, : length - chunk]], 1)
         return self._walk(actions, self.start_node.long().expand(num))
 
     def _walk(self, actions: Tensor, node: Tensor) -> Tensor:
@@ -88,29 +90,37 @@ class HistoryPrior(Prior):
             node = follow[node * self.num_actions + actions[:, t]].long()
         return nodes
 
-    def fit(self, plans: Plans | Tensor) -> Self:
-        """Count; whatever was learned before is forgotten. Returns self.
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+        """Count anew; returns self.
 
         The plans are counted some at a time: beside them and the tables this takes little memory.
 
+        Args:
+            plans: `Plans`, or integers `[N, L]` for plans without context.
+            generator: not used; counting is deterministic.
+            settings: there are none.
+
         Raises:
-            ValueError: the plans do not fit this prior, or so many histories occur in them that the tables would need
-                over 2 GB.
+            ValueError: the plans do not fit this prior, any setting is given, or so many histories occur that the
+                tables would need more than `max_table_bytes`.
         """
+        self.check_settings(settings)
         self.learn(*self.count(plans))
         return self
 
     def count(self, plans: Plans | Tensor) -> tuple[Tree, Counts]:
-        """What `fit` counts and `learn` takes over; the same for every prior of this depth that sees the same.
+        """What `fit` counts and `learn` takes over; the same for all priors of one depth and kind of context.
 
         Raises:
             ValueError: as `fit`.
         """
-        return count_histories(self.training_plans(plans), self._depth, self.num_contexts, self.openings, self.device)
+        plans = self.training_plans(plans)
+        limit = self.max_table_bytes
+        return count_histories(plans, self._depth, self.num_contexts, self.openings, self.device, max_bytes=limit)
 
     @abstractmethod
     def estimate(self, tree: Tree, counts: Counts) -> Tensor:
-        """The log-probabilities `[R + 1, A]` (float32) of each row of `counts`; the last: of a context never seen."""
+        """The log-probabilities `[R + 1, A]` (float32) after each row of `counts`; last: in contexts without counts."""
 
     def learn(self, tree: Tree, counts: Counts) -> None:
         """Take over a tree and its counts."""
@@ -120,12 +130,12 @@ class HistoryPrior(Prior):
             self.register_buffer(name, value.to(self.device))
 
     def _at(self, node: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-        """The logits and the state at `node [N]` where `context [N]` is seen."""
+        """The logits and the state at `node [N]` in `context [N]`."""
         contexts = self.num_contexts or 1
         return self.log_probs[self._row(node, context)], node * contexts + context
 
     def _row(self, node: Tensor, context: Tensor) -> Tensor:
-        """The row of `log_probs` for each history and context: that of the longest history seen in the context."""
+        """The row of `log_probs` for each history and context: of the longest history that occurred in the context."""
         if self.num_contexts is None or len(self.row_code) == 0:
             return node
         fallback = len(self.row_code)
@@ -148,7 +158,7 @@ class HistoryPrior(Prior):
             raise RuntimeError(f"the tables of a {type(self).__name__} do not fit one another")
 
     def tables_fit(self) -> bool:
-        """Whether the tables may be those of a prior of this kind; for files that come from elsewhere."""
+        """Whether the tables are those of a prior of this kind; checks what was read from a file."""
         nodes, rows, contexts = len(self.next_node), len(self.log_probs), self.num_contexts or 1
         whole = (self.next_node, self.parent, self.start_node, self.row_code)
         return (

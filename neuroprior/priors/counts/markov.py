@@ -1,22 +1,30 @@
 """Markov priors of any order: counts of what followed the last k actions, with back-off to shorter histories."""
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+import torch
 from torch import Tensor
 
-from neuroprior.priors.counts.backoff import BACKOFFS, Backoff, back_off_probs
-from neuroprior.priors.counts.histories import Counts, Tree
+from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
+
+Backoff = Literal["dirichlet", "witten-bell", "kneser-ney"]
+
+BACKOFFS: tuple[Backoff, ...] = get_args(Backoff)
+
+FALLBACK_DISCOUNTS = (0.5, 1.0, 1.5)
+"""Discounts of Kneser-Ney where the counts give none: those of KenLM's option `--discount_fallback`."""
 
 
 class MarkovPrior(HistoryPrior):
     """A Markov chain of order k over actions (Hyvärinen, the section on Markov models).
 
-    The probability of action a after the history h of the last k actions leans on that after h', the history without
-    its oldest action, the more the less often h occurred; the empty history leans on the uniform distribution. So a
-    history never seen takes the probabilities of the longest one that was, and nothing is ever impossible. Sampling
-    goes on past the training length with the same probabilities. With n the counts of training and k(h) how many
-    different actions followed h, the three ways to lean (`backoff`) are
+    The probability of action a after the history h of the last k actions is interpolated with that after h', the
+    history without its oldest action: the less often h occurred, the more weight h' has. The empty history is
+    interpolated with the uniform distribution. So a history that did not occur in training has the probabilities of the
+    longest one that did, and every action stays possible. Sampling continues past the training length with the same
+    probabilities. With n the counts of training and k(h) the number of different actions that followed h, the three
+    methods (`backoff`) are
 
     - "kneser-ney": p(a | h) = (n(h, a) - D + (sum of all D after h) * p(a | h')) / n(h). There are three discounts D,
       for counts of 1, of 2 and of more, estimated for each length of history from how many counts are 1, 2, 3 and 4. In
@@ -24,24 +32,24 @@ class MarkovPrior(HistoryPrior):
       plan's beginning is one): interpolated modified Kneser-Ney smoothing (Chen and Goodman 1999, section 3).
     - "witten-bell": p(a | h) = (n(h, a) + s * k(h) * p(a | h')) / (n(h) + s * k(h)), with s = `smoothing` (Witten and
       Bell 1991; method C).
-    - "dirichlet": p(a | h) = (n(h, a) + s * p(a | h')) / (n(h) + s): s observations are spread like p(a | h') (MacKay
+    - "dirichlet": p(a | h) = (n(h, a) + s * p(a | h')) / (n(h) + s): s pseudo-counts distributed as p(a | h') (MacKay
       and Peto 1995).
 
-    On held-out sequences "kneser-ney" was the best or near it without anything to set, above all where the order is
-    higher than the plans can fill; the other two come near it with the right `smoothing`.
+    On held-out sequences "kneser-ney" was the best or close to it without tuning, above all at orders for which there
+    are few data; the other two come close with the right `smoothing`.
 
-    With a context index every history is counted apart for each context; (context, empty history) leans on all contexts
-    together.
+    With a context index the histories are counted apart in each context; the empty history in a context is interpolated
+    with all contexts together.
 
     Args:
         num_actions: A.
         order: k >= 0, the number of past actions that count.
-        smoothing: > 0, how much a history leans on the shorter one: s above; of "kneser-ney", a factor on D (which
-            stays at most n(h, a)). 1 is the published formula of each.
-        initial: the first k actions. "joint": from the distribution of the openings of the plans (which leans on
+        smoothing: > 0, the weight of the shorter history: s above; for "kneser-ney", a factor on D (which stays at most
+            n(h, a)). 1 is the published formula of each method.
+        initial: the first k actions. "joint": from the distribution of the openings of the plans (interpolated with
             "lower"). "lower": action t < k from the chain of order t, wherever in a plan those t actions stood (the
             paper's footnote 2).
-        num_contexts: number of context indices, where the prior sees one.
+        num_contexts: number of context indices, for a prior that takes an index.
         backoff: "kneser-ney", "witten-bell" or "dirichlet".
 
     Raises:
@@ -81,8 +89,86 @@ class MarkovPrior(HistoryPrior):
         """`[A, A]`: the probability of each action (column) after each action (row), wherever in a plan.
 
         Raises:
-            ValueError: the order is 0, or the prior sees a context.
+            ValueError: the order is 0, or the prior takes a context.
         """
         if self.order == 0 or self.takes_context:
             raise ValueError("transition_matrix: a prior of order 1 or more without context is expected")
         return self.log_probs[self.next_node[0].long()].exp()
+
+
+def back_off_probs(
+    tree: Tree, counts: Counts, num_contexts: int | None, num_actions: int, rule: Backoff, smoothing: float
+) -> Tensor:
+    """The log-probabilities of each action after each row of `counts`.
+
+    Each row is interpolated with that of its parent in the tree in the same context; the empty history in a context
+    with all contexts together; and these (without contexts, the empty history) with the uniform distribution.
+
+    Args:
+        tree, counts: of `count_histories`.
+        num_contexts: number of contexts counted apart, or None.
+        num_actions: A.
+        rule, smoothing: see `MarkovPrior`.
+
+    Returns:
+        `[R + 1, A]`, float32; the last row is that of all contexts together.
+    """
+    contexts = num_contexts or 1
+    values = counts.kinds if rule == "kneser-ney" else counts.count
+    root = torch.full((1, num_actions), 1 / num_actions, dtype=torch.double, device=counts.row.device)
+    if num_contexts is not None:
+        root = _pooled(counts, contexts, root, rule, smoothing)
+    table = torch.empty(len(counts.row_code) + 1, num_actions, device=root.device)
+    table[-1:] = root.clamp(min=1e-300).log()
+    parent = parent_rows(tree, counts, contexts)
+    discounts, known, ends = torch.zeros(3), -1, level_bounds(tree, counts, contexts)
+    for level, first, until in row_blocks(tree, counts, contexts, num_actions):
+        if rule == "kneser-ney" and level != known:
+            here = torch.searchsorted(counts.row, torch.tensor(ends[level : level + 2], device=root.device))
+            discounts, known = kneser_ney_discounts(values[here[0] : here[1]]), level
+        # The table holds logarithms, as a probability may be too small for float32.
+        lower = table[parent[first:until]].double().exp()
+        n = counts.dense(first, until, num_actions, values)
+        table[first:until] = blend(n, lower, rule, smoothing, discounts).clamp(min=1e-300).log()
+    return table
+
+
+def blend(n: Tensor, lower: Tensor, rule: Backoff, smoothing: float, discounts: Tensor) -> Tensor:
+    """Probabilities `[..., A]` from counts `n` and those after the shorter history, `lower`: `[..., A]`, float64."""
+    if rule == "kneser-ney":
+        # Counts of one, of two and of more are reduced by their discounts; this mass goes to `lower`.
+        off = torch.cat([discounts.new_zeros(1), discounts * smoothing])[n.clamp(max=3).long()].minimum(n)
+        total = n.sum(-1, keepdim=True)
+        share = torch.where(total > 0, off.sum(-1, keepdim=True) / total.clamp(min=1), 1.0)
+        return (n - off) / total.clamp(min=1) + share * lower
+    kinds = (n > 0).sum(-1, keepdim=True) if rule == "witten-bell" else torch.ones_like(n[..., :1])
+    weight = kinds.double() * smoothing
+    total = n.sum(-1, keepdim=True) + weight
+    return torch.where(total > 0, (n + weight * lower) / total, lower)
+
+
+def kneser_ney_discounts(counts: Tensor) -> Tensor:
+    """The discounts `[3]` (float64) of counts of 1, 2 and more, from how many of `counts [P]` are 1, 2, 3 and 4.
+
+    Chen and Goodman (1999), "An empirical study of smoothing techniques for language modeling", section 3 ("modified
+    Kneser-Ney smoothing"). Where no count is 1, 2 or 3, or a discount is not between 0 and its count:
+    `FALLBACK_DISCOUNTS`.
+    """
+    number = [int((counts == k).sum()) for k in range(1, 5)]
+    if 0 in number[:3]:
+        return torch.tensor(FALLBACK_DISCOUNTS, dtype=torch.double, device=counts.device)
+    common = number[0] / (number[0] + 2 * number[1])
+    found = [k - (k + 1) * common * number[k] / number[k - 1] for k in (1, 2, 3)]
+    if not all(0 < d <= k for k, d in enumerate(found, 1)):
+        found = list(FALLBACK_DISCOUNTS)
+    return torch.tensor(found, dtype=torch.double, device=counts.device)
+
+
+def _pooled(counts: Counts, contexts: int, lower: Tensor, rule: Backoff, smoothing: float) -> Tensor:
+    """The probabilities `[1, A]` in all contexts together."""
+    if rule != "kneser-ney":
+        n = counts.pooled(contexts, lower.shape[1], counts.count)
+        return blend(n.double()[None], lower, rule, smoothing, lower)
+    # The histories longer by one symbol are here the contexts.
+    n = counts.pooled(contexts, lower.shape[1], torch.ones_like(counts.count))
+    return blend(n.double()[None], lower, rule, smoothing, kneser_ney_discounts(n))

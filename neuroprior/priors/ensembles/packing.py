@@ -1,4 +1,4 @@
-"""Several state tensors in one: a prior made of others keeps their states side by side."""
+"""Several state tensors in one: a prior made of other priors holds their states side by side."""
 
 from math import prod
 
@@ -6,13 +6,13 @@ import torch
 from torch import Tensor
 
 DIGITS = 2**24
-"""Up to here float32 holds every integer: larger ones, up to its square, are kept as two numbers."""
+"""Up to here float32 represents every integer; larger ones, up to its square, are stored as two numbers."""
 
 MOST_DIMENSIONS = 4
-"""Of a part, beside the batch."""
+"""Dimensions of a part, beside the batch."""
 
 HEADER = 2 + MOST_DIMENSIONS
-"""Numbers that tell what each part is: 1 for integers, 2 for bool; how many dimensions; and these."""
+"""Numbers that describe each part: its kind (1 for integers, 2 for bool), its number of dimensions, and these."""
 
 
 def pack(parts: list[Tensor]) -> Tensor:
@@ -40,7 +40,7 @@ def pack(parts: list[Tensor]) -> Tensor:
 
 
 def unpack(packed: Tensor, number: int) -> list[Tensor]:
-    """The `number` parts that were packed; of an empty batch empty ones of unknown size.
+    """The `number` parts that were packed; for an empty batch, empty parts of unknown size.
 
     Args:
         packed: `[N, K]`; all rows were packed together, or of the same sizes.

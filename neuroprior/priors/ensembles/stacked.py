@@ -1,5 +1,4 @@
-"""The stacked prior: a recurrent network that weighs the forecasts of count-based priors by the history, and adds to
-them."""
+"""The stacked prior: a recurrent network that combines the forecasts of count-based priors."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,50 +11,48 @@ from neuroprior._checks import check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
-from neuroprior.priors.counts.context_tree import ContextTreePrior
-from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.counts.markov import MarkovPrior
+from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.neural.neural import NeuralPrior, context_embedding
 from neuroprior.priors.prior import Prior
 
 LEAST = -6.0
-"""Log-probabilities of experts below this are taken for it."""
+"""Log-probabilities of experts are at least this in the network's inputs."""
 
 LONG_AGO = 500.0
-"""Steps from which on it is no matter how long ago an action was taken."""
+"""Steps beyond which it makes no difference how long ago an action was taken."""
 
 MOST_NUMBERS = 2**24
-"""Of the table of when each action was last taken in each context, held at a time."""
+"""Largest size of the table of when each action was last taken in each context."""
 
 PARTS = 8
-"""Parts of the plans: experts forecast each of them after learning from the others."""
+"""Parts of the plans: experts forecast each part after learning from the others."""
 
 
 class StackedPrior(Prior):
-    """Count-based experts, mixed by a gated recurrent network that has read the whole plan so far.
+    """Count-based experts, combined by a gated recurrent network over the whole plan so far.
 
-    With p_e the forecast of expert e, h the network's state and A logits b(h) and weights w_e(h) read off it, actions
-    are drawn with log-odds b(h) + sum of w_e(h) log p_e: a mixture of experts (Jacobs et al. 1991) in log-odds, as in
-    products of experts, in which the weights depend on the history and the network can add what no expert knows. It
-    learns from forecasts that experts made of plans they had not learned from (stacking: Wolpert 1992), else it would
-    trust them too much; the experts learn from all plans in the end.
+    With p_e the forecast of expert e, h the network's hidden state, and logits b(h) and weights w_e(h) linear in it,
+    actions are drawn with log-odds b(h) + sum of w_e(h) log p_e: a mixture of experts (Jacobs et al. 1991) in log-odds,
+    as in products of experts, in which the weights depend on the history and the network can add what no expert
+    predicts. The network learns from forecasts that experts made for plans they did not learn from (stacking: Wolpert
+    1992), as it would rely on them too much otherwise; the experts learn from all plans in the end.
 
-    With a context index the network also sees how long ago each action was last taken in this context: what an animal
-    did here the last time, however many actions ago that was.
+    With a context index the network's input also has how long ago each action was last taken in this context: what an
+    animal did here the last time, however many actions ago that was.
 
-    Against a GRU alone it needs far fewer plans: the counts tell what is common, and are never learned by heart.
+    It needs far fewer plans than a GRU alone: the counts predict what is common, and are not overfitted.
 
-    The state holds, in float32, the network's memory, each expert's state, and for a context index when each action was
-    last taken in each context: `num_contexts * A` numbers.
+    The state holds, in float32, the network's hidden state, each expert's state, and for a context index when each
+    action was last taken in each context: `num_contexts * A` numbers.
 
     Args:
         num_actions: A.
         hidden_size: of the network.
-        dropout: in training, of the network's input vectors and of what it gives.
+        dropout: in training, of the network's input vectors and of its output.
         orders: of the Markov priors among the experts.
-        depth: of the context trees among them; with a context, one of these sees it and one does not.
-        num_contexts: number of context indices, where the prior sees one.
+        depth: of the context trees among them; with contexts, one of two trees takes the context.
+        num_contexts: number of context indices, for a prior that takes an index.
         seed: draws the initial weights.
 
     Raises:
@@ -79,8 +76,10 @@ class StackedPrior(Prior):
         chains = [
             MarkovPrior(num_actions, k, 4.0, num_contexts=num_contexts, backoff="witten-bell") for k in self.orders
         ]
-        seen = [None] if num_contexts is None else [num_contexts, None]
-        trees = [ContextTreePrior(num_actions, depth, num_contexts=contexts) for contexts in seen]
+        trees = [
+            ContextTreePrior(num_actions, depth, num_contexts=contexts)
+            for contexts in ([None] if num_contexts is None else [num_contexts, None])
+        ]
         self.experts = nn.ModuleList([*chains, *trees])
         self.mixer = Mixer(num_actions, len(self.experts), hidden_size, dropout, num_contexts, seed)
 
@@ -90,47 +89,52 @@ class StackedPrior(Prior):
         return super().config | own | {"orders": list(self.orders), "depth": self.depth}
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        forecasts, states = zip(*(e.start(batch_size, seen_by(e, context)) for e in self._experts()), strict=True)
+        forecasts, states = zip(*(e.start(batch_size, context_for(e, context)) for e in self._experts()), strict=True)
         ago = torch.full((batch_size, (self.num_contexts or 0) * self.num_actions), LONG_AGO, device=self.device)
-        logits, memory = self.mixer.start(batch_size, self._features(torch.stack(forecasts, 1), ago, context))
-        return logits, self._packed(memory, states, ago, context)
+        logits, hidden = self.mixer.start(batch_size, self._features(torch.stack(forecasts, 1), ago, context))
+        return logits, self._packed(hidden, states, ago, context)
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if len(state) == 0:
             return torch.zeros(0, self.num_actions, device=self.device), state
-        memory, before, ago, last = self._open(state)
+        hidden, before, ago, last = self._unpacked(state)
         if self.num_contexts is not None:
             assert last is not None
             ago = ago.add(1).clamp_(max=LONG_AGO)
             ago = ago.scatter(1, (last * self.num_actions + action.long())[:, None], 1.0)
             context = last if context is None else context.long()
-        found = [e.step(action, s, seen_by(e, context)) for e, s in zip(self._experts(), before, strict=True)]
+        found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), before, strict=True)]
         forecasts, states = zip(*found, strict=True)
-        logits, memory = self.mixer.step(action, memory, self._features(torch.stack(forecasts, 1), ago, context))
-        return logits, self._packed(memory, states, ago, context)
+        logits, hidden = self.mixer.step(action, hidden, self._features(torch.stack(forecasts, 1), ago, context))
+        return logits, self._packed(hidden, states, ago, context)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
-        seen = self._each_step(plans, context)
+        context = self._each_step(plans, context)
         with torch.no_grad():
-            forecasts = torch.stack([e(plans, seen_by(e, seen)) for e in self._experts()], 2)
-        logits: Tensor = self.mixer(plans, self._all_features(forecasts, plans, seen))
+            forecasts = torch.stack([e(plans, context_for(e, context)) for e in self._experts()], 2)
+        logits: Tensor = self.mixer(plans, self._all_features(forecasts, plans, context))
         return logits
 
-    def fit(self, plans: Plans | Tensor, generator: torch.Generator | None = None, **settings: Any) -> Self:
+    @property
+    def fit_settings(self) -> tuple[str, ...]:
+        return self.mixer.fit_settings
+
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Fit the experts by counting and the network with Lightning; returns self.
 
         Args:
-            plans: at least two (two groups, where there are any), or one long one; a tensor `[N, L]` is taken as plans
-                without context.
+            plans: at least two (two groups, where there are any), or one long one; integers `[N, L]` for plans without
+                context.
             generator: draws the parts, the held-out plans and the order of training.
-            settings: fields of `neuroprior.training.Settings`.
+            settings: fields of `neuroprior.training.Settings`, for the network.
 
         Raises:
-            ValueError: plans that this prior cannot learn from, too few of them, a setting out of range, or a training
-                that diverged.
+            ValueError: plans that this prior cannot learn from, too few of them, a setting that is unknown or out of
+                range, or a training that diverged.
         """
+        self.check_settings(settings)
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
         learned = plans[plans.mask().any(1)]
@@ -139,11 +143,11 @@ class StackedPrior(Prior):
         if len(learned) < FEWEST_UNITS:
             raise ValueError("plans: at least two plans with an action are needed to train a stacked prior")
         learned = divisible(learned)
-        seen = self._each_step(learned.actions, learned.context)
-        features = self._all_features(self._forecasts(learned, generator), learned.actions, seen)
+        context = self._each_step(learned.actions, learned.context)
+        features = self._all_features(self._forecasts(learned, generator), learned.actions, context)
         stacked = replace(learned, context=features, context_names=None)
-        self.mixer.fit(stacked, generator, **settings)
-        self.mixer.window = None  # its memory is carried on
+        self.mixer.fit(stacked, generator=generator, **settings)
+        self.mixer.window = None  # its hidden state is carried on without limit
         for expert in self._experts():
             expert.fit(plans)
         return self
@@ -153,7 +157,7 @@ class StackedPrior(Prior):
         self.mixer.window = None
 
     def _forecasts(self, plans: Plans, generator: torch.Generator) -> Tensor:
-        """`[N, L, E, A]`: the log-probabilities of experts that did not learn from the plan they forecast."""
+        """`[N, L, E, A]`: log-probabilities of experts that did not learn from the plan they predict."""
         units = len(plans) if plans.group is None else len(plans.group.unique())
         shape = (*plans.actions.shape, len(self.experts), self.num_actions)
         out = torch.zeros(shape, device=plans.actions.device)
@@ -162,7 +166,7 @@ class StackedPrior(Prior):
                 part = plans[left_out]
                 for number, expert in enumerate(self._experts()):
                     expert.fit(plans[learned])
-                    out[left_out, :, number] = expert(part.actions, seen_by(expert, part.context))
+                    out[left_out, :, number] = expert(part.actions, context_for(expert, part.context))
         return out
 
     def _experts(self) -> Iterator[HistoryPrior]:
@@ -177,11 +181,11 @@ class StackedPrior(Prior):
         return context[:, None].expand(plans.shape)
 
     def _features(self, forecasts: Tensor, ago: Tensor, context: Tensor | None) -> Tensor:
-        """What the network sees, `[N, D]`, of forecasts `[N, E, A]`."""
+        """The network's features `[N, D]`, from forecasts `[N, E, A]`."""
         if self.num_contexts is None:
             return self._joined(forecasts, None, None)
         if context is None:
-            raise ValueError("context: this prior sees a context, and none was given")
+            raise ValueError("context: this prior takes a context, and none was given")
         here = context.long()[:, None] * self.num_actions + torch.arange(self.num_actions, device=ago.device)
         return self._joined(forecasts, ago.gather(1, here), context)
 
@@ -191,7 +195,7 @@ class StackedPrior(Prior):
             return self._joined(forecasts, None, None)
         size = max(MOST_NUMBERS // (self.num_contexts * self.num_actions), 1)
         parts = zip(plans.split(size), context.split(size), strict=True)
-        ago = torch.cat([self._ago(some.long(), seen.long()) for some, seen in parts])
+        ago = torch.cat([self._ago(some.long(), theirs.long()) for some, theirs in parts])
         return self._joined(forecasts, ago, context)
 
     def _joined(self, forecasts: Tensor, ago: Tensor | None, context: Tensor | None) -> Tensor:
@@ -212,18 +216,18 @@ class StackedPrior(Prior):
             last.scatter_(1, code[:, t, None], float(t))
         return ago.clamp_(max=LONG_AGO)
 
-    def _packed(self, memory: Tensor, states: tuple[Tensor, ...], ago: Tensor, context: Tensor | None) -> Tensor:
-        """The state: the network's memory, each expert's state, how long ago, and the context."""
-        return pack([memory, torch.stack(states, 1), ago, *([] if context is None else [context.long()])])
+    def _packed(self, hidden: Tensor, states: tuple[Tensor, ...], ago: Tensor, context: Tensor | None) -> Tensor:
+        """The state: the network's, each expert's, how long ago each action was taken, and the context."""
+        return pack([hidden, torch.stack(states, 1), ago, *([] if context is None else [context.long()])])
 
-    def _open(self, state: Tensor) -> tuple[Tensor, list[Tensor], Tensor, Tensor | None]:
-        """What was `_packed`."""
-        memory, states, ago, *last = unpack(state, 3 + (self.num_contexts is not None))
-        return memory, list(states.unbind(1)), ago, last[0] if last else None
+    def _unpacked(self, state: Tensor) -> tuple[Tensor, list[Tensor], Tensor, Tensor | None]:
+        """The parts of a state."""
+        hidden, states, ago, *last = unpack(state, 3 + (self.num_contexts is not None))
+        return hidden, list(states.unbind(1)), ago, last[0] if last else None
 
 
 class Mixer(NeuralPrior):
-    """The network of a `StackedPrior`: reads forecasts as features, weighs them, and adds logits of its own."""
+    """The network of a `StackedPrior`: reads forecasts as features, weights them, and adds logits of its own."""
 
     def __init__(
         self,
@@ -253,32 +257,32 @@ class Mixer(NeuralPrior):
         self.drop = nn.Dropout(self.dropout)
         self.head = nn.Linear(width, self.num_actions)
         self.weights = nn.Linear(width, self.num_experts)
-        # Before it has learned anything it forecasts the experts' geometric mean.
+        # Untrained, it gives the experts' geometric mean.
         for layer, first in ((self.head, 0.0), (self.weights, 1 / self.num_experts)):
             nn.init.zeros_(layer.weight)
             nn.init.constant_(layer.bias, first)
 
-    def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         vectors = self.action(inputs[..., 0].long())
         rest = inputs[..., 1:]
         if self.index is not None:
             vectors, rest = vectors + self.index(rest[..., 0].long()), rest[..., 1:]
         forecasts = rest[..., : self.num_experts * self.num_actions]
         vectors = vectors + self.features(rest / 2)
-        hidden, last = self.gru(self.drop(vectors), None if memory is None else memory[None].contiguous())
-        hidden = self.drop(hidden)
-        mixed = (self.weights(hidden)[..., None] * forecasts.unflatten(-1, (self.num_experts, -1))).sum(-2)
-        return self.head(hidden) + mixed, last[0]
+        out, last = self.gru(self.drop(vectors), None if hidden is None else hidden[None].contiguous())
+        out = self.drop(out)
+        mixed = (self.weights(out)[..., None] * forecasts.unflatten(-1, (self.num_experts, -1))).sum(-2)
+        return self.head(out) + mixed, last[0]
 
-    def memory_size(self, state_size: int) -> int:
+    def hidden_size_of(self, state_size: int) -> int:
         return self.hidden_size
 
 
-def seen_by(expert: Prior, context: Tensor | None) -> Tensor | None:
-    """The context, for an expert that sees it."""
+def context_for(expert: Prior, context: Tensor | None) -> Tensor | None:
+    """The context, for an expert that takes one; else None."""
     return context if expert.takes_context else None
 
 
 def _log(ago: Tensor) -> Tensor:
-    """How long ago on a scale that tells 1 from 2 as well as 100 from 200 steps."""
+    """How long ago, on a logarithmic scale."""
     return (ago + 1).log() * (2 / 3)

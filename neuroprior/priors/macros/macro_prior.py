@@ -17,12 +17,12 @@ from neuroprior.priors.prior import Prior
 class MacroPrior(Prior):
     """A prior that chooses between actions and macro-actions, sequences of actions that it takes as one.
 
-    `inner` is a prior over the A actions and M macros, numbered from A. What it draws is read as actions: the same plan
-    may come about in several ways, with macros and without, and its probability is the sum over all of them (a plan
-    that is cut off within a macro counts, too). After each action the ways that fit it are known with their
-    probabilities; ways that `inner` cannot tell apart from there on are one. So all is exact, as long as a prefix has
-    no more than `MOST` ways; of more, the least probable are left out. A chain forgets, and so has few ways; a network
-    has all of them, hundreds after a dozen actions, and takes time and memory in proportion.
+    `inner` is a prior over A + M symbols: the actions, and the macros numbered from A. A plan may arise from several
+    sequences of symbols, its parses; its probability is the sum over all of them (a plan that is cut off within a macro
+    counts, too). After each action the parses of the prefix are known with their probabilities; parses after which
+    `inner` is in the same state are merged. This is exact as long as a prefix has at most `MOST` parses; of more, the
+    least probable are dropped. A chain soon reaches the same state and so has few parses; a network has all of them,
+    hundreds after a dozen actions, and takes time and memory in proportion.
 
     Args:
         num_actions: A.
@@ -41,10 +41,10 @@ class MacroPrior(Prior):
 
     actions_at_once = 2**14
 
-    ahead: Tensor
+    symbol_actions: Tensor
     """`[A + M, longest]`: the actions of each symbol; -1 beyond."""
 
-    begun: Tensor
+    symbols_from: Tensor
     """`[A, most]`: the symbols that begin with each action; -1 beyond."""
 
     def __init__(self, num_actions: int, inner: Prior | Mapping[str, Any], by: Criterion = "count") -> None:
@@ -60,10 +60,10 @@ class MacroPrior(Prior):
         if isinstance(made, MacroPrior):
             raise ValueError("inner: a prior without macros is expected; give this one more of them")
         if made.takes_context:
-            raise ValueError("inner: a prior without context is expected: a macro is one step of many sights")
+            raise ValueError("inner: a prior without context is expected: a macro is one step with many contexts")
         super().__init__(num_actions)
         self.inner, self.by = made, by
-        self._take([])
+        self._set_macros([])
 
     @property
     def num_macros(self) -> int:
@@ -86,116 +86,128 @@ class MacroPrior(Prior):
         known = all(isinstance(a, int) and 0 <= a < self.num_actions for macro in macros for a in macro.actions)
         if not known or len(macros) > self.num_macros or any(len(macro.actions) < 2 for macro in macros):
             raise ValueError(f"macros: at most {self.num_macros} sequences of at least two actions are expected")
-        self._take(macros)
+        self._set_macros(macros)
         self._inner().restore(learned["inner"])
 
-    def fit(self, plans: Plans | Tensor, **settings: Any) -> Self:
+    @property
+    def fit_settings(self) -> tuple[str, ...]:
+        return self._inner().fit_settings
+
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Learn macros, and then the inner prior from the plans as recoded with them; returns self.
 
         Args:
-            plans: what to learn from.
+            plans: `Plans`, or integers `[N, L]` for plans without context.
+            generator: passed on to the inner prior.
             settings: passed on to the inner prior.
 
         Raises:
-            ValueError: the plans do not fit this prior, or have an end symbol.
+            ValueError: the plans do not fit this prior, or have an end symbol, or a setting that the inner prior does
+                not have.
         """
+        self.check_settings(settings)
         given = plans if isinstance(plans, Plans) else Plans(torch.as_tensor(plans), self.num_actions)
-        macros, recoded = learn_macros(given, self.num_macros, self.by)  # which refuses before anything is noted
+        macros, recoded = learn_macros(given, self.num_macros, self.by)  # raises before anything is changed
         self.training_plans(given)
-        self._inner().fit(recoded, **settings)
-        self._take(macros)
+        self._inner().fit(recoded, generator=generator, **settings)
+        self._set_macros(macros)
         return self
 
-    @torch.no_grad()  # what is learned is learned by `fit`
+    @torch.no_grad()  # `fit` trains the inner prior itself
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, memory = self._inner().start(batch_size)
+        logits, state = self._inner().start(batch_size)
         row = torch.arange(batch_size, device=logits.device)
-        return self._joined([self._ways(row, logits.new_zeros(batch_size), logits, memory)], batch_size)
+        return self._joined([self._parses(row, logits.new_zeros(batch_size), logits, state)], batch_size)
 
     @torch.no_grad()
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if len(state) == 0:  # of which nothing can be unpacked
             return torch.zeros(0, self.num_actions, device=self.device), state
-        action, groups = action.long(), self._open(state)
-        after = [[ways.within(action, self.ahead)] for ways in groups]
-        for place, ways in enumerate(groups):
-            begun = self._begun(ways, action)
-            # A way to which a symbol was added goes on among those with one more, whose states may be of another size.
-            further = place + (begun.memory.dim() > 1)
+        action, groups = action.long(), self._unpacked(state)
+        after = [[parses.within(action, self.symbol_actions)] for parses in groups]
+        for place, parses in enumerate(groups):
+            extended = self._extended(parses, action)
+            # Parses with one more symbol form a group of their own, since their states may be of another size.
+            further = place + (extended.state.dim() > 1)
             if further == len(after):
                 after.append([])
-            after[further].append(begun)
-        return self._joined(_likeliest([_merged(some) for some in after], len(state), self.MOST), len(state))
+            after[further].append(extended)
+        return self._joined(_most_probable([_merged(some) for some in after], len(state), self.MOST), len(state))
 
-    def _begun(self, ways: "_Ways", action: Tensor) -> "_Ways":
-        """The ways that add a symbol which begins with `action [N]`."""
-        free = ways.place == 0
-        row, weight, told, memory = ways.row[free], ways.weight[free], ways.told[free], ways.memory[free]
-        symbols = self.begun[action[row]]
-        way, which = (symbols >= 0).nonzero(as_tuple=True)
-        symbol = symbols[way, which]
-        weight = weight[way] + told[way, symbol]
+    def _extended(self, parses: "_Parses", action: Tensor) -> "_Parses":
+        """The parses with one more symbol, which begins with `action [N]`."""
+        free = parses.place == 0
+        row, weight, log_probs, state = (
+            parses.row[free],
+            parses.weight[free],
+            parses.log_probs[free],
+            parses.state[free],
+        )
+        symbols = self.symbols_from[action[row]]
+        parse, which = (symbols >= 0).nonzero(as_tuple=True)
+        symbol = symbols[parse, which]
+        weight = weight[parse] + log_probs[parse, symbol]
         possible = weight > -torch.inf
-        way, symbol, weight = way[possible], symbol[possible], weight[possible]
+        parse, symbol, weight = parse[possible], symbol[possible], weight[possible]
         inner = self._inner()
-        if len(way) == 0:
-            return ways.taken(way)
-        logits, after = inner.step(symbol, memory[way])
-        found = self._ways(row[way], weight, logits, after)
-        longer = (self.ahead[symbol] >= 0).sum(1) > 1
-        place = torch.where(longer, symbol * self.ahead.shape[1] + 1, 0)
+        if len(parse) == 0:
+            return parses.taken(parse)
+        logits, after = inner.step(symbol, state[parse])
+        found = self._parses(row[parse], weight, logits, after)
+        longer = (self.symbol_actions[symbol] >= 0).sum(1) > 1
+        place = torch.where(longer, symbol * self.symbol_actions.shape[1] + 1, 0)
         return found._replace(place=place)
 
-    def _ways(self, row: Tensor, weight: Tensor, logits: Tensor, memory: Tensor) -> "_Ways":
-        """Ways at whose end the inner prior gives `logits`; macros that were not learned are never taken."""
+    def _parses(self, row: Tensor, weight: Tensor, logits: Tensor, state: Tensor) -> "_Parses":
+        """Parses at whose end the inner prior gives `logits`; macros that were not learned have probability 0."""
         unknown = torch.arange(logits.shape[1], device=logits.device) >= self.num_actions + len(self.macros)
-        told = logits.masked_fill(unknown, -torch.inf).log_softmax(-1)
-        return _Ways(row, weight, torch.zeros_like(row), told, memory)
+        log_probs = logits.masked_fill(unknown, -torch.inf).log_softmax(-1)
+        return _Parses(row, weight, torch.zeros_like(row), log_probs, state)
 
-    def _joined(self, groups: Sequence["_Ways"], batch: int) -> tuple[Tensor, Tensor]:
-        """Logits and state of `batch` plans: probabilities are summed over ways, whose weights then sum to one."""
+    def _joined(self, groups: Sequence["_Parses"], batch: int) -> tuple[Tensor, Tensor]:
+        """Logits and state of `batch` plans: probabilities are summed over parses, whose weights then sum to one."""
         total = torch.full((batch,), -torch.inf, dtype=torch.float64, device=self.device)
-        for ways in groups:
-            total = torch.logaddexp(total, _log_sums(ways.weight, ways.row, batch))
+        for parses in groups:
+            total = torch.logaddexp(total, _log_sums(parses.weight, parses.row, batch))
         probs = torch.zeros(batch, self.num_actions, dtype=torch.float64, device=self.device)
         parts: list[Tensor] = []
-        for ways in groups:
-            weight = (ways.weight.double() - total[ways.row]).exp()
-            probs.index_add_(0, ways.row, weight[:, None] * self._next(ways))
-            parts += ways._replace(weight=weight.log()).padded(batch)
+        for parses in groups:
+            weight = (parses.weight.double() - total[parses.row]).exp()
+            probs.index_add_(0, parses.row, weight[:, None] * self._next(parses))
+            parts += parses._replace(weight=weight.log()).padded(batch)
         logits = probs.log().float()
         groups_of = torch.full((batch, 1), float(len(groups)), device=self.device)
         return logits, torch.cat([groups_of, pack(parts)], 1)
 
-    def _next(self, ways: "_Ways") -> Tensor:
-        """The probabilities `[R, A]` of the next action in each way."""
-        first = torch.zeros(len(self.ahead), self.num_actions, dtype=torch.float64, device=self.device)
-        first[torch.arange(len(first)), self.ahead[:, 0]] = 1
-        free = ways.told.double().exp() @ first
-        size = self.ahead.shape[1]
-        coming = self.ahead[ways.place.div(size, rounding_mode="floor"), ways.place % size]
+    def _next(self, parses: "_Parses") -> Tensor:
+        """The probabilities `[R, A]` of the next action under each parse."""
+        first = torch.zeros(len(self.symbol_actions), self.num_actions, dtype=torch.float64, device=self.device)
+        first[torch.arange(len(first)), self.symbol_actions[:, 0]] = 1
+        free = parses.log_probs.double().exp() @ first
+        size = self.symbol_actions.shape[1]
+        coming = self.symbol_actions[parses.place.div(size, rounding_mode="floor"), parses.place % size]
         certain = torch.nn.functional.one_hot(coming, self.num_actions).double()
-        return torch.where((ways.place > 0)[:, None], certain, free)
+        return torch.where((parses.place > 0)[:, None], certain, free)
 
-    def _open(self, state: Tensor) -> list["_Ways"]:
-        """What was `_joined`."""
+    def _unpacked(self, state: Tensor) -> list["_Parses"]:
+        """The parses in a state."""
         groups = int(state[0, 0])
         parts = unpack(state[:, 1:], 4 * groups)
-        return [_Ways.unpadded(*parts[k : k + 4]) for k in range(0, 4 * groups, 4)]
+        return [_Parses.unpadded(*parts[k : k + 4]) for k in range(0, 4 * groups, 4)]
 
-    def _take(self, macros: Sequence[Macro]) -> None:
-        """Take over macros, and their tables."""
+    def _set_macros(self, macros: Sequence[Macro]) -> None:
+        """Set the macros, and the tables of their actions."""
         self.macros = tuple(macros)
         meaning = [(a,) for a in range(self.num_actions)] + [macro.actions for macro in macros]
         meaning += [(0,)] * (self.num_macros - len(macros))  # which are never taken
         longest = max(len(actions) for actions in meaning)
-        ahead = torch.tensor([[*actions, *[-1] * (longest - len(actions))] for actions in meaning])
+        table = torch.tensor([[*actions, *[-1] * (longest - len(actions))] for actions in meaning])
+        self.register_buffer("symbol_actions", table.to(self.device), persistent=False)
         known = meaning[: self.num_actions + len(macros)]
         begun = [[k for k, actions in enumerate(known) if actions[0] == a] for a in range(self.num_actions)]
         most = max(map(len, begun))
-        self.register_buffer("ahead", ahead.to(self.device), persistent=False)
         table = torch.tensor([[*symbols, *[-1] * (most - len(symbols))] for symbols in begun])
-        self.register_buffer("begun", table.to(self.device), persistent=False)
+        self.register_buffer("symbols_from", table.to(self.device), persistent=False)
 
     def _inner(self) -> Prior:
         inner = self.inner
@@ -203,81 +215,83 @@ class MacroPrior(Prior):
         return inner
 
 
-class _Ways(NamedTuple):
-    """R ways in which some plans may have come about, with equally many symbols.
+class _Parses(NamedTuple):
+    """R parses of prefixes of some plans, with equally many symbols.
 
     Attributes:
         row: `[R]`: the plan, from 0.
         weight: `[R]`: the logarithm of the probability.
         place: `[R]`: 0 at the end of a symbol; within symbol s, before its action i: s * longest + i.
-        told: `[R, A + M]`: the log-probabilities of the next symbol.
-        memory: `[R]` or `[R, D]`: the inner prior's state.
+        log_probs: `[R, A + M]`: the log-probabilities of the next symbol.
+        state: `[R]` or `[R, D]`: the inner prior's state.
     """
 
     row: Tensor
     weight: Tensor
     place: Tensor
-    told: Tensor
-    memory: Tensor
+    log_probs: Tensor
+    state: Tensor
 
-    def taken(self, some: Tensor) -> "_Ways":
-        """Some of the ways, by number or by mask."""
-        return _Ways(*(part[some] for part in self))
+    def taken(self, some: Tensor) -> "_Parses":
+        """Some of the parses, by index or by mask."""
+        return _Parses(*(part[some] for part in self))
 
-    def within(self, action: Tensor, ahead: Tensor) -> "_Ways":
-        """The ways within a symbol that go on with `action [N]`."""
-        size = ahead.shape[1]
+    def within(self, action: Tensor, symbol_actions: Tensor) -> "_Parses":
+        """The parses within a symbol whose next action is `action [N]`."""
+        size = symbol_actions.shape[1]
         symbol, turn = self.place.div(size, rounding_mode="floor"), self.place % size
-        left = self.taken((turn > 0) & (ahead[symbol, turn] == action[self.row]))
+        left = self.taken((turn > 0) & (symbol_actions[symbol, turn] == action[self.row]))
         turn = left.place % size + 1
         symbol = left.place.div(size, rounding_mode="floor")
-        more = (turn < size) & (ahead[symbol, turn.clamp(max=size - 1)] >= 0)
+        more = (turn < size) & (symbol_actions[symbol, turn.clamp(max=size - 1)] >= 0)
         return left._replace(place=torch.where(more, left.place + 1, 0))
 
     def padded(self, batch: int) -> list[Tensor]:
-        """Weight, place, told and memory as `[batch, K, ...]`; beyond a plan's ways the weight is -inf."""
-        ways = self.taken(self.row.argsort(stable=True))
-        count = ways.row.bincount(minlength=batch)
-        turn = torch.arange(len(ways.row), device=ways.row.device) - (count.cumsum(0) - count)[ways.row]
+        """Weight, place, log_probs and state as `[batch, K, ...]`; beyond a plan's parses the weight is -inf."""
+        parses = self.taken(self.row.argsort(stable=True))
+        count = parses.row.bincount(minlength=batch)
+        turn = torch.arange(len(parses.row), device=parses.row.device) - (count.cumsum(0) - count)[parses.row]
         wide = max(int(count.max()) if batch else 0, 1)
         parts = []
-        for part, nothing in ((ways.weight.float(), -torch.inf), (ways.place, 0), (ways.told, 0), (ways.memory, 0)):
-            room = part.new_full((batch, wide, *part.shape[1:]), nothing)
-            room[ways.row, turn] = part
-            parts.append(room)
+        for part in (parses.weight.float(), parses.place, parses.log_probs, parses.state):
+            padded = part.new_full((batch, wide, *part.shape[1:]), 0 if parts else -torch.inf)
+            padded[parses.row, turn] = part
+            parts.append(padded)
         return parts
 
     @classmethod
-    def unpadded(cls, weight: Tensor, place: Tensor, told: Tensor, memory: Tensor) -> "_Ways":
-        """What was `padded`."""
+    def unpadded(cls, weight: Tensor, place: Tensor, log_probs: Tensor, state: Tensor) -> "_Parses":
+        """The inverse of `padded`."""
         row, turn = (weight > -torch.inf).nonzero(as_tuple=True)
-        return cls(row, *(part[row, turn] for part in (weight, place, told, memory)))
+        return cls(row, *(part[row, turn] for part in (weight, place, log_probs, state)))
 
 
-def _merged(some: Sequence[_Ways]) -> _Ways:
-    """All of these ways; those that go on alike are one."""
-    # Of none the memory may be of another size.
-    there = [ways for ways in some if len(ways.row)] or some[:1]
-    ways = _Ways(*(torch.cat(parts) for parts in zip(*there, strict=True)))
-    if len(ways.row) < 2:
-        return ways
-    memory = ways.memory.reshape(len(ways.row), -1)
-    alike = torch.cat([ways.row[:, None].double(), ways.place[:, None].double(), memory.double()], 1)
-    _, group = row_hashes(alike).unique(return_inverse=True)
+def _merged(some: Sequence[_Parses]) -> _Parses:
+    """All of these parses; those of the same plan in the same state are merged into one."""
+    # The state of an empty group may be of another size.
+    there = [parses for parses in some if len(parses.row)] or some[:1]
+    parses = _Parses(*(torch.cat(parts) for parts in zip(*there, strict=True)))
+    if len(parses.row) < 2:
+        return parses
+    state = parses.state.reshape(len(parses.row), -1)
+    key = torch.cat([parses.row[:, None].double(), parses.place[:, None].double(), state.double()], 1)
+    _, group = row_hashes(key).unique(return_inverse=True)
     groups = int(group.max()) + 1
     first = torch.full((groups,), len(group), device=group.device)
     first.scatter_reduce_(0, group, torch.arange(len(group), device=group.device), "amin")
-    # In the order in which they were met: of equally probable ways the same must be left out in equal plans.
+    # In order of first occurrence: of equally probable parses the same must be dropped in equal plans.
     first, order = first.sort()
-    return ways.taken(first)._replace(weight=_log_sums(ways.weight, group, groups)[order].to(ways.weight))
+    return parses.taken(first)._replace(weight=_log_sums(parses.weight, group, groups)[order].to(parses.weight))
 
 
-def _likeliest(groups: Sequence[_Ways], batch: int, most: int) -> list[_Ways]:
-    """Of each of `batch` plans the most probable ways, at most so many in all groups together."""
-    row, weight, place = (torch.cat([getattr(ways, part) for ways in groups]) for part in ("row", "weight", "place"))
+def _most_probable(groups: Sequence[_Parses], batch: int, most: int) -> list[_Parses]:
+    """The most probable parses of each of `batch` plans, at most `most` in all groups together."""
+    row, weight, place = (
+        torch.cat([getattr(parses, part) for parses in groups]) for part in ("row", "weight", "place")
+    )
     if len(row) <= most or int(row.bincount(minlength=batch).max()) <= most:
         return list(groups)
-    # One at the end of a symbol is always among them: from there every action can be taken.
+    # One of them is always at the end of a symbol, so that no action becomes impossible.
     free = weight.masked_fill(place > 0, -torch.inf)
     best = torch.full((batch,), -torch.inf, device=row.device, dtype=weight.dtype).scatter_reduce(0, row, free, "amax")
     weight = weight.masked_fill((place == 0) & (free == best[row]), torch.inf)
@@ -287,7 +301,7 @@ def _likeliest(groups: Sequence[_Ways], batch: int, most: int) -> list[_Ways]:
     turn = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count)[row[order]]
     kept = torch.zeros_like(row, dtype=torch.bool)
     kept[order[turn < most]] = True
-    return [ways.taken(some) for ways, some in zip(groups, kept.split([len(w.row) for w in groups]), strict=True)]
+    return [parses.taken(some) for parses, some in zip(groups, kept.split([len(w.row) for w in groups]), strict=True)]
 
 
 def _log_sums(values: Tensor, group: Tensor, groups: int) -> Tensor:

@@ -22,8 +22,8 @@ class Macro:
     Attributes:
         actions: of the plans, two or more.
         count: how often it replaced its two halves when it was learned.
-        gain: bits by which it shortened the plans then, each symbol coded by its frequency, less those that tell what
-            it stands for; it may be negative where it was not learned for its gain.
+        gain: bits by which it shortened the plans then, each symbol coded by its frequency, less the bits that its
+            definition costs; it may be negative where macros are not chosen by their gain.
     """
 
     actions: tuple[int, ...]
@@ -34,24 +34,24 @@ class Macro:
 def learn_macros(plans: Plans, num_macros: int, by: Criterion = "count") -> tuple[list[Macro], Plans]:
     """Find the macro-actions of executed plans, and recode the plans with them.
 
-    Again and again the best pair of symbols that follow one another is replaced, wherever it occurs, from left to
-    right, by a new symbol: byte-pair encoding (Gage 1994; of actions: Iba 1989, McGovern 1998). The best is
+    Again and again the best pair of consecutive symbols is replaced, wherever it occurs, from left to right, by a new
+    symbol: byte-pair encoding (Gage 1994; of actions: Iba 1989, McGovern 1998). The best pair is
 
     - "count": the pair that occurs most often;
-    - "information": the pair with the greatest n log2(p(xy) / (p(x) p(y))), n being how often it occurs: the mutual
-      information that it has a part in;
+    - "information": the pair with the greatest n log2(p(xy) / (p(x) p(y))), n being how often it occurs: its
+      contribution to the mutual information of consecutive symbols;
     - "compression": the pair whose replacement shortens the plans most; see `Macro.gain`.
 
-    It ends when no pair occurs twice or, by "information" and "compression", none is better than nothing.
+    The search ends when no pair occurs twice or, by "information" and "compression", no pair has a positive value.
 
     Args:
-        plans: of A actions; their context is left aside.
+        plans: of A actions; their context is ignored.
         num_macros: M, the most macros to find.
-        by: what a good pair is.
+        by: how pairs are chosen.
 
     Returns:
         At most M macros, in the order in which they were found, and the plans with A + M actions, of which A + i is
-        macro i. A macro may hold earlier ones; its actions are always those of the plans.
+        macro i. A macro may be made of earlier ones; its `actions` are always those of the plans.
 
     Raises:
         ValueError: an argument is out of range, or the plans have an end symbol.
@@ -78,7 +78,7 @@ def learn_macros(plans: Plans, num_macros: int, by: Criterion = "count") -> tupl
 
 
 def _occurrences(symbols: Tensor) -> Tensor:
-    """Where pairs begin, `[N, L - 1]`; of those of equal symbols that overlap, every other one."""
+    """Where pairs begin, `[N, L - 1]`; of overlapping pairs of equal symbols, every other one."""
     first, second = symbols[:, :-1], symbols[:, 1:]
     same = first == second
     place = torch.arange(first.shape[1], device=symbols.device).expand_as(first)
@@ -87,7 +87,7 @@ def _occurrences(symbols: Tensor) -> Tensor:
 
 
 def _best_pair(symbols: Tensor, kinds: int, by: Criterion) -> tuple[int, int, float] | None:
-    """The best pair, and the bits that it saves; of equals the first. None where none is of use."""
+    """The best pair, and the bits that it saves; of equally good pairs the first. None where there is none."""
     starts = _occurrences(symbols)
     code, count = (symbols[:, :-1] * kinds + symbols[:, 1:])[starts].unique(return_counts=True)
     code, count = code[count > 1], count[count > 1].double()
@@ -124,7 +124,7 @@ def _gain(single: Tensor, first: Tensor, second: Tensor, count: Tensor, kinds: i
 
 
 def _replaced(symbols: Tensor, starts: Tensor, new: int) -> Tensor:
-    """The symbols with pairs that begin at `starts [N, L - 1]` as `new` ones; what is left moves up, -1 follows."""
+    """The symbols with the pairs that begin at `starts [N, L - 1]` replaced by `new`; rows are filled up with -1."""
     symbols = symbols.clone()
     symbols[:, :-1][starts] = new
     symbols[:, 1:][starts] = -1

@@ -17,11 +17,8 @@ class GRUPrior(NeuralPrior):
         num_actions: A.
         hidden_size: width of the hidden state and of the input vectors.
         num_layers: number of layers.
-        window: how many past actions are read; None: set by `fit`; see `NeuralPrior`.
-        lags: past actions that each input shows directly; see `NeuralPrior`.
-        dropout: in training, of the input vectors and of what each layer gives.
-        num_contexts, context_size: what it sees; see `Prior`.
-        seed: draws the initial weights.
+        window, lags, dropout, num_contexts, context_size, seed: see `NeuralPrior`. Dropout is applied to the input
+            vectors and to the output of each layer.
 
     Raises:
         ValueError: an argument is out of range.
@@ -54,41 +51,41 @@ class GRUPrior(NeuralPrior):
         self.drop = nn.Dropout(self.dropout)
         self.head = nn.Linear(width, self.num_actions)
 
-    def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        hidden, recent, size = None, None, self.num_layers * self.hidden_size
-        if memory is not None:
-            hidden = memory[:, :size].unflatten(1, (self.num_layers, self.hidden_size)).transpose(0, 1)
-            recent = memory[:, size:]
-        if hidden is not None and recent is not None and self._may_step(inputs):
-            out, hidden, recent = self._one_step(inputs, hidden, recent)
+    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        layers, recent, size = None, None, self.num_layers * self.hidden_size
+        if hidden is not None:
+            layers = hidden[:, :size].unflatten(1, (self.num_layers, self.hidden_size)).transpose(0, 1)
+            recent = hidden[:, size:]
+        if layers is not None and recent is not None and self._may_step(inputs):
+            out, layers, recent = self._one_step(inputs, layers, recent)
         else:
             vectors, recent = self.embedding(inputs, recent)
-            out, hidden = self.gru(self.drop(vectors), None if hidden is None else hidden.contiguous())
-        state = hidden.transpose(0, 1).flatten(1)
-        return self.head(self.drop(out)), state if recent.shape[1] == 0 else torch.cat([state, recent], 1)
+            out, layers = self.gru(self.drop(vectors), None if layers is None else layers.contiguous())
+        hidden = layers.transpose(0, 1).flatten(1)
+        return self.head(self.drop(out)), hidden if recent.shape[1] == 0 else torch.cat([hidden, recent], 1)
 
     def _may_step(self, inputs: Tensor) -> bool:
-        """Whether `_one_step` gives the same as `nn.GRU`, and sooner."""
+        """Whether `_one_step` gives the same as `nn.GRU`, and faster."""
         plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"))
         return plain and inputs.device.type == "cpu" and inputs.shape[1] == 1
 
-    def _one_step(self, inputs: Tensor, hidden: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What `nn.GRU`, which is made for long sequences, gives for a single input, in half the time.
+    def _one_step(self, inputs: Tensor, layers: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The output of `nn.GRU`, which is made for long sequences, for a single input, in half the time.
 
         Args:
             inputs: `[N, 1, D]`.
-            hidden: `[layers, N, H]`.
+            layers: `[layers, N, hidden_size]`, the hidden states.
             recent: `[N, lags - 1]`: the actions before, see `Embedding`.
 
         Returns:
-            The output `[N, 1, H]`, the new `hidden` and the new `recent`.
+            The output `[N, 1, hidden_size]`, the new `layers` and the new `recent`.
         """
         size, below, after = self.hidden_size, None, []
-        # Input gates that depend on an action alone are looked up, where plans are more than actions.
+        # Input gates that depend on an action alone are looked up, where there are more plans than actions.
         if self.takes_context or self.lags > 1 or len(inputs) <= self.num_actions:
             vectors, recent = self.embedding(inputs, recent)
             below = vectors[:, 0]
-        for layer, before in enumerate(hidden):
+        for layer, before in enumerate(layers):
             w_in, w_hidden, b_in, b_hidden = self.gru.all_weights[layer]
             bias = torch.cat([b_in[: 2 * size] + b_hidden[: 2 * size], b_in[2 * size :]])
             if below is None:
@@ -104,5 +101,5 @@ class GRUPrior(NeuralPrior):
         assert below is not None
         return below[:, None], after[0][None] if len(after) == 1 else torch.stack(after), recent
 
-    def memory_size(self, state_size: int) -> int:
+    def hidden_size_of(self, state_size: int) -> int:
         return self.num_layers * self.hidden_size + self.lags - 1

@@ -1,6 +1,7 @@
-"""What the neural priors share: how they see actions and contexts, the window past the training length, and fitting."""
+"""The base of the neural priors: inputs, the window beyond the training length, and fitting."""
 
 from abc import abstractmethod
+from dataclasses import fields
 from typing import Any, Self
 
 import torch
@@ -12,36 +13,44 @@ from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.prior import Prior
 
 CONTEXT_SPREAD = 0.03
-"""Standard deviation of the first weights of contexts. With 1, as of other vectors, few plans are learned by heart."""
+"""Standard deviation of contexts' initial vectors. With 1, as for other embeddings, small data sets are overfitted."""
 
 LAG_WIDTH = 16
-"""Numbers that stand for each of the last actions."""
+"""Size of the embedding of each of the last actions."""
 
 
 class NeuralPrior(Prior):
     """A network over (last action, context) inputs; the first input is a start symbol.
 
-    Past the training length a network meets positions and memories that it has never seen. So each action is predicted
-    from at most the last `window` actions, read as if they opened the plan: with plans of length T in training,
-    `window = T - 1`, the most that was ever seen before an action. Up to length T nothing changes. Measured on a chain
-    of order 2 (1.288 bits an action) at actions 20 to 32, after training on plans of length 8: the transformer takes
-    1.291 bits with this window and 2.171 without one, the GRU 1.291 with and without; windows of 5 and 3 are no worse
-    there, since they still hold the order (`python -m pytest -m slow -k past_the_training_length -s` prints this).
+    Beyond the training length a network meets positions and hidden states that it was not trained on. Therefore each
+    action is predicted from at most the last `window` actions, read as the beginning of a plan: with plans of length T
+    in training, `window = T - 1`, the most that preceded any action there. Up to length T this changes nothing.
+    Measured on a chain of order 2 (1.288 bits per action) at actions 20 to 32, after training on plans of length 8: the
+    transformer takes 1.291 bits with this window and 2.171 without one, the GRU 1.291 with and without; windows of 5
+    and 3 are no worse there, since they still hold the order
+    (`python -m pytest -m slow -k past_the_training_length -s` prints this).
 
-    Plans longer than the training window (`Settings.window`) are trained on in consecutive windows with the memory
-    carried over; such a prior has met old memories, so it carries its memory on in use as well, without limit.
+    Plans longer than the training window (`Settings.window`) are read in consecutive windows in training, the hidden
+    state carried from each to the next (truncated backpropagation through time). A prior trained in this way carries
+    its hidden state on in use as well, without limit.
 
-    The state holds, beside the network's memory, the inputs that the window may still need: `[N, memory + (t + 1) * D]`
-    for t actions so far, D = 1 + (1 for a context index, C for features); past the window those inputs alone,
-    `[N, window + 1, D]`.
+    In this class "hidden" is what the network carries along a sequence, `[N, H]`: the hidden state of a recurrent
+    network, the key-value cache of a transformer. The prior's `state` holds, beside it, the inputs that the window may
+    still need: `[N, H + (t + 1) * D]` after t actions, D = 1 + (1 for a context index, C for features); past the window
+    it is these inputs alone, `[N, window + 1, D]`.
+
+    A subclass writes `build`, `encode` and `hidden_size_of`.
 
     Args:
         num_actions: A.
-        window: see above; None: set by `fit`, and without limit before that.
-        lags: past actions that each input shows directly; see `Embedding`.
-        dropout: share of the numbers between layers that are left out at random in training.
+        window: past actions that are read, at most; None: set by `fit`, and no limit before that.
+        lags: past actions that each input shows to the network directly; see `Embedding`.
+        dropout: share of the network's activations that is set to 0 at random in training.
         num_contexts, context_size: see `Prior`.
         seed: draws the initial weights; torch's global generator is left alone.
+
+    Raises:
+        ValueError: an argument is out of range.
     """
 
     actions_at_once = 2**18
@@ -91,108 +100,118 @@ class NeuralPrior(Prior):
         """Make the layers."""
 
     @abstractmethod
-    def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Read a sequence.
 
         Args:
-            inputs: `[N, T, D]`: the action before (A for none) and the context, as floating point numbers.
-            memory: `[N, M]`, of the inputs before these; None: there are none.
+            inputs: `[N, T, D]`: the previous action (A for none) and the context, as floating point numbers.
+            hidden: `[N, H]`, after the inputs before these; None: there are none.
 
         Returns:
-            Logits `[N, T, A]`, and the memory `[N, M']` after the last input.
+            Logits `[N, T, A]`, and `hidden` `[N, H']` after the last input.
         """
 
-    def carry_over(self, window: int | None) -> None:
-        """Before a training in windows of so many actions: from now on the memory goes on without limit.
+    @abstractmethod
+    def hidden_size_of(self, state_size: int) -> int:
+        """The size H of the hidden part of a state of `state_size` numbers."""
 
-        None: before a training on whole plans.
+    def set_training_window(self, window: int | None) -> None:
+        """Prepare for training in windows of so many actions, after which the hidden state is carried on without limit.
+
+        Args:
+            window: in actions; None: plans are trained on whole, which changes nothing.
 
         Raises:
-            ValueError: this prior was made to read a window of its own.
+            ValueError: this prior was made with a window of its own.
         """
         if window is None:
             return
         if self._given_window is not None:
             raise ValueError(
                 f"window: this prior reads {self._given_window} actions at a time, but plans of more than {window} are"
-                " trained on with the memory carried over; train with a window as long as the plans, or make the prior"
-                " without one"
+                " trained on with the hidden state carried over; train with a window as long as the plans, or make the"
+                " prior without one"
             )
         self.window = None
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        before = torch.full((batch_size,), self.num_actions, device=self.device)
-        inputs = self._inputs(before, context, None)
-        logits, memory = self.encode(inputs[:, None])
-        return logits[:, 0], torch.cat([memory, inputs], 1)
+        previous = torch.full((batch_size,), self.num_actions, device=self.device)
+        inputs = self._inputs(previous, context, None)
+        logits, hidden = self.encode(inputs[:, None])
+        return logits[:, 0], torch.cat([hidden, inputs], 1)
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        memory, history = self._open(state)
+        hidden, history = self._split(state)
         new = self._inputs(action, context, history[:, -1])
         kept = history if self.window is not None else history[:, :0]
         history = torch.cat([kept, new[:, None]], 1)
         if self.window is not None and history.shape[1] > self.window + 1:
             history = history[:, 1:]
             return self._read_window(history), history
-        logits, memory = self.encode(new[:, None], memory)
-        return logits[:, 0], torch.cat([memory, history.flatten(1)], 1)
+        logits, hidden = self.encode(new[:, None], hidden)
+        return logits[:, 0], torch.cat([hidden, history.flatten(1)], 1)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         num, length = plans.shape
         if length == 0:
             return torch.zeros(num, 0, self.num_actions, device=self.device)
         if self.window is None or length <= self.window + 1:
-            return self.read_on(plans, context)[0]
+            return self.forward_from(plans, context)[0]
         inputs = self._sequence(plans, context, None)
         first = self.encode(inputs[:, : self.window + 1])[0]
         late = inputs[:, 1:].unfold(1, self.window + 1, 1).transpose(2, 3)
         logits = self._read_window(late.flatten(0, 1))
         return torch.cat([first, logits.view(num, length - self.window - 1, self.num_actions)], 1)
 
-    def read_on(
+    def forward_from(
         self,
         plans: Tensor,
         context: Tensor | None = None,
-        before: Tensor | None = None,
-        memory: Tensor | None = None,
+        previous: Tensor | None = None,
+        hidden: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """The logits of actions that go on from where a memory stands.
+        """The logits of actions that continue a sequence; training in windows calls this.
 
         Args:
             plans: integers `[N, L]`, L > 0.
             context: None, one a plan or one a step.
-            before: integers `[N]`: the action before the first; None: there is none.
-            memory: as the last call returned it; None: nothing was read before.
+            previous: integers `[N]`: the action before the first (A for none); None: there is none.
+            hidden: as the last call returned it; None: nothing was read before.
 
         Returns:
-            Logits `[N, L, A]`, and the memory.
+            Logits `[N, L, A]`, and `hidden` after these plans.
         """
-        return self.encode(self._sequence(plans, context, before), memory)
+        return self.encode(self._sequence(plans, context, previous), hidden)
 
-    def _sequence(self, plans: Tensor, context: Tensor | None, before: Tensor | None) -> Tensor:
+    def _sequence(self, plans: Tensor, context: Tensor | None, previous: Tensor | None) -> Tensor:
         """The inputs `[N, L, D]` that come before each action of `plans [N, L]`."""
         num, length = plans.shape
         shifted = nn.functional.pad(plans.long(), (1, 0), value=self.num_actions)[:, :-1]
-        if before is not None:
-            shifted = torch.cat([before[:, None].long(), shifted[:, 1:]], 1)
+        if previous is not None:
+            shifted = torch.cat([previous[:, None].long(), shifted[:, 1:]], 1)
         if context is not None and not is_per_step(context):
             context = context[:, None].expand(num, length, *context.shape[1:])
         return self._inputs(shifted, context, None)
 
-    def fit(self, plans: Plans | Tensor, generator: torch.Generator | None = None, **settings: Any) -> Self:
-        """Train with Lightning until held-out plans stop being told better; returns self.
+    @property
+    def fit_settings(self) -> tuple[str, ...]:
+        return _training_settings()
 
-        A prior that has learned before goes on from the weights that it has.
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+        """Train with Lightning until the loss on held-out plans no longer falls; returns self.
+
+        A prior that has learned before is trained further from its present weights.
 
         Args:
-            plans: what to learn from; a tensor `[N, L]` is taken as plans without context.
+            plans: `Plans`, or integers `[N, L]` for plans without context.
             generator: draws the held-out plans, the order of training and dropout.
             settings: fields of `neuroprior.training.Settings`, such as `max_steps=500` or `progress=False`.
 
         Raises:
-            ValueError: plans that this prior cannot learn from, too few of them, a setting out of range, or a training
-                that diverged.
+            ValueError: plans that this prior cannot learn from, too few of them, a setting that is unknown or out of
+                range, or a training that diverged.
         """
+        self.check_settings(settings)
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
         how = Settings(**settings)
@@ -201,7 +220,7 @@ class NeuralPrior(Prior):
         return self
 
     def prepare(self, plans: Plans | Tensor, window: int) -> Plans:
-        """What this prior will learn from, before a training in windows of so many actions; sets how it will read.
+        """The plans to train on, in windows of so many actions; sets the window in which the prior will read.
 
         Raises:
             ValueError: plans that this prior cannot learn from, or too few of them.
@@ -212,34 +231,34 @@ class NeuralPrior(Prior):
         if len(plans) < 2 and int(lengths.sum()) < 2:
             raise ValueError("plans: at least two plans with an action are needed to train a neural prior")
         longest = int(lengths.max())
-        self.carry_over(window if longest > window else None)
+        self.set_training_window(window if longest > window else None)
         if longest <= window and self._given_window is None:
             self.window = longest - 1
         return plans
 
-    def _inputs(self, before: Tensor, context: Tensor | None, last: Tensor | None) -> Tensor:
-        """The action before `[...]` and the context as one input `[..., D]`; None: the context of the `last` input."""
-        action = before[..., None].float()
+    def _inputs(self, previous: Tensor, context: Tensor | None, last: Tensor | None) -> Tensor:
+        """Previous actions `[...]` and contexts as inputs `[..., D]`; context None: that of the `last` input."""
+        action = previous[..., None].float()
         if not self.takes_context:
             return action
         if context is None:
             if last is None:
-                raise ValueError("context: this prior sees a context, and none was given")
+                raise ValueError("context: this prior takes a context, and none was given")
             return torch.cat([action, last[..., 1:]], -1)
-        seen = context[..., None] if self.num_contexts is not None else context
-        return torch.cat([action, seen.to(action)], -1)
+        values = context[..., None] if self.num_contexts is not None else context
+        return torch.cat([action, values.to(action)], -1)
 
-    def _open(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """The memory `[N, M]` and the inputs `[N, T, D]` in a state; past the window it is the inputs alone."""
+    def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """The hidden part `[N, H]` and the inputs `[N, T, D]` of a state; past the window it is the inputs alone."""
         if state.dim() == 3:
             return state[:, 0, :0], state
-        size = self.memory_size(state.shape[1])
+        size = self.hidden_size_of(state.shape[1])
         return state[:, :size], state[:, size:].unflatten(1, (-1, self.input_size))
 
     def _read_window(self, inputs: Tensor) -> Tensor:
-        """The logits `[N, A]` after `inputs [N, window + 1, D]`, read as if they opened a plan.
+        """The logits `[N, A]` after `inputs [N, window + 1, D]`, read as the beginning of a plan.
 
-        The same few windows come again and again in samples and trees; without context each is read once.
+        Samples and trees have few different windows; without context each of these is read once.
         """
         start = torch.full_like(inputs[:, :1, :1], self.num_actions)
         inputs = torch.cat([torch.cat([start, inputs[:, :1, 1:]], -1), inputs[:, 1:]], 1)
@@ -250,24 +269,26 @@ class NeuralPrior(Prior):
         last = torch.empty_like(distinct).scatter_(0, which, torch.arange(len(which), device=inputs.device))
         return self.encode(inputs[last])[0][:, -1][which]
 
-    @abstractmethod
-    def memory_size(self, state_size: int) -> int:
-        """The size of the memory in a state of `state_size` numbers."""
+
+def _training_settings() -> tuple[str, ...]:
+    from neuroprior.training.settings import Settings  # see `NeuralPrior.fit`
+
+    return tuple(field.name for field in fields(Settings))
 
 
 def context_embedding(num_contexts: int, width: int) -> nn.Embedding:
-    """Vectors of contexts that begin nearly alike: what tells them apart is learned, where plans show it."""
+    """An embedding of contexts that is initialised close to 0, so that contexts differ only where plans show it."""
     made = nn.Embedding(num_contexts, width)
     nn.init.normal_(made.weight, std=CONTEXT_SPREAD)
     return made
 
 
 class Embedding(nn.Module):
-    """Inputs `[N, T, D]` (action before, context) to vectors `[N, T, width]`.
+    """Inputs `[N, T, D]` (previous action, context) to vectors `[N, T, width]`.
 
-    Beside the action before, each vector holds the `lags` last actions, each embedded in `LAG_WIDTH` numbers and mapped
-    by a matrix of its lag (a causal convolution): what hangs on the k-th last action is there to be read, and needs
-    neither memory nor attention.
+    Each vector is the sum of an embedding of the previous action, of the context, and of a causal convolution over the
+    last `lags` actions, each embedded in `LAG_WIDTH` numbers: what depends on the k-th last action can be read off
+    directly, without recurrence or attention.
     """
 
     def __init__(
@@ -282,18 +303,18 @@ class Embedding(nn.Module):
         self.features = None if context_size is None else nn.Linear(context_size, width)
 
     def forward(self, inputs: Tensor, recent: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The vectors, and the last `lags` - 1 actions for inputs to come; `recent [N, lags - 1]`: those before."""
+        """The vectors, and the last `lags` - 1 actions; `recent [N, lags - 1]`: those before these inputs."""
         now = inputs[..., 0]
         vectors: Tensor = self.action(now.long())
         if recent is None:
             recent = now.new_full((len(now), self.lags - 1), self.nothing)
         line = torch.cat([recent.to(now), now], 1)
         if self.past is not None and self.mix is not None:
-            seen = self.past(line.long()).transpose(1, 2)
+            past = self.past(line.long()).transpose(1, 2)
             if now.shape[1] == 1:  # one output of a convolution is a product, which is quicker
-                vectors = vectors + nn.functional.linear(seen.flatten(1), self.mix.weight.flatten(1))[:, None]
+                vectors = vectors + nn.functional.linear(past.flatten(1), self.mix.weight.flatten(1))[:, None]
             else:
-                vectors = vectors + self.mix(seen).transpose(1, 2)
+                vectors = vectors + self.mix(past).transpose(1, 2)
         if self.index is not None:
             vectors = vectors + self.index(inputs[..., 1].long())
         if self.features is not None:

@@ -15,20 +15,17 @@ from neuroprior.sampling.rows import grown, states_with_room
 class TransformerPrior(NeuralPrior):
     """A pre-norm transformer (Vaswani et al. 2017) with rotary positions (Su et al. 2021) as a prior.
 
-    The memory of its state is the key-value cache: `num_layers * 2 * width` numbers for each input so far. Trained in
-    windows (see `NeuralPrior`), each layer attends to at most `span` inputs before its own, `span` being the training
-    window, and the cache keeps no more; layer upon layer still sees further back.
+    Its state holds the key-value cache: `num_layers * 2 * width` numbers for each input so far. Trained in windows (see
+    `NeuralPrior`), each layer attends to at most `span` inputs before its own, `span` being the training window, and
+    the cache keeps no more; several layers together still reach further back.
 
     Args:
         num_actions: A.
         width: width of the vectors; a multiple of 2 * `num_heads`.
         num_layers: number of blocks.
         num_heads: attention heads.
-        window: how many past actions are read; None: set by `fit`; see `NeuralPrior`.
-        lags: past actions that each input shows directly; see `NeuralPrior`.
-        dropout: in training, of the input vectors and of what each layer adds.
-        num_contexts, context_size: what it sees; see `Prior`.
-        seed: draws the initial weights.
+        window, lags, dropout, num_contexts, context_size, seed: see `NeuralPrior`. Dropout is applied to the input
+            vectors and to what each block adds.
 
     Raises:
         ValueError: an argument is out of range.
@@ -68,8 +65,8 @@ class TransformerPrior(NeuralPrior):
             check_sizes(span=learned["span"])
         self.span = learned["span"]
 
-    def carry_over(self, window: int | None) -> None:
-        super().carry_over(window)
+    def set_training_window(self, window: int | None) -> None:
+        super().set_training_window(window)
         self.span = window
 
     def build(self) -> None:
@@ -79,13 +76,13 @@ class TransformerPrior(NeuralPrior):
         self.norm = nn.LayerNorm(self.width)
         self.head = nn.Linear(self.width, self.num_actions)
 
-    def encode(self, inputs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if self.span is not None and inputs.shape[1] > 2 * self.span:
-            return self._encode_in_parts(inputs, memory)
+            return self._encode_in_parts(inputs, hidden)
         past, recent, kept = None, None, self.lags - 1
-        if memory is not None:
-            past = memory[:, kept:].view(len(memory), -1, self.num_layers, 2 * self.width)
-            recent = memory[:, :kept]
+        if hidden is not None:
+            past = hidden[:, kept:].view(len(hidden), -1, self.num_layers, 2 * self.width)
+            recent = hidden[:, :kept]
         x, recent = self.embedding(inputs, recent)
         x = self.drop(x)
         caches = []
@@ -95,42 +92,42 @@ class TransformerPrior(NeuralPrior):
         return self.head(self.norm(x)), torch.cat([recent, torch.stack(caches, 2).flatten(1)], 1)
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if self._may_write(state) is None:
+        if self.steps_in_place(state) is None:
             return super().step(action, state, context)
-        return self._write(action, state, context)
+        return self._step_in_place(action, state, context)
 
     def advance(
         self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
     ) -> tuple[Tensor, Tensor]:
-        most = self._may_write(state)
+        most = self.steps_in_place(state)
         if most is None or type(self).step is not TransformerPrior.step:
             return self.step(action, state, context)
-        return self._write(action, state, context, min(room, most))
+        return self._step_in_place(action, state, context, min(room, most))
 
-    def _write(
+    def _step_in_place(
         self, action: Tensor, state: Tensor, context: Tensor | None, room: int | None = None
     ) -> tuple[Tensor, Tensor]:
-        """A step in which new keys and values are written behind the cache, which is most of what there is to move.
+        """A step in which new keys and values are written behind the cache, which is the largest part of the state.
 
         Args:
             action, state, context: see `step`.
-            room: None: the cache is copied once, and `state` stays as it is. Else a state for which room was made is
-                written over, and any other copied to where so many further steps have room.
+            room: None: the cache is copied once, and `state` stays as it is. Otherwise a state that has room is
+                overwritten, and any other is copied to a tensor with room for so many further steps.
         """
-        memory, history = self._open(state)
+        hidden, history = self._split(state)
         new = self._inputs(action, context, history[:, -1])
         kept = 0 if self.window is None else history.shape[1] * self.input_size
-        recent, past, cached = self.lags - 1, memory.shape[1], memory.shape[1] + self._cache_size
-        before = state[:, past : past + kept].clone()  # where the cache will be
+        recent, past, cached = self.lags - 1, hidden.shape[1], hidden.shape[1] + self.cache_size
+        before = state[:, past : past + kept].clone()  # the cache will be written there
         size = cached + kept + self.input_size
-        x, line = self.embedding(new[:, None], memory[:, :recent])
+        x, line = self.embedding(new[:, None], hidden[:, :recent])
         after = None if room is None else grown(state, size)
         if after is None:
-            free = (room or 0) * (self._cache_size + self.input_size)
+            free = (room or 0) * (self.cache_size + self.input_size)
             after = state.new_empty(len(state), size) if room is None else states_with_room(state, size, free)
-            after[:, recent:past] = memory[:, recent:]
+            after[:, recent:past] = hidden[:, recent:]
         after[:, :recent] = line
-        places = after[:, recent:cached].unflatten(1, ((cached - recent) // self._cache_size, self.num_layers, -1))
+        places = after[:, recent:cached].unflatten(1, ((cached - recent) // self.cache_size, self.num_layers, -1))
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, _Block)
             x = block.step(x, places[:, :, layer])
@@ -138,16 +135,17 @@ class TransformerPrior(NeuralPrior):
         after[:, cached + kept :] = new
         return self.head(self.norm(x))[:, 0], after
 
-    def _may_write(self, state: Tensor) -> int | None:
-        """How many steps after the next can be written in place, too; None: not even that one.
+    def steps_in_place(self, state: Tensor) -> int | None:
+        """How many steps after the next can be written in place as well; None: not even the next one.
 
-        Nothing may be learned, nothing fall out of the window or span, and no subclass read in a way of its own.
+        In training, under autocast, where inputs leave the window or span, and in subclasses with an `encode` of their
+        own, steps are not written in place.
         """
         plain = type(self).encode is TransformerPrior.encode and not (self.training or torch.is_grad_enabled())
         if not plain or state.dim() == 3 or torch.is_autocast_enabled(state.device.type):
             return None
-        memory, history = self._open(state)
-        read = (memory.shape[1] - self.lags + 1) // self._cache_size
+        hidden, history = self._split(state)
+        read = (hidden.shape[1] - self.lags + 1) // self.cache_size
         limits = [
             *([] if self.window is None else [self.window - history.shape[1]]),
             *([] if self.span is None else [self.span - read - 1]),
@@ -156,27 +154,27 @@ class TransformerPrior(NeuralPrior):
         return None if most < 0 else most
 
     @property
-    def _cache_size(self) -> int:
-        """Numbers that are kept of an input."""
+    def cache_size(self) -> int:
+        """Numbers of the key-value cache for each input."""
         return self.num_layers * 2 * self.width
 
-    def _encode_in_parts(self, inputs: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The same for a long sequence, part by part: attention costs the square of what is read at once."""
+    def _encode_in_parts(self, inputs: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
+        """As `encode`, part by part, since the cost of attention grows with the square of what is read at once."""
         logits = []
         for part in inputs.split(self.span or inputs.shape[1], 1):
-            out, memory = self.encode(part, memory)
+            out, hidden = self.encode(part, hidden)
             logits.append(out)
-        assert memory is not None
-        return torch.cat(logits, 1), memory
+        assert hidden is not None
+        return torch.cat(logits, 1), hidden
 
-    def memory_size(self, state_size: int) -> int:
+    def hidden_size_of(self, state_size: int) -> int:
         if self.window is None:
             return state_size - self.input_size
-        return (state_size - self.lags + 1) // (self._cache_size + self.input_size) * self._cache_size + self.lags - 1
+        return (state_size - self.lags + 1) // (self.cache_size + self.input_size) * self.cache_size + self.lags - 1
 
 
 class _Block(nn.Module):
-    """Attention and a two-layer network, each behind a layer norm and added to its input."""
+    """Attention and a two-layer network, each after a layer norm and added to its input."""
 
     def __init__(self, width: int, num_heads: int, dropout: float) -> None:
         super().__init__()
@@ -192,8 +190,8 @@ class _Block(nn.Module):
     def forward(self, x: Tensor, past: Tensor | None, span: int | None) -> tuple[Tensor, Tensor]:
         """`x [N, T, width]` after `past [N, S, 2 * width]`: the new `x`, and the keys and values to be kept.
 
-        Each input attends to itself and those before it, at most `span` back. Positions count from the first of the
-        past; where that moves, because only the last `span` are kept, the kept keys are turned back by as much.
+        Each input attends to itself and those before it, at most `span` back. Positions count from the first input of
+        the past; where the oldest ones are dropped, the keys that are kept are rotated back by as many positions.
         """
         start = 0 if past is None else past.shape[1]
         place = torch.arange(start, start + x.shape[1], device=x.device)
@@ -216,18 +214,18 @@ class _Block(nn.Module):
         return self._add(x, self._attend(query, key, value, None))
 
     def _project(self, x: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values of `x [N, T, width]`, turned to their places `[T]`."""
+        """Queries, keys and values of `x [N, T, width]`, rotated to their positions `place [T]`."""
         query, key, value = self.query_key_value(self.attention_norm(x)).chunk(3, -1)
         return self._rotate(query, place), self._rotate(key, place), value
 
     def _add(self, x: Tensor, mixed: Tensor) -> Tensor:
-        """What attention found, and then the two-layer network, added to `x`."""
+        """`x` plus the output of attention, `mixed`, and then plus that of the two-layer network."""
         x = x + self.drop(self.out(mixed))
         added: Tensor = self.drop(self.mlp(x))
         return x + added
 
     def _attend(self, query: Tensor, key: Tensor, value: Tensor, span: int | None) -> Tensor:
-        """`[N, T, width]`: for each query what it finds among keys and values `[N, S + T, width]`."""
+        """`[N, T, width]`: attention of each query over keys and values `[N, S + T, width]`."""
         num, total = query.shape[1], key.shape[1]
         query, key, value = (v.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for v in (query, key, value))
         plain = num == total and (span is None or num <= span + 1)
@@ -241,7 +239,7 @@ class _Block(nn.Module):
         return mixed.transpose(1, 2).flatten(2)
 
     def _rotate(self, x: Tensor, place: Tensor) -> Tensor:
-        """Turn each pair of numbers of each head of `x [N, T, width]` by an angle proportional to `place [T]`."""
+        """Rotate each pair of numbers of each head of `x [N, T, width]` by an angle proportional to `place [T]`."""
         pairs = x.unflatten(-1, (self.num_heads, 2, -1))
         half = pairs.shape[-1]
         rate = 10_000 ** -(torch.arange(half, device=x.device) / half)

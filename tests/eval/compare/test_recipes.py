@@ -41,14 +41,14 @@ def test_counts_see_what_networks_see():
     _, number = plans.context.flatten(0, 1).unique(dim=0, return_inverse=True)
     counted = replace(plans, context=number.view(60, 3))
     plain = MarkovPrior(3, 2, num_contexts=int(number.max()) + 1).fit(counted)
-    told = prior.log_prob(plans.actions, plans.context)
-    assert torch.allclose(told, plain.log_prob(counted.actions, counted.context), atol=1e-5)
+    told = prior.log_prob(plans)
+    assert torch.allclose(told, plain.log_prob(counted), atol=1e-5)
     assert torch.allclose(told, stepped(prior, plans), atol=1e-5)
     grid = gridworld(4, 4)
     plans = collect(ExhaustivePlanner(2), grid, 20, context="step")
     assert sizes_of(grid, plans) == {"num_contexts": 16}
-    told = chain(1, grid, plans, ()).fit(plans).log_prob(plans.actions, plans.context)
-    assert torch.allclose(told, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans.actions, plans.context))
+    told = chain(1, grid, plans, ()).fit(plans).log_prob(plans)
+    assert torch.allclose(told, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans))
     assert isinstance(chain(1, grid, replace(plans, context=None), ()), MarkovPrior)
     assert network("gru", grid, plans, 0).num_contexts == 16
 
@@ -62,11 +62,11 @@ def test_at_sights_never_met_a_chain_goes_on_blind(per):
     prior, blind = ContextMarkov(2, 2, context_size=3), MarkovPrior(2, 2).fit(actions)
     prior.fit(Plans(actions, 2, context=seen))
     other = seen + 5
-    assert torch.allclose(prior.log_prob(actions, other), blind.log_prob(actions), atol=1e-6)
+    assert torch.allclose(prior.log_prob(Plans(actions, 2, context=other)), blind.log_prob(actions), atol=1e-6)
     if per == "step":
         half = torch.where(torch.arange(6)[:, None] < 3, seen, other)
         plans = Plans(actions, 2, context=half)
-        assert torch.allclose(stepped(prior, plans), prior.log_prob(actions, half), atol=1e-5)
+        assert torch.allclose(stepped(prior, plans), prior.log_prob(plans), atol=1e-5)
 
 
 def stepped(prior: Prior, plans: Plans) -> torch.Tensor:

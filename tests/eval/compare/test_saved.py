@@ -58,7 +58,8 @@ def test_context_goes_to_the_prior(per, tmp_path):
     found = load_for(saved(tmp_path, prior, plans), "maze", 3, ("down", "up", "right"))
     assert (found.context_per, found.num_contexts) == (per, 25)
     some, seen = every_plan(3, 3), torch.randint(25, (27,) if per == "plan" else (27, 3), generator=seeded(3))
-    torch.testing.assert_close(found.log_prob(some, seen), prior.log_prob(torch.tensor([2, 0, 1])[some], seen))
+    there = Plans(torch.tensor([2, 0, 1])[some], 3, context=seen)
+    torch.testing.assert_close(found.log_prob(Plans(some, 3, context=seen)), prior.log_prob(there))
 
 
 def test_a_planner_takes_it(tmp_path):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans
-from neuroprior.priors.counts.backoff import BACKOFFS, FALLBACK_DISCOUNTS, blend, kneser_ney_discounts
+from neuroprior.priors.counts.markov import BACKOFFS, FALLBACK_DISCOUNTS, blend, kneser_ney_discounts
 from tests.support.sources import distribution, seeded
 
 

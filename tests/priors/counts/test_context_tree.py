@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import ContextTreePrior, Plans, load, save
+from neuroprior.priors.counts.context_tree import Weighting
 from neuroprior.priors.counts.histories import Counts, Tree
-from neuroprior.priors.counts.weighting import Weighting
 from tests.support.sources import refuses, seeded
 
 BEGINNING = "beginning"
@@ -253,7 +253,7 @@ def test_the_best_tree_of_what_never_occurred():
     nothing = Tree.empty(3, torch.device("cpu")), Counts.empty(torch.device("cpu"))
     for beta in (0.05, 0.2, 0.5, 0.9):
         want = [math.log(max(p for _, p in trees(3, depth, beta))) for depth in (2, 1, 0)]
-        assert Weighting(*nothing, None, 3, 2, beta).never_seen() == pytest.approx(want)
+        assert Weighting(*nothing, None, 3, 2, beta).absent() == pytest.approx(want)
 
 
 def test_default_beta():

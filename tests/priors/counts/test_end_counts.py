@@ -66,7 +66,7 @@ def test_what_comes_after_the_end_costs_nothing(name):
     prior = fitted(name)
     short = prior.log_prob(torch.tensor([[0, 1, 2]]))
     assert torch.equal(short, prior.log_prob(torch.tensor([[0, 1, 2, 2, 2]])))
-    assert torch.equal(short, prior.log_prob(torch.tensor([[0, 1, 2, 0]]), lengths=torch.tensor([3])))
+    assert torch.equal(short, prior.log_prob(Plans(torch.tensor([[0, 1, 2, 0]]), 3, torch.tensor([3]))))
 
 
 @pytest.mark.parametrize("name", PRIORS)

@@ -8,8 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import ContextTreePrior, MarkovPrior, Plans
-from neuroprior.priors.counts import histories
-from neuroprior.priors.counts.grams import few_grams, grams
 from neuroprior.priors.counts.histories import count_histories
 from tests.support.sources import refuses, seeded
 
@@ -64,9 +62,7 @@ def names(tree, depth):
 @given(problems(), st.sampled_from([1, 7, 2**18]))
 def test_the_tree_and_its_counts(problem, at_once):
     plans, contexts, depth = problem
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(histories, "ACTIONS_AT_ONCE", at_once)
-        tree, counts = count_histories(plans, depth, contexts, True, torch.device("cpu"))
+    tree, counts = count_histories(plans, depth, contexts, True, torch.device("cpu"), at_once=at_once)
     truth = dictionary(plans, contexts, depth)
     name = names(tree, depth)
     assert len(name) == len(tree.parent) == len(tree.next_node)
@@ -84,20 +80,21 @@ def test_the_tree_and_its_counts(problem, at_once):
 @pytest.mark.parametrize(
     "make", [lambda: MarkovPrior(3, 4, num_contexts=2), lambda: ContextTreePrior(3, 6, num_contexts=2)]
 )
-def test_read_in_parts(make, monkeypatch):
+def test_read_in_parts(make):
     """Parts of any size give the same prior, but for the numbering of its histories."""
     generator = seeded(0)
     lengths = torch.randint(10, (300,), generator=generator)
     plans = Plans(torch.randint(3, (300, 9), generator=generator), 3, lengths, context=torch.arange(300) % 2)
     test, seen = torch.randint(3, (50, 12), generator=generator), torch.randint(2, (50, 12), generator=generator)
-    want = make().fit(plans)(test, seen)
-    monkeypatch.setattr(histories, "ACTIONS_AT_ONCE", 50)
-    torch.testing.assert_close(make().fit(plans)(test, seen), want)
+    want, prior = make().fit(plans)(test, seen), make()
+    depth = getattr(prior, "depth", 4)
+    prior.learn(*count_histories(plans, depth, 2, True, prior.device, at_once=50))
+    torch.testing.assert_close(prior(test, seen), want)
 
 
 @pytest.mark.parametrize("prior", [MarkovPrior(300, 3), ContextTreePrior(300, 3)])
-def test_tables_over_the_limit_are_refused(prior, monkeypatch):
-    monkeypatch.setattr(histories, "MAX_TABLE_BYTES", 10**6)
+def test_tables_over_the_limit_are_refused(prior):
+    prior.max_table_bytes = 10**6
     plans = torch.randint(300, (50, 20), generator=seeded(0))
     with refuses("fewer than 3 actions"):
         prior.fit(plans)
@@ -107,33 +104,47 @@ def test_tables_over_the_limit_are_refused(prior, monkeypatch):
 
 def test_rows_of_contexts_over_the_limit_are_refused(monkeypatch):
     plans = Plans(torch.zeros(1_000, 2).long(), 10, context=torch.arange(1_000))
-    monkeypatch.setattr(histories, "MAX_TABLE_BYTES", 10**5)
+    monkeypatch.setattr(MarkovPrior, "max_table_bytes", 10**5)
     MarkovPrior(10, 1).fit(plans)
     with refuses("histories"):
         MarkovPrior(10, 1, num_contexts=1_000).fit(plans)
-
-
-def test_many_plans_are_counted_by_their_short_sequences():
-    plans = Plans(torch.randint(4, (200, 30), dtype=torch.uint8, generator=seeded(0)), 4)
-    kept = plans.actions.clone()
-    assert few_grams(plans, 2)
-    assert not few_grams(plans, 30)
-    assert not few_grams(plans, 0)
-    assert not few_grams(plans[:2], 2)
-    sequences, times = grams(plans.actions, 3, 4, 7, torch.device("cpu"))
-    found = {tuple(one): number for one, number in zip(sequences.tolist(), times.tolist(), strict=True)}
-    assert found == Counter(tuple(plan[t : t + 3]) for plan in plans.actions.tolist() for t in range(28))
-    assert torch.equal(plans.actions, kept)
 
 
 @pytest.mark.parametrize("initial", ["joint", "lower"])
 @pytest.mark.parametrize(
     ("num_actions", "depth", "length"), [(1, 1, 3), (2, 1, 2), (2, 3, 4), (3, 2, 9), (4, 2, 30), (5, 1, 3)]
 )
-def test_counted_first_or_not_the_prior_is_the_same(num_actions, depth, length, initial, monkeypatch):
-    plans = Plans(torch.randint(num_actions, (2000, length), generator=seeded(0)).square() % num_actions, num_actions)
-    assert few_grams(plans, depth)
+def test_counted_by_ngrams_or_not_the_prior_is_the_same(num_actions, depth, length, initial):
+    actions = torch.randint(num_actions, (2000, length), generator=seeded(0)).square() % num_actions
+    plans = Plans(actions.to(torch.uint8), num_actions)
     test = torch.randint(num_actions, (50, length + 3), generator=seeded(1))
-    got = MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test)
-    monkeypatch.setattr(histories, "few_grams", lambda plans, depth: False)
-    torch.testing.assert_close(got, MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test))
+    want = MarkovPrior(num_actions, depth, initial=initial).fit(plans)(test)
+    for by_ngrams in (True, False):
+        prior = MarkovPrior(num_actions, depth, initial=initial)
+        counted = count_histories(plans, depth, None, prior.openings, prior.device, by_ngrams=by_ngrams)
+        prior.learn(*counted)
+        torch.testing.assert_close(prior(test), want)
+    assert torch.equal(plans.actions, actions.to(torch.uint8))
+
+
+def test_ngrams_are_counted_whole():
+    """Read some plans at a time, every sequence is counted as often as it occurs, and the plans stay as they are."""
+    plans = Plans(torch.randint(4, (200, 30), dtype=torch.uint8, generator=seeded(0)), 4)
+    kept = plans.actions.clone()
+    tree, counts = count_histories(plans, 2, None, True, torch.device("cpu"), at_once=7 * 30, by_ngrams=True)
+    name = names(tree, 2)
+    found = Counter()
+    for row, action, count in zip(counts.row.tolist(), counts.action.tolist(), counts.count.tolist(), strict=True):
+        found[(*name[int(counts.row_code[row])], 0, action)] = count
+    assert found == dictionary(plans, None, 2)
+    assert torch.equal(plans.actions, kept)
+
+
+@pytest.mark.parametrize(("num_plans", "depth"), [(200, 30), (200, 0), (2, 2), (10, 8)])
+def test_ngrams_only_where_they_are_few(num_plans, depth):
+    """Depths as long as the plans, of no action, or with too many possible sequences are counted otherwise."""
+    plans = Plans(torch.randint(4, (num_plans, 30), generator=seeded(0)), 4)
+    found = count_histories(plans, depth, None, True, torch.device("cpu"))
+    want = count_histories(plans, depth, None, True, torch.device("cpu"), by_ngrams=False)
+    assert all(a.equal(b) for a, b in zip(found[0][:2], want[0][:2], strict=True))
+    assert all(getattr(found[1], name).equal(getattr(want[1], name)) for name in ("row_code", "row", "action", "count"))

@@ -1,4 +1,4 @@
-"""`HistoryPrior.forward`, which reads long plans in parts side by side, against stepping, bit for bit."""
+"""`HistoryPrior.forward`, which reads long plans in chunks side by side, against stepping, bit for bit."""
 
 import pytest
 import torch
@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import ContextTreePrior, MarkovPrior, Plans, Prior
-from neuroprior.priors.counts import history_prior
-from neuroprior.priors.counts.history_prior import PART
+from neuroprior.priors.counts import HistoryPrior
 from tests.support.sources import seeded
 
+CHUNK = HistoryPrior.chunk_length
 MARKOV = [(initial, order) for initial in ("joint", "lower") for order in range(7)]
 PRIORS = {f"markov-{order} {initial}": (MarkovPrior, order, {"initial": initial}) for initial, order in MARKOV}
 PRIORS |= {f"tree-{depth}": (ContextTreePrior, depth, {}) for depth in (0, 1, 2, 3, 4, 5, 6, 10)}
@@ -47,14 +47,14 @@ def equals_stepping(prior: Prior, length: int, kind: str, seed: int = 0, num: in
 @pytest.mark.parametrize("kind", ["none", "plan", "step"])
 @pytest.mark.parametrize("name", PRIORS)
 def test_forward_is_stepping(name, kind):
-    """At every length from which plans are read in other parts; the shorter ones are beginnings of the longest."""
+    """At every length from which plans are read in other chunks; the shorter ones are beginnings of the longest."""
     make, depth, more = PRIORS[name]
     prior, longest = fitted(make, depth, more, kind), 1500 if depth in (0, 3, 6) else 600
     plans = torch.randint(3, (3, longest), generator=seeded(depth))
     plans[0] = torch.randint(2, (longest,), generator=seeded(depth + 1))  # as those learned from
     seen = contexts(kind, 3, 3, longest, seed=depth + 2)
-    want, edge = Prior.forward(prior, plans, seen), PART + depth
-    for length in (0, 1, PART, edge - 1, edge, edge + 1, 2 * edge - 1, 2 * edge, 2 * edge + 1, longest - 1, longest):
+    want, edge = Prior.forward(prior, plans, seen), CHUNK + depth
+    for length in (0, 1, CHUNK, edge - 1, edge, edge + 1, 2 * edge - 1, 2 * edge, 2 * edge + 1, longest - 1, longest):
         got = prior(plans[:, :length], seen[:, :length] if kind == "step" else seen)
         assert got.shape == (3, length, 3)
         assert torch.equal(got, want[:, :length]), length
@@ -70,17 +70,16 @@ def problems(draw):
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(problems(), st.integers(1, 12), st.integers(0, 2**31))
-def test_in_parts_of_any_size(problem, part, seed):
-    """Also where a part is shorter than the histories that count."""
+def test_in_chunks_of_any_size(problem, chunk, seed):
+    """Also where a chunk is shorter than the histories that matter."""
     prior, kind, length = problem
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(history_prior, "PART", part)
-        assert equals_stepping(prior, length, kind, seed)
+    prior.chunk_length = chunk
+    assert equals_stepping(prior, length, kind, seed)
 
 
-@pytest.mark.parametrize("depth", [PART, PART + 1, PART + 44])
-def test_histories_longer_than_a_part(depth):
-    """What matters lies further back than a part: plans that repeat `depth` random actions."""
+@pytest.mark.parametrize("depth", [CHUNK, CHUNK + 1, CHUNK + 44])
+def test_histories_longer_than_a_chunk(depth):
+    """What matters lies further back than a chunk: plans that repeat `depth` random actions."""
     period = torch.randint(2, (1, depth), generator=seeded(3))
     plans = period.repeat(1, 4)
     prior = ContextTreePrior(2, depth).fit(Plans(plans, 2))
@@ -113,7 +112,7 @@ def test_a_longer_plan_begins_as_a_shorter_one(name):
     prior = fitted(make, depth, more, "none")
     plans = torch.randint(3, (4, 1500), generator=seeded(7))
     whole = prior(plans)
-    for length in (1, PART, PART + depth, 2 * PART, 2 * (PART + depth) + 1, 1000):
+    for length in (1, CHUNK, CHUNK + depth, 2 * CHUNK, 2 * (CHUNK + depth) + 1, 1000):
         assert torch.equal(prior(plans[:, :length]), whole[:, :length]), length
     assert torch.equal(prior(plans[2:3]), whole[2:3])
 

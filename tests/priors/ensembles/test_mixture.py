@@ -73,10 +73,10 @@ def conformance() -> list[MixturePrior]:
     small = {"max_steps": 5, "progress": False}
     made = [weighted(MixturePrior(A, experts()), [0.1, 0.4, 0.3, 0.2], 0.1)]
     some = [MarkovPrior(A, 1, num_contexts=4), ContextTreePrior(A, 2), GRUPrior(A, 8, num_contexts=4)]
-    made.append(MixturePrior(A, some).fit(seen, seeded(0), **small))
+    made.append(MixturePrior(A, some).fit(seen, generator=seeded(0), **small))
     made.append(MixturePrior(A, [TransformerPrior(A, 16, window=2), GRUPrior(A, 8, window=1)]))
     nested = MixturePrior(A, [StackedPrior(A, 8, orders=(1,), depth=2), UniformPrior(A)])
-    return [*made, MixturePrior(A, [nested, MarkovPrior(A, 1)]).fit(plans, seeded(0), **small)]
+    return [*made, MixturePrior(A, [nested, MarkovPrior(A, 1)]).fit(plans, generator=seeded(0), **small)]
 
 
 @pytest.mark.parametrize("number", range(4), ids=["no context", "contexts", "windows", "nested"])
@@ -108,11 +108,11 @@ def test_a_share_is_learned_where_the_best_expert_changes():
 def test_it_is_saved_and_loaded(tmp_path):
     plans = some_plans(contexts=4)
     made = [MarkovPrior(A, 2, num_contexts=4), GRUPrior(A, 8, num_contexts=4), StackedPrior(A, 8, num_contexts=4)]
-    prior = MixturePrior(A, made).fit(plans, seeded(0), max_steps=5, progress=False)
+    prior = MixturePrior(A, made).fit(plans, generator=seeded(0), max_steps=5, progress=False)
     again = load(save(prior, tmp_path / "mixture"))
     assert isinstance(again, MixturePrior)
     assert again.share == prior.share
-    assert again.log_prob(plans.actions, plans.context).equal(prior.log_prob(plans.actions, plans.context))
+    assert again.log_prob(plans).equal(prior.log_prob(plans))
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def some_plans(num: int = 30, length: int = 12, per: str = "step", seed: int = 0
 
 def fitted(plans: Plans, sees: bool, **settings) -> StackedPrior:
     prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C if sees else None)
-    return prior.fit(plans, seeded(0), **({"max_steps": 10, "progress": False} | settings))
+    return prior.fit(plans, generator=seeded(0), **({"max_steps": 10, "progress": False} | settings))
 
 
 @pytest.mark.parametrize("sees", [False, True])
@@ -60,7 +60,7 @@ def test_it_sees_how_long_ago_an_action_was_taken_here():
     _, state = prior.start(6, context[:, 0])
     for t in range(19):
         _, state = prior.step(actions[:, t], state, context[:, t + 1])
-        _, _, since, here = prior._open(state)
+        _, _, since, here = prior._unpacked(state)
         assert here.equal(context[:, t + 1])
         code = here[:, None] * A + torch.arange(A)
         assert ((since.gather(1, code) + 1).log() * 2 / 3).allclose(ago[:, t + 1], atol=1e-5)
@@ -99,7 +99,7 @@ def test_it_learns_what_counts_cannot_hold():
     """One bit is what an action holds, two choices; a chain of any order knows little of it."""
     training, held_out = memories(200, 0), memories(100, 1)
     stacked = StackedPrior(A, 32, 0.1, (1, 2), 3, num_contexts=C)
-    stacked.fit(training, seeded(0), max_steps=250, progress=False)
+    stacked.fit(training, generator=seeded(0), max_steps=250, progress=False)
     mine = score("stacked", stacked, held_out).bits_per_action().mean
     chains = [MarkovPrior(A, order, num_contexts=C).fit(training) for order in range(4)]
     best = min(score("chain", chain, held_out).bits_per_action().mean for chain in chains)
@@ -111,7 +111,7 @@ def test_it_is_saved_and_loaded(tmp_path):
     plans = some_plans()
     prior = fitted(plans, True)
     again = load(save(prior, tmp_path / "stacked"))
-    assert again.log_prob(plans.actions, plans.context).equal(prior.log_prob(plans.actions, plans.context))
+    assert again.log_prob(plans).equal(prior.log_prob(plans))
     assert again.config == prior.config
     same = fitted(plans, True)
     assert all(a.equal(b) for a, b in zip(prior.state_dict().values(), same.state_dict().values(), strict=True))

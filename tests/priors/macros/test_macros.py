@@ -21,7 +21,7 @@ from neuroprior import (
     load,
     save,
 )
-from neuroprior.priors.macros.macros import CRITERIA
+from neuroprior.priors.macros import CRITERIA
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, random_world, refuses, seeded
 

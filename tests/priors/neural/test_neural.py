@@ -85,9 +85,9 @@ def test_learns_from_each_kind_of_context(kind, what, per):
     prior = small(kind, **arguments)
     prior.fit(Plans(actions, 3, context=context), generator=seeded(0), max_steps=60, learning_rate=0.03, progress=False)
     assert prior.context_per == per
-    assert prior.log_prob(actions, context).exp().mean() > 0.7  # chance: 1/81
+    assert prior.log_prob(Plans(actions, 3, context=context)).exp().mean() > 0.7  # chance: 1/81
     wrong = context.roll(1, -1) if what == "features" else (context + 1) % 3
-    assert prior.log_prob(actions, wrong).exp().mean() < 1 / 81
+    assert prior.log_prob(Plans(actions, 3, context=wrong)).exp().mean() < 1 / 81
 
 
 @BOTH
@@ -95,7 +95,7 @@ def test_lengths_mask_the_loss(kind):
     """Beyond a plan's length nothing is learned: there action 0 is stored, but 1 and 2 are all that is ever done."""
     actions = torch.randint(1, 3, (400, 6), generator=seeded(0))
     lengths = torch.randint(7, (400,), generator=seeded(1))
-    prior = small(kind).fit(Plans(actions, 3, lengths), seeded(0), max_steps=60, learning_rate=0.03, progress=False)
+    prior = small(kind).fit(Plans(actions, 3, lengths), generator=seeded(0), max_steps=60, learning_rate=0.03, progress=False)
     with torch.no_grad():
         first = prior(torch.randint(1, 3, (50, 6), generator=seeded(2))).softmax(-1)[..., 0]
     assert first.max() < 0.05
@@ -111,7 +111,7 @@ def test_fit_sets_the_window_to_the_longest_plan(kind, lengths):
 
 @BOTH
 def test_plans_of_one_action(kind):
-    prior = small(kind).fit(torch.tensor([[1], [1], [1], [2]] * 50), seeded(0), progress=False, max_steps=200)
+    prior = small(kind).fit(torch.tensor([[1], [1], [1], [2]] * 50), generator=seeded(0), progress=False, max_steps=200)
     probs = prior(torch.zeros(1, 4, dtype=torch.long)).softmax(-1)[0]
     torch.testing.assert_close(probs, torch.tensor([[0, 0.75, 0.25]]).expand(4, 3), atol=0.1, rtol=0)
 
@@ -209,8 +209,8 @@ def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, spa
     action = torch.randint(4, (7, batch), generator=seeded(0))
     context = {"num_contexts": torch.arange(batch), "context_size": torch.rand(batch, 2, generator=seeded(1))}
     seen = next((context[name] for name in sees), None)
-    may, answers = prior._may_write, []
-    monkeypatch.setattr(prior, "_may_write", lambda state: answers.append(may(state)) or answers[-1])
+    may, answers = prior.steps_in_place, []
+    monkeypatch.setattr(prior, "steps_in_place", lambda state: answers.append(may(state)) or answers[-1])
 
     def steps(step, learning=False):
         with torch.set_grad_enabled(learning):
@@ -269,10 +269,10 @@ def test_a_transformer_in_training_or_in_rough_numbers_does_not_write_in_place()
     prior = TransformerPrior(4, width=8, num_heads=2)
     with torch.no_grad():
         _, state = prior.start(3)
-        assert prior._may_write(state) is not None
+        assert prior.steps_in_place(state) is not None
         with torch.autocast("cpu", torch.bfloat16):
-            assert prior._may_write(state) is None
-        assert prior.train()._may_write(state) is None
+            assert prior.steps_in_place(state) is None
+        assert prior.train().steps_in_place(state) is None
 
 
 class NeverFirst(TransformerPrior):
@@ -286,9 +286,9 @@ class NeverFirst(TransformerPrior):
 class Loud(TransformerPrior):
     """Reads in a way of its own."""
 
-    def encode(self, inputs, memory=None):
-        logits, memory = super().encode(inputs, memory)
-        return 2 * logits + 1, memory
+    def encode(self, inputs, hidden=None):
+        logits, hidden = super().encode(inputs, hidden)
+        return 2 * logits + 1, hidden
 
 
 @pytest.mark.parametrize("kind", [NeverFirst, Loud])
@@ -328,4 +328,4 @@ def test_no_more_room_is_taken_than_is_used(window, span):
     with torch.no_grad():
         _, state = prior.start(2)
         _, state = prior.advance(torch.tensor([0, 1]), state, None, 10**6)
-    assert state.untyped_storage().nbytes() < 2 * 4 * 12 * (prior._cache_size + prior.lags + 1)
+    assert state.untyped_storage().nbytes() < 2 * 4 * 12 * (prior.cache_size + prior.lags + 1)

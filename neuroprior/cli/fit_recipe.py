@@ -1,0 +1,170 @@
+"""Recipes of `fit`: where those that come with the package are, and their sections `data` and `model`."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from neuroprior.planners import Planner, collect
+from neuroprior.plans import Plans, read_plans
+from neuroprior.priors import Prior
+from neuroprior.priors.fitting import context_arguments, make_prior
+from neuroprior.training import PlansModule, PriorModule, Settings
+from neuroprior.worlds import World
+
+PARTS, LEAST_ACTIONS = 3, 2
+"""Parts that plans are split into, and the fewest actions of each."""
+
+MOST_INDICES = 2**20
+"""Actions or contexts beyond which indices are taken for names that look like numbers."""
+
+
+def recipes() -> dict[str, Path]:
+    """The recipes that come with the package, by name: from the wheel, or from `train/` in a checkout."""
+    shipped = Path(str(files("neuroprior.cli"))) / "recipes"
+    folder = shipped if shipped.is_dir() else Path(__file__).parents[2] / "train"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def recipe_path(name: str) -> str:
+    """The file of a recipe that is given by its path or its name.
+
+    Raises:
+        ValueError: there is neither a file nor a recipe of this name.
+    """
+    known = recipes()
+    if not Path(name).is_file() and name not in known:
+        raise ValueError(f"config: no file {name!r}, and no recipe of this name; the recipes are {', '.join(known)}")
+    return name if Path(name).is_file() else str(known[name])
+
+
+class PlansData(PlansModule):
+    """Plans to learn from, for early stopping and choices (validation), and for the table at the end (held out).
+
+    Args:
+        file: plans to learn from: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
+        num_actions: number of actions, where the file does not say.
+        action_names: names of the actions in the order of their numbers, where the file does not say.
+        world: where plans are collected if no file is given, such as `neuroprior.worlds.gridworld`.
+        planner: that chooses them, such as `ExhaustivePlanner`.
+        num_plans: how many are collected.
+        context: the world's observations as context: none, that at the start, or that before each action.
+        end: close each plan with a symbol for its end, so that the prior learns how long plans are.
+        validation: share of plans (of groups, where there are any) for early stopping and the choice of baselines.
+        held_out: share of plans (or groups) for the table at the end; nothing is learned or chosen on them.
+        batch_size: plans a step (pieces of plans, where they are longer than a window).
+        window: actions that a step reads of a plan; longer plans are read in windows, the hidden state carried over.
+        check_every: steps between two validations; null for two passes through the plans, but at least 10 and at most
+            100.
+        max_steps: steps of training.
+        seed: draws the collected plans, the split and the order of training.
+    """
+
+    def __init__(
+        self,
+        file: str | None = None,
+        num_actions: int | None = None,
+        action_names: list[str] | None = None,
+        world: World | None = None,
+        planner: Planner | None = None,
+        num_plans: int = 10_000,
+        context: Literal["plan", "step"] | None = None,
+        end: bool = False,
+        validation: float = 0.1,
+        held_out: float = 0.1,
+        batch_size: int = 64,
+        window: int = 128,
+        check_every: int | None = None,
+        max_steps: int = 1000,
+        seed: int = 0,
+    ) -> None:
+        for name, share in (("validation", validation), ("held_out", held_out)):
+            if not 0 < share < 1:
+                raise ValueError(f"data.{name}: a share between 0 and 1 is expected, not {share}")
+        if validation + held_out >= 1:
+            raise ValueError(f"data: validation and held_out leave nothing to learn from: {validation} + {held_out}")
+        settings = Settings(max_steps, batch_size, window, check_every=check_every)
+        if file is not None:
+            self.source = read_plans(file, num_actions=num_actions, action_names=action_names)
+        elif world is not None and planner is not None:
+            generator = torch.Generator().manual_seed(seed)
+            self.source = collect(planner, world, num_plans, context=context, generator=generator)
+        else:
+            raise ValueError("data: give either --data.file, or both --data.world and --data.planner")
+        _check_indices("action", self.source.num_actions)
+        self.plans = _in_parts(self.source.with_end() if end and self.source.end is None else self.source)
+        self.num_contexts = context_arguments(self.plans).get("num_contexts")
+        _check_indices("context", self.num_contexts or 0)
+        # Seeded anew, so that collected plans are split in the same way when they come from the run's own copy.
+        generator = torch.Generator().manual_seed(seed)
+        rest, self.held_out = self.plans.split(held_out, generator)
+        self.learned_from, self.chosen_on = rest.split(validation / (1 - held_out), generator)
+        for name, part in (("validation", self.chosen_on), ("held_out", self.held_out)):
+            if int(part.mask().sum()) < LEAST_ACTIONS:
+                raise ValueError(
+                    f"data.{name}: too few actions are left for it, {int(part.mask().sum())}; more plans are needed"
+                )
+        super().__init__(self.learned_from, self.chosen_on, settings, seed)
+        self.settings = replace(settings, validation=validation)
+
+
+class PriorModel(PriorModule):
+    """The prior to be trained.
+
+    Args:
+        prior: its class, such as `GRUPrior`; its other arguments go below it (`--model.prior.hidden_size 128`). The
+            number of actions and of contexts come from the plans.
+        use_context: whether it takes the context of the plans, where they have one.
+        learning_rate: of AdamW, after the first tenth of the steps; it falls to 0 with half a cosine.
+        weight_decay: of AdamW.
+        data: the plans.
+
+    Raises:
+        ValueError: the prior cannot take the context of the plans, or an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        prior: Callable[[int], Prior],
+        use_context: bool = True,
+        learning_rate: float = 5e-3,
+        weight_decay: float = 0.01,
+        data: PlansData | None = None,
+    ) -> None:
+        assert data is not None
+        try:
+            made = make_prior(data.plans, prior, use_context)
+        except TypeError as error:
+            if "unexpected keyword" not in str(error) or data.plans.context is None:
+                raise
+            raise ValueError(
+                "model.prior: it cannot take the context of these plans; use --model.use_context false, or another"
+                f" prior ({error})"
+            ) from error
+        super().__init__(made, learning_rate, weight_decay, data.seed)
+
+
+def _in_parts(plans: Plans) -> Plans:
+    """Plans that can be split in three; a single group is dropped, so that its plans can be split."""
+    if plans.group is None:
+        units, what = len(plans), "plans"
+        if units == 1:
+            units, what = int(plans.mask().sum()), "actions"
+    else:
+        units, what = len(plans.group.unique()), "groups"
+        if units == 1:
+            return _in_parts(replace(plans, group=None, group_names=None))
+    if units < PARTS:
+        raise ValueError(
+            f"data: {units} {what} cannot be split in three, to learn from, for validation and held out;"
+            f" at least {PARTS} {what} are needed"
+        )
+    return plans
+
+
+def _check_indices(what: str, number: int) -> None:
+    if number > MOST_INDICES:
+        raise ValueError(f"data: {what} indices go up to {number - 1}; number them from 0, or write them as names")

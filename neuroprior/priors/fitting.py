@@ -1,0 +1,97 @@
+"""Fitting in one call: a prior is made for the plans, and learns from them."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import Plans
+from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
+from neuroprior.priors.ensembles import MixturePrior, StackedPrior
+from neuroprior.priors.neural import GRUPrior, TransformerPrior
+from neuroprior.priors.prior import Prior
+from neuroprior.priors.uniform import UniformPrior
+
+MakePrior = Callable[..., Prior]
+"""A prior's class, or a function: of the number of actions, and perhaps of `num_contexts` or `context_size`."""
+
+
+def fit(
+    plans: Plans | Tensor,
+    prior: MakePrior | str = GRUPrior,
+    *,
+    generator: torch.Generator | None = None,
+    **settings: Any,
+) -> Prior:
+    """Make a prior for plans, and fit it to them.
+
+    Args:
+        plans: `Plans`, or integers `[N, L]` for plans without context, of as many actions as occur.
+        prior: its class, such as `GRUPrior`; a function that makes it, such as `partial(GRUPrior, hidden_size=128)`,
+            called with the number of actions and, where it takes it, `num_contexts` or `context_size`; or one of the
+            names in `NAMES`. A prior that cannot take the context of the plans ignores it.
+        generator: source of randomness; see `Prior.fit`.
+        settings: of the prior's `fit`, such as `max_steps=500`; see `neuroprior.training.Settings`.
+
+    Returns:
+        The fitted prior.
+
+    Raises:
+        ValueError: an unknown name, plans that the prior cannot learn from, or a setting that it does not have.
+    """
+    if not isinstance(plans, Plans):
+        actions = torch.as_tensor(plans)
+        plans = Plans(actions, int(actions.max()) + 1 if actions.numel() else 1)
+    if isinstance(prior, str):
+        if prior not in NAMES:
+            raise ValueError(f"prior: one of {', '.join(NAMES)} is expected, not {prior!r}")
+        prior = NAMES[prior]
+    return make_prior(plans, prior).fit(plans, generator=generator, **settings)
+
+
+def make_prior(plans: Plans, prior: MakePrior, use_context: bool = True) -> Prior:
+    """A prior for plans: with their number of actions, and their kind of context where it can take one.
+
+    Args:
+        plans: that it is to learn from.
+        prior: its class, or a function that makes it; see `fit`.
+        use_context: False: the prior is made without context.
+    """
+    contexts = context_arguments(plans) if use_context else {}
+    parameters = inspect.signature(prior).parameters
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    return prior(plans.num_actions, **{name: c for name, c in contexts.items() if takes_any or name in parameters})
+
+
+def context_arguments(plans: Plans) -> dict[str, int]:
+    """The constructor's arguments of a prior that takes the context of `plans`: `num_contexts`, `context_size` or none.
+
+    The number of contexts is that of their names, if these are more than occur.
+    """
+    context = plans.context
+    if context is None:
+        return {}
+    if context.is_floating_point():
+        return {"context_size": context.shape[-1]}
+    most = int(context.max()) + 1 if context.numel() else 1
+    return {"num_contexts": max(most, len(plans.context_names or ()))}
+
+
+def _mixture(num_actions: int, num_contexts: int | None = None) -> MixturePrior:
+    """Chains, a context tree and a network."""
+    kinds = (MarkovPrior, ContextTreePrior, GRUPrior)
+    return MixturePrior(num_actions, [kind(num_actions, num_contexts=num_contexts) for kind in kinds])
+
+
+NAMES: dict[str, MakePrior] = {
+    "uniform": UniformPrior,
+    "markov": MarkovPrior,
+    "context-tree": ContextTreePrior,
+    "gru": GRUPrior,
+    "transformer": TransformerPrior,
+    "stacked": StackedPrior,
+    "mixture": _mixture,
+}
+"""Priors that `fit` knows by name."""

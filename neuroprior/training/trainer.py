@@ -1,0 +1,244 @@
+"""The trainer: Lightning's, with early stopping and checkpoints, for `fit` and for the command line alike."""
+
+import io
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import nn
+
+from neuroprior._files import write_whole
+from neuroprior._threads import one_thread
+from neuroprior.plans import Plans
+from neuroprior.training.batches import PlansModule
+from neuroprior.training.module import PriorModule
+from neuroprior.training.settings import Settings
+
+SMALL_STEP = 1e9
+"""Operations in a training step below which it runs on one thread."""
+
+CHECKPOINTS = "checkpoints"
+"""Folder of `best.ckpt` and `last.ckpt`, in the folder of a training."""
+
+
+def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> float:
+    """Train `prior` in place, keeping the weights with the lowest loss on held-out plans.
+
+    Args:
+        prior: any module with `forward(plans, context) -> logits [N, L, A]`; one without `forward_from` (see
+            `NeuralPrior`) is trained on whole plans, however long.
+        plans: at least two plans (two groups, where there are any), each with an action; or a single long one, whose
+            end is then held out.
+        settings: how.
+        seed: draws the held-out plans and the order of training; the same seed gives the same weights on a CPU.
+
+    Returns:
+        Bits per action on the held-out plans.
+
+    Raises:
+        ValueError: too few plans or groups, or the training diverged.
+    """
+    device = next(prior.parameters()).device
+    training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
+    window = settings.window if hasattr(prior, "forward_from") else plans.max_length
+    data = PlansModule(training, validation, replace(settings, window=window), seed)
+    cuda = device.type == "cuda"
+    with quiet(), tempfile.TemporaryDirectory() as folder, torch.random.fork_rng([device] if cuda else []):
+        torch.manual_seed(seed)
+        trainer = make_trainer(
+            folder,
+            settings.max_steps,
+            settings.patience,
+            data.steps,
+            accelerator="gpu" if cuda else device.type,
+            devices=[device.index or 0] if cuda else 1,
+            gradient_clip_val=settings.gradient_clip,
+            enable_progress_bar=settings.progress,
+            logs=False,
+        )
+        module = PriorModule(prior, settings.learning_rate, settings.weight_decay, seed)
+        best = run_training(trainer, module, data)
+        module.to(device)
+    return best
+
+
+def make_trainer(
+    folder: str = "",
+    max_steps: int = 1000,
+    patience: int = 400,
+    validate_every: int = 100,
+    accelerator: str = "auto",
+    devices: int | str | list[int] = 1,
+    num_nodes: int = 1,
+    strategy: str = "auto",
+    precision: str | int = "32-true",
+    gradient_clip_val: float = 1.0,
+    accumulate_grad_batches: int = 1,
+    max_time: str | None = None,
+    enable_progress_bar: bool = True,
+    logs: bool = True,
+    callbacks: list[lightning.Callback] | None = None,
+) -> lightning.Trainer:
+    """Lightning's trainer for a `PriorModule` and a `PlansModule`.
+
+    An epoch is what lies between two validations. After each of them the best and the last checkpoint are kept.
+
+    Args:
+        folder: of checkpoints and logs.
+        max_steps: gradient steps at most (rounded up to whole epochs); the learning rate falls to 0 over them.
+        patience: steps without lower validation bits after which training stops (rounded up to whole epochs).
+        validate_every: steps between two validations, as in `PlansModule.steps`.
+        accelerator: "cpu", "gpu", or "auto".
+        devices: number of devices, or their numbers.
+        num_nodes: machines.
+        strategy: "ddp" for several devices (processes, on a CPU).
+        precision: "bf16-mixed" on a GPU that has it.
+        gradient_clip_val: the largest norm of a gradient.
+        accumulate_grad_batches: batches for one step of the optimiser.
+        max_time: stop after so much time, DD:HH:MM:SS.
+        enable_progress_bar: show it.
+        logs: write logs as CSV and for TensorBoard.
+        callbacks: further callbacks of Lightning's.
+
+    Raises:
+        ValueError: a number of steps or batches below 1.
+    """
+    steps = {"max_steps": max_steps, "patience": patience, "accumulate_grad_batches": accumulate_grad_batches}
+    for name, number in steps.items():
+        if number < 1:
+            raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
+    stopping = Stopping("validation_bits", patience=ceil(patience / validate_every), min_delta=1e-4)
+    checkpoints = Checkpoints(
+        Path(folder) / CHECKPOINTS,
+        "best",
+        monitor="validation_bits",
+        save_last=True,
+        save_on_train_epoch_end=True,
+        enable_version_counter=False,
+    )
+    return lightning.Trainer(
+        max_epochs=ceil(max_steps / validate_every),
+        accelerator=accelerator,
+        devices=devices,
+        num_nodes=num_nodes,
+        strategy=strategy,
+        precision=precision,  # type: ignore[arg-type]
+        gradient_clip_val=gradient_clip_val,
+        accumulate_grad_batches=accumulate_grad_batches,
+        max_time=max_time,
+        enable_progress_bar=enable_progress_bar,
+        callbacks=[stopping, checkpoints, *(callbacks or [])],
+        logger=[CSVLogger(folder, "logs"), TensorBoardLogger(folder, "tensorboard", "")] if logs else False,
+        plugins=[WholeCheckpoints()],
+        num_sanity_val_steps=0,
+        log_every_n_steps=10,
+        use_distributed_sampler=False,
+        enable_model_summary=False,
+        default_root_dir=folder,
+    )
+
+
+def run_training(
+    trainer: lightning.Trainer, module: PriorModule, data: PlansModule, checkpoint: Path | None = None
+) -> float:
+    """Train a module, and load its best weights (of several processes, in the first alone).
+
+    Args:
+        trainer: of `make_trainer`.
+        module, data: what is trained, and on what.
+        checkpoint: where to go on from.
+
+    Returns:
+        The validation bits per action of the best weights.
+
+    Raises:
+        ValueError: the training diverged, or ended before the first validation.
+        KeyboardInterrupt: Ctrl-C.
+    """
+    try:
+        with few_threads(module.prior, data):
+            trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except SystemExit as interrupted:
+        # Lightning turns Ctrl-C into this; other processes of the same training are ended by it.
+        if not trainer.interrupted or not trainer.is_global_zero:
+            raise
+        raise KeyboardInterrupt from interrupted
+    if not trainer.is_global_zero:
+        return float("nan")
+    best = trainer.checkpoint_callback
+    assert isinstance(best, ModelCheckpoint)
+    if best.best_model_score is None:
+        raise ValueError("training ended before the first validation; nothing was learned")
+    if not best.best_model_score.isfinite():
+        raise ValueError(f"training diverged; a learning_rate below {module.learning_rate} may help")
+    saved = torch.load(best.best_model_path, weights_only=True, map_location=module.device)
+    module.load_state_dict(saved["state_dict"])
+    module.eval()
+    return float(best.best_model_score)
+
+
+class Stopping(EarlyStopping):
+    """Early stopping that also stops a training which is resumed after it was stopped."""
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if self.wait_count >= self.patience:
+            trainer.should_stop = True
+
+
+class Checkpoints(ModelCheckpoint):
+    """The best and the last checkpoint in a folder that may be moved between two runs."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        def here(path: str) -> str:
+            return str(Path(str(self.dirpath)) / Path(path).name) if path else path
+
+        paths = ("best_model_path", "kth_best_model_path", "last_model_path")
+        moved = {name: here(state_dict[name]) for name in paths}
+        models = {here(path): score for path, score in state_dict["best_k_models"].items()}
+        super().load_state_dict(state_dict | moved | {"best_k_models": models, "dirpath": self.dirpath})
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints that are written whole or not at all, whenever the process is killed."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        write_whole(Path(path), content.getvalue())
+
+
+@contextmanager
+def few_threads(prior: nn.Module, data: PlansModule) -> Iterator[None]:
+    """One thread for small steps: more threads gain little there, and on a busy machine wait for one another."""
+    tokens = data.training.group_size * data.training.window
+    operations = 6 * tokens * sum(weight.numel() for weight in prior.parameters())
+    with one_thread(operations < SMALL_STEP):
+        yield
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Silence Lightning's remarks on the machine and on worker processes; its errors and progress bar stay."""
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="lightning")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
