@@ -10,7 +10,6 @@ from torch import Tensor
 
 from eval.worlds.suite import Task, best_score
 from neuroprior import Prior, SamplingPlanner, TabularWorld, World, expected_score
-from neuroprior.planners.chance import mean_scores
 
 ROLLOUTS = 16
 """Of each candidate, where chance decides."""
@@ -111,17 +110,11 @@ def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.
     """
     told, true = [], []
     for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
-        if starts.world.stochastic:
-            plans = planner.proposals(starts.world, state, generator)
-            told.append(mean_scores(planner, starts.world, state, plans, ROLLOUTS, generator)[0])
-            true.append(worth(starts.task, starts.world, state, plans))
-            continue
-        _, rollout = planner.candidates(starts.world, state, generator)
-        score = planner.scored(rollout)[0]
+        plans, score, _ = planner.candidates(starts.world, state, generator)
         if planner.any_prefix:
             score = score.amax(-1)
         told.append(score)
-        true.append(score)
+        true.append(worth(starts.task, starts.world, state, plans) if starts.world.stochastic else score)
     return torch.cat(told), torch.cat(true)
 
 

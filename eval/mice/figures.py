@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from eval.paper.figures import save
-from neuroprior import Plans, Prior, SamplingPlanner, TabularWorld, labyrinth, oracle
+from neuroprior import Plans, Prior, TabularWorld, labyrinth, oracle
+from neuroprior.sampling import sample_in_world
 from neuroprior.worlds.labyrinth import DEPTH, WATER
 
 COLORS = {"uniform": "#7f7f7f", "markov": "#2171b5", "gru": "#e6550d", "transformer": "#88419d", "oracle": "black"}
@@ -101,8 +102,7 @@ def plans_in_maze(path: Path, priors: dict[str, Prior], world: TabularWorld, see
     for axes, (name, prior), color in zip(figure.subplots(1, len(priors)), priors.items(), colors, strict=True):
         _corridors(axes, place, 5.5)
         generator = torch.Generator().manual_seed(seed)
-        planner = SamplingPlanner(prior, 16, number, any_prefix=True)
-        _, rollout = planner.candidates(world, start, generator)
+        _, rollout = sample_in_world(prior, world, start, number, 16, generator=generator, keep_states=True)
         assert rollout.states is not None
         course = torch.cat([start.expand(number, 1), rollout.states[0]], 1)
         shift = 0.4 * (torch.rand(number, 1, 2, generator=generator) - 0.5)

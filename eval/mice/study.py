@@ -23,6 +23,7 @@ from neuroprior import (
 )
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
+from neuroprior.sampling import sample_in_world
 from neuroprior.worlds.labyrinth import WATER
 
 ORDERS = range(9)
@@ -137,16 +138,17 @@ def shares_reached(
     Returns:
         `[T, P]`, float64, for T `lengths` and P `num_plans`.
     """
-    planner = SamplingPlanner(prior, max(lengths), max(num_plans), objective="return")
-    found = torch.empty(len(start), planner.num_plans, len(lengths), dtype=torch.bool)
+    most = max(num_plans)
+    found = torch.empty(len(start), most, len(lengths), dtype=torch.bool)
     ends = torch.tensor(lengths) - 1
-    size = max(ROWS // planner.num_plans, 1)
+    size = max(ROWS // most, 1)
     for at in range(0, len(start), size):
-        _, rollout = planner.candidates(world, start[at : at + size], generator)
+        some = start[at : at + size]
+        _, rollout = sample_in_world(prior, world, some, most, max(lengths), generator=generator)
         found[at : at + size] = (rollout.rewards.cumsum(-1) > 0)[..., ends]
     shares = []
     for number in num_plans:
-        blocks = planner.num_plans // number
+        blocks = most // number
         block = found[:, : blocks * number].view(len(start), blocks, number, len(lengths))
         shares.append(block.any(2).double().mean((0, 1)))
     return torch.stack(shares, 1)

@@ -10,8 +10,7 @@ from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
-from neuroprior.planners.collect import executed, observed
-from neuroprior.planners.execution import Change, follow, joined
+from neuroprior.planners.execution import Change, executed_steps, follow, join_executions, observations
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior, UniformPrior
@@ -125,7 +124,7 @@ class Agent:
             self.time += self.replan_every
             parts.append(done)
             self._learn(done)
-        return joined(parts)
+        return join_executions(parts)
 
     def _decide(self) -> Decision:
         decision = self.planner.plan(self.world, self.state, self.generator)
@@ -158,7 +157,7 @@ class Agent:
         self.recent.append(done)
         if self.time % self.plan_length:
             return
-        self._remember(joined(self.recent))
+        self._remember(join_executions(self.recent))
         self.recent, self.before = [], self.state
         if self.time % self.learn_every == 0:
             self.replay.forget(self.generator)
@@ -169,11 +168,11 @@ class Agent:
     def _remember(self, done: Execution) -> None:
         """Put a plan that was executed from the state `before` into the replay."""
         before = torch.cat([self.before[:, None], done.states[:, :-1]], 1)
-        lengths = executed(self.world, before)
+        lengths = executed_steps(self.world, before)
         kept = lengths > 0
         if self.min_score is not None:
             kept &= done.rewards.sum(1) > self.min_score
-        seen = observed(self.world, before, self.prior.context_per)
+        seen = observations(self.world, before, self.prior.context_per)
         plans = Plans(done.actions, self.world.num_actions, lengths, self.world.action_names, seen)
         if kept.any():
             self.replay.add(plans[kept])

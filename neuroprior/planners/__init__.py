@@ -1,18 +1,17 @@
-"""Planners: they choose, for each start, a plan with a high score."""
+"""Planners: they choose, for each start, a plan with a high score; executing, collecting and scoring plans."""
 
-from neuroprior.planners.collect import collect
 from neuroprior.planners.cross_entropy import CrossEntropyPlanner
 from neuroprior.planners.distinct import DistinctPlanner
-from neuroprior.planners.execution import Execution, execute
+from neuroprior.planners.exact import expected_score, oracle
+from neuroprior.planners.execution import Execution, collect, execute
 from neuroprior.planners.exhaustive import ExhaustivePlanner
-from neuroprior.planners.expected import expected_score
 from neuroprior.planners.foraging import ForagingOracle
 from neuroprior.planners.frontier import FrontierPlanner
 from neuroprior.planners.horizon import HorizonPlanner
 from neuroprior.planners.horizon_curriculum import HorizonRound, extend_horizon
 from neuroprior.planners.mcts import MCTSPlanner
-from neuroprior.planners.oracle import oracle
-from neuroprior.planners.planner import Decision, Planner
+from neuroprior.planners.planner import Decision, Planner, PriorPlanner, random_best
+from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
 
 __all__ = [
@@ -23,14 +22,17 @@ __all__ = [
     "ExhaustivePlanner",
     "ForagingOracle",
     "FrontierPlanner",
-    "HorizonRound",
     "HorizonPlanner",
+    "HorizonRound",
     "MCTSPlanner",
     "Planner",
+    "PriorPlanner",
     "SamplingPlanner",
     "collect",
     "execute",
     "expected_score",
     "extend_horizon",
+    "mean_scores",
     "oracle",
+    "random_best",
 ]

@@ -1,7 +1,7 @@
-"""Executing plans: open loop, or planning anew after every few steps, which is what chance calls for."""
+"""Executing plans: `execute` in open or closed loop, and `collect` executed plans for a prior to be fitted to."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,20 +9,21 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner
+from neuroprior.plans import Plans, is_per_step
 from neuroprior.worlds.world import World
 
 Change = Callable[[Tensor, torch.Generator | None], Tensor]
-"""What happens to states `[B, ...]` beside the agent's own steps."""
+"""A change of states `[B, ...]` that is not caused by the agents' own steps, such as `ForagingWorld.regrow`."""
 
 
 class Execution(NamedTuple):
-    """What was done from B starts.
+    """What was executed from B starts.
 
     Attributes:
         actions: `[B, T]`.
-        rewards: `[B, T]`: what was met, not what was planned for.
+        rewards: `[B, T]`: the actual rewards, not the planned ones.
         states: `[B, T, ...]`: after each action.
-        model_steps: simulator steps for each start, in all decisions together; those executed do not count.
+        model_steps: simulator steps that the planner took for each start, in all its decisions.
     """
 
     actions: Tensor
@@ -40,16 +41,17 @@ def execute(
     generator: torch.Generator | None = None,
     change: Change | None = None,
 ) -> Execution:
-    """Plan, execute the first actions, and plan anew from where they led, again and again.
+    """Plan, execute the first actions, replan from the state that they led to, and so on.
 
     Args:
-        planner: whose plans have at least `replan_every` actions.
-        world: where; its steps are the real ones as well as those that the planner tries.
+        planner: its plans have at least `replan_every` actions.
+        world: the world in which plans are executed, and tried by the planner.
         state: `[B, ...]`.
         num_steps: T, at least 1.
-        replan_every: after so many actions it is planned anew: 1 is a closed loop, the length of the plans an open one.
-        generator: draws what the planner draws, and what is random in the world.
-        change: what happens after each step besides, unforeseen by the planner (such as `ForagingWorld.regrow`).
+        replan_every: actions that are executed before replanning: 1 is a closed loop, the length of the plans an open
+            one.
+        generator: draws what the planner draws, and the steps of a stochastic world.
+        change: applied to the states after each step; the planner does not foresee it.
 
     Raises:
         ValueError: an argument is out of range, or a plan is too short.
@@ -59,10 +61,69 @@ def execute(
     parts = []
     for at in range(0, num_steps, replan_every):
         decision = planner.plan(world, state, generator)
-        done = follow(decision, world, state, min(replan_every, num_steps - at), generator, change)
-        state = done.states[:, -1]
-        parts.append(done)
-    return joined(parts)
+        part = follow(decision, world, state, min(replan_every, num_steps - at), generator, change)
+        state = part.states[:, -1]
+        parts.append(part)
+    return join_executions(parts)
+
+
+def collect(
+    planner: Planner,
+    world: World,
+    num_plans: int | None = None,
+    *,
+    state: Tensor | None = None,
+    context: Literal["plan", "step"] | None = None,
+    min_score: float | None = None,
+    generator: torch.Generator | None = None,
+) -> Plans:
+    """Plan from many starts, and keep the plans that were chosen.
+
+    Args:
+        planner: chooses the plans.
+        world: the world.
+        num_plans: plan from so many starts, drawn by `world.reset`.
+        state: or plan from these starts, `[N, ...]`.
+        context: what is recorded with the plans: "plan": `world.observe` of the start; "step": of the state before each
+            action; None: nothing.
+        min_score: keep only plans with a higher score: in worlds where most plans lead nowhere. None: all.
+        generator: draws the starts, and whatever the planner draws.
+
+    Returns:
+        N plans, fewer with `min_score`, each up to the action with which it terminated (`World.terminated`). Their
+        groups are the independent worlds that they were collected in, see `World.group`.
+
+    Raises:
+        ValueError: neither or both of `num_plans` and `state` are given, an argument is out of range, or no plan scored
+            more than `min_score`.
+    """
+    if (num_plans is None) == (state is None):
+        raise ValueError("collect: give either num_plans or state")
+    if context not in (None, "plan", "step"):
+        raise ValueError(f'context: "plan", "step" or None is expected, not {context!r}')
+    if state is None:
+        check_sizes(num_plans=num_plans)
+        assert num_plans is not None
+        state = world.reset(num_plans, generator)
+    plan, score, _, _, lengths = planner.plan(world, state, generator)
+    _, states = _step_through(world, state, plan, generator)
+    before = torch.cat([state[:, None], states[:, :-1]], 1)
+    steps = executed_steps(world, before)
+    if lengths is not None:
+        lengths = torch.minimum(steps, lengths)
+    elif bool((steps < plan.shape[1]).any()):
+        lengths = steps
+    if min_score is not None:
+        kept = score > min_score
+        if not kept.any():
+            best = f"; the best {float(score.max())}" if len(score) else ""
+            raise ValueError(f"min_score: none of {len(state)} plans scored more than {min_score}{best}")
+        plan, state, before = plan[kept], state[kept], before[kept]
+        lengths = None if lengths is None else lengths[kept]
+    if context is not None and is_per_step(world.observe(state[:1])):
+        raise ValueError("observe: indices [N] or floating point features [N, C] are expected of a world")
+    observed = observations(world, before, context)
+    return Plans(plan, world.num_actions, lengths, world.action_names, observed, world.group(state))
 
 
 def follow(
@@ -73,26 +134,50 @@ def follow(
     generator: torch.Generator | None = None,
     change: Change | None = None,
 ) -> Execution:
-    """Execute the first `num_steps` actions of what was decided for `state [B, ...]`; see `execute`."""
+    """Execute the first `num_steps` actions of a decision for `state [B, ...]`; see `execute`."""
     plan, lengths = decision.plan, decision.lengths
     if plan.shape[1] < num_steps or (lengths is not None and (lengths < num_steps).any()):
-        raise ValueError(
-            f"replan_every: {num_steps} actions are to be executed, but a plan has fewer; plan anew sooner"
-        )
-    columns: tuple[list[Tensor], ...] = ([], [], [])  # actions, rewards and states
-    for t in range(num_steps):
-        action = plan[:, t].long()
-        state, reward = world.step(state, action, generator)
-        state = state if change is None else change(state, generator)
-        for column, what in zip(columns, (action, reward, state), strict=True):
-            column.append(what)
-    actions, rewards, states = (torch.stack(column, 1) for column in columns)
+        raise ValueError(f"replan_every: {num_steps} actions are to be executed, but a plan has fewer; replan sooner")
+    actions = plan[:, :num_steps].long()
+    rewards, states = _step_through(world, state, actions, generator, change)
     return Execution(actions, rewards, states, decision.model_steps)
 
 
-def joined(parts: Sequence[Execution]) -> Execution:
-    """What was done one after another, as one."""
+def join_executions(parts: Sequence[Execution]) -> Execution:
+    """Executions one after another, as one."""
     actions, rewards, states = (
         torch.cat([getattr(part, name) for part in parts], 1) for name in ("actions", "rewards", "states")
     )
     return Execution(actions, rewards, states, sum(part.model_steps for part in parts))
+
+
+def observations(world: World, before: Tensor, context: Literal["plan", "step"] | None) -> Tensor | None:
+    """The context of executed plans: what the world observes in the states `before [N, L, ...]` the actions.
+
+    "plan": `[N]` or `[N, C]`, in the first state; "step": `[N, L]` or `[N, L, C]`, in each; None: None.
+    """
+    if context is None:
+        return None
+    if context == "plan":
+        return world.observe(before[:, 0])
+    observed = world.observe(before.flatten(0, 1))
+    return observed.view(*before.shape[:2], *observed.shape[1:])
+
+
+def executed_steps(world: World, before: Tensor) -> Tensor:
+    """How many actions are executed until the world terminates, `[N]`; `before [N, L, ...]`: the states before them."""
+    going = ~world.terminated(before.flatten(0, 1)).view(before.shape[:2])
+    return going.long().cumprod(1).sum(1)
+
+
+def _step_through(
+    world: World, state: Tensor, plans: Tensor, generator: torch.Generator | None, change: Change | None = None
+) -> tuple[Tensor, Tensor]:
+    """The rewards `[N, L]`, and the states `[N, L, ...]` after each action, of `plans [N, L]` from `state [N, ...]`."""
+    rewards, states = [], []
+    for t in range(plans.shape[1]):
+        state, reward = world.step(state, plans[:, t].long(), generator)
+        state = state if change is None else change(state, generator)
+        rewards.append(reward)
+        states.append(state)
+    return torch.stack(rewards, 1), torch.stack(states, 1)

@@ -1,14 +1,14 @@
-"""The exhaustive planner: every plan up to a depth."""
+"""The exhaustive planner: tries all plans up to a depth."""
 
-from collections.abc import Callable
-from typing import Literal
+from typing import Unpack
 
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
-from neuroprior.planners.chance import check_rollouts, mean_scores
-from neuroprior.planners.planner import Decision, Planner, decide, in_chunks, random_best
+from neuroprior.planners.planner import Decision, Objective, Planner, decide, join_decisions, random_best
+from neuroprior.planners.rollouts import mean_scores
 from neuroprior.plans import action_dtype, all_plans
 from neuroprior.worlds.world import World
 
@@ -16,34 +16,23 @@ MOST_PLANS = 2**24
 
 
 class ExhaustivePlanner(Planner):
-    """Tries every plan of `depth` actions: Hyvärinen's deterministic planner.
+    """Tries all plans of `depth` actions: Hyvärinen's deterministic planner.
 
-    Plans that share a prefix share its steps, so a decision takes A + A**2 + ... + A**depth of them. In a world with
-    chance each plan is tried by itself, which takes num_rollouts * depth * A**depth.
+    Plans that share a prefix share its steps, so that a decision takes A + A**2 + ... + A**depth simulator steps. In a
+    stochastic world each plan is tried by itself, which takes num_rollouts * depth * A**depth.
 
     Args:
         depth: number of actions in a plan, at least 1; A**depth may be at most 2**24.
-        objective, discount, value, any_prefix: see `Planner`.
         num_rollouts: see `SamplingPlanner`.
+        **goal: objective, discount, value, any_prefix: see `Planner`.
 
     Raises:
         ValueError: an argument is out of range.
     """
 
-    def __init__(
-        self,
-        depth: int,
-        *,
-        objective: Literal["terminal", "return"] = "terminal",
-        discount: float = 1.0,
-        value: Callable[[Tensor], Tensor] | None = None,
-        any_prefix: bool = False,
-        num_rollouts: int = 1,
-    ) -> None:
-        super().__init__(objective, discount, value, any_prefix)
-        if depth < 1:
-            raise ValueError(f"depth: at least 1 is expected, not {depth}")
-        check_rollouts(num_rollouts)
+    def __init__(self, depth: int, *, num_rollouts: int = 1, **goal: Unpack[Objective]) -> None:
+        super().__init__(**goal)
+        check_sizes(depth=depth, num_rollouts=num_rollouts)
         self.depth, self.num_rollouts = depth, num_rollouts
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
@@ -52,29 +41,26 @@ class ExhaustivePlanner(Planner):
             raise ValueError(f"depth: {actions}**{self.depth} plans are too many; at most {MOST_PLANS} can be tried")
         world.check_state(state)
         generator = generator_on(generator, state.device)
-        steps = sum(actions**depth for depth in range(1, self.depth + 1))
-
         if world.stochastic:
-            steps = self.num_rollouts * self.depth * actions**self.depth
+            plan_some, steps = self._plan_apart, self.num_rollouts * self.depth * actions**self.depth
+        else:
+            plan_some, steps = self._plan_together, sum(actions**depth for depth in range(1, self.depth + 1))
+        chunks = self.chunks(state, steps, cached=not world.stochastic)
+        return join_decisions((plan_some(world, some, generator, steps) for some in chunks), len(state))
 
-        def some(state: Tensor) -> Decision:
-            if world.stochastic:
-                return self._plan_with_chance(world, state, generator, steps)
-            return self._plan(world, state, generator, steps)
-
-        return in_chunks(some, state, steps, cached=not world.stochastic)
-
-    def _plan(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
+    def _plan_together(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
+        """In a deterministic world: all prefixes of a depth take their last step together."""
         batch, actions = len(state), world.num_actions
-        every = torch.arange(actions, device=state.device)
+        all_actions = torch.arange(actions, device=state.device)
         now, rewards = state, torch.zeros(batch, 0, device=state.device)
         legal = torch.ones(batch, dtype=torch.bool, device=state.device)
-        found = []  # of each depth at which a plan may end: scores, states and, unless all are, legality, [B, A**depth]
+        # For each depth at which a plan may end: scores, states and, unless all plans are legal, which ones are.
+        found = []
         for depth in range(1, self.depth + 1):
             if not world.all_legal:
                 legal = (legal[:, None] & world.legal_actions(now)).flatten()
-            now, reward = world.step(_for_each(actions, now), every.repeat(len(now)), generator)
-            # A terminal score looks at nothing before the last reward.
+            now, reward = world.step(_for_each(actions, now), all_actions.repeat(len(now)), generator)
+            # A terminal score depends on the last reward only.
             before = _for_each(actions, rewards if self.objective == "return" else rewards[:, :0])
             rewards = torch.cat([before, reward[:, None]], 1)
             if self.any_prefix or depth == self.depth:
@@ -86,7 +72,7 @@ class ExhaustivePlanner(Planner):
         depths = torch.arange(self.depth - len(found) + 1, self.depth + 1, device=state.device)
         past = (actions**depths).cumsum(0)
         length = depths[torch.searchsorted(past, best, right=True)]
-        # The number of a plan among those of its length, written in base A, is the plan; zeros fill it up.
+        # The digits in base A of a plan's number among those of its length are its actions; zeros fill it up.
         number = (best - past[length - depths[0]] + actions**length) * actions ** (self.depth - length)
         base = actions ** torch.arange(self.depth - 1, -1, -1, device=state.device)
         plan = number[:, None].div(base, rounding_mode="floor") % actions
@@ -98,12 +84,13 @@ class ExhaustivePlanner(Planner):
             length if self.any_prefix else None,
         )
 
-    def _plan_with_chance(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
+    def _plan_apart(self, world: World, state: Tensor, generator: torch.Generator, steps: int) -> Decision:
+        """In a stochastic world: each plan has rollouts of its own."""
         actions = world.num_actions
         plans = all_plans(actions, self.depth).to(state.device, action_dtype(actions))
         ending = None
         if self.any_prefix:
-            # Of the plans that share a prefix, the one that goes on with zeros stands for it.
+            # A prefix is scored once: in the plan that goes on with zeros.
             rest = actions ** torch.arange(self.depth - 1, -1, -1, device=state.device)
             ending = torch.arange(len(plans), device=state.device)[:, None] % rest == 0
         plans = plans.expand(len(state), -1, -1)
@@ -112,5 +99,5 @@ class ExhaustivePlanner(Planner):
 
 
 def _for_each(actions: int, values: Tensor) -> Tensor:
-    """`values [N, ...]`, each so many times in a row: `[N * actions, ...]`."""
+    """`values [N, ...]`, each repeated for all actions: `[N * actions, ...]`."""
     return values[:, None].expand(-1, actions, *values.shape[1:]).flatten(0, 1)

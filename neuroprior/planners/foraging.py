@@ -1,11 +1,11 @@
-"""The foraging oracle: the best of all plans where food is eaten, by dynamic programming."""
+"""The foraging oracle: the optimal plan in a foraging world, by dynamic programming."""
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
-from neuroprior.planners.planner import Decision, Planner, in_chunks, random_best
+from neuroprior.planners.planner import Decision, Planner, join_decisions, random_best
 from neuroprior.plans import action_dtype
 from neuroprior.worlds.foraging import ForagingWorld
 from neuroprior.worlds.world import World
@@ -14,19 +14,19 @@ MOST_ITEMS = 12
 
 
 class ForagingOracle(Planner):
-    """Finds the plan of so many actions that eats most in a `ForagingWorld`; what is yet to grow it does not know.
+    """Finds the plan that eats most in a `ForagingWorld`, given the food that is there now (`regrow` is not foreseen).
 
-    Finite-horizon dynamic programming over the cell and which of the K items are left: `L * 2**K * S * A` operations
-    for each start, which are counted as model steps. No planner whose plans are as long scores more. At each step
-    it takes a random one of the best actions.
+    Finite-horizon dynamic programming over the cell and the subset of the K items that is left: `L * 2**K * S * A`
+    operations for each start, which are counted as model steps. No plan of the same length scores more. At each step it
+    takes a random one of the optimal actions.
 
     Args:
         length: number of actions in a plan, at least 1.
         discount: see `Planner`; the objective is "return".
 
     Raises:
-        ValueError: an argument is out of range. `plan` raises it for another world, or one with chance or more than
-            `MOST_ITEMS` items.
+        ValueError: an argument is out of range. `plan` raises it for another kind of world, a stochastic one, or one
+            with more than 12 items.
     """
 
     def __init__(self, length: int, discount: float = 1.0) -> None:
@@ -36,19 +36,19 @@ class ForagingOracle(Planner):
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         if not isinstance(world, ForagingWorld) or world.stochastic or world.num_items > MOST_ITEMS:
-            raise ValueError(f"world: a ForagingWorld without chance, of at most {MOST_ITEMS} items, is expected")
+            raise ValueError(f"world: a deterministic ForagingWorld of at most {MOST_ITEMS} items is expected")
         world.check_state(state)
         generator = generator_on(generator, state.device)
         work = self.length * 2**world.num_items * world.table.num_states * world.num_actions
-        # Of its numbers, which take less memory than steps elsewhere, a good many are kept together.
-        room = work // (8 * world.num_actions)
-        decision = in_chunks(lambda some: self._plan(world, some, generator), state, room)
+        # These operations take less memory than simulator steps elsewhere.
+        chunks = self.chunks(state, work // (8 * world.num_actions))
+        decision = join_decisions((self._plan(world, some, generator) for some in chunks), len(state))
         return decision._replace(model_steps=work)
 
     def _plan(self, world: ForagingWorld, state: Tensor, generator: torch.Generator) -> Decision:
         bits = 2 ** torch.arange(world.num_items, device=state.device)
-        there = ((state[:, 2:, None] == world.place).long() * bits[:, None]).sum(1)  # which items lie in each cell
-        arriving = self._arriving(world, there)
+        there = ((state[:, 2:, None] == world.place).long() * bits[:, None]).sum(1)  # the items in each cell
+        arriving = self._arrival_values(world, there)
         row, now, plan = torch.arange(len(state), device=state.device), state, []
         left = (state[:, 2:] < world.num_places).long() @ bits
         for values in reversed(arriving):
@@ -60,23 +60,26 @@ class ForagingOracle(Planner):
         score = self.score(world.rollout(state, plans[:, None]).rewards[:, 0], now)
         return Decision(plans.to(action_dtype(world.num_actions)), score, now, 0)
 
-    def _arriving(self, world: ForagingWorld, there: Tensor) -> list[Tensor]:
-        """What arriving in a cell is worth, `[S, B, 2**K]` each: as the last step of a plan, the one before, and so on.
+    def _arrival_values(self, world: ForagingWorld, there: Tensor) -> list[Tensor]:
+        """The values of arriving in a cell, `[S, B, 2**K]` each: by the last step of a plan, the one before, and so on.
 
-        The last dimension is which items are left, as a number; `there [B, S]` is which lie in each cell.
+        Sets of items are numbers of K bits: the last dimension is the set that is left; `there [B, S]` is the set that
+        lies in each cell.
         """
         table, (batch, cells) = world.table, there.shape
         items = torch.arange(2**world.num_items, device=there.device)
-        start, cell = there.nonzero(as_tuple=True)  # where nothing lies nothing is gained
+        start, cell = there.nonzero(as_tuple=True)  # elsewhere nothing is gained
         found = items & there[start, cell][:, None]
         gain = ((found[..., None] >> torch.arange(world.num_items, device=there.device)) & 1).sum(-1).float()
         after, value, arriving = items & ~found, torch.zeros(cells, batch, len(items), device=there.device), []
-        acting = value.new_empty(cells * world.num_actions, batch * len(items))  # new memory would cost more than this
+        acting = value.new_empty(
+            cells * world.num_actions, batch * len(items)
+        )  # allocating it anew would cost more than filling it
         for _ in range(self.length):
             worth = self.discount * value
             worth[cell, start] = gain + worth[cell, start].gather(1, after)
             arriving.append(worth)
-            # A row a cell: whole rows are copied.
+            # One row per cell: whole rows are copied.
             torch.index_select(worth.flatten(1), 0, table.next_state.flatten(), out=acting)
             if table.legal_table is not None:
                 acting.masked_fill_(~table.legal_table.view(-1, 1), -torch.inf)

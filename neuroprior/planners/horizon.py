@@ -1,17 +1,15 @@
-"""The horizon planner: how deep to plan, and so how many plans to try, is chosen by what the candidates score."""
+"""The horizon planner: how many actions a plan has, and so how many plans are tried, depends on their scores."""
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple, Unpack
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from neuroprior._checks import check_sizes
-from neuroprior._random import generator_on
-from neuroprior.planners.planner import Decision, decide, in_chunks
-from neuroprior.planners.sampling import Proposer, SamplingPlanner
-from neuroprior.sampling.ancestral import check_in_world
+from neuroprior.planners.planner import Decision, Objective, decide, join_decisions
+from neuroprior.planners.sampling import SamplingPlanner
+from neuroprior.sampling.stepping import Steppable
 from neuroprior.worlds.world import World
 
 POOLED = 4.0
@@ -22,24 +20,25 @@ QUANTILES = 16
 
 
 class HorizonPlanner(SamplingPlanner):
-    """Chooses for each start how many actions its plans have: few long ones, or many short ones, for as many steps.
+    """Chooses a horizon for each start: few long plans, or many short ones, for as many simulator steps.
 
-    Plans may end after any of their actions. At first some of the longest are drawn, which tell what plans of each
-    shorter horizon would have scored, too. Then, round after round, that horizon is chosen from which most is to be
-    expected for the steps that are left: where the scores of plans of d actions spread widely, the best of many more
-    will be better than the best so far (the value of information, Dearden et al. 1999; the uncertainty of values as the
-    arbiter of how far to plan, Daw et al. 2005). Scores of a horizon are taken to be normal, with the mean and the
-    spread of those seen from this start and, for a little, from the others that are planned from together. Where none
-    promises anything, plans are as long as they may be.
+    Plans may end after any of their actions. First some plans of the greatest length are drawn; their prefixes give the
+    scores at each shorter horizon. Then, round after round, the horizon with the greatest expected improvement for the
+    remaining steps is chosen: where the scores of plans of d actions have a large variance, the best of many more is
+    likely to beat the best so far (the value of information, Dearden et al. 1999; uncertainty as the arbiter of how far
+    to plan, Daw et al. 2005). Scores at a horizon are modelled as normal, with the mean and variance of those from this
+    start, pooled a little with those from the other starts of the batch. Where no improvement is expected, plans have
+    the greatest length.
 
     Args:
-        prior: what proposes.
+        prior: proposes the candidates.
         length: the longest horizon, at least 1.
-        num_plans: as many steps as this many plans of `length` actions take are spent on each start, or a few less.
-        pilot: the share of the plans with which it begins, all of `length` actions; above 0, at most 1.
-        rounds: in which the rest is spent; no more than there are plans left.
-        objective, discount, value: see `Planner`; `any_prefix` is True.
-        temperature, num_rollouts: see `SamplingPlanner`.
+        num_plans: the budget of each start is the steps of so many plans of `length` actions; a few may be left.
+        pilot: the share of the plans that is drawn first, with `length` actions; above 0, at most 1.
+        rounds: in which the rest of the budget is spent; at most as many as there are plans left.
+        num_rollouts: see `SamplingPlanner`.
+        temperature: divides the prior's logits.
+        **goal: objective, discount, value: see `Planner`; `any_prefix` is True.
 
     Raises:
         ValueError: an argument is out of range.
@@ -47,28 +46,20 @@ class HorizonPlanner(SamplingPlanner):
 
     def __init__(
         self,
-        prior: Proposer,
+        prior: Steppable,
         length: int,
         num_plans: int,
         *,
         pilot: float = 0.5,
         rounds: int = 3,
-        objective: Literal["terminal", "return"] = "terminal",
-        discount: float = 1.0,
-        value: Callable[[Tensor], Tensor] | None = None,
-        temperature: float = 1.0,
         num_rollouts: int = 1,
+        temperature: float = 1.0,
+        **goal: Unpack[Objective],
     ) -> None:
+        if not goal.setdefault("any_prefix", True):
+            raise ValueError("any_prefix: this planner chooses among all prefixes; leave it out")
         super().__init__(
-            prior,
-            length,
-            num_plans,
-            objective=objective,
-            discount=discount,
-            value=value,
-            any_prefix=True,
-            temperature=temperature,
-            num_rollouts=num_rollouts,
+            prior, length, num_plans, num_rollouts=num_rollouts, halving=False, temperature=temperature, **goal
         )
         check_sizes(rounds=rounds)
         if not 0 < pilot <= 1:
@@ -77,47 +68,50 @@ class HorizonPlanner(SamplingPlanner):
         self.rounds = min(rounds, num_plans - self.first)
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
-        check_in_world(self.prior, world, state)
-        generator = generator_on(generator, state.device)
-        return in_chunks(lambda some: self._plan(world, some, generator), state, self._steps(world))
+        generator = self._check(world, state, generator)
+        chunks = self.chunks(state, self.model_steps(world))
+        return join_decisions((self._plan(world, some, generator) for some in chunks), len(state))
 
     def _plan(self, world: World, state: Tensor, generator: torch.Generator) -> Decision:
-        found = self._found(world, state, self.length, self.first, generator)
+        found = self._try(world, state, self.length, self.first, generator)
         left = (self.num_plans - self.first) * self.length
         for k in range(self.rounds):
             share = left // (self.rounds - k)
-            horizon = self._horizon(found, left)
+            horizon = self._best_horizon(found, left)
             left -= share
             for depth in horizon.unique().tolist():
                 here = (horizon == depth).nonzero()[:, 0]
-                more = self._found(world, state[here], depth, share // depth, generator)
-                found = found.joined(here, more, generator)
+                more = self._try(world, state[here], depth, share // depth, generator)
+                found = found.join(here, more, generator)
         return found.decision._replace(model_steps=int(found.steps.max()) if len(state) else 0)
 
-    def _found(self, world: World, state: Tensor, depth: int, number: int, generator: torch.Generator) -> "_Found":
-        """What `number` plans of `depth` actions find."""
-        planner = self.like(self.prior, depth, number, self.temperature)
-        plans, score, ends = planner.tried(world, state, generator)
+    def _try(self, world: World, state: Tensor, depth: int, number: int, generator: torch.Generator) -> "_Found":
+        """Try `number` plans of `depth` actions from each start."""
+        rollouts, temperature = self.num_rollouts, self.temperature
+        sampler = SamplingPlanner(
+            self.prior, depth, number, num_rollouts=rollouts, temperature=temperature, **self.goal
+        )
+        plans, score, ends = sampler.candidates(world, state, generator)
         best = decide(plans, score, ends, 0, generator)
-        # Up to each horizon a plan scores what its best beginning does.
+        # At each horizon the score of a plan is that of its best prefix so far.
         so_far = score.double().cummax(2).values
         moments = torch.stack([torch.full_like(so_far, 1.0), so_far, so_far**2], -1).sum(1)
         ties = (score == best.score[:, None, None]).sum((1, 2))
         longer = self.length - depth
-        steps = torch.full_like(ties, planner._steps(world))
+        steps = torch.full_like(ties, sampler.model_steps(world))
         return _Found(best._replace(plan=pad(best.plan, (0, longer))), ties, pad(moments, (0, 0, 0, longer)), steps)
 
-    def _horizon(self, found: "_Found", left: int) -> Tensor:
-        """The horizon `[B]` from which most is to be expected for so many steps; the longest of equals."""
+    def _best_horizon(self, found: "_Found", left: int) -> Tensor:
+        """The horizon `[B]` with the greatest expected improvement for `left` more steps; of equals the longest."""
         moments = found.moments + POOLED * found.moments.sum(0) / found.moments.sum(0)[:, :1].clamp(min=1)
         number, total, squares = moments.unbind(-1)
         mean = total / number
         spread = (squares / number - mean**2).clamp(min=0).sqrt()
         depth = torch.arange(1, self.length + 1, device=mean.device)
-        # Of few actions there are few plans.
+        # There are not more different plans than this.
         tries = (left // depth).double().minimum(self.prior.num_actions ** depth.double())
         share = (torch.arange(QUANTILES, device=mean.device, dtype=torch.float64) + 0.5) / QUANTILES
-        # The best of n scores is below its quantile q with probability q, so each of them with probability q ** (1/n).
+        # The best of n scores is below x with probability q where each of them is with probability q ** (1 / n).
         above = -torch.expm1(share.log() / tries[:, None])
         best = mean[..., None] - spread[..., None] * torch.special.ndtri(above)
         gain = (best - found.decision.score.double()[:, None, None]).clamp(min=0).mean(-1).nan_to_num(0.0, 0.0)
@@ -126,13 +120,13 @@ class HorizonPlanner(SamplingPlanner):
 
 
 class _Found(NamedTuple):
-    """What was found from B starts.
+    """The candidates from B starts so far.
 
     Attributes:
-        decision: the best so far.
-        ties: `[B]`: how many candidates are as good as that one, itself among them.
-        moments: `[B, L, 3]`: of the scores up to each horizon, how many, their sum and that of their squares.
-        steps: `[B]`: steps of the world that were taken.
+        decision: the best of them.
+        ties: `[B]`: how many of them are as good as that one, itself included.
+        moments: `[B, L, 3]`: of the scores at each horizon: their number, sum, and sum of squares.
+        steps: `[B]`: simulator steps taken.
     """
 
     decision: Decision
@@ -140,8 +134,8 @@ class _Found(NamedTuple):
     moments: Tensor
     steps: Tensor
 
-    def joined(self, here: Tensor, more: "_Found", generator: torch.Generator) -> "_Found":
-        """With what more was found from the starts `here`; of candidates that are equally good each is as likely."""
+    def join(self, here: Tensor, more: "_Found", generator: torch.Generator) -> "_Found":
+        """Together with `more` from the starts `here`; among equally good candidates the choice stays uniform."""
         own, new = self.decision, more.decision
         score = own.score[here]
         ties = torch.where(new.score == score, self.ties[here] + more.ties, self.ties[here])

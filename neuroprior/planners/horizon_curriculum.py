@@ -1,25 +1,26 @@
-"""Growing the horizon: plan with a prior, learn from those plans, plan longer, learn again."""
+"""The horizon curriculum: plan with a prior, fit it to those plans, plan longer, fit it again."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
 
-from neuroprior.planners.collect import collect
+from neuroprior.planners.execution import collect
+from neuroprior.planners.planner import Objective
 from neuroprior.planners.sampling import SamplingPlanner
 from neuroprior.plans import Plans
 from neuroprior.priors.prior import Prior
 from neuroprior.worlds.world import World
 
-TRIED = 128
-"""Starts at which temperatures are tried before a round."""
+STARTS_PER_TEMPERATURE = 128
+"""Starts from which each temperature is tried before a round."""
 
 
 class HorizonRound(NamedTuple):
     """A round of `extend_horizon`.
 
     Attributes:
-        length: number of actions in the plans that the prior has learned from last.
+        length: number of actions in the plans that the prior was fitted to.
         plans: these plans.
     """
 
@@ -44,31 +45,31 @@ def extend_horizon(
     generator: torch.Generator | None = None,
     **settings: Any,
 ) -> Iterator[HorizonRound]:
-    """Let a prior learn from short plans, plan longer with it, learn from those plans, and so on.
+    """Fit a prior to short plans, find longer plans with it, fit it to those, and so on (a horizon curriculum).
 
-    All plans of a length are soon too many to be tried, so that only short plans can be had by trying them all. A prior
-    that has learned from them proposes longer ones, the best of which are the next to learn from. Priors that count
-    learn anew from the plans of each round alone; neural ones go on from the weights that they have.
+    The number of plans grows exponentially with their length, so that an exhaustive search finds short plans only. A
+    prior that was fitted to them proposes longer ones, and the best of these are what it is fitted to next.
+    Count-based priors are fitted anew to the plans of each round; neural ones continue from their present weights.
 
     Args:
-        prior: learns in place, by its `fit`, which takes a neural prior on from the weights that it has.
-        plans: what it learns from first, such as an `ExhaustivePlanner` collects. The prior goes on seeing what
-            these plans have as context: what is seen at the start, before each action, or nothing.
-        world: where longer plans are looked for.
-        lengths: numbers of actions of the further rounds, one after another.
-        num_starts: from so many starts plans are looked for in each round.
-        num_plans: candidate plans for each.
+        prior: fitted in place.
+        plans: what it is fitted to first, such as an `ExhaustivePlanner` collects. Longer plans are collected with the
+            same kind of context: none, of the start, or per step.
+        world: the world in which longer plans are searched for.
+        lengths: numbers of actions in the plans of the further rounds.
+        num_starts: number of starts that are planned from in each round.
+        num_plans: candidates for each start.
         objective, discount, any_prefix: see `Planner`.
-        min_score: plans that scored no more than this are not learned from, see `collect`.
-        num_rollouts: of each candidate where chance decides, see `SamplingPlanner`.
-        temperatures: at which candidates may be drawn; before each round that one is chosen with which most is scored
-            from a few starts. A prior that has learned from few plans is often so sure of itself that it finds no
-            longer ones unless it is sampled at more than 1.
-        generator: draws the starts and candidates, and is passed on to a prior's `fit` where there are settings.
-        settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
+        min_score: the prior is fitted to plans with a higher score only, see `collect`.
+        num_rollouts: see `SamplingPlanner`.
+        temperatures: candidates are drawn at one of these: before each round, the one with the highest mean score from
+            some starts is chosen. A prior fitted to few plans is often overconfident, and finds longer plans only at a
+            temperature above 1.
+        generator: draws starts and candidates, and is passed on to the prior's `fit` where there are settings.
+        **settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
 
     Yields:
-        After the first plans, and after each length: what was learned from. The prior is as it is after that round.
+        After each fit, the plans that the prior was fitted to.
 
     Raises:
         ValueError: an argument is out of range, or no plan of a round scored more than `min_score`.
@@ -79,13 +80,15 @@ def extend_horizon(
         raise ValueError("temperatures: at least one is expected")
     if settings:
         settings |= {"generator": generator}
-    how: dict[str, Any] = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
-    how |= {"num_rollouts": num_rollouts}
+    goal: Objective = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
     prior.fit(plans, **settings)
     yield HorizonRound(plans.max_length, plans)
     for length in lengths:
-        planners = [SamplingPlanner(prior, length, num_plans, temperature=heat, **how) for heat in temperatures]
-        planner = _best(planners, world, min(num_starts, TRIED), generator)
+        planners = [
+            SamplingPlanner(prior, length, num_plans, num_rollouts=num_rollouts, temperature=temperature, **goal)
+            for temperature in temperatures
+        ]
+        planner = _best(planners, world, min(num_starts, STARTS_PER_TEMPERATURE), generator)
         plans = collect(planner, world, num_starts, context=prior.context_per, min_score=min_score, generator=generator)
         prior.fit(plans, **settings)
         yield HorizonRound(length, plans)
@@ -94,7 +97,7 @@ def extend_horizon(
 def _best(
     planners: Sequence[SamplingPlanner], world: World, number: int, generator: torch.Generator | None
 ) -> SamplingPlanner:
-    """The planner that scores most from so many starts, the same for all; the first of equals."""
+    """The planner with the highest mean score from `number` starts, the same for all; the first of equals."""
     if len(planners) == 1:
         return planners[0]
     state = world.reset(number, generator)

@@ -1,19 +1,20 @@
-"""The interface of a planner, what it optimises, and how ties are broken."""
+"""The interface of a planner, its objective, and how ties are broken (`random_best`)."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Literal, NamedTuple, TypedDict, Unpack
 
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
+from neuroprior.sampling.draws import check_temperature
+from neuroprior.sampling.stepping import Steppable, check_in_world
 from neuroprior.worlds.world import Rollout, World
 
-STEPS_AT_ONCE = 2**22
-"""Simulator steps (starts x plans x length) that a planner takes together; bounds memory."""
-
 STEPS_CACHED = 2**19
-"""The same where the results of the steps should stay in a CPU's cache: new memory costs more than the steps do."""
+"""Simulator steps whose results stay in a CPU's cache."""
 
 
 class Decision(NamedTuple):
@@ -21,11 +22,11 @@ class Decision(NamedTuple):
 
     Attributes:
         plan: `[B, L]`: the best plan that it found; 0 beyond `lengths`.
-        score: `[B]`: what its objective gives for that plan; in a world with chance the mean over the planner's own
-            rollouts, which flatters the winner (`expected_score` does not).
-        final_state: `[B, ...]`: where the plan ends (its executed part, where there are `lengths`); in a world with
-            chance, in the first of the planner's rollouts.
-        model_steps: single simulator steps that it took for each start.
+        score: `[B]`: the score of that plan; in a stochastic world its mean over the planner's own rollouts, which is
+            biased upwards for the best of several plans (the winner's curse; `expected_score` is not).
+        final_state: `[B, ...]`: where the plan (where there are `lengths`, its executed part) ends; in a stochastic
+            world, in the first of the planner's rollouts.
+        model_steps: single simulator steps taken for each start.
         lengths: `[B]`: how many actions of each plan are to be executed; None: all.
     """
 
@@ -36,21 +37,35 @@ class Decision(NamedTuple):
     lengths: Tensor | None = None
 
 
+class Objective(TypedDict, total=False):
+    """What a planner optimises, as keyword arguments; see `Planner`."""
+
+    objective: Literal["terminal", "return"]
+    discount: float
+    value: Callable[[Tensor], Tensor] | None
+    any_prefix: bool
+
+
 class Planner(ABC):
-    """Chooses, for each start, a plan with a high score.
+    """Chooses, for each start, a plan with a high score. Ties are broken uniformly at random, see `random_best`.
 
     Args:
-        objective: "terminal": a plan's score is the reward of its last step, where it ends (Hyvärinen, both
-            simulations). "return": the sum of its rewards, step t (from 0) times `discount ** t`.
-        discount: above 0, at most 1; for "return" alone.
-        value: adds the value of the final state: a function from final states `[N, ...]` to `[N]`; with "return" times
-            `discount ** L`.
-        any_prefix: the agent may end a plan after any of its actions (at least one), so that a plan counts as its best
-            prefix, and a shorter prefix with the same score as a longer one is as good.
+        objective: "terminal": the score of a plan is the reward of its last step (Hyvärinen, both simulations).
+            "return": the sum of its rewards, that of step t (from 0) times `discount ** t`.
+        discount: above 0, at most 1; only for "return".
+        value: its value of the final state is added to the score: a function from final states `[N, ...]` to `[N]`;
+            with "return" it is multiplied by `discount ** L`.
+        any_prefix: the agent may stop after any action but none at all: the score of a plan is that of its best prefix,
+            and of two prefixes with the same score neither is preferred.
+
+    Attributes:
+        steps_at_once: starts are planned for in chunks of about so many simulator steps; bounds memory.
 
     Raises:
         ValueError: an argument is out of range.
     """
+
+    steps_at_once: int = 2**22
 
     def __init__(
         self,
@@ -62,17 +77,27 @@ class Planner(ABC):
         check_objective(objective, discount)
         self.objective, self.discount, self.value, self.any_prefix = objective, discount, value, any_prefix
 
+    @property
+    def goal(self) -> Objective:
+        """The objective, discount, value and any_prefix, to make another planner with the same ones."""
+        return {
+            "objective": self.objective,
+            "discount": self.discount,
+            "value": self.value,
+            "any_prefix": self.any_prefix,
+        }
+
     @abstractmethod
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         """Plan from each of B starts.
 
         Args:
-            world: where.
+            world: the world, in which the planner tries plans.
             state: `[B, ...]`.
-            generator: draws candidates, what is random in the world, and the winner among equally good plans.
+            generator: draws candidates, the steps of a stochastic world, and the winner among equally good plans.
 
         Raises:
-            ValueError: states that are not the world's, or a prior for another number of actions.
+            ValueError: these are no states of the world, or the planner cannot plan there; the message says why.
         """
 
     def score(self, rewards: Tensor, final_state: Tensor) -> Tensor:
@@ -89,11 +114,25 @@ class Planner(ABC):
         weights = self._weights(rewards)
         return self._add_value((rewards * weights).cumsum(-1), states, self.discount * weights)
 
-    def scored(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
-        """Scores and ends as `decide` takes them: of all prefixes where the rollout kept its states, else of plans."""
+    def score_rollout(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
+        """Scores and final states for `decide`: of all prefixes where the rollout has states, else of plans."""
         if rollout.states is None:
             return self.score(rollout.rewards, rollout.final_state), rollout.final_state
         return self.prefix_scores(rollout.rewards, rollout.states), rollout.states
+
+    def chunks(self, state: Tensor, steps: int, cached: bool = False) -> tuple[Tensor, ...]:
+        """`state [B, ...]` in chunks to plan for one after another, where each start takes so many `steps`.
+
+        Args:
+            state: the starts.
+            steps: simulator steps for each start.
+            cached: on a CPU, use chunks whose results stay in its cache: for steps that cost little but memory.
+        """
+        at_once = self.steps_at_once
+        if cached and state.device.type == "cpu":
+            at_once = min(at_once, STEPS_CACHED)
+        parts: tuple[Tensor, ...] = state.split(max(at_once // max(steps, 1), 1))
+        return parts
 
     def _weights(self, rewards: Tensor) -> Tensor:
         return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=rewards.dtype)
@@ -106,8 +145,37 @@ class Planner(ABC):
         return score + weight * value.view_as(score).to(score.dtype)
 
 
+class PriorPlanner(Planner):
+    """A planner that tries plans which a prior proposes.
+
+    Args:
+        prior: any prior over the world's actions; all that is needed is a number of actions, `start` and `step`, see
+            `neuroprior.sampling.Steppable`.
+        length: number of actions in a plan, L, at least 1.
+        num_plans: P, at least 1: the budget of a decision is that of P plans of L actions.
+        temperature: divides the prior's logits.
+        **goal: objective, discount, value, any_prefix: see `Planner`.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(
+        self, prior: Steppable, length: int, num_plans: int, *, temperature: float = 1.0, **goal: Unpack[Objective]
+    ) -> None:
+        super().__init__(**goal)
+        check_sizes(length=length, num_plans=num_plans)
+        check_temperature(temperature)
+        self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
+
+    def _check(self, world: World, state: Tensor, generator: torch.Generator | None) -> torch.Generator:
+        """Raise ValueError unless the prior can act in the world from `state`; the generator to draw with."""
+        check_in_world(self.prior, world, state)
+        return generator_on(generator, state.device)
+
+
 def value_of(value: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
-    """The values `[N]` of `state [N, ...]`; raises ValueError where there are more, fewer, or a NaN among them."""
+    """The values `[N]` of `state [N, ...]`; raises ValueError unless there are N of them and none is NaN."""
     values = value(state)
     if values.numel() != len(state) or values.isnan().any():
         raise ValueError(
@@ -117,28 +185,36 @@ def value_of(value: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
 
 
 def check_objective(objective: str, discount: float) -> None:
-    """Raise ValueError where `objective` is not known or `discount` is out of range or has no part in it."""
+    """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
     if objective not in ("terminal", "return"):
         raise ValueError(f'objective: "terminal" or "return" is expected, not {objective!r}')
     if not 0 < discount <= 1:
         raise ValueError(f"discount: a number above 0 and at most 1 is expected, not {discount}")
     if objective == "terminal" and discount != 1:
-        raise ValueError('discount: it has no part in objective="terminal"; use objective="return"')
+        raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')
 
 
-def random_best(score: Tensor, generator: torch.Generator, legal: Tensor | None = None) -> Tensor:
-    """The index `[B]` of a highest score in each row of `score [B, P]`, uniform among equals.
+def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | None = None) -> Tensor:
+    """The index `[B]` of the highest score in each row of `score [B, P]`; among equal ones a uniform draw.
 
-    Where `legal [B, P]` is given, only scores that it marks count; it marks at least one in each row.
+    All planners break their ties here.
+
+    Args:
+        score: `[B, P]`.
+        generator: breaks ties.
+        allowed: bool `[B, P]`: the scores that count, at least one in each row; None: all.
+
+    Raises:
+        ValueError: a score is NaN.
     """
     # Scores are often one column of many, which is slow to read more than once.
-    score = score.contiguous() if legal is None else score.masked_fill(~legal, -torch.inf)
+    score = score.contiguous() if allowed is None else score.masked_fill(~allowed, -torch.inf)
     highest = score.amax(1, keepdim=True)
     if highest.isnan().any():
         raise ValueError("score: NaN; a reward of the world, or its value, is not a number")
     best = score == highest
-    if legal is not None:
-        best = best & legal
+    if allowed is not None:
+        best = best & allowed
     draws = torch.rand(score.shape, generator=generator, device=score.device)
     return torch.where(best, draws, -1.0).argmax(1)
 
@@ -158,15 +234,15 @@ def decide(
     generator: torch.Generator,
     allowed: Tensor | None = None,
 ) -> Decision:
-    """The best of some candidates, or of their prefixes.
+    """The best of the candidates, or of their prefixes.
 
     Args:
         plans: `[B, P, L]`.
         score: `[B, P]`, or `[B, P, L]` where any prefix may win.
-        ends: where they end, or their prefixes: as `score`, and the state's own dimensions.
-        model_steps: what that took for each start.
+        ends: the final states of the plans or prefixes: the shape of `score`, and the state's own dimensions.
+        model_steps: simulator steps taken for each start.
         generator: breaks ties.
-        allowed: bool, of a shape that `score` has or can be spread to: what may win; None: all. Something may.
+        allowed: bool, of the shape of `score` or broadcast to it: what may win, at least one per start; None: all.
     """
     row = torch.arange(len(plans), device=plans.device)
     if allowed is not None:
@@ -183,33 +259,20 @@ def decide(
     return Decision(plan, score[row, chosen], ends[row, best, last], model_steps, last + 1)
 
 
-def in_chunks(
-    plan_some: Callable[[Tensor], Decision], state: Tensor, steps_per_start: int, cached: bool = False
-) -> Decision:
-    """`plan_some` applied to as many starts at a time as memory allows, put together again.
-
-    Where steps need little but memory, only so many are `cached` together on a CPU that they find room in its cache.
-    """
-    at_once = min(STEPS_AT_ONCE, STEPS_CACHED) if cached and state.device.type == "cpu" else STEPS_AT_ONCE
-    size = max(at_once // max(steps_per_start, 1), 1)
-    first = plan_some(state[:size])
-    if len(state) <= size:
-        return first
-    # Room for all is made once: small results between large blocks that come and go would keep memory from being freed.
-    plan, score, final_state = (part.new_empty(len(state), *part.shape[1:]) for part in first[:3])
-    whole = Decision(
-        plan,
-        score,
-        final_state,
-        first.model_steps,
-        None if first.lengths is None else first.lengths.new_empty(len(state)),
-    )
-    steps = first.model_steps
-    for at in range(0, len(state), size):
-        part = plan_some(state[at : at + size]) if at else first
-        steps = max(steps, part.model_steps)
-        for result, some in ((whole.plan, part.plan), (whole.score, part.score), (whole.final_state, part.final_state)):
-            result[at : at + size] = some
-        if whole.lengths is not None and part.lengths is not None:
-            whole.lengths[at : at + size] = part.lengths
+def join_decisions(parts: Iterable[Decision], batch_size: int) -> Decision:
+    """The decisions for chunks of `batch_size` starts as one; its model steps are the most of any chunk."""
+    whole, at, steps = None, 0, 0
+    for part in parts:
+        if len(part.plan) == batch_size:
+            return part
+        if whole is None:
+            # Allocated once: small results between large temporary blocks would keep memory from being freed.
+            plan, score, final_state = (values.new_empty(batch_size, *values.shape[1:]) for values in part[:3])
+            lengths = None if part.lengths is None else part.lengths.new_empty(batch_size)
+            whole = Decision(plan, score, final_state, 0, lengths)
+        for result, values in zip((*whole[:3], whole.lengths), (*part[:3], part.lengths), strict=True):
+            if isinstance(result, Tensor) and isinstance(values, Tensor):
+                result[at : at + len(part.plan)] = values
+        at, steps = at + len(part.plan), max(steps, part.model_steps)
+    assert whole is not None
     return whole._replace(model_steps=steps)

@@ -1,4 +1,4 @@
-"""Drawing actions: from logits one by one, or a number of plans split over the actions that go on from a prefix."""
+"""Drawing actions: from logits one by one, or by splitting the plans that share a prefix over its next actions."""
 
 import torch
 from torch import Tensor
@@ -23,21 +23,26 @@ def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:
 
 
 class Draw:
-    """Draws actions from logits."""
+    """Draws actions from logits, which are divided by a temperature."""
 
-    def __init__(
-        self, num_actions: int, temperature: float, generator: torch.Generator, end: int | None = None
-    ) -> None:
-        self.num_actions, self.temperature, self.generator, self.end = num_actions, temperature, generator, end
+    def __init__(self, num_actions: int, temperature: float, generator: torch.Generator) -> None:
+        self.num_actions, self.temperature, self.generator = num_actions, temperature, generator
         self.dtype = action_dtype(num_actions)
 
     def uniform(self, shape: tuple[int, ...], logits: Tensor) -> Tensor:
-        """Numbers from 0 to below 1 to draw actions by, of the dtype of their `logits`."""
+        """Uniform numbers in [0, 1) to draw actions with, of the dtype of their `logits`."""
         return torch.rand(shape, generator=self.generator, device=logits.device, dtype=logits.dtype)
 
-    def actions(self, logits: Tensor, uniform: Tensor) -> Tensor:
-        """One action a row of `logits [N, A]`, by `uniform [N]`: int64 `[N]`. None of probability 0 is ever drawn."""
-        # A row an action: with few actions and many rows each operation is several times as fast this way round.
+    def actions(self, logits: Tensor, uniform: Tensor | None = None) -> Tensor:
+        """One action for each row of `logits [N, A]`: int64 `[N]`; never one of probability 0.
+
+        Args:
+            logits: `[N, A]`.
+            uniform: `[N]`: what to draw with; None: new uniform numbers.
+        """
+        if uniform is None:
+            uniform = self.uniform((len(logits),), logits)
+        # Actions first: with few actions and many rows each operation is several times as fast this way round.
         cumulative = self._weights(logits.T.contiguous(), 0).cumsum(0)
         total = cumulative[-1]
         action = (cumulative <= uniform * total).sum(0)
@@ -45,14 +50,14 @@ class Draw:
         return torch.minimum(action, (cumulative < total).sum(0))
 
     def _weights(self, logits: Tensor, dim: int) -> Tensor:
-        """Probabilities but for a factor that is the same along `dim`."""
-        # The largest is taken off first, so that no temperature makes it infinite.
+        """Unnormalised probabilities along `dim`."""
+        # The largest logit is subtracted first, so that no temperature makes it infinite.
         return ((logits - logits.amax(dim, keepdim=True)) / self.temperature).exp_()
 
     def split(self, counts: Tensor, logits: Tensor) -> Tensor:
-        """Split `counts [M]` multinomially by the rows of `logits [M, A]`: `[M, A]`, a binomial draw an action."""
+        """Split `counts [M]` multinomially by the rows of `logits [M, A]`: `[M, A]`, one binomial draw per action."""
         probs = self._weights(logits.double(), -1)
-        # The share of an action among those not yet dealt out: exact 0 and 1 are kept by summing from the end.
+        # The share of an action among the remaining ones; summing from the end keeps shares of exactly 0 and 1.
         rest = probs.flip(-1).cumsum(-1).flip(-1)
         share = torch.where(rest > 0, probs / rest, 0).clamp_(0, 1)
         share[:, -1] = 1
@@ -66,12 +71,15 @@ class Draw:
 
 
 def worth_splitting(children: int, total: int) -> bool:
-    """A split costs one evaluation a child; drawing plan by plan costs one a plan and needs no shuffling."""
+    """Whether splitting `total` plans is cheaper than drawing them one by one.
+
+    A split costs one evaluation of the prior per child; drawing one by one costs one per plan, and no shuffling.
+    """
     return 8 * children <= total
 
 
 def levels_worth_splitting(prefixes: int, total: int, num_actions: int) -> int:
-    """How many levels of a tree are worth it beyond one with so many prefixes, if all of them branch."""
+    """How many more levels of a tree with so many prefixes are worth splitting, if all of them branch."""
     levels = 0
     while num_actions > 1 and worth_splitting(prefixes * num_actions ** (levels + 1), total):
         levels += 1
@@ -79,11 +87,20 @@ def levels_worth_splitting(prefixes: int, total: int, num_actions: int) -> int:
 
 
 def shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> Tensor:
-    """The prefix of each plan (int32 where that is enough): m `counts[m]` times; by root, in random order within."""
-    # The narrowest numbers that will do: to shuffle and to sort is to move memory.
+    """The prefix of each plan, prefix m `counts[m]` times: ordered by root, in random order within a root.
+
+    Args:
+        counts: `[M]`: plans of each prefix.
+        root: `[M]`, ascending: the root that each prefix belongs to.
+        generator: shuffles.
+
+    Returns:
+        Indices `[sum of counts]`, int32 where that is enough.
+    """
+    # Narrow integers: shuffling and sorting cost as much as the memory that they move.
     row = torch.repeat_interleave(counts.to(_narrow(int(counts.sum()))), output_size=int(counts.sum()))
     if len(row) == 0 or len(counts) == int(root[-1]) + 1:
-        return row  # one prefix a root
+        return row  # one prefix for each root
     order = torch.randperm(len(row), generator=generator, device=row.device, dtype=_narrow(len(row)))
     row = rows_of(row, order)
     last = int(root[-1])
@@ -94,5 +111,5 @@ def shuffled_rows(counts: Tensor, root: Tensor, generator: torch.Generator) -> T
 
 
 def _narrow(number: int) -> torch.dtype:
-    """The integers that can tell so many things apart and be indices."""
+    """The narrowest integers that can index so many things."""
     return torch.int32 if number < 2**31 else torch.int64

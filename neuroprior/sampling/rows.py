@@ -1,19 +1,19 @@
-"""Moving little memory: rows that are taken as whole numbers, and room behind the states of priors that grow."""
+"""Moving little memory: rows moved as single integers, and spare room behind states that grow with each step."""
 
 import torch
 from torch import Tensor
 
 WIDE = {2: torch.int16, 4: torch.int32, 8: torch.int64}
-"""Whole numbers by their bytes."""
+"""Integers by their bytes."""
 
 MARK = "room_to_advance"
-"""Of memory that was taken for states which are written over."""
+"""Attribute of tensors that were allocated with spare room, for states that are overwritten."""
 
 
 def rows_of(values: Tensor, row: Tensor) -> Tensor:
-    """The rows `row [M]` of `values [N, ...]`; several times as quick as by brackets where they are long.
+    """The rows `row [M]` of `values [N, ...]`; several times as fast as `values[row]` for long rows.
 
-    Rows of states with room have as much again.
+    Rows of states with spare room get as much room again.
     """
     base = values._base
     if base is None or values.dim() != 2 or grown(values, values.shape[1]) is None:
@@ -25,7 +25,7 @@ def rows_of(values: Tensor, row: Tensor) -> Tensor:
 
 def _selected(values: Tensor, row: Tensor) -> Tensor:
     if values.dim() == 2 and values.is_contiguous() and values.storage_offset() == 0 and not values.requires_grad:
-        # A row that is as long as a number is moved as one.
+        # A row of as many bytes as an integer is moved as one.
         whole = WIDE.get(values.shape[1] * values.element_size())
         if whole is not None and values.shape[1] > 1:
             return _selected(values.view(whole).view(-1), row).view(values.dtype).view(-1, values.shape[1])
@@ -33,14 +33,14 @@ def _selected(values: Tensor, row: Tensor) -> Tensor:
 
 
 def states_with_room(like: Tensor, size: int, room: int) -> Tensor:
-    """States `[N, size]` to be written, as many and as precise as `like [N, ...]`; a row has room for `room` more."""
+    """Uninitialised states `[N, size]`, like `like [N, ...]`, with room for `room` more numbers in each row."""
     taken = like.new_empty(len(like), size + room)
     setattr(taken, MARK, True)
     return taken[:, :size]
 
 
 def grown(state: Tensor, size: int) -> Tensor | None:
-    """The state and what follows it in memory, `[N, size]`; None where it is not one with so much room."""
+    """`state [N, ...]` together with its spare room, `[N, size]`; None where it has not so much room."""
     base = state._base
     if (
         base is None

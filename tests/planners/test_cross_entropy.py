@@ -4,15 +4,15 @@ import pytest
 import torch
 
 from neuroprior import CrossEntropyPlanner, GRUPrior, MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, cube
-from neuroprior.planners.cross_entropy import _places, _Refitted
-from tests.support.sources import chance_world, every_plan, fits, random_world, refuses, seeded
+from neuroprior.planners.cross_entropy import RefittedPrior, _places
+from tests.support.sources import every_plan, fits, random_world, refuses, seeded, stochastic_world
 
 WALK = every_plan(3, 4)
 
 
 def refitted(order, counts, strength=2.0, temperature=1.0):
     prior = MarkovPrior(3, 2).fit(torch.randint(3, (200, 6), generator=seeded(0)))
-    return prior, _Refitted(prior, counts, order, strength, temperature)
+    return prior, RefittedPrior(prior, counts, order, strength, temperature)
 
 
 @pytest.mark.parametrize("order", [None, 1, 2])
@@ -31,7 +31,7 @@ def test_it_draws_from_counts_and_prior_together(order, temperature):
         total = counts[start][where].double().sum(-1)
         expected = ((n + 2 * probs) / (total + 2)).prod(1)
         assert torch.isclose(expected.sum(), torch.tensor(1.0).double(), atol=1e-5)
-        plans = proposer.sample(2 * 50_000, 4, temperature=1.0, generator=seeded(start)).view(2, -1, 4)
+        plans = proposer.sample(50_000, 4, seeded(start))
         assert fits(plans[start], expected, 3)
 
 
@@ -45,7 +45,7 @@ def test_elites_are_the_best_plans_so_far():
     planner = CrossEntropyPlanner(UniformPrior(3), 4, 10, elites=0.2)
     plans = torch.stack([WALK[:10], WALK[30:40]]).to(torch.uint8)
     score = torch.tensor([[0, 1, 2, 9, 4, 5, 6, 7, 8, 3], [5, 5, 0, 0, 0, 0, 0, 0, 0, 0]]).float()
-    counts = planner._counted(plans, score, torch.zeros(2, 4, 3), seeded(0))
+    counts = planner._elite_counts(plans, score, torch.zeros(2, 4, 3), seeded(0))
     for start, best in ((0, (3, 8)), (1, (0, 1))):
         expected = sum(torch.nn.functional.one_hot(plans[start, k].long(), 3) for k in best)
         assert torch.equal(counts[start], expected.float())
@@ -66,7 +66,7 @@ def test_it_comes_nearer_step_by_step():
 
 
 def test_in_worlds_with_chance_and_where_not_all_is_legal():
-    world, state = chance_world(0), torch.zeros(7, dtype=torch.long)
+    world, state = stochastic_world(0), torch.zeros(7, dtype=torch.long)
     planner = CrossEntropyPlanner(UniformPrior(world.num_actions), 3, 12, num_rollouts=5)
     assert planner.plan(world, state, seeded(0)).model_steps == 12 * 3 * 5
     world = random_world(0, "WSA", legal=True)

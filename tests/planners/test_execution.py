@@ -1,17 +1,17 @@
-"""Executing plans: what is done is what was planned, open loop or closed, and replanning pays where chance decides."""
+"""Executing plans in open and closed loop: as they were planned; replanning pays where outcomes are random."""
 
 import pytest
 import torch
 
 from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, execute, gridworld
-from tests.support.sources import chance_world, random_world, refuses, seeded
+from tests.support.sources import random_world, refuses, seeded, stochastic_world
 
 
 def test_an_open_loop_is_the_plan():
     world = random_world(0)
     state = world.reset(20, seeded(0))
     planner = ExhaustivePlanner(4, objective="return")
-    done = execute(planner, world, state, 4, every=4, generator=seeded(1))
+    done = execute(planner, world, state, 4, replan_every=4, generator=seeded(1))
     decision = planner.plan(world, state, seeded(1))
     assert torch.equal(done.actions, decision.plan.long())
     assert torch.allclose(done.rewards.sum(1), decision.score)
@@ -20,7 +20,7 @@ def test_an_open_loop_is_the_plan():
 
 
 @pytest.mark.parametrize(("every", "decisions"), [(1, 7), (2, 4), (3, 3)])
-def test_it_is_planned_anew_after_every_few_steps(every, decisions):
+def test_it_replans_after_so_many_steps(every, decisions):
     world = gridworld(8, 8, num_worlds=3)
     state = world.reset(5, seeded(0))
     planner = SamplingPlanner(UniformPrior(4), 3, 10)
@@ -34,7 +34,7 @@ def test_it_is_planned_anew_after_every_few_steps(every, decisions):
         assert torch.equal(reward, done.rewards[:, t])
 
 
-def test_a_closed_loop_answers_what_chance_did():
+def test_a_closed_loop_responds_to_random_outcomes():
     """A coin leads to cell 1 or 2, where the right answer is another: a closed loop is always right, an open one half.
 
     Wrong answers of 4,000 coins: by Hoeffding their share is within .05 of a half but with probability 5e-9.
@@ -49,7 +49,7 @@ def test_a_closed_loop_answers_what_chance_did():
 
 
 def test_the_same_seed_does_the_same():
-    world, state = chance_world(0), torch.arange(5)
+    world, state = stochastic_world(0), torch.arange(5)
     planner = SamplingPlanner(UniformPrior(3), 3, 10)
     first, second = (execute(planner, world, state, 5, generator=seeded(3)) for _ in range(2))
     for one, other in zip(first[:3], second[:3], strict=True):
@@ -57,15 +57,16 @@ def test_the_same_seed_does_the_same():
 
 
 @pytest.mark.parametrize(
-    ("given", "word"), [({"num_steps": 0}, "num_steps"), ({"every": 0}, "every"), ({"every": 4}, "fewer")]
+    ("given", "word"),
+    [({"num_steps": 0}, "num_steps"), ({"replan_every": 0}, "replan_every"), ({"replan_every": 4}, "fewer")],
 )
 def test_refuses(given, word):
     world = random_world(0)
     with refuses(word):
-        execute(ExhaustivePlanner(3), world, world.reset(2, seeded(0)), **({"num_steps": 5, "every": 2} | given))
+        execute(ExhaustivePlanner(3), world, world.reset(2, seeded(0)), **({"num_steps": 5, "replan_every": 2} | given))
 
 
 def test_refuses_to_execute_beyond_the_prefix_that_won():
     world = TabularWorld(torch.tensor([[1], [2], [2]]), torch.tensor([0.0, 1.0, 0.0]))
     with refuses("fewer"):
-        execute(ExhaustivePlanner(3, any_prefix=True), world, torch.tensor([0]), 3, every=3)
+        execute(ExhaustivePlanner(3, any_prefix=True), world, torch.tensor([0]), 3, replan_every=3)

@@ -22,7 +22,7 @@ from neuroprior import (
     oracle,
 )
 from neuroprior.planners import frontier
-from tests.support.sources import chance_world, random_world, refuses, seeded
+from tests.support.sources import random_world, refuses, seeded, stochastic_world
 
 HOW = (
     {},
@@ -128,9 +128,9 @@ def test_plans_that_meet_add_up_and_the_best_goes_on():
         torch.zeros(2, 3, 1),
         torch.tensor([7, 8, 7, 9, 9, 9]),
     )
-    blind = front.merged(None).log_prob.exp()
+    blind = front.merge(None).log_prob.exp()
     assert torch.allclose(blind, torch.tensor([[0.0, 0.5, 0.5], [0.0, 0.0, 0.5]], dtype=torch.double))
-    gained = front.merged(torch.tensor([[2.0, 1.0, 1.0], [1.0, 9.0, 1.0]]).double()).log_prob.exp()
+    gained = front.merge(torch.tensor([[2.0, 1.0, 1.0], [1.0, 9.0, 1.0]]).double()).log_prob.exp()
     assert torch.allclose(gained, torch.tensor([[0.5, 0.5, 0.0], [0.0, 0.0, 0.5]], dtype=torch.double))
 
 
@@ -187,8 +187,8 @@ def test_refuses(given, word):
 
 def test_refuses_worlds_and_priors():
     state = torch.zeros(2, dtype=torch.long)
-    with refuses("chance"):
-        FrontierPlanner(UniformPrior(3), 2, 2).plan(chance_world(0), state)
+    with refuses("deterministic"):
+        FrontierPlanner(UniformPrior(3), 2, 2).plan(stochastic_world(0), state)
     with refuses("4 actions", "3"):
         FrontierPlanner(UniformPrior(4), 2, 2).plan(random_world(0), state)
     with refuses("state"):

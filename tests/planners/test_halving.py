@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuroprior import SamplingPlanner, TabularWorld, UniformPrior, expected_score
-from neuroprior.planners.chance import halved_scores, halving, mean_scores
-from tests.support.sources import chance_world, every_plan, seeded
+from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
+from tests.support.sources import every_plan, seeded, stochastic_world
 
 
 @given(num_plans=st.integers(1, 500), num_rollouts=st.integers(1, 50))
 def test_rounds_share_the_rollouts_out(num_plans, num_rollouts):
-    rounds = list(halving(num_plans, num_rollouts))
+    rounds = list(halving_rounds(num_plans, num_rollouts))
     assert rounds[0][0] == num_plans
     assert all(times >= 1 for _, times in rounds)
     assert sum(kept * times for kept, times in rounds) <= num_plans * num_rollouts
@@ -26,7 +26,7 @@ def test_rounds_share_the_rollouts_out(num_plans, num_rollouts):
 @pytest.mark.parametrize("prefix", [False, True])
 def test_scores_are_means_over_all_rollouts_of_the_plans_that_are_left(prefix):
     """Rewards are in [0, 1]: by Hoeffding a mean of 4,000 misses by 0.055 with probability 2 exp(-24)."""
-    world, plans = chance_world(4, "WS"), every_plan(3, 3)
+    world, plans = stochastic_world(4, "WS"), every_plan(3, 3)
     state = torch.arange(10)
     planner = SamplingPlanner(UniformPrior(3), 3, 27, any_prefix=prefix)
     left, score, ends = halved_scores(planner, world, state, plans.expand(10, -1, -1), 4000, seeded(0))
@@ -58,7 +58,7 @@ def test_it_finds_better_plans_with_as_many_steps():
 
 
 def test_steps_are_counted_and_without_chance_there_is_nothing_to_halve():
-    world = chance_world(5, "WSAK")
+    world = stochastic_world(5, "WSAK")
     planner = SamplingPlanner(UniformPrior(3), 3, 20, num_rollouts=7, halving=True)
     taken, rollout = [], world.rollout
     world.rollout = lambda state, plans, *rest: taken.append(plans.numel()) or rollout(state, plans, *rest)
@@ -68,7 +68,7 @@ def test_steps_are_counted_and_without_chance_there_is_nothing_to_halve():
 
 
 def test_a_single_round_is_the_plain_mean():
-    world, state, plans = chance_world(6, "WS"), torch.arange(10), every_plan(3, 2).expand(10, -1, -1)
+    world, state, plans = stochastic_world(6, "WS"), torch.arange(10), every_plan(3, 2).expand(10, -1, -1)
     planner = SamplingPlanner(UniformPrior(3), 2, 9)
     plain = mean_scores(planner, world, state, plans, 1, seeded(0))
     _, *halved = halved_scores(planner, world, state, plans, 1, seeded(0))

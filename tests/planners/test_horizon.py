@@ -11,7 +11,7 @@ from neuroprior import HorizonPlanner, MarkovPrior, SamplingPlanner, TabularWorl
 from neuroprior.planners.horizon import _Found
 from neuroprior.testing import check_planner
 from tests.support.reports import FROM_ELSEWHERE
-from tests.support.sources import FALSE_ALARM, chance_world, p_value, refuses, seeded
+from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded, stochastic_world
 
 
 @pytest.mark.parametrize("settings", [{"pilot": 0.1}, {"pilot": 1.0}, {"rounds": 8, "temperature": 2.0}])
@@ -48,14 +48,14 @@ def test_what_promises_most():
     long = [[[0.0, 0.0, 0.1], [0.0, 0.0, 1.0], [0.0, 0.0, 0.6], [0.0, 0.0, 0.3]]]
     nothing = [[[0.0] * 3] * 4]
     for scores, horizon in ((short, 1), (long, 3), (nothing, 3)):
-        assert planner._horizon(gathered(scores), 60).tolist() == [horizon]
+        assert planner._best_horizon(gathered(scores), 60).tolist() == [horizon]
 
 
 def test_of_few_actions_there_are_few_plans():
     """Two actions: of one step there are two plans, of which sixty tries tell no more."""
     scores = [[[0.0] * 3, [1.0] * 3, [0.5] * 3, [0.2] * 3]]
-    assert HorizonPlanner(UniformPrior(100), 3, 60)._horizon(gathered(scores), 60).tolist() == [1]
-    assert HorizonPlanner(UniformPrior(2), 3, 60)._horizon(gathered(scores), 60).tolist() == [3]
+    assert HorizonPlanner(UniformPrior(100), 3, 60)._best_horizon(gathered(scores), 60).tolist() == [1]
+    assert HorizonPlanner(UniformPrior(2), 3, 60)._best_horizon(gathered(scores), 60).tolist() == [3]
 
 
 def test_deep_horizons_count():
@@ -66,17 +66,17 @@ def test_deep_horizons_count():
     found = found._replace(decision=found.decision._replace(score=torch.tensor([0.5])))
     for actions in (2, 4, 300):
         planner = HorizonPlanner(UniformPrior(actions), 64, 16)
-        assert planner._horizon(found, 640).tolist() == [64]
+        assert planner._best_horizon(found, 640).tolist() == [64]
     scores[0, :, 40:] = scores[0, :, -1:]
     found = gathered(scores.tolist())
-    assert HorizonPlanner(UniformPrior(4), 64, 16)._horizon(found, 640).tolist() == [42]  # 15 plans, as of 41
+    assert HorizonPlanner(UniformPrior(4), 64, 16)._best_horizon(found, 640).tolist() == [42]  # 15 plans, as of 41
 
 
 def test_what_others_found_counts_for_a_little():
     """A start that found nothing goes by the others; alone it would plan as deep as it may."""
     planner = HorizonPlanner(UniformPrior(100), 3, 60)
     short, nothing = [[0.0] * 3, [1.0] * 3, [0.5] * 3, [0.2] * 3], [[0.0] * 3] * 4
-    assert planner._horizon(gathered([nothing, short, short]), 60).tolist() == [1, 1, 1]
+    assert planner._best_horizon(gathered([nothing, short, short]), 60).tolist() == [1, 1, 1]
 
 
 def test_ties_over_rounds():
@@ -96,7 +96,7 @@ def test_ties_over_rounds():
 
 
 def test_with_chance_and_where_not_all_is_legal():
-    world = chance_world(0)
+    world = stochastic_world(0)
     planner = HorizonPlanner(UniformPrior(3), 4, 10, objective="return", num_rollouts=5)
     decision = planner.plan(world, world.reset(20, seeded(0)), seeded(1))
     assert decision.model_steps <= 10 * 4 * 5

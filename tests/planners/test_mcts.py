@@ -16,7 +16,7 @@ from neuroprior import (
     gridworld,
     oracle,
 )
-from tests.support.sources import chance_world, random_world, refuses, seeded
+from tests.support.sources import random_world, refuses, seeded, stochastic_world
 
 
 @settings(deadline=None, max_examples=40)
@@ -103,13 +103,13 @@ def test_rewards_are_as_precise_as_the_worlds():
     assert torch.allclose(decision.score, oracle(world, state, 3, objective="return"), rtol=0, atol=1e-6)
 
 
-def test_the_start_that_took_most_steps_tells_how_many(monkeypatch):
+def test_the_start_that_took_most_steps_tells_how_many():
     """A start where little can be tried before others, in chunks of one."""
     world = TabularWorld(torch.tensor([[0, 0], [2, 3], [4, 5], [6, 1], [1, 2], [3, 4], [5, 6]]), torch.rand(7))
     state = torch.tensor([0, 1, 0])
     planner = MCTSPlanner(UniformPrior(2), 4, 6)
     together = planner.plan(world, state, seeded(0)).model_steps
-    monkeypatch.setattr("neuroprior.planners.planner.STEPS_AT_ONCE", 1)
+    planner.steps_at_once = 1
     assert planner.plan(world, state, seeded(0)).model_steps == together == 24
 
 
@@ -128,7 +128,7 @@ def test_refuses(given, word):
         MCTSPlanner(UniformPrior(4), **({"length": 2, "num_plans": 2} | given))
 
 
-def test_refuses_chance():
-    world = chance_world(0)
-    with refuses("chance"):
+def test_refuses_stochastic_worlds():
+    world = stochastic_world(0)
+    with refuses("deterministic"):
         MCTSPlanner(UniformPrior(world.num_actions), 2, 2).plan(world, torch.zeros(1, dtype=torch.long))

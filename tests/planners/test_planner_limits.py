@@ -6,12 +6,12 @@ import torch
 from neuroprior import ExhaustivePlanner, Planner, SamplingPlanner, UniformPrior, World, gridworld, oracle
 
 
-def test_chunks_are_put_together_with_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_are_put_together_with_lengths() -> None:
     world = gridworld(5, 5, num_worlds=2, seed=1)
     state = torch.arange(50)
     planner = ExhaustivePlanner(3, any_prefix=True)
     whole = planner.plan(world, state, torch.Generator().manual_seed(0))
-    monkeypatch.setattr("neuroprior.planners.planner.STEPS_AT_ONCE", 400)
+    planner.steps_at_once = 400
     parts = planner.plan(world, state, torch.Generator().manual_seed(0))
     assert parts.score.equal(whole.score)
     assert parts.lengths is not None

@@ -16,7 +16,6 @@ from neuroprior import (
     gridworld,
     oracle,
 )
-from neuroprior.planners import planner as planner_module
 from tests.support.sources import (
     FALSE_ALARM,
     best_plan_distribution,
@@ -92,17 +91,17 @@ def test_exhaustive_is_brute_force_and_so_is_the_oracle(world, goal, depth):
 def test_sampling_decides_for_the_best_of_its_candidates(world, goal, prior):
     class Watched(SamplingPlanner):
         def candidates(self, *arguments):
-            self.seen = super().candidates(*arguments)
-            return self.seen
+            self.found = super().candidates(*arguments)
+            return self.found
 
     states, planner = torch.arange(world.num_maps * 6), Watched(prior, 4, 5, **goal)
     decision = planner.plan(world, states, seeded(1))
-    plans, rollout = planner.seen
+    plans, score, ends = planner.found
     assert decision.model_steps == 20
     assert plans.shape == (len(states), 5, 4)
     again = world.rollout(states, plans)
-    assert torch.equal(again.rewards, rollout.rewards)
-    assert torch.equal(again.final_state, rollout.final_state)
+    assert torch.equal(planner.score(again.rewards, again.final_state), score)
+    assert torch.equal(again.final_state, ends)
     for i in range(len(states)):
         found = [brute_force(world, i, plan, goal) for plan in plans[i]]
         assert None not in found[0]
@@ -133,7 +132,7 @@ def test_candidates_of_a_start_are_independent_of_its_place():
     """Plans are drawn for all starts together: each start's candidates must still have the prior's distribution."""
     world = random_world(0)
     planner = SamplingPlanner(UniformPrior(3), 2, 4)
-    plans, _ = planner.candidates(world, torch.zeros(20_000, dtype=torch.long), seeded(0))
+    plans, _, _ = planner.candidates(world, torch.zeros(20_000, dtype=torch.long), seeded(0))
     number = plan_number(plans, 3)
     for part in (number[:10_000], number[10_000:], number[:, 0]):
         assert p_value(part, torch.ones(9)) > FALSE_ALARM
@@ -143,10 +142,10 @@ def test_candidates_of_a_start_are_independent_of_its_place():
 @pytest.mark.parametrize("steps", [1, 100, 2**22])
 @pytest.mark.parametrize("make", [lambda: ExhaustivePlanner(3), lambda: SamplingPlanner(UniformPrior(3), 2, 500)])
 def test_chunks(make, steps, monkeypatch):
-    monkeypatch.setattr(planner_module, "STEPS_AT_ONCE", steps)
     world = random_world(4, "WSA", legal=True)
     states = torch.randint(12, (50,), generator=seeded(0))
     planner = make()
+    planner.steps_at_once = steps
     sizes, reference = [], world.step
     monkeypatch.setattr(world, "step", lambda s, a, g=None: sizes.append(len(s)) or reference(s, a, g))
     decision = planner.plan(world, states, seeded(1))

@@ -13,16 +13,16 @@ from neuroprior import (
     gridworld,
     labyrinth,
 )
-from neuroprior.planners.warm_start import continued, with_rest
+from neuroprior.planners.warm_start import continue_plans, with_rest
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,
-    chance_world,
     distribution,
     p_value,
     plan_number,
     random_world,
     seeded,
+    stochastic_world,
 )
 
 
@@ -32,7 +32,7 @@ def test_the_rest_goes_on_as_the_prior_would():
     rest = torch.tensor([[2, 0, 1]]).repeat(4000, 1)
     left = torch.full((4000,), 2)
     state = world.reset(4000, seeded(0))
-    plans, rollout = continued(prior, world, state, rest, left, 4, seeded(1))
+    plans, rollout = continue_plans(prior, world, state, rest, left, 4, seeded(1))
     assert (plans[:, 0, :2].long() == rest[:, :2]).all()
     begin = torch.tensor([2, 0])
     due = distribution(prior, 4).view(9, 9)[plan_number(begin, 3)]
@@ -46,7 +46,7 @@ def test_actions_that_do_not_exist_are_drawn_anew():
     world = labyrinth()
     state = torch.zeros(500, dtype=torch.long)
     rest = torch.full((500, 5), 3)
-    plans, rollout = continued(UniformPrior(4), world, state, rest, torch.full((500,), 5), 5, seeded(0))
+    plans, rollout = continue_plans(UniformPrior(4), world, state, rest, torch.full((500,), 5), 5, seeded(0))
     now = state
     for t, action in enumerate(plans[:, 0].long().T):
         legal = world.legal_actions(now)
@@ -90,7 +90,7 @@ def test_of_equals_a_random_one():
 
 def test_with_chance_both_are_tried_alike():
     """The score of a winner among many flatters it; where both are tried anew, the better one wins in the mean."""
-    world, prior = chance_world(0), UniformPrior(3)
+    world, prior = stochastic_world(0), UniformPrior(3)
     state = world.reset(400, seeded(0))
     planner = SamplingPlanner(prior, 3, 10, objective="return")
     decision = planner.plan(world, state, seeded(1))
@@ -109,7 +109,9 @@ def test_seeing_priors_see_where_the_rest_leads():
     world = gridworld(4, 4)
     state = world.reset(50, seeded(0))
     prior = MarkovPrior(4, 1, num_contexts=16)
-    plans, _ = continued(prior, world, state, torch.zeros(50, 2, dtype=torch.long), torch.full((50,), 2), 4, seeded(0))
+    plans, _ = continue_plans(
+        prior, world, state, torch.zeros(50, 2, dtype=torch.long), torch.full((50,), 2), 4, seeded(0)
+    )
     assert (plans[:, 0, :2] == 0).all()
 
 

@@ -17,11 +17,9 @@ from neuroprior import (
     sample_distinct,
     sample_distinct_in_world,
 )
-from neuroprior.sampling import distinct
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,
-    chance_world,
     distribution,
     fits,
     in_world_distribution,
@@ -30,6 +28,7 @@ from tests.support.sources import (
     random_world,
     refuses,
     seeded,
+    stochastic_world,
 )
 
 MANY = 20_000
@@ -164,10 +163,9 @@ def test_the_greedy_plan_need_not_be_the_most_probable():
     assert float(log_prob.exp()) == pytest.approx(0.4)
 
 
-def test_flat_distributions_have_too_many_plans_of_one_probability(monkeypatch):
-    monkeypatch.setattr(distinct, "MOST_PREFIXES", 100)
-    with refuses("num_plans", "more than 100 beginnings of 4 actions"):
-        most_probable(UniformPrior(4), 3, 5)
+def test_flat_distributions_have_too_many_plans_of_one_probability():
+    with refuses("num_plans", "more than max_prefixes = 100 prefixes of 4 actions"):
+        most_probable(UniformPrior(4), 3, 5, max_prefixes=100)
 
 
 @pytest.mark.parametrize(
@@ -189,7 +187,7 @@ def test_refuses(given, word):
 def test_refuses_contexts_a_step_and_sets_beside_contexts():
     prior = TablePrior.random(3, 2, num_contexts=2)
     for call in (sample_distinct, most_probable):
-        with refuses("context", "one a plan"):
+        with refuses("context", "one per set"):
             call(prior, 2, 2, torch.zeros(4, 2, dtype=torch.long))
     with refuses("num_sets"):
         sample_distinct(prior, 2, 2, torch.zeros(4, dtype=torch.long), num_sets=4)
@@ -220,7 +218,7 @@ def test_refuses_in_worlds():
     world, state = random_world(0), torch.zeros(2, dtype=torch.long)
     with refuses("prior", "2 actions", "3"):
         sample_distinct_in_world(UniformPrior(2), world, state, 2, 3)
-    with refuses("chance"):
-        sample_distinct_in_world(UniformPrior(3), chance_world(0), state, 2, 3)
+    with refuses("deterministic"):
+        sample_distinct_in_world(UniformPrior(3), stochastic_world(0), state, 2, 3)
     with refuses("state"):
         sample_distinct_in_world(UniformPrior(3), world, state + 99, 2, 3)

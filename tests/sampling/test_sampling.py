@@ -16,7 +16,7 @@ from neuroprior import (
     sample,
     sample_in_world,
 )
-from neuroprior.sampling import ancestral as sampling
+from neuroprior.sampling.draws import Draw
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,
@@ -200,38 +200,19 @@ def test_batches_bound_memory_and_change_nothing_else(method):
     assert fits(plans, distribution(TablePrior.random(A, 6), 6), A)
 
 
-@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
-def test_plans_drawn_together_in_parts_are_the_same(kind, monkeypatch):
-    prior = kind(3, lags=2)
-
-    def draws():
-        return sample(prior, 50, 6, generator=seeded(0), method="ancestral")
-
-    whole = draws()
-    monkeypatch.setattr(sampling, "CACHED", 1)
-    monkeypatch.setattr(sampling, "FEWEST", 7)
-    assert torch.equal(draws(), whole)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_start_and_step_are_enough(method):
-    """Of a prior that is no `Prior`."""
-
-    class Plain:
-        num_actions, context_per, end, device = 3, None, None, torch.device("cpu")
-
-        def start(self, batch_size, context=None):
-            return torch.zeros(batch_size, 3), torch.zeros(batch_size, 1)
-
-        def step(self, action, state, context=None):
-            return torch.eye(3)[action].log(), state
-
-        def check_context_of(self, plans, num_plans=0, length=0):
-            pass
-
-    plans = sample(Plain(), 40, 4, generator=seeded(0), method=method)
-    assert (plans == plans[:, :1]).all()
-    assert len(plans[:, 0].unique()) == 3
+@pytest.mark.parametrize("prior", [GRUPrior(3, 600), TransformerPrior(3, 256)], ids=["gru", "transformer"])
+def test_parts_that_fit_a_cache_draw_the_same_plans(prior):
+    """States so large that 2,500 plans are drawn in three parts, against stepping all plans together."""
+    plans = sample(prior, 2500, 4, generator=seeded(0), method="ancestral")
+    draw = Draw(3, 1.0, seeded(0))
+    with torch.no_grad():
+        logits, state = prior.start(2500)
+        assert 2**19 // state[0].numel() < 1024
+        uniform = draw.uniform((4, 2500), logits)
+        for t in range(4):
+            action = draw.actions(logits, uniform[t])
+            assert torch.equal(plans[:, t].long(), action)
+            logits, state = prior.step(action, state)
 
 
 def test_a_tree_evaluates_each_prefix_once():

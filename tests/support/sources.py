@@ -95,7 +95,7 @@ def random_world(
     return TabularWorld(table, reward, exists)
 
 
-def chance_world(
+def stochastic_world(
     seed: int, rewards: str = "WSAK", states: int = 5, actions: int = 3, outcomes: int = 4, maps: int = 2
 ) -> TabularWorld:
     """A random table with chance; the outcomes of an action are different cells, about a third of which cannot occur.
@@ -112,7 +112,9 @@ def chance_world(
     return TabularWorld(table, reward, probability=probability / probability.sum(-1, keepdim=True))
 
 
-def courses(world: TabularWorld, state: int, plan: list[int]) -> list[tuple[float, tuple[int, ...], tuple[float, ...]]]:
+def trajectories(
+    world: TabularWorld, state: int, plan: list[int]
+) -> list[tuple[float, tuple[int, ...], tuple[float, ...]]]:
     """All that may come of `plan` from `state`: (probability, states after each step, rewards), by recursion."""
     if not plan:
         return [(1.0, (), ())]
@@ -123,7 +125,7 @@ def courses(world: TabularWorld, state: int, plan: list[int]) -> list[tuple[floa
         if p > 0:
             where = {2: (number, to), 3: (number, cell, plan[0]), 4: (number, cell, plan[0], k)}[world.reward.dim()]
             after, reward = number * world.num_states + to, float(world.reward[where])
-            for q, states, rewards in courses(world, after, plan[1:]):
+            for q, states, rewards in trajectories(world, after, plan[1:]):
                 found.append((p * q, (after, *states), (reward, *rewards)))
     return found
 

@@ -27,7 +27,7 @@ from neuroprior import (
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
 from neuroprior.worlds import Rollout
-from tests.support.sources import chance_world
+from tests.support.sources import stochastic_world
 
 
 def random_plans(num_actions: int, context: Tensor | None = None, length: int = 5) -> Plans:
@@ -92,7 +92,7 @@ def legal_world() -> TabularWorld:
         legal_world(),
         cube(),
         cube("quarter", scramble=3),
-        chance_world(0),
+        stochastic_world(0),
         maze(7, 9, num_layouts=3, num_worlds=2),
         four_rooms(egocentric=True, view=2, reward="goal"),
         egocentric(gridworld(5, 5, "torus")),
@@ -282,7 +282,7 @@ class Lucky(TabularWorld):
     """Each plan meets its own chance."""
 
     def __init__(self) -> None:
-        world = chance_world(0)
+        world = stochastic_world(0)
         super().__init__(world.next_state, world.reward, probability=world.probability)
 
     def rollout(

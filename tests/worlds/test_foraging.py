@@ -22,13 +22,13 @@ from neuroprior import (
 from neuroprior.testing import check_world
 from tests.support.sources import (
     FALSE_ALARM,
-    chance_world,
     corridor,
     every_plan,
     p_value,
     random_world,
     refuses,
     seeded,
+    stochastic_world,
 )
 
 
@@ -111,7 +111,7 @@ def test_bad_worlds():
         "above it": lambda: ForagingWorld(table, growth * 0, 5),
         "one layout": lambda: ForagingWorld(maze(7, 7, num_layouts=2), growth, 5),
         "radius": lambda: patches(table, 1, 0),
-        "without chance": lambda: patches(chance_world(0), 1, 1),
+        "without chance": lambda: patches(stochastic_world(0), 1, 1),
     }.items():
         with refuses(word):
             make()

@@ -11,7 +11,7 @@ from neuroprior import TabularWorld
 from neuroprior.testing import check_world
 from neuroprior.values import can_reach, q_learning, value_iteration
 from neuroprior.worlds.chance import Chance
-from tests.support.sources import FALSE_ALARM, chance_world, courses, p_value, random_world, refuses, seeded
+from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded, stochastic_world, trajectories
 
 KINDS = ("S", "SA", "SAK", "WS", "WSA", "WSAK")
 
@@ -47,7 +47,7 @@ def test_rounding_cannot_draw_past_the_last_outcome():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_step_has_the_given_probabilities_and_rewards(kind):
-    world = chance_world(1, kind)
+    world = stochastic_world(1, kind)
     assert world.stochastic
     cell, action = torch.meshgrid(torch.arange(5), torch.arange(3), indexing="ij")
     start = world.state(cell.flatten(), world.num_maps - 1).repeat(2000)
@@ -64,9 +64,9 @@ def test_step_has_the_given_probabilities_and_rewards(kind):
 
 @pytest.mark.parametrize("kind", ["WS", "WSA", "WSAK"])
 def test_rollout_has_the_distribution_of_its_courses(kind):
-    world = chance_world(2, kind)
+    world = stochastic_world(2, kind)
     start, plan = 7, [2, 0, 1]
-    all_courses = courses(world, start, plan)
+    all_courses = trajectories(world, start, plan)
     assert sum(p for p, _, _ in all_courses) == pytest.approx(1)
     rollout = world.rollout(torch.full((20_000,), start), torch.tensor([[plan]]).expand(20_000, 1, 3), seeded(0), True)
     number = {states: n for n, (_, states, _) in enumerate(all_courses)}
@@ -77,7 +77,7 @@ def test_rollout_has_the_distribution_of_its_courses(kind):
 
 
 def test_plans_of_a_start_meet_the_same_chance_and_starts_do_not():
-    world = chance_world(3)
+    world = stochastic_world(3)
     state = torch.full((4000,), 3)
     plans = torch.randint(3, (1, 5, 4), generator=seeded(1)).repeat(4000, 1, 1)
     plans[:, 3] = plans[:, 0]
@@ -103,7 +103,7 @@ def test_chance_is_a_quantile_that_every_plan_shares():
 
 @pytest.mark.parametrize("num_plans", [0, 1, 50])
 def test_as_many_numbers_are_drawn_however_many_plans(num_plans):
-    world, generator = chance_world(4), seeded(5)
+    world, generator = stochastic_world(4), seeded(5)
     world.rollout(torch.arange(6), torch.zeros(6, num_plans, 7, dtype=torch.long), generator)
     other = seeded(5)
     torch.rand(6 * 7, generator=other)
@@ -129,12 +129,12 @@ def test_a_sure_outcome_is_no_chance(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_means(kind):
-    world = chance_world(7, kind)
+    world = stochastic_world(7, kind)
     values = torch.rand(world.num_maps, 5, generator=seeded(1))
     reward, after = world.mean_reward(), world.mean_after(values)
     assert reward.shape == after.shape == (world.num_maps, 5, 3)
     for number, cell, action in itertools.product(range(world.num_maps), range(5), range(3)):
-        found = courses(world, number * 5 + cell, [action])
+        found = trajectories(world, number * 5 + cell, [action])
         assert float(reward[number, cell, action]) == pytest.approx(sum(p * r[0] for p, _, r in found))
         want = sum(p * float(values.view(-1)[s[0]]) for p, s, _ in found)
         assert float(after[number, cell, action]) == pytest.approx(want)
@@ -149,7 +149,7 @@ def test_what_cannot_occur_has_no_part_in_a_mean():
 
 def test_values_are_those_of_the_mean():
     """One action: values solve a linear equation. Then a goal that each step reaches with probability 1/4."""
-    world = chance_world(8, "WSAK", actions=1)
+    world = stochastic_world(8, "WSAK", actions=1)
     moves = torch.zeros(5, 5).double().scatter_add(1, world.next_state[:, 0], world.probability[:, 0])
     rewards = world.mean_reward()[..., 0].double()
     want = torch.linalg.solve(torch.eye(5) - 0.8 * moves, rewards.T).T
@@ -222,9 +222,9 @@ def test_a_cube_of_rewards_is_ambiguous():
 
 def test_nobody_is_sure_to_reach_a_goal_by_chance():
     with refuses("chance"):
-        can_reach(chance_world(0), torch.tensor([0]), 1, 3)
+        can_reach(stochastic_world(0), torch.tensor([0]), 1, 3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_conforms(kind):
-    check_world(chance_world(9, kind))
+    check_world(stochastic_world(9, kind))

@@ -1,4 +1,4 @@
-"""The exact mean score of plans in a table with chance, by carrying the distribution over its cells forward."""
+"""Exact scores in tables, by dynamic programming: of the best plan (`oracle`), of given plans (`expected_score`)."""
 
 from collections.abc import Callable
 from typing import Literal
@@ -6,13 +6,59 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range
+from neuroprior._checks import check_range, check_sizes
 from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import check_plans
 
-NUMBERS_AT_ONCE = 2**22
-"""Outcomes (plans x cells x outcomes of an action) that are looked at together; bounds memory."""
+
+def oracle(
+    world: TabularWorld,
+    state: Tensor,
+    length: int,
+    *,
+    objective: Literal["terminal", "return"] = "terminal",
+    discount: float = 1.0,
+    value: Callable[[Tensor], Tensor] | None = None,
+    any_prefix: bool = False,
+) -> Tensor:
+    """The exact highest score of all legal plans of `length` actions, by finite-horizon dynamic programming.
+
+    In a stochastic world it is the highest expected score of all closed-loop policies, which choose each action in the
+    state that the earlier ones led to: an upper bound for plans, whose actions are fixed in advance.
+
+    Args:
+        world: a table.
+        state: starts `[B]`.
+        length: number of actions, at least 1.
+        objective, discount, value, any_prefix: see `Planner`.
+
+    Returns:
+        `[B]` floating point. Takes `length * W * S * A` operations whatever B is.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    check_sizes(length=length)
+    check_objective(objective, discount)
+    world.check_state(state)
+    maps, states, actions = world.num_maps, world.num_states, world.num_actions
+    reward = world.mean_reward()
+    best = torch.zeros(maps, states, device=world.device, dtype=reward.dtype)
+    if value is not None:
+        best = value_of(value, torch.arange(maps * states, device=world.device)).view(maps, states).to(reward.dtype)
+    prefix = torch.full_like(best, -torch.inf)
+    for left in range(length):
+        after = world.mean_after(best)
+        if objective == "return":
+            after = reward + discount * after
+        elif left == 0:
+            after = reward + after
+        if world.legal_table is not None:
+            after = after.masked_fill(~world.legal_table, -torch.inf)
+        best = after.view(maps, states, actions).amax(-1)
+        prefix = torch.maximum(prefix, best)
+    return (prefix if any_prefix else best).view(-1)[state]
 
 
 @torch.no_grad()
@@ -25,18 +71,20 @@ def expected_score(
     discount: float = 1.0,
     value: Callable[[Tensor], Tensor] | None = None,
     lengths: Tensor | None = None,
+    outcomes_at_once: int = 2**22,
 ) -> Tensor:
-    """The exact mean score of plans whose actions are executed whatever comes of them (open loop).
+    """The exact expected score of plans that are executed in open loop, whatever their actions lead to.
 
-    A planner's own score of the plan that it chose is the best of many noisy means, and so too high (the winner's
-    curse); this is what the plan is worth. Without chance it is the plan's score.
+    The score that a planner gives the plan it chose is the greatest of many noisy means, and so biased upwards (the
+    winner's curse); this one is exact. In a deterministic world it is the plan's score.
 
     Args:
         world: a table.
         state: starts `[B]`.
-        plans: integers `[B, P, L]`; for one plan a start, `plans[:, None]`.
-        objective, discount, value: what is scored; see `Planner`.
+        plans: integers `[B, P, L]`; for one plan per start, `plans[:, None]`.
+        objective, discount, value: see `Planner`.
         lengths: integers `[B, P]`, 1 to L: how many actions of each plan are executed; None: all.
+        outcomes_at_once: plans times cells times outcomes of an action that are computed together; bounds memory.
 
     Returns:
         `[B, P]` floating point. Takes `B * P * L * S * K` operations.
@@ -58,7 +106,7 @@ def expected_score(
         worth = value_of(value, torch.arange(len(worth), device=world.device))
     table = _Table(world, worth)
     outcomes = 1 if world.probability is None else world.probability.shape[2]
-    size = max(NUMBERS_AT_ONCE // (world.num_states * outcomes), 1)
+    size = max(outcomes_at_once // (world.num_states * outcomes), 1)
     rows = zip(
         state.repeat_interleave(num_plans).split(size),
         plans.reshape(-1, length).split(size),
@@ -81,10 +129,10 @@ class _Table:
         self.worth = worth.double().view(-1, world.num_states)
 
     def scores(self, state: Tensor, plans: Tensor, lengths: Tensor, terminal: bool, discount: float) -> Tensor:
-        """The mean scores `[N]` of `plans [N, L]` from `state [N]`, of which `lengths [N]` actions are executed."""
+        """The expected scores `[N]` of the first `lengths [N]` actions of `plans [N, L]` from `state [N]`."""
         world = self.world
         reward_map = world.reward_map(state)
-        # How likely each cell is, N x S.
+        # The probability of each cell, [N, S].
         share = torch.zeros(len(state), world.num_states, device=state.device, dtype=torch.float64)
         share.scatter_(1, world.cell(state)[:, None], 1.0)
         score = torch.zeros(len(state), device=state.device, dtype=torch.float64)
@@ -98,7 +146,7 @@ class _Table:
         return score + weight * _mean(share, self.worth.index_select(0, reward_map))
 
     def _after(self, share: Tensor, action: Tensor) -> Tensor:
-        """How likely each cell is after one more `action [N]`."""
+        """The probability of each cell after one more `action [N]`."""
         to = self.next_state.index_select(0, action)
         outcomes = to.shape[1] // share.shape[1]
         weight = share.repeat_interleave(outcomes, 1)
@@ -108,7 +156,7 @@ class _Table:
 
 
 def _mean(share: Tensor, values: Tensor) -> Tensor:
-    """The mean `[N]` of `values [N, S]`; a cell that cannot be has no part in it, infinite or not."""
+    """The mean `[N]` of `values [N, S]`; a cell of probability 0 does not count, even if its value is infinite."""
     return (share * values).masked_fill(share == 0, 0).sum(1)
 
 
@@ -118,4 +166,4 @@ def _check_lengths(lengths: Tensor, shape: torch.Size) -> None:
     check_range("lengths", lengths, shape[2] + 1, "lengths")
     if (lengths < 1).any():
         where = (lengths < 1).nonzero()[0].tolist()
-        raise ValueError(f"lengths{where}: at least one action is executed, not 0")
+        raise ValueError(f"lengths{where}: at least one action must be executed, not 0")

@@ -13,20 +13,19 @@ from neuroprior import (
     collect,
     expected_score,
     oracle,
+    sample_in_world,
 )
-from neuroprior.planners import expected as expected_module
-from neuroprior.planners import planner as planner_module
-from neuroprior.planners.chance import mean_scores
+from neuroprior.planners.rollouts import mean_scores
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,
-    chance_world,
-    courses,
     every_plan,
     p_value,
     random_world,
     refuses,
     seeded,
+    stochastic_world,
+    trajectories,
 )
 
 VALUES = torch.rand(10, generator=seeded(99)) * 2 - 1
@@ -50,7 +49,7 @@ def brute_force(world, state, plan, goal):
     """The exact mean score of one plan, course by course."""
     total = 0.0
     discount = goal.get("discount", 1.0)
-    for p, states, rewards in courses(world, state, plan):
+    for p, states, rewards in trajectories(world, state, plan):
         score = rewards[-1]
         if goal.get("objective") == "return":
             score = sum(reward * discount**t for t, reward in enumerate(rewards))
@@ -62,8 +61,8 @@ def brute_force(world, state, plan, goal):
 
 @pytest.mark.parametrize("goal", OBJECTIVES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_expected_scores_are_those_of_all_courses(kind, goal, monkeypatch):
-    world = chance_world(1, kind)
+def test_expected_scores_are_those_of_all_courses(kind, goal):
+    world = stochastic_world(1, kind)
     states = torch.arange(world.num_maps * 5)
     plans = torch.randint(3, (len(states), 4, 3), generator=seeded(2))
     lengths = torch.randint(1, 4, (len(states), 4), generator=seeded(3))
@@ -78,8 +77,7 @@ def test_expected_scores_are_those_of_all_courses(kind, goal, monkeypatch):
             plan = plans[b, p].tolist()
             assert float(whole[b, p]) == pytest.approx(brute_force(world, b, plan, goal), abs=1e-5)
             assert float(cut[b, p]) == pytest.approx(brute_force(world, b, plan[: int(lengths[b, p])], goal), abs=1e-5)
-    monkeypatch.setattr(expected_module, "NUMBERS_AT_ONCE", 60)
-    assert torch.equal(expected_score(world, states, plans, **goal), whole)
+    assert torch.equal(expected_score(world, states, plans, outcomes_at_once=60, **goal), whole)
 
 
 @pytest.mark.parametrize("goal", OBJECTIVES)
@@ -101,7 +99,7 @@ def test_a_cell_that_cannot_be_has_no_part_in_the_mean():
 @pytest.mark.parametrize("kind", ["SAK", "WS"])
 def test_means_over_rollouts_come_to_the_expected_score(kind):
     """Rewards are in [0, 1]: by Hoeffding a mean of 4000 misses by 0.055 with probability 2 exp(-24), 1e-8 for all."""
-    world = chance_world(4, kind)
+    world = stochastic_world(4, kind)
     states = torch.arange(world.num_maps * 5)
     plans = PLANS.expand(len(states), -1, -1)
     planner = ExhaustivePlanner(3)
@@ -119,11 +117,11 @@ def test_means_over_rollouts_come_to_the_expected_score(kind):
 @pytest.mark.parametrize("prefix", [False, True])
 @pytest.mark.parametrize("rollouts", [1, 6])
 def test_all_plans_meet_the_same_chance_whatever_is_tried_together(prefix, rollouts, monkeypatch):
-    world = chance_world(5, "WSAK")
+    world = stochastic_world(5, "WSAK")
     states, planner = torch.arange(10), ExhaustivePlanner(3, any_prefix=prefix)
     plans = torch.cat([PLANS, PLANS]).expand(10, -1, -1)
     together = mean_scores(planner, world, states, plans, rollouts, seeded(0))
-    monkeypatch.setattr(planner_module, "STEPS_AT_ONCE", 1000)
+    planner.steps_at_once = 1000
     sizes, rollout = [], world.rollout
     monkeypatch.setattr(world, "rollout", lambda s, p, *rest: sizes.append(p.numel()) or rollout(s, p, *rest))
     apart = mean_scores(planner, world, states, plans, rollouts, seeded(0))
@@ -145,7 +143,7 @@ def test_all_plans_meet_the_same_chance_whatever_is_tried_together(prefix, rollo
 )
 def test_a_decision_is_what_the_first_rollout_says(make, prefix, monkeypatch):
     """With one rollout and rewards on arrival the score is the reward where the plan, or its executed part, ends."""
-    world = chance_world(6, "WS")
+    world = stochastic_world(6, "WS")
     planner = make(any_prefix=prefix)
     decision = planner.plan(world, torch.arange(10).repeat(20), seeded(0))
     assert torch.equal(decision.score, world.reward.view(-1)[decision.final_state])
@@ -192,7 +190,8 @@ def test_plans_that_a_prior_drew_seeing_the_world_are_scored_anew():
     prior.step = lambda action, state, context=None: (answers[context], state)
     planner = SamplingPlanner(prior, 2, 1)
     state = torch.zeros(5000, dtype=torch.long)
-    assert bool((planner.candidates(world, state, seeded(0))[1].rewards[..., -1] == 1).all())
+    _, rollout = sample_in_world(prior, world, state, 1, 2, generator=seeded(0))
+    assert bool((rollout.rewards[..., -1] == 1).all())
     decision = planner.plan(world, state, seeded(0))
     assert p_value(decision.score.long(), torch.ones(2)) > FALSE_ALARM
 
@@ -201,7 +200,7 @@ def test_plans_that_a_prior_drew_seeing_the_world_are_scored_anew():
 @pytest.mark.parametrize("prefix", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 def test_oracle_is_the_best_policy_and_no_plan_is_better(kind, prefix, goal):
-    world = chance_world(7, kind)
+    world = stochastic_world(7, kind)
     states = torch.arange(world.num_maps * 5)
     discount = goal.get("discount", 1.0)
 
@@ -215,7 +214,7 @@ def test_oracle_is_the_best_policy_and_no_plan_is_better(kind, prefix, goal):
             found.append(
                 sum(
                     p * (counts * rewards[0] + discount * best(after[0], left - 1))
-                    for p, after, rewards in courses(world, state, [action])
+                    for p, after, rewards in trajectories(world, state, [action])
                 )
             )
         return max(found)
@@ -246,7 +245,7 @@ def test_without_chance_one_rollout_is_taken(make):
 
 @pytest.mark.parametrize("rollouts", [1, 3])
 def test_same_seed_same_decisions_and_no_global_state(rollouts):
-    world = chance_world(8)
+    world = stochastic_world(8)
     for planner in (
         ExhaustivePlanner(3, num_rollouts=rollouts),
         SamplingPlanner(UniformPrior(3), 3, 20, num_rollouts=rollouts),
@@ -301,22 +300,25 @@ ONE = torch.zeros(1, 1, 2, dtype=torch.long)
         (lambda: SamplingPlanner(UniformPrior(3), 2, 2, num_rollouts=-1), ["num_rollouts", "-1"]),
         (lambda: ExhaustivePlanner(2).plan(half_legal(), torch.zeros(1, 2)), ["legal"]),
         (lambda: SamplingPlanner(UniformPrior(2), 2, 2).plan(half_legal(), torch.zeros(1, 2)), ["legal"]),
-        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE[0]), ["plans", "[1, 2]"]),
-        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE[:, :, :0]), ["plans", "action"]),
-        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE + 3), ["plans", "3"]),
-        (lambda: expected_score(chance_world(0), torch.tensor([10]), ONE), ["state", "10"]),
-        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, objective="x"), ["objective"]),
-        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, discount=0.5), ["discount"]),
+        (lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE[0]), ["plans", "[1, 2]"]),
+        (lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE[:, :, :0]), ["plans", "action"]),
+        (lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE + 3), ["plans", "3"]),
+        (lambda: expected_score(stochastic_world(0), torch.tensor([10]), ONE), ["state", "10"]),
+        (lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE, objective="x"), ["objective"]),
+        (lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE, discount=0.5), ["discount"]),
         (
-            lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([[3]])),
+            lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([[3]])),
             ["lengths[0, 0]", "3"],
         ),
         (
-            lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([[0]])),
+            lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([[0]])),
             ["lengths", "0"],
         ),
-        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([1])), ["[B, P]", "[1]"]),
-        (lambda: expected_score(chance_world(0), torch.tensor([0]), ONE, lengths=torch.ones(1, 1)), ["lengths"]),
+        (
+            lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE, lengths=torch.tensor([1])),
+            ["[B, P]", "[1]"],
+        ),
+        (lambda: expected_score(stochastic_world(0), torch.tensor([0]), ONE, lengths=torch.ones(1, 1)), ["lengths"]),
     ],
 )
 def test_refuses(call, words):

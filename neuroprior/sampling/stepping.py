@@ -1,0 +1,130 @@
+"""What sampling needs of a prior (`Steppable`), and one way to step any prior, whatever else it offers (`Stepper`)."""
+
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import Tensor
+
+from neuroprior.plans import is_per_step
+from neuroprior.sampling.draws import after_end
+from neuroprior.worlds.world import World
+
+
+class Steppable(Protocol):
+    """What samplers and planners need of a prior: any class with these three will do.
+
+    The state is ONE tensor whose first dimension is the batch, so that reordering and branching are `state[index]`.
+
+    What a prior may offer besides, and is then used (every `neuroprior.priors.Prior` offers all of it):
+
+    - `context_per`: "step" or "plan": `start`, and with "step" also `step`, get a context as last argument; without
+      this attribute, or None, they never get one. `check_context_of(context, num_plans, length)` raises ValueError for
+      a context that does not fit.
+    - `end`: the action that ends a plan.
+    - `advance(action, state, context, room)`: as `step`, but may overwrite the state; `room` more steps will follow.
+    - `device`: where the prior computes.
+
+    Attributes:
+        num_actions: A.
+    """
+
+    @property
+    def num_actions(self) -> int: ...
+
+    def start(self, batch_size: int, /) -> tuple[Tensor, Tensor]:
+        """Logits `[N, A]` of the first action, and the state `[N, ...]`, for N = `batch_size` plans."""
+
+    def step(self, action: Tensor, state: Tensor, /) -> tuple[Tensor, Tensor]:
+        """Logits `[N, A]` of the next action and the next state, after `action [N]` (int64) in `state`."""
+
+
+class Stepper:
+    """A prior as samplers and planners step it: with what it leaves out filled in.
+
+    Args:
+        prior: any prior.
+        in_place: `step` may overwrite the state that it is given, where the prior can.
+
+    Attributes:
+        num_actions: A.
+        context_per: "plan" or "step"; None for a prior without context.
+        end: the end symbol; None for a prior without one.
+    """
+
+    def __init__(self, prior: Steppable, in_place: bool = True) -> None:
+        self._prior: Any = prior
+        self.num_actions = prior.num_actions
+        self.context_per: Literal["plan", "step"] | None = getattr(prior, "context_per", None)
+        self.end: int | None = getattr(prior, "end", None)
+        self._advance = getattr(prior, "advance", None) if in_place else None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the prior computes."""
+        device = getattr(self._prior, "device", None)
+        return self._prior.start(1)[0].device if device is None else torch.device(device)
+
+    def check_context(self, context: Tensor | None, num_plans: int = 0, length: int = 0) -> None:
+        """Raise ValueError unless the prior takes such a context for so many plans of this length."""
+        check = getattr(self._prior, "check_context_of", None)
+        if check is not None:
+            check(context, num_plans, length)
+        elif (context is None) != (self.context_per is None):
+            raise ValueError(f"context: this prior {'takes none' if context is not None else 'needs one'}")
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Logits `[N, A]` of the first action, and the state `[N, ...]`."""
+        logits, state = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
+        return logits, state
+
+    def step(
+        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        """Logits `[N, A]` of the next action, and the next state; `room` more steps will follow.
+
+        After the end symbol nothing else has a probability above 0.
+        """
+        if self._advance is not None:
+            logits, state = self._advance(action, state, context, room)
+        elif context is None:
+            logits, state = self._prior.step(action, state)
+        else:
+            logits, state = self._prior.step(action, state, context)
+        return after_end(logits, action, self.end), state
+
+    def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
+        """As `start`, with the observation of `state [B, ...]` as context.
+
+        Raises:
+            ValueError: the prior cannot act in the world, or its context is not what the world observes.
+        """
+        check_in_world(self._prior, world, state)
+        context = None if self.context_per is None else world.observe(state)
+        if context is not None and is_per_step(context):
+            raise ValueError(
+                f"observe: indices [N] or features [N, C] are expected, not {context.dtype} {list(context.shape)}"
+            )
+        self.check_context(context, len(state))
+        return self.start(len(state), context)
+
+    def step_in(
+        self, world: World, action: Tensor, state: Tensor, reached: Tensor, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        """As `step`, after `action` led to the world's states `reached [N, ...]`."""
+        return self.step(action, state, world.observe(reached) if self.context_per == "step" else None, room)
+
+
+def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
+    """Raise ValueError unless a prior can act in a world from `state [B, ...]`."""
+    world.check_state(state)
+    if getattr(prior, "end", None) is not None:
+        raise ValueError(
+            "prior: it samples an end symbol, which is no action of the world; fit it to plans without one"
+        )
+    if prior.num_actions != world.num_actions:
+        raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
+
+
+def legal_logits(world: World, state: Tensor, logits: Tensor) -> Tensor:
+    """`logits [N, A]` with -inf for the actions that are not legal in `state [N, ...]`."""
+    return logits if world.all_legal else logits.masked_fill(~world.legal_actions(state), -torch.inf)
