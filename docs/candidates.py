@@ -22,9 +22,7 @@ titles = {"random plans": UniformPrior(4), "plans sampled from a prior": GRUPrio
 for axes, (name, prior), colour in zip(all_axes, titles.items(), ("#da9f2e", "#e4530f"), strict=True):
     candidates = prior.sample(NUM_PLANS, LENGTH, generator=generator).long()
     cells = torch.cat([torch.zeros(NUM_PLANS, 1, 2, dtype=torch.long), MOVES[candidates].cumsum(1)], 1)
-    shifted = cells + 0.25 * (
-        torch.rand(NUM_PLANS, 1, 2, generator=generator) - 0.5
-    )  # so that paths do not hide others
+    shifted = cells + 0.25 * (torch.rand(NUM_PLANS, 1, 2, generator=generator) - 0.5)  # paths side by side
     for path in shifted:
         axes.plot(*path.T, color=colour, alpha=0.18, linewidth=1.2)
     axes.scatter(*shifted[:, -1].T, color=colour, s=10, zorder=3)
