@@ -1,50 +1,174 @@
-"""The worked page on one's own data: its example writes the table, and the report finds what was put into it."""
+"""The README and the pages of docs: examples run, commands have the options they are given, links lead somewhere."""
 
 import csv
 import json
+import pkgutil
 import re
-import runpy
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
 
-from eval.__main__ import main
-
-PAGE = Path(__file__).parents[2] / "docs" / "your-own-data.md"
-
-
-@pytest.fixture(scope="module")
-def report(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("docs")
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    (folder / "example.py").write_text(example, encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        runpy.run_path("example.py")
-        arguments = ["plans", "behaviour.csv", "--models", "counts", "--max-steps", "10", "--processes", "1"]
-        assert main([*arguments, "--out", "report"]) == 0
-    return folder / "report"
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "train/README.md", *sorted((ROOT / "docs").glob("*.md"))]
+OWN_DATA = ROOT / "docs/your-own-data.md"
+PROGRAMS = {"neuroprior": "neuroprior.cli.__main__", "eval": "eval.__main__"}
 
 
-def rows(folder: Path, name: str) -> list[dict[str, str]]:
-    with open(folder / f"{name}.csv", newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
 
 
-def test_the_order_that_was_put_in(report):
-    scores = json.loads((report / "results.json").read_text())["rows"]
-    chains = {row["model"]: row["bits_per_action"] for row in scores if row["model"].startswith("markov")}
-    assert min(chains, key=chains.get) == "markov-2"
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
-def test_the_sequence_that_was_put_in(report):
-    first = rows(report, "motifs")[0]
-    assert first["sequence"] == "sniff rear groom"
-    assert float(first["low"]) > 1
+def run(code: str, folder: Path) -> None:
+    (folder / "example.py").write_text(code, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "example.py"], cwd=folder, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
 
 
-def test_the_difference_that_was_put_in(report):
-    """Only what follows walking differs between animals."""
-    marked = [row for row in rows(report, "transitions") if row["p_value"] and float(row["p_value"]) < 0.05]
-    assert marked
-    assert {row["from"] for row in marked} == {"walk"}
+EXAMPLES = [(page, number) for page in PAGES if page != OWN_DATA for number in range(len(blocks(page, "python")))]
+
+
+@pytest.mark.parametrize(("page", "number"), EXAMPLES, ids=[f"{name(page)}-{number}" for page, number in EXAMPLES])
+def test_example(page: Path, number: int, tmp_path: Path) -> None:
+    run(blocks(page, "python")[number], tmp_path)
+
+
+class TestOwnData:
+    """The report of the page on one's own data finds what its example put into the data."""
+
+    @pytest.fixture(scope="class")
+    def report(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        folder = tmp_path_factory.mktemp("docs")
+        for example in blocks(OWN_DATA, "python"):
+            run(example, folder)
+        return folder / "runs/counts"
+
+    def rows(self, folder: Path, name: str) -> list[dict[str, str]]:
+        with open(folder / f"{name}.csv", newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    def test_order(self, report: Path) -> None:
+        scores = json.loads((report / "results.json").read_text())["rows"]
+        chains = {row["model"]: row["bits_per_action"] for row in scores if row["model"].startswith("markov")}
+        assert min(chains, key=chains.__getitem__) == "markov-2"
+
+    def test_sequence(self, report: Path) -> None:
+        first = self.rows(report, "motifs")[0]
+        assert first["sequence"] == "sniff rear groom"
+        assert float(first["low"]) > 1
+
+    def test_difference(self, report: Path) -> None:
+        """Only what follows walking differs between animals."""
+        marked = [row for row in self.rows(report, "transitions") if row["p_value"] and float(row["p_value"]) < 0.05]
+        assert marked
+        assert {row["from"] for row in marked} == {"walk"}
+
+
+def test_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if link.startswith("http"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_every_picture_is_shown() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert not [path.name for path in (ROOT / "docs").glob("*.png") if f"{path.name})" not in text]
+
+
+def test_every_page_is_listed() -> None:
+    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    assert pages == set(re.findall(r"^\| \[.*?\]\(([\w\-]+\.md)\)", (ROOT / "docs/index.md").read_text(), re.MULTILINE))
+
+
+def exists(dotted: str) -> bool:
+    """Whether a name can be imported, or is a method of something that can."""
+    try:
+        return pkgutil.resolve_name(dotted) is not None
+    except (AttributeError, ImportError):
+        return False
+
+
+def test_names_exist() -> None:
+    """Those that are written as `neuroprior.module.name`."""
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert not [dotted for dotted in sorted(set(re.findall(r"`(neuroprior[.\w]+)[(`]", text))) if not exists(dotted)]
+
+
+def commands() -> Iterator[tuple[str, str]]:
+    """The commands of all pages, each with its page."""
+    for page in PAGES:
+        for block in blocks(page, "console") + blocks(page, ""):
+            for line in block.replace("\\\n", " ").splitlines():
+                yield name(page), line.removeprefix("$ ").removeprefix(".venv/bin/")
+
+
+def given() -> Iterator[tuple[str, str, str, list[str]]]:
+    """Page, program, command and arguments of each command of this project."""
+    for page, line in commands():
+        if not re.match(r"neuroprior \w|python -m (eval|train) \w", line):
+            continue
+        words = shlex.split(line, comments=True)
+        if words[0] == "python":
+            words = ["neuroprior" if words[2] == "train" else words[2], *words[3:]]
+        yield page, words[0], words[1], words[2:]
+
+
+@lru_cache
+def known(program: str, command: str) -> set[str]:
+    """The options of a command, by what it says itself."""
+    code = f"import sys; from {PROGRAMS[program]} import main; sys.exit(main(['{command}', '--help']))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return {option.replace("-", "_") for option in re.findall(r"(?<!\w)--([\w.\-]+)", done.stdout)}
+
+
+def test_commands_have_these_options() -> None:
+    asked = list(given())
+    assert len(asked) > 20
+    for page, program, command, arguments in asked:
+        options = known(program, command)
+        for word in arguments:
+            if not word.startswith("--"):
+                continue
+            option = word[2:].partition("=")[0].replace("-", "_")
+            # what a class in a recipe takes, such as --model.prior.dropout, is listed under the class alone
+            parents = {option, option.rpartition(".")[0]} - {""}
+            assert parents & options, f"{page}: {program} {command} has no option --{option}"
+
+
+def test_make_has_these_targets() -> None:
+    targets = set(re.findall(r"^([\w.%/\-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    asked = {line.split()[1] for _, line in commands() if line.startswith("make ")}
+    assert asked
+    assert not [target for target in asked if target not in targets and re.sub("/.*", "/%", target) not in targets]
+
+
+def test_import_leaves_lightning_for_training() -> None:
+    heavy = "import sys, neuroprior; print([m for m in ('lightning', 'scipy', 'matplotlib') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "[]"
