@@ -9,7 +9,7 @@ from rich.table import Table
 
 from neuroprior import save
 from neuroprior._files import versions, write_csv, write_json
-from neuroprior.analysis.comparison import Score, rivals, score, unit_name
+from neuroprior.analysis.comparison import Score, baselines, score, unit_name
 from neuroprior.cli.fit_data import PlansData
 from neuroprior.cli.fit_figures import learning_curve
 from neuroprior.cli.fit_model import PriorModel
@@ -24,16 +24,16 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
     rows, chosen = [], None
     with console.status("fitting count-based priors") as status:
         contexts = data.num_contexts if prior.takes_context else None
-        tell = lambda what: status.update(f"fitting {what}")  # noqa: E731
-        for rival in rivals(data.learned_from, data.chosen_on, contexts, tell):
-            more = {"how": rival.how, "validation_bits": rival.validation_bits}
-            if rival.prior is None:
-                rows.append(dict.fromkeys(_row(trained, trained), None) | {"model": rival.model} | more)
+        progress = lambda what: status.update(f"fitting {what}")  # noqa: E731
+        for baseline in baselines(data.learned_from, data.chosen_on, contexts, progress):
+            more = {"how": baseline.how, "validation_bits": baseline.validation_bits}
+            if baseline.prior is None:
+                rows.append(dict.fromkeys(_row(trained, trained), None) | {"model": baseline.model} | more)
                 continue
-            one = score(rival.model, rival.prior, data.held_out)
+            one = score(baseline.model, baseline.prior, data.held_out)
             rows.append(_row(one, trained) | more)
-            if chosen is None or rival.validation_bits < chosen[0]:
-                chosen = rival.validation_bits, one
+            if chosen is None or baseline.validation_bits < chosen[0]:
+                chosen = baseline.validation_bits, one
     assert chosen is not None
     best = chosen[1]
     rows.append(_row(trained, trained) | {"how": "", "validation_bits": None})
@@ -66,7 +66,7 @@ def _row(one: Score, trained: Score) -> dict[str, Any]:
     taken, gap = one.bits_per_action(), one.minus(trained)
     return {
         "model": one.model,
-        "sees": one.sees,
+        "sees": one.inputs,
         "bits_per_action": taken.mean,
         "low": taken.low,
         "high": taken.high,

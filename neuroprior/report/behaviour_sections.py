@@ -139,7 +139,7 @@ def _likeness_table(rows: list[dict[str, Any]], found: Sequence[Any], tested: bo
     )
     return Table(
         ("model", "sees", *(name.replace(" ", "\n") for name in statistic)),
-        [*named, ["alike", "", *(f"{one.chance:.3f}" for one in found)]],
+        [*named, ["alike", "", *(f"{one.null_distance:.3f}" for one in found)]],
         f"Total variation between the distributions in generated and in held-out real plans (0: the same). {test}"
         " alike: what two such sets of one source differ by, were all plans independent.",
         "ll" + "r" * len(statistic),

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuroprior import GRUPrior, MarkovPrior, MixturePrior, Plans, Prior, StackedPrior, TabularWorld, TransformerPrior
 from neuroprior.analysis import Reliability, pieces, reliability
-from neuroprior.analysis.comparison import Score, action_bits, rivals, score_bits
+from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits
 from neuroprior.plans import is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible
 from neuroprior.priors.counts.histories import TooLargeError
@@ -118,10 +118,10 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
         if "context_size" in sizes:
             return  # features cannot be counted
         training, validation = _split(learned, seed)
-        for rival in rivals(training, validation, sizes.get("num_contexts"), always_see=True):
-            if rival.prior is not None:
-                # Chosen on the validation plans; then these are learned from as well.
-                yield rival.model, rival.how, rival.prior.fit(learned)  # type: ignore[operator]
+        for baseline in baselines(training, validation, sizes.get("num_contexts"), always_context=True):
+            if baseline.prior is not None:
+                # Its settings are chosen on the validation plans; then it is fitted to these as well.
+                yield baseline.model, baseline.how, baseline.prior.fit(learned)  # type: ignore[operator]
         return
     if kind in ("stacked", "mixture") and "context_size" in sizes:
         return  # their experts count

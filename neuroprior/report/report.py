@@ -229,7 +229,7 @@ def _of_fitted(
         models,
         scores,
         rows,
-        f"{reference.model} ({reference.sees})",
+        f"{reference.model} ({reference.inputs})",
         held_out.step_rows(study, todo),
         settings,
     )

@@ -98,7 +98,7 @@ def score_row(one: Score, reference: Score) -> dict[str, Any]:
     taken = one.bits_per_action()
     row = {
         "model": one.model,
-        "sees": one.sees,
+        "sees": one.inputs,
         "bits_per_action": taken.mean,
         "low": taken.low,
         "high": taken.high,

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from neuroprior.analysis import (
-    likeness,
     motifs,
     mutual_information,
     order_selection,
     transitions,
+    two_sample_tests,
 )
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import folds
@@ -50,7 +50,7 @@ def information_rows(plans: Plans, skip: int) -> list[dict[str, Any]]:
         return []
     return [
         {"what": "mutual information", "model": "counts", "sees": "actions"}
-        | {key: value for key, value in asdict(one).items() if key != "pairs"}
+        | {"lag": one.lag, "bits": one.bits, "low": one.low, "high": one.high, "chance": one.critical_value}
         | {"units": None}
         for one in mutual_information(plans, MOST_LAG, skip, _shuffles())
     ]
@@ -126,14 +126,14 @@ def likeness_rows(real: Plans, model: Model, tested: bool) -> tuple[list[dict[st
     like = real[: len(generated)]
     sampled = Plans(torch.from_numpy(generated), real.num_actions, like.lengths)
     plain = Plans(like.actions, real.num_actions, like.lengths)
-    found = likeness(plain, sampled, generator=_shuffles())
+    found = two_sample_tests(plain, sampled, generator=_shuffles())
     rows = [
         {
             "model": model.name,
             "sees": model.sees,
             "statistic": one.statistic,
             "distance": one.distance,
-            "chance": one.chance,
+            "chance": one.null_distance,
             "p_value": one.p_value if tested else None,
             "corrected": one.corrected if tested else None,
         }
