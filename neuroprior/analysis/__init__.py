@@ -1,6 +1,10 @@
-"""Statistics of executed plans: how actions follow each other, how far back that reaches, and where it changes."""
+"""Statistics of executed plans: how actions follow each other, how far back that reaches, and where it changes.
+
+Priors are compared in `neuroprior.analysis.comparison`, intervals and tests are in `neuroprior.analysis.statistics`.
+"""
 
 from neuroprior.analysis.calibration import Reliability, reliability
+from neuroprior.analysis.comparison import Baseline, Score, action_bits, baselines, score, score_bits, unit_name, units
 from neuroprior.analysis.drift import (
     ActionDrift,
     GroupDrift,
@@ -12,32 +16,64 @@ from neuroprior.analysis.drift import (
     by_position,
 )
 from neuroprior.analysis.lags import LagInformation, bits_by_position, mutual_information, pieces
-from neuroprior.analysis.likeness import Likeness, likeness
 from neuroprior.analysis.motifs import Motif, motifs
 from neuroprior.analysis.orders import OrderFit, order_selection
+from neuroprior.analysis.statistics import (
+    Difference,
+    Interval,
+    best_of,
+    holm,
+    interquartile_mean,
+    mean_interval,
+    mean_intervals,
+    paired_difference,
+    probability_of_improvement,
+    ratio_difference,
+    share_interval,
+)
 from neuroprior.analysis.transitions import Transitions, transitions
+from neuroprior.analysis.two_sample import TwoSampleTest, two_sample_tests
 
 __all__ = [
     "ActionDrift",
+    "Baseline",
+    "Difference",
     "GroupDrift",
+    "Interval",
     "LagInformation",
-    "Likeness",
     "Motif",
     "OrderFit",
     "PlanDrift",
     "PositionDrift",
     "Reliability",
+    "Score",
     "Transitions",
+    "TwoSampleTest",
+    "action_bits",
     "action_drift",
+    "baselines",
+    "best_of",
     "bits_by_position",
     "by_group",
     "by_plan",
     "by_position",
-    "likeness",
+    "holm",
+    "interquartile_mean",
+    "mean_interval",
+    "mean_intervals",
     "motifs",
     "mutual_information",
     "order_selection",
+    "paired_difference",
     "pieces",
+    "probability_of_improvement",
+    "ratio_difference",
     "reliability",
+    "score",
+    "score_bits",
+    "share_interval",
     "transitions",
+    "two_sample_tests",
+    "unit_name",
+    "units",
 ]

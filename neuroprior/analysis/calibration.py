@@ -1,4 +1,4 @@
-"""Whether a prior's probabilities are those with which actions are taken: reliability by bins of the forecast."""
+"""Calibration: whether actions are taken as often as a prior predicts, in bins of the predicted probability."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,10 @@ from neuroprior._checks import check_range, check_sizes, is_integer
 from neuroprior.analysis.statistics import Interval, ratio_difference, share_interval
 
 UNITS = 997
-"""Independent units kept apart: those whose numbers are alike modulo this prime are one."""
-
-AT_ONCE = 2**22
-"""Forecasts looked at together; bounds memory."""
+"""Independent units that are distinguished: those whose numbers are equal modulo this prime are joined."""
 
 TOLERANCE = 1e-3
-"""How far the probabilities of a place may sum from 1."""
+"""How far the probabilities of all actions may sum from 1."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +22,9 @@ class Bin:
     Attributes:
         low, high: the edges; a forecast on an edge belongs to the bin above it, and 1 to the last.
         forecast: their mean probability.
-        taken: the share of them whose action was taken, with its 95 % interval over units; NaN for the ends where only
-            one unit has any.
-        number: how many there are.
+        taken: the share of them whose action was taken, with its 95 % interval over units; the ends are NaN if only one
+            unit has any.
+        number: of forecasts.
     """
 
     low: float
@@ -49,10 +46,10 @@ class Reliability:
     sums: Tensor
 
     def __add__(self, other: "Reliability") -> "Reliability":
-        """Both together, such as two folds of one cross-validation.
+        """The sum of both, such as two folds of one cross-validation.
 
         Raises:
-            ValueError: unlike numbers of bins.
+            ValueError: different numbers of bins.
         """
         if self.sums.shape != other.sums.shape:
             raise ValueError(f"bins: {self.sums.shape[1]} and {other.sums.shape[1]} cannot be added")
@@ -73,30 +70,34 @@ class Reliability:
 
     @property
     def expected_calibration_error(self) -> float:
-        """The mean difference of forecast and share taken in a bin, weighted by number (Naeini et al. 2015)."""
+        """The absolute difference of forecast and share taken, averaged over forecasts (Naeini et al. 2015)."""
         forecast, taken, number = self.sums.sum(0).unbind(-1)
         return float((forecast - taken).abs().sum() / number.sum())
 
 
-def reliability(log_probs: Tensor, actions: Tensor, unit: Tensor, bins: int = 10) -> Reliability:
-    """How often actions were taken that had been forecast with a probability of about 0.05, 0.15, ... 0.95.
+def reliability(
+    log_probs: Tensor, actions: Tensor, unit: Tensor, bins: int = 10, *, chunk_size: int = 2**22
+) -> Reliability:
+    """How often actions were taken that had been predicted with a probability of about 0.05, 0.15, ... 0.95.
 
-    Each place and action counts as one forecast, in `bins` bins of equal width (DeGroot and Fienberg 1983, reliability
-    diagrams). The share of a bin has the interval of a ratio over units (`neuroprior.analysis.statistics.ratio_difference`); a
-    share of 0 or 1, which has no spread, has Wilson's, with units for trials.
+    The probability of each action at each place is one forecast; forecasts are sorted into `bins` bins of equal width
+    (DeGroot and Fienberg 1983, reliability diagrams). The interval of a bin's share is that of a ratio over units
+    (`neuroprior.analysis.ratio_difference`); a share of 0 or 1, which has no spread, has Wilson's, with units as
+    trials.
 
     Args:
         log_probs: floating point `[M, A]`, nats: the log-probabilities of all actions at M places, such as
             `prior(plans.actions).log_softmax(-1)[plans.mask()]`.
         actions: integers `[M]`: what was taken.
-        unit: integers `[M]`: the independent unit of each place (see `neuroprior.analysis.comparison.units`). Those alike modulo
-            `UNITS` are one, so number few units from 0.
+        unit: integers `[M]`: the independent unit of each place (see `neuroprior.analysis.units`), best
+            numbered from 0: units whose numbers are equal modulo `UNITS` are joined.
         bins: number of bins.
+        chunk_size: forecasts that are in memory at a time.
 
     Raises:
-        ValueError: no places, a shape or dtype is wrong, or probabilities that do not sum to 1.
+        ValueError: no places, a wrong shape or dtype, or probabilities that do not sum to 1.
     """
-    check_sizes(bins=bins)
+    check_sizes(bins=bins, chunk_size=chunk_size)
     if log_probs.dim() != 2 or not log_probs.is_floating_point() or log_probs.numel() == 0:
         raise ValueError(
             f"log_probs: floating point, shape [M, A], is expected, not {log_probs.dtype}, {list(log_probs.shape)}"
@@ -108,7 +109,7 @@ def reliability(log_probs: Tensor, actions: Tensor, unit: Tensor, bins: int = 10
     check_range("actions", actions, num_actions, "actions")
     actions, unit = actions.to(log_probs.device).long(), unit.to(log_probs.device).long()
     sums = torch.zeros(UNITS * bins, 3, dtype=torch.double)
-    size = max(AT_ONCE // num_actions, 1)
+    size = max(chunk_size // num_actions, 1)
     for at in range(0, places, size):
         part = slice(at, at + size)
         probs = log_probs[part].double().exp()

@@ -1,8 +1,8 @@
-"""Priors compared on held-out plans: bits per action with intervals, and the count-based rivals a prior must meet."""
+"""Priors compared on held-out plans: bits per action with intervals, and count-based baselines."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from math import log
+from math import inf, log
 
 import torch
 from torch import Tensor
@@ -14,10 +14,10 @@ from neuroprior.priors import ContextTreePrior, MarkovPrior, Prior, UniformPrior
 from neuroprior.priors.counts import Backoff, TooLargeError
 
 ORDERS = range(7)
-"""Markov orders that a prior is compared with."""
+"""Orders of the Markov chains among the baselines."""
 
 DEPTH = 10
-"""Depth of the context trees that a prior is compared with."""
+"""Depth of the context tree among the baselines."""
 
 BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
     ("kneser-ney", 1),
@@ -27,22 +27,22 @@ BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
     ("dirichlet", 1),
     ("dirichlet", 8),
 ]
-"""Back-offs and their smoothing of which each Markov order takes the best."""
+"""Back-offs and their smoothing; for each Markov order the best of them is chosen on validation plans."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """What a prior paid for held-out plans.
+    """The negative log-likelihood of held-out plans under a prior, by independent unit.
 
     Attributes:
-        model: its name.
-        sees: "actions", or "actions and context".
-        bits: `[G]`, float64: the bits that each independent unit cost.
-        actions: `[G]`, float64: the actions of each unit.
+        model: the prior's name.
+        inputs: what it predicts from, "actions" or "actions and context".
+        bits: `[G]`, float64: the negative log2-likelihood of each independent unit.
+        actions: `[G]`, float64: the number of actions in each unit.
     """
 
     model: str
-    sees: str
+    inputs: str
     bits: Tensor
     actions: Tensor
 
@@ -51,10 +51,10 @@ class Score:
         return ratio_difference(self.bits, self.actions)
 
     def minus(self, other: "Score") -> Difference:
-        """Bits per action more than `other` took for the same plans, paired by unit.
+        """Bits per action less those of `other` on the same plans, paired by unit; below 0 this prior is better.
 
         Raises:
-            ValueError: the other was scored on other plans.
+            ValueError: the two were not scored on the same plans.
         """
         if not self.actions.equal(other.actions):
             raise ValueError(f"{self.model} and {other.model}: not scored on the same plans")
@@ -62,31 +62,28 @@ class Score:
 
 
 def score(model: str, prior: Prior, plans: Plans) -> Score:
-    """Score `prior` on plans that it has not learned from.
-
-    The units of the interval are the groups of the plans, or the plans where there are no two groups, or `BLOCKS`
-    consecutive parts of a single plan.
+    """Score `prior` on plans that it was not fitted to; see `units` for what the interval is over.
 
     Args:
         model: the prior's name in tables.
-        prior: any prior over the plans' actions; one that sees nothing leaves their context aside.
+        prior: any prior over the plans' actions; their context is only used by a prior that takes one.
         plans: held-out plans with at least two actions in all.
 
     Raises:
         ValueError: plans that the prior cannot score, or fewer than two actions.
     """
-    sees = "actions and context" if prior.takes_context else "actions"
-    return score_bits(model, sees, action_bits(prior, plans), plans)
+    inputs = "actions and context" if prior.takes_context else "actions"
+    return score_bits(model, inputs, action_bits(prior, plans), plans)
 
 
-def score_bits(model: str, sees: str, bits: Tensor, plans: Plans, mask: Tensor | None = None) -> Score:
-    """The score of a model whose bits are known.
+def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor | None = None) -> Score:
+    """The score of a model from the bits of each action.
 
     Args:
         model: its name.
-        sees: "actions", or "actions and context".
-        bits: `[N, L]`, what each action cost.
-        plans: held-out plans, of which the units come.
+        inputs: "actions", or "actions and context".
+        bits: `[N, L]`, the negative log2-probability of each action.
+        plans: the held-out plans, which define the units.
         mask: `[N, L]` bool: the actions that count; None: all.
 
     Raises:
@@ -98,24 +95,24 @@ def score_bits(model: str, sees: str, bits: Tensor, plans: Plans, mask: Tensor |
     if size < FEWEST_UNITS:
         raise ValueError(f"plans: at least two held-out actions are needed for a comparison, not {int(mask.sum())}")
     totals = torch.zeros(size, dtype=torch.double).index_add_(0, unit, bits[mask].double())
-    return Score(model, sees, totals, unit.bincount(minlength=size).double())
+    return Score(model, inputs, totals, unit.bincount(minlength=size).double())
 
 
 def action_bits(prior: Prior, plans: Plans) -> Tensor:
-    """What each action costs under `prior`: `[N, L]` bits, float64, on the CPU; 0 beyond a plan's end.
+    """The surprisal of each action, its negative log2-probability under `prior`: `[N, L]`, float64, on the CPU.
 
-    A prior that sees nothing leaves the context of the plans aside.
+    It is 0 beyond a plan's end. The context of the plans is only used by a prior that takes one.
 
     Raises:
         ValueError: plans that the prior cannot score.
     """
-    seen = plans if prior.takes_context else replace(plans, context=None, context_names=None)
+    given = plans if prior.takes_context else replace(plans, context=None, context_names=None)
     with torch.no_grad():
-        return -prior.action_log_probs(seen).double().cpu() / log(2)
+        return -prior.action_log_probs(given).double().cpu() / log(2)
 
 
 def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
-    """What intervals go over: "groups", "plans", "plans of one group" or "parts of the plan".
+    """The kind of `units` that intervals are over: "groups", "plans", "plans of one group" or "parts of the plan".
 
     Args:
         plans: the plans.
@@ -130,13 +127,13 @@ def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
 
 
 @dataclass(frozen=True)
-class Rival:
-    """A count-based prior that another prior is compared with.
+class Baseline:
+    """A count-based prior that other priors are compared with.
 
     Attributes:
         model: its name, such as "markov-3".
-        how: the settings that tell the validation plans best, of those in `BACKOFFS_TRIED`.
-        prior: fitted; None where its tables would be too large.
+        how: its settings, those with the highest likelihood of the validation plans (see `BACKOFFS_TRIED`).
+        prior: the fitted prior; None if its tables would be too large.
         validation_bits: bits per action on the validation plans; infinite without a prior.
     """
 
@@ -146,73 +143,73 @@ class Rival:
     validation_bits: float
 
 
-def rivals(
+def baselines(
     training: Plans,
     validation: Plans,
     num_contexts: int | None = None,
-    tell: Callable[[str], None] | None = None,
-    always_see: bool = False,
-) -> Iterator[Rival]:
-    """The uniform prior and the count-based ones: Markov chains of every order in `ORDERS`, and a context tree.
+    progress: Callable[[str], None] | None = None,
+    always_context: bool = False,
+) -> Iterator[Baseline]:
+    """The uniform prior, Markov chains of all orders in `ORDERS`, and a context tree, each fitted when it is asked for.
 
-    Each Markov order comes with the back-off and smoothing, and where the plans have a context index with or without
-    it, that tell the validation plans best; so does the context tree. Features cannot be counted and are left aside.
+    The back-off and smoothing of each Markov chain are those with the highest likelihood of the validation plans. So is
+    whether a chain or the tree takes the context, if it is an index; features cannot be counted and are ignored.
 
     Args:
-        training: what they learn from.
-        validation: what they are chosen on.
-        num_contexts: number of context indices, where they may see one.
-        tell: called with the name of what is fitted next.
-        always_see: all see the context, whether or not it helps; the uniform prior, which cannot, is left out.
+        training: the plans that baselines are fitted to.
+        validation: the plans that settings are chosen on.
+        num_contexts: number of context indices; None to ignore the context.
+        progress: called with the name of the baseline that is fitted next.
+        always_context: all take the context, whether or not it helps; the uniform prior, which cannot, is left out.
 
     Yields:
-        One rival after the other, each fitted when it is asked for.
+        One baseline after the other.
     """
-    seen: list[int | None] = [None] if num_contexts is None else [num_contexts] if always_see else [None, num_contexts]
-    if not (always_see and num_contexts is not None):
-        yield _best("uniform", iter([("", UniformPrior(training.num_actions).fit(training))]), validation)
+    contexts: list[int | None] = [num_contexts] if num_contexts is None or always_context else [None, num_contexts]
+    if num_contexts is None or not always_context:
+        yield _best("uniform", [("", UniformPrior(training.num_actions).fit(training))], validation)
     for order in ORDERS:
-        if tell is not None:
-            tell(f"markov-{order}")
-        yield _best(f"markov-{order}", _chains(training, order, seen), validation)
-    if tell is not None:
-        tell("context tree")
-    trees = (ContextTreePrior(training.num_actions, DEPTH, num_contexts=contexts) for contexts in seen)
+        if progress is not None:
+            progress(f"markov-{order}")
+        yield _best(f"markov-{order}", _chains(training, order, contexts), validation)
+    if progress is not None:
+        progress("context tree")
+    trees = (ContextTreePrior(training.num_actions, DEPTH, num_contexts=num) for num in contexts)
     yield _best("context tree", ((f"depth {DEPTH}", tree.fit(training)) for tree in trees), validation)
 
 
-def _chains(training: Plans, order: int, seen: list[int | None]) -> Iterator[tuple[str, Prior]]:
+def _chains(training: Plans, order: int, contexts: list[int | None]) -> Iterator[tuple[str, Prior]]:
     """Markov chains of an order with every back-off; what they count is counted once."""
-    for contexts in seen:
+    for num_contexts in contexts:
         counted = None
         for backoff, smoothing in BACKOFFS_TRIED:
-            prior = MarkovPrior(training.num_actions, order, smoothing, num_contexts=contexts, backoff=backoff)
+            prior = MarkovPrior(training.num_actions, order, smoothing, num_contexts=num_contexts, backoff=backoff)
             counted = prior.count(training) if counted is None else counted
             prior.training_plans(training)
             prior.learn(*counted)
             yield f"{backoff} {smoothing:g}", prior
 
 
-def _best(model: str, made: Iterator[tuple[str, Prior]], validation: Plans) -> Rival:
-    """The rival that tells `validation` best; at most two are held at a time."""
-    best = Rival(model, "too large", None, float("inf"))
+def _best(model: str, made: Iterable[tuple[str, Prior]], validation: Plans) -> Baseline:
+    """The one with the highest likelihood of `validation`; at most two are in memory at a time."""
+    best = Baseline(model, "too large", None, inf)
     try:
         for how, prior in made:
-            taken = score(model, prior, validation)
-            bits = float(taken.bits.sum() / taken.actions.sum())
+            found = score(model, prior, validation)
+            bits = float(found.bits.sum() / found.actions.sum())
             if bits < best.validation_bits:
-                best = Rival(model, how, prior, bits)
+                best = Baseline(model, how, prior, bits)
     except TooLargeError:
-        # Those that see a context come last and are the largest: what was found before them stands.
+        # Those that take a context come last and are the largest: what was found before them stands.
         pass
     return best
 
 
 def units(plans: Plans, mask: Tensor) -> Tensor:
-    """The independent unit of each action: what the interval of every statistic of plans goes over.
+    """The independent unit of each action; the intervals of all statistics of plans are over these units.
 
-    The groups; or the plans, where no two groups have actions that count; or `BLOCKS` consecutive parts of the only
-    plan that has any, alike in size but for one action.
+    The groups; or the plans, if fewer than two groups have actions that count; or `BLOCKS` consecutive parts of the
+    only plan that has any, which differ in size by one action at most.
 
     Args:
         plans: the plans.
@@ -220,7 +217,7 @@ def units(plans: Plans, mask: Tensor) -> Tensor:
 
     Returns:
         `[N, L]` int64, on the device of `mask`: numbers from 0, ascending with the number of the group, of the plan or
-        of the part. They mean nothing outside `mask`, and a group without actions leaves out its number.
+        of the part. They are arbitrary outside `mask`, and the number of a group without actions is not used.
     """
     what = unit_name(plans, mask)
     if what == "groups":

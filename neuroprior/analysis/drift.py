@@ -1,19 +1,30 @@
-"""Drift: how costs and actions change within plans, from plan to plan of a group, and between groups."""
+"""Drift: how surprisal and actions change within plans, from plan to plan of a group, and between groups.
+
+The surprisal of an action is its negative log2-probability under a prior, in bits.
+"""
 
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import permutations
 from math import nan
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import stats
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior.analysis.comparison import units
-from neuroprior.analysis.ranks import FEWEST_RANKED, mean_correlation, rank_correlation
 from neuroprior.analysis.statistics import Difference, Interval, holm, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
+
+FEWEST_RANKED = 3
+"""Plans without which there is no rank correlation to test."""
+
+EXACT = 7
+"""Plans up to which the p-value of a rank correlation is computed from all their orders."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +32,11 @@ class PositionDrift:
     """Bits per action from the beginning to the end of plans.
 
     Attributes:
-        parts: bits per action in each part, with the 95 % interval over units; NaN in a part without actions, and for
-            the ends of one in which a single unit has any.
-        actions: int64 `[parts]`: how many actions fall in each.
-        trend: bits per action that a straight line gains over the length of a plan (below 0: plans get easier to
-            predict), with its interval over units and the p-value of 0.
+        parts: bits per action in each part, with the 95 % interval over units; NaN in a part without actions, and
+            without an interval in one where only one unit has any.
+        actions: int64 `[parts]`: the number of actions in each.
+        trend: the change in bits per action from beginning to end of a plan, by a straight line (below 0: plans become
+            easier to predict), with its interval over units and the p-value of 0.
     """
 
     parts: list[Interval]
@@ -37,18 +48,18 @@ class PositionDrift:
 class PlanDrift:
     """Bits per action of each plan, in the order of the file within its group; groups in the order of their first plan.
 
-    A single plan is cut in `neuroprior.analysis.comparison.BLOCKS` parts, which stand for plans (`item` is "parts").
+    A single plan is cut into `BLOCKS` parts, which take the place of plans (`item` is "parts").
 
     Attributes:
         item: "plans" or "parts".
-        index: int64 `[K]`: which plan of `plans` (or which part).
-        group: int64 `[K]`: the group's number; 0 where there are none.
-        bits, actions: float64 `[K]`: bits per action, and how many actions count.
-        correlations: of each group with at least three plans, its number and Spearman's rank correlation of the plans'
-            order and their bits per action (below 0: plans get easier to predict), with a 95 % interval (Fisher's; -1
-            to 1 of three plans) and the p-value of 0.
-        trend: their mean over groups, with Student's interval and p-value; that of the only group where there is one;
-            None without any.
+        index: int64 `[K]`: the number of the plan (or part).
+        group: int64 `[K]`: the number of its group; 0 without groups.
+        bits, actions: float64 `[K]`: its bits per action, and how many actions count.
+        correlations: by the number of each group with at least three plans, Spearman's rank correlation of the order of
+            its plans and their bits per action (below 0: plans become easier to predict), with a 95 % interval
+            (Fisher's; -1 to 1 for three plans) and the p-value of 0.
+        trend: the mean of the correlations, with Student's interval and p-value over groups; of a single group its
+            correlation; None without any.
     """
 
     item: str
@@ -65,10 +76,10 @@ class GroupDrift:
     """Bits per action of each group.
 
     Attributes:
-        groups: for each group's number, in ascending order, its bits per action with the 95 % interval over its plans;
-            NaN for the ends where it has a single one. A single plan's interval is over its parts.
-        p_value: of all groups being alike: Kruskal and Wallis's test (1952) of the plans' bits per action, of groups
-            with two plans or more; None where there are no two of these.
+        groups: by the number of each group, ascending, its bits per action with the 95 % interval over its plans; the
+            ends are NaN if it has only one. If there is only one plan in all, the interval is over its parts.
+        p_value: of the hypothesis that groups do not differ: the test of Kruskal and Wallis (1952) on the plans' bits
+            per action, for groups with two plans or more; None with fewer than two such groups.
     """
 
     groups: dict[int, Interval]
@@ -77,13 +88,13 @@ class GroupDrift:
 
 @dataclass(frozen=True)
 class ActionDrift:
-    """How often an action is taken in the second half of plans, and in the first.
+    """How often an action is taken in the first and in the second half of plans.
 
     Attributes:
         action: its number.
-        first, second: its share of the actions of the halves.
-        change: the second less the first, with its 95 % interval over units and the p-value of 0.
-        corrected: that p-value, corrected for the number of actions (`neuroprior.analysis.statistics.holm`).
+        first, second: its share of all actions in either half.
+        change: `second - first`, with its 95 % interval over units and the p-value of 0.
+        corrected: that p-value, corrected for the number of actions (`neuroprior.analysis.holm`).
     """
 
     action: int
@@ -95,7 +106,7 @@ class ActionDrift:
 
 @dataclass(frozen=True, eq=False)
 class _Counted:
-    """The actions that count, `[M]` each, in the order of the file: bits, plan, step and length of the plan, unit."""
+    """For the M actions that count, in the order of the file: bits, plan, step, length of plan, unit; `[M]` each."""
 
     bits: Tensor
     plan: Tensor
@@ -105,21 +116,22 @@ class _Counted:
 
 
 def by_position(plans: Plans, bits: Tensor, mask: Tensor, parts: int = 10) -> PositionDrift:
-    """How the cost of actions changes from the beginning to the end of plans.
+    """How surprisal changes from the beginning to the end of plans.
 
-    The trend is the common least-squares slope of bits on the place in the plan, from 0 to 1, each plan about its own
-    means; its error is that of a ratio over units (`neuroprior.analysis.statistics.ratio_difference`), which units of the same
-    length weigh alike. Units are those of `neuroprior.analysis.comparison.units`, so a single long plan has a trend too.
+    The trend is the least-squares slope of bits on the relative position in the plan (0 to 1), common to all plans,
+    after the means of each plan are subtracted. Its error is that of a ratio over units
+    (`neuroprior.analysis.ratio_difference`). The units are those of `neuroprior.analysis.units`, so that a single long
+    plan has a trend too.
 
     Args:
         plans: the plans.
-        bits: floating point `[N, L]`: what each action costs, such as `neuroprior.analysis.comparison.action_bits` of a prior
-            that has not learned from these plans.
+        bits: floating point `[N, L]`: the surprisal of each action, such as `neuroprior.analysis.action_bits` of a
+            prior that was not fitted to these plans.
         mask: bool `[N, L]`: the actions that count (held out), none beyond a plan's end.
-        parts: into how many parts of its length each plan is cut. Short plans have actions in some of them only.
+        parts: number of equal parts into which each plan is cut. Short plans have actions in some of them only.
 
     Raises:
-        ValueError: a shape or dtype is wrong, bits that are no numbers, fewer than two units of actions, no plan with
+        ValueError: a wrong shape or dtype, bits that are not finite, fewer than two units with actions, no plan with
             two actions that count, or no parts.
     """
     check_sizes(parts=parts)
@@ -130,48 +142,48 @@ def by_position(plans: Plans, bits: Tensor, mask: Tensor, parts: int = 10) -> Po
     for k in range(parts):
         here = part == k
         found.append(_interval(counted.bits[here], counted.unit[here]) if here.any() else Interval(nan, nan, nan))
-    off, cost = _about_means(place, counted.plan), _about_means(counted.bits, counted.plan)
+    off, excess = _about_means(place, counted.plan), _about_means(counted.bits, counted.plan)
     if float(off.square().sum()) < 1e-12:
         raise ValueError("mask: no plan has two actions that count, so there is no trend within plans")
-    trend = ratio_difference(_sums(off * cost, counted.unit), _sums(off.square(), counted.unit))
+    trend = ratio_difference(_sums(off * excess, counted.unit), _sums(off.square(), counted.unit))
     return PositionDrift(found, part.bincount(minlength=parts).cpu(), trend)
 
 
 def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
-    """How the cost of actions changes from plan to plan of a group, in the order of the file.
+    """How surprisal changes from plan to plan of a group, in the order of the file.
 
     Args:
         plans, bits, mask: as for `by_position`.
 
     Raises:
-        ValueError: as for `by_position`, but for trends within plans.
+        ValueError: as for `by_position`, except that one action per plan is enough.
     """
     item, index, group, totals, actions = _items(plans, _counted(plans, bits, mask))
     numbers, inverse = group.unique(return_inverse=True)
     first = torch.full((len(numbers),), len(group)).scatter_reduce(0, inverse, torch.arange(len(group)), "amin")
     order = first[inverse].argsort(stable=True)
-    costs, inverse = (totals / actions)[order], inverse[order]
+    surprisal, inverse = (totals / actions)[order], inverse[order]
     correlations: dict[int, Difference] = {}
     starts = first.sort().indices  # ranks of groups in the order of their first plan
     sizes = inverse.bincount(minlength=len(numbers))[starts].tolist()
-    for number, part in zip(numbers[starts].tolist(), costs.split(sizes), strict=True):
+    for number, part in zip(numbers[starts].tolist(), surprisal.split(sizes), strict=True):
         if len(part) >= FEWEST_RANKED:
-            correlations[number] = rank_correlation(part.numpy())
+            correlations[number] = _rank_correlation(part.numpy())
     means = [one.mean for one in correlations.values()]
     trend = next(iter(correlations.values()), None)
     if len(means) >= FEWEST_UNITS:
-        trend = mean_correlation(means)
-    return PlanDrift(item, index[order], group[order], costs, actions[order], correlations, trend)
+        trend = _mean_correlation(means)
+    return PlanDrift(item, index[order], group[order], surprisal, actions[order], correlations, trend)
 
 
 def by_group(plans: Plans, bits: Tensor, mask: Tensor) -> GroupDrift:
-    """How the cost of actions differs between groups; where plans have none, all are of group 0.
+    """How surprisal differs between groups; without groups, all plans are of group 0.
 
     Args:
         plans, bits, mask: as for `by_position`.
 
     Raises:
-        ValueError: as for `by_position`, but for trends within plans.
+        ValueError: as for `by_position`, except that one action per plan is enough.
     """
     _, _, group, totals, actions = _items(plans, _counted(plans, bits, mask))
     order = group.argsort(stable=True)
@@ -182,16 +194,16 @@ def by_group(plans: Plans, bits: Tensor, mask: Tensor) -> GroupDrift:
     if len(several) < FEWEST_UNITS:
         return GroupDrift(found, None)
     together = np.concatenate(several)
-    alike = bool((together == together[0]).all())
-    return GroupDrift(found, 1.0 if alike else float(stats.kruskal(*several).pvalue))
+    constant = bool((together == together[0]).all())
+    return GroupDrift(found, 1.0 if constant else float(stats.kruskal(*several).pvalue))
 
 
 def action_drift(plans: Plans) -> list[ActionDrift]:
     """How the share of each action changes from the first half of plans to the second.
 
-    The middle action of a plan of odd length is left out, so that halves are alike in size; the difference is paired by
-    unit. Units are the groups, or the plans where no two groups have any; of a single plan each half is cut into
-    `BLOCKS` / 2 parts, and the first part of one half makes a pair with the first part of the other.
+    The central action of a plan of odd length is left out, so that halves have equal sizes; the difference is paired by
+    unit. Units are the groups, or the plans if fewer than two groups have any; of a single plan each half is cut into
+    `BLOCKS` / 2 parts, and the first part of one half is paired with the first part of the other.
 
     Args:
         plans: the plans.
@@ -228,7 +240,7 @@ def action_drift(plans: Plans) -> list[ActionDrift]:
 
 
 def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
-    """What counts, checked; on the device of `bits`."""
+    """The actions that count, after checks; on the device of `bits`."""
     shape = plans.actions.shape
     for name, values in (("bits", bits), ("mask", mask)):
         if values.shape != shape:
@@ -239,7 +251,9 @@ def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
     for wrong, what in ((mask & ~within, "mask"), (mask & ~bits.isfinite(), "bits")):
         if wrong.any():
             where = wrong.nonzero()[0].tolist()
-            why = "the plan has ended there" if what == "mask" else f"{float(bits[tuple(where)])} is no finite number"
+            why = (
+                "the plan has ended there" if what == "mask" else f"{float(bits[tuple(where)])} is not a finite number"
+            )
             raise ValueError(f"{what}{where}: {why}")
     unit = units(plans, mask)[mask]
     if len(unit) == 0 or bool((unit == unit[0]).all()):
@@ -249,7 +263,7 @@ def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
 
 
 def _items(plans: Plans, counted: _Counted) -> tuple[str, Tensor, Tensor, Tensor, Tensor]:
-    """Plans, or the parts of a single one: what they are, their numbers, groups, bits and actions `[K]`, on the CPU."""
+    """Plans, or the parts of a single one: which of the two, and their numbers, groups, bits and actions `[K]`."""
     single = bool((counted.plan == counted.plan[0]).all())
     index, item = (counted.unit if single else counted.plan).unique(return_inverse=True)
     totals, actions = _sums(counted.bits, item).cpu(), item.bincount().double().cpu()
@@ -278,7 +292,49 @@ def _interval(bits: Tensor, unit: Tensor) -> Interval:
 
 
 def _ratio(totals: Tensor, sizes: Tensor) -> Interval:
-    """A ratio over units `[G]`, without an interval where there is but one."""
+    """A ratio over units `[G]`, without an interval if there is only one."""
     if len(sizes) < FEWEST_UNITS:
         return Interval(float(totals.sum() / sizes.sum()), nan, nan)
     return Interval(*ratio_difference(totals, sizes)[:3])
+
+
+def _rank_correlation(values: NDArray[np.float64]) -> Difference:
+    """Spearman's rank correlation of values `[K]` with their order, for K >= `FEWEST_RANKED`; 0 if all are equal.
+
+    The interval is Fisher's (-1 to 1 where that is undefined), the p-value that of all orders for up to `EXACT` values,
+    else Student's approximation.
+    """
+    num = len(values)
+    if (values == values[0]).all():
+        return Difference(0.0, -1.0, 1.0, 1.0)
+    ranks = stats.rankdata(values)
+    ranks = (ranks - ranks.mean()) / np.linalg.norm(ranks - ranks.mean())
+    order = np.arange(num) - (num - 1) / 2
+    order /= np.linalg.norm(order)
+    correlation = round(float(order @ ranks), 12)  # so that a perfect one is 1
+    if num <= EXACT:  # Student's approximation would be certain of three values in ascending order
+        every = order[_orders(num)] @ ranks
+        p_value = float((np.abs(every) >= abs(correlation) - 1e-9).mean())
+    else:
+        t = correlation * np.sqrt((num - 2) / max(1 - correlation**2, 1e-12))
+        p_value = float(2 * stats.t.sf(abs(t), num - 2))
+    if num <= FEWEST_RANKED or abs(correlation) == 1:
+        return Difference(correlation, -1.0, 1.0, p_value)
+    # 1.06: the variance for ranks (Fieller, Hartley and Pearson 1957).
+    centre, half = np.arctanh(correlation), stats.norm.ppf(0.975) * np.sqrt(1.06 / (num - 3))
+    return Difference(correlation, float(np.tanh(centre - half)), float(np.tanh(centre + half)), p_value)
+
+
+def _mean_correlation(correlations: list[float]) -> Difference:
+    """The mean of the correlations of two groups or more, with Student's interval, cut at -1 and 1."""
+    mean, low, high, p_value = ratio_difference(correlations, np.ones(len(correlations)))
+    if len(set(correlations)) == 1 and mean != 0:
+        # Correlations of few plans are often equal at random, without any spread: a sign test instead.
+        return Difference(mean, -1.0, 1.0, 2.0 ** (1 - len(correlations)))
+    return Difference(mean, max(low, -1.0), min(high, 1.0), p_value)
+
+
+@cache
+def _orders(num: int) -> NDArray[np.int64]:
+    """All orders of a few values, `[num!, num]`."""
+    return np.array(list(permutations(range(num))))

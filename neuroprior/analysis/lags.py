@@ -1,4 +1,4 @@
-"""How far back the structure of plans reaches: what an action tells of later ones, by counts and by a prior."""
+"""How far back dependence reaches: the information of an action about later ones, by counts and by a prior."""
 
 from dataclasses import dataclass, replace
 from math import log
@@ -15,13 +15,13 @@ from neuroprior.plans.folds import BLOCKS
 from neuroprior.priors import Prior
 
 MOST_BLOCKS = 200
-"""Units beyond this number are taken together in so many blocks, for the jackknife."""
+"""Blocks of the jackknife; more units are joined to so many."""
 
 ENOUGH_PAIRS = 20
-"""Pairs per degree of freedom, (A - 1)**2, below which the jackknife leaves a bias that shuffled pairs must tell."""
+"""Pairs per degree of freedom, (A - 1)**2, below which the jackknife leaves a bias, which shuffled pairs estimate."""
 
 SHUFFLES = 20
-"""Shuffles that tell it."""
+"""Shuffles that estimate it."""
 
 MOST_CELLS = 2**24
 """Cells of a table of counts up to which it is made in full."""
@@ -29,14 +29,14 @@ MOST_CELLS = 2**24
 
 @dataclass(frozen=True)
 class LagInformation:
-    """What an action tells of the one `lag` steps later.
+    """The mutual information of an action and the one `lag` steps later.
 
     Attributes:
         lag: k.
-        bits: the mutual information of the two, corrected for bias; where there is none, it is as often a little below
-            0 as above.
+        bits: the mutual information, corrected for bias; where it is 0, the estimate is as often slightly negative as
+            positive.
         low, high: its 95 % interval over units.
-        chance: bits that 95 % of the estimates stay below where the two actions are independent.
+        critical_value: bits that the estimate stays below with a probability of 95 % if the two are independent.
         pairs: how many pairs of actions were counted.
     """
 
@@ -44,7 +44,7 @@ class LagInformation:
     bits: float
     low: float
     high: float
-    chance: float
+    critical_value: float
     pairs: int
 
 
@@ -53,29 +53,29 @@ def mutual_information(
 ) -> list[LagInformation]:
     """The mutual information I(a_t; a_{t-k}) of actions k = 1 to `max_lag` steps apart in the same plan, in bits.
 
-    Counts are pooled over plans: plans (groups) that prefer unlike actions show information at every lag, which is that
-    of knowing whose plan it is.
+    Counts are pooled over plans: if plans (or groups) differ in how often they take each action, there is information
+    at every lag, namely about which plan it is.
 
-    The bias of the counts is taken off, and the interval made, by a jackknife (for units of unlike size: Busing, Meijer
-    and van der Leeden 1999, Delete-m jackknife for unequal m). That of the bias leaves out plan by plan, or one of
-    `BLOCKS` consecutive parts where there are fewer plans; unlike the correction of Miller and Madow it holds where
-    successive pairs depend on each other. That of the interval leaves out the units of `neuroprior.analysis.comparison.units`,
-    at most `MOST_BLOCKS` blocks of them. Where the actions are independent, twice the number of pairs times the
-    information (in nats) is chi-square distributed but for a factor, which the bias tells (Rao and Scott 1981): from
-    that comes `chance`. With fewer than `ENOUGH_PAIRS` pairs per degree of freedom, (A - 1)**2, some bias is left:
-    there `chance` is at least what 95 % of shuffled pairs stay below. An interval is at least as wide as `chance` to
-    both sides, as the jackknife's error vanishes where there is no information.
+    Bias is corrected, and the interval made, by a jackknife (for units of unequal size: Busing, Meijer and van der
+    Leeden 1999, Delete-m jackknife for unequal m). That of the bias leaves out one plan at a time, or one of `BLOCKS`
+    consecutive parts if there are fewer plans; unlike the correction of Miller and Madow it holds for successive pairs
+    that depend on each other. That of the interval leaves out the units of `neuroprior.analysis.units`,
+    joined to at most `MOST_BLOCKS`. If the actions are independent, twice the number of pairs times the information (in
+    nats) is chi-square distributed up to a factor, which the bias determines (Rao and Scott 1981): that gives
+    `critical_value`. With fewer than `ENOUGH_PAIRS` pairs per degree of freedom, (A - 1)**2, some bias is left:
+    `critical_value` is then at least what 95 % of shuffled pairs stay below. An interval extends at least by
+    `critical_value` to both sides, as the jackknife's error vanishes if there is no information.
 
     Args:
         plans: the plans.
         max_lag: the longest lag.
-        skip: the first actions of each plan that are not predicted, only looked back to. With `max_lag` all lags look
-            at the same actions.
-        generator: draws the shuffles, where few pairs need any.
+        skip: number of first actions of each plan that only count as the earlier of a pair. With `max_lag` the later
+            actions are the same for all lags.
+        generator: draws the shuffles, if there are few pairs.
 
     Returns:
-        One for each lag, up to the longest at which there are two pairs. Intervals and `chance` are those of one lag,
-        not corrected for the number of lags.
+        One for each lag, up to the longest with two pairs. Intervals and critical values are not corrected for the
+        number of lags.
 
     Raises:
         ValueError: a lag below 1, a negative `skip`, or plans without two pairs of successive actions.
@@ -107,15 +107,15 @@ def _information(plans: Plans, lag: int, later: Tensor, generator: torch.Generat
     unit = ((unit.bincount() > 0).cumsum(0) - 1)[unit]  # a group without pairs must not leave a block empty
     _, _, error, blocks = _jackknife(past, then, actions, unit % MOST_BLOCKS)
     freedom = (len(past.unique()) - 1) * (len(then.unique()) - 1)
-    chance = max(bias, 0) * (float(stats.chi2.ppf(0.95, freedom)) / freedom - 1) if freedom else 0.0
+    critical = max(bias, 0) * (float(stats.chi2.ppf(0.95, freedom)) / freedom - 1) if freedom else 0.0
     if pairs < ENOUGH_PAIRS * freedom:
         order = [torch.randperm(pairs, generator=generator, device=past.device) for _ in range(SHUFFLES)]
         shuffled = [_jackknife(past, then[index], actions, fine)[:2] for index in order]
         left = torch.tensor([whole - part for whole, part in shuffled], dtype=torch.double)
-        chance = max(chance, float(left.mean() + stats.norm.ppf(0.95) * left.std()))
-    half = max(float(stats.t.ppf(0.975, blocks - 1)) * error, chance)
-    bits, half, chance = ((nats - bias) / log(2), half / log(2), chance / log(2))
-    return LagInformation(lag, bits, bits - half, bits + half, chance, pairs)
+        critical = max(critical, float(left.mean() + stats.norm.ppf(0.95) * left.std()))
+    half = max(float(stats.t.ppf(0.975, blocks - 1)) * error, critical)
+    bits, half, critical = (nats - bias) / log(2), half / log(2), critical / log(2)
+    return LagInformation(lag, bits, bits - half, bits + half, critical, pairs)
 
 
 def _jackknife(past: Tensor, then: Tensor, num_actions: int, block: Tensor) -> tuple[float, float, float, int]:
@@ -164,20 +164,20 @@ def _leave_one_out(past: Tensor, then: Tensor, num_actions: int, block: Tensor) 
 def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | None = None) -> Plans:
     """Pieces of `length` consecutive actions, cut from plans at random places, as plans of their own.
 
-    A prior that learns from them as if they were whole plans predicts the action j of a piece from exactly j past
-    actions: one training gives what each past action tells (see `bits_by_position`). Pieces overlap: split plans
-    between training and validation before they are cut.
+    A prior that is fitted to them as to whole plans predicts the action j of a piece from exactly j past actions: one
+    training gives the information in each past action (see `bits_by_position`). Pieces overlap: split plans between
+    training and validation before they are cut.
 
     Args:
         plans: the plans.
         length: of each piece.
-        most: how many are drawn, without replacement; all that there are, where there are fewer.
+        most: how many are drawn, without replacement; all if there are fewer.
         generator: draws them.
 
     Returns:
-        The pieces, in the order of the plans. A context is cut likewise, one a plan is repeated. Their `group` is the
-        independent unit: that of the plan, or where no two groups have pieces the number of the plan, or where only one
-        plan has any that of one of `BLOCKS` consecutive parts of it.
+        The pieces, in the order of the plans. A context per step is cut likewise, one per plan repeated. Their `group`
+        is the independent unit (see `neuroprior.analysis.units`): the group of the plan; or the number of the plan, if
+        fewer than two groups have pieces; or one of `BLOCKS` consecutive parts, if only one plan has any.
 
     Raises:
         ValueError: no plan has that many actions, or `length` or `most` is below 1.
@@ -214,10 +214,10 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
 
 
 def bits_by_position(prior: Prior, plans: Plans) -> list[Score]:
-    """What a prior pays for the action j of each plan, given the j before it, for j = 0 to L - 1.
+    """Scores of a prior on the action j of each plan, given the j before it, for j = 0 to L - 1.
 
-    Of held-out `pieces`, `scores[j - 1].minus(scores[j])` is what the action j steps back still tells beyond the nearer
-    ones.
+    On held-out `pieces`, `scores[j - 1].minus(scores[j])` is the information in the action j steps back beyond that in
+    the nearer ones.
 
     Args:
         prior: any prior over the plans' actions.
@@ -227,7 +227,7 @@ def bits_by_position(prior: Prior, plans: Plans) -> list[Score]:
         L scores over the same units: the groups of the plans, or the plans where there are no two groups.
 
     Raises:
-        ValueError: plans of unlike length, fewer than two, or that the prior cannot score.
+        ValueError: plans of unequal lengths, fewer than two, or that the prior cannot score.
     """
     mask = plans.mask().cpu()
     if len(plans) < 2 or plans.max_length == 0 or not bool(mask.all()):
@@ -235,6 +235,6 @@ def bits_by_position(prior: Prior, plans: Plans) -> list[Score]:
     bits, unit = action_bits(prior, plans), units(plans, mask)[:, 0]
     actions = unit.bincount().double()
     totals = torch.zeros(len(actions), plans.max_length, dtype=torch.double).index_add_(0, unit, bits)
-    sees = "actions and context" if prior.takes_context else "actions"
+    inputs = "actions and context" if prior.takes_context else "actions"
     name = type(prior).__name__
-    return [Score(f"{name} after {j}", sees, totals[:, j], actions) for j in range(plans.max_length)]
+    return [Score(f"{name} after {j}", inputs, totals[:, j], actions) for j in range(plans.max_length)]

@@ -1,4 +1,4 @@
-"""Order selection: how many past actions a Markov chain needs to tell the next one, by BIC and AIC."""
+"""Order selection: on how many past actions the next one depends, as a Markov chain, by BIC and AIC."""
 
 import math
 from dataclasses import dataclass
@@ -7,17 +7,17 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_range, is_integer
-from neuroprior.analysis.windows import Line, ranks
+from neuroprior.analysis.flat import FlatPlans, ranks
 from neuroprior.plans import Plans, is_per_step
 
 
 @dataclass(frozen=True)
 class OrderFit:
-    """A Markov chain of one order, fitted by maximum likelihood to the actions that it is scored on.
+    """A Markov chain of one order, fitted by maximum likelihood and scored on the same actions.
 
     Attributes:
-        order: how many past actions the next one may depend on.
-        log_likelihood: of all scored actions given those before them, nats; in sample.
+        order: the number of past actions that the next one may depend on.
+        log_likelihood: of all scored actions given the past ones, nats; in sample.
         num_parameters: free parameters: (histories that occurred) x (A - 1).
         bic: -2 log-likelihood + parameters x log(scored actions) (Schwarz 1978); the lowest is best.
         aic: -2 log-likelihood + 2 x parameters (Akaike 1974); it tends to choose too high an order (Katz 1981).
@@ -35,16 +35,17 @@ class OrderFit:
 def order_selection(plans: Plans, max_order: int = 6, num_contexts: int | None = None) -> list[OrderFit]:
     """Markov chains of orders 0 to `max_order`, all scored on the same actions.
 
-    The first `max_order` actions of each plan are left out: they have no history of that length. With enough data the
-    order of the lowest BIC is the true one (Katz 1981; Csiszár and Shields 2000). They count the parameters of all
-    A**k histories; here only histories that occurred count, as the others have nothing to fit. With enough data that
-    is the same where every history is possible, and does not punish high orders for histories that are not.
+    The first `max_order` actions of each plan are not scored, as they have no history of that length. With enough data
+    the order of the lowest BIC is the true one (Katz 1981; Csiszár and Shields 2000). These authors count the
+    parameters of all A**k histories; here only those of histories that occurred count, as the others are not fitted.
+    With enough data that is the same if all histories are possible, and does not penalise high orders for impossible
+    ones.
 
     Args:
-        plans: of which at least one has more than `max_order` actions.
+        plans: at least one has more than `max_order` actions.
         max_order: the highest order.
-        num_contexts: number of context indices, where the next action may depend on the one seen with it (a step or a
-            plan); histories are then pairs of past actions and that index. None leaves context aside.
+        num_contexts: number of context indices, if the next action may also depend on the context of its step (or of
+            the plan); a history is then the past actions with that index. None to ignore the context.
 
     Returns:
         One fit for each order, from 0.
@@ -55,19 +56,19 @@ def order_selection(plans: Plans, max_order: int = 6, num_contexts: int | None =
     """
     if max_order < 0:
         raise ValueError(f"max_order: an integer of at least 0 is expected, not {max_order}")
-    line = Line.of(plans)
-    scored = line.starts(max_order + 1) + max_order
+    flat = FlatPlans.of(plans)
+    scored = flat.starts(max_order + 1) + max_order
     if len(scored) == 0:
         longest = int(plans.mask().sum(1).max()) if len(plans) else 0
         raise ValueError(f"max_order: below {longest}, the actions of the longest plan, is expected, not {max_order}")
-    following, history = line.actions[scored], torch.zeros_like(scored)
+    following, history = flat.actions[scored], torch.zeros_like(scored)
     if num_contexts is not None:
-        history = ranks(_context(plans, line, num_contexts)[scored])
+        history = ranks(_context(plans, flat, num_contexts)[scored])
     fits = []
     for order in range(max_order + 1):
         if order:
-            history = ranks(history * line.num_actions + line.actions[scored - order])
-        fits.append(_fit(order, history, following, line.num_actions))
+            history = ranks(history * flat.num_actions + flat.actions[scored - order])
+        fits.append(_fit(order, history, following, flat.num_actions))
     return fits
 
 
@@ -91,10 +92,10 @@ def _sum_n_log_n(counts: Tensor) -> Tensor:
     return torch.xlogy(counts.double(), counts.double()).sum()
 
 
-def _context(plans: Plans, line: Line, num_contexts: int) -> Tensor:
-    """`[M]`: the context index seen with each action of the line."""
+def _context(plans: Plans, flat: FlatPlans, num_contexts: int) -> Tensor:
+    """`[M]`: the context index of each action."""
     if plans.context is None or not is_integer(plans.context):
         found = "none" if plans.context is None else str(plans.context.dtype).removeprefix("torch.")
         raise ValueError(f"context: indices below {num_contexts} are expected, not {found}")
     check_range("context", plans.context, num_contexts, "contexts")
-    return plans.context.flatten()[line.place if is_per_step(plans.context) else line.plan].long()
+    return plans.context.flatten()[flat.place if is_per_step(plans.context) else flat.plan].long()

@@ -34,7 +34,7 @@ class Interval(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """A mean with its confidence interval, and the p-value of its being 0 (two-sided)."""
+    """A mean with its confidence interval, and the two-sided p-value of the hypothesis that it is 0."""
 
     mean: float
     low: float
@@ -42,24 +42,24 @@ class Difference(NamedTuple):
     p_value: float
 
 
-def best_of(scores: Tensor, rivals: Sequence[int] | None = None) -> Tensor:
-    """Where each planner was best: at least as good as every rival, so that ties count for each (Hyvärinen, Table 1).
+def best_of(scores: Tensor, baselines: Sequence[int] | None = None) -> Tensor:
+    """Where each planner was at least as good as every baseline, so that ties count for each (Hyvärinen, Table 1).
 
     Args:
         scores: `[K, ...]`: the scores of K planners on the same starts.
-        rivals: the planners to be compared with; None: all K.
+        baselines: the numbers of the planners to compare with; None for all K.
 
     Returns:
         `[K, ...]` bool.
     """
-    return scores >= (scores if rivals is None else scores[list(rivals)]).amax(0)
+    return scores >= (scores if baselines is None else scores[list(baselines)]).amax(0)
 
 
 def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
     """The mean of independent values `[G]`, G >= 2, with Student's interval.
 
     Args:
-        values: one number a world, a subject or a fold: whatever is independent.
+        values: one number for each world, subject or fold: whatever is independent.
         level: of confidence.
 
     Raises:
@@ -154,7 +154,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     """
     a, b = _vector("first", first), _vector("second", second)
     if len(a) != len(b):
-        raise ValueError(f"paired_difference: {len(a)} and {len(b)} values are no pairs")
+        raise ValueError(f"paired_difference: {len(a)} and {len(b)} values cannot be paired")
     mean, low, high = mean_interval(a - b, level)
     if np.ptp(a - b) == 0:
         return Difference(mean, low, high, 1.0 if mean == 0 else 2.0 ** (1 - len(a)))
@@ -162,20 +162,20 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
 
 
 def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -> Difference:
-    """The ratio of two sums over independent units, such as bits per action over plans of unlike length.
+    """The ratio of two sums over independent units, such as bits per action over plans of unequal lengths.
 
     The interval is Student's, on the residuals of the units from the common ratio (Cochran 1977, section 6.3).
 
     Args:
-        totals: `[G]`: what each of G >= 2 units adds to the sum above; of differences, for a paired comparison.
-        sizes: `[G]`: what it adds to the sum below; none negative.
+        totals: `[G]`: the part of each of G >= 2 units in the numerator; differences for a paired comparison.
+        sizes: `[G]`: its part in the denominator; none negative.
         level: of confidence.
 
     Returns:
         The ratio with its interval, and the p-value of a ratio of 0 (two-sided).
 
     Raises:
-        ValueError: fewer than two units, unlike numbers of totals and sizes, or sizes that sum to nothing.
+        ValueError: fewer than two units, unequal numbers of totals and sizes, or sizes that sum to 0.
     """
     above, below = _vector("totals", totals), _vector("sizes", sizes)
     if len(above) != len(below):
@@ -186,7 +186,7 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
     error = float(np.sqrt(units / (units - 1) * ((above - ratio * below) ** 2).sum()) / below.sum())
     half = float(stats.t.ppf((1 + level) / 2, units - 1)) * error
     if error == 0:
-        # No spread at all: by a sign test, since few units may agree by chance.
+        # Without spread Student's test would be certain: a sign test, as few units may agree at random.
         return Difference(ratio, ratio, ratio, 1.0 if ratio == 0 else 2.0 ** (1 - units))
     return Difference(ratio, ratio - half, ratio + half, float(2 * stats.t.sf(abs(ratio) / error, units - 1)))
 
@@ -194,8 +194,8 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
 def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """P-values corrected for the number of tests: Holm's step-down Bonferroni procedure (Holm 1979, section 3).
 
-    The tests may depend on each other in any way: what stays below 0.05 holds for all of them together with a
-    probability of at least 0.95.
+    The tests may depend on each other in any way: if all null hypotheses are true, any corrected p-value is below 0.05
+    with a probability of at most 0.05.
 
     Args:
         p_values: `[M]`, between 0 and 1; M may be 0.

@@ -8,47 +8,42 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
+from neuroprior.analysis.flat import FlatPlans
 from neuroprior.analysis.statistics import holm
-from neuroprior.analysis.windows import Line
 from neuroprior.plans import Plans
 
 FEWEST_PERMUTATIONS = 99
 """Permutations that are made whatever they cost."""
 
-WORK = 10**9
-"""Numbers that the permutations may touch in all: some ten seconds on one core."""
-
-AT_ONCE = 2**21
-"""Numbers that permutations made together may touch; memory is bounded by it."""
-
 FEWEST_DIVISIONS = 20
 """Ways of dividing plans into groups below which no permutation could give a p-value of 0.05."""
 
 ROUNDING = 1e-12
-"""Statistics that differ less than this share of the terms they are sums of are tied: rounding depends on the order."""
+"""Statistics whose difference is below this share of their terms are tied, as rounding depends on the order of sums."""
 
 Test = Literal["permutation", "chi-square", "none"]
 
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """How often each action followed each other one, and whether groups differ in that.
+    """How often each action was followed by each other one, and whether groups differ in that.
 
     Attributes:
-        counts: int64 `[A, A]`: how often each action (row) was followed by each (column) in one plan.
+        counts: int64 `[A, A]`: how often each action (row) was followed by each action (column) within a plan.
         group_counts: int64 `[G, A, A]`: the same in each group.
-        groups: int64 `[G]`: the numbers of the groups, ascending; a single 0 where plans have no groups.
-        statistic: the likelihood-ratio statistic G of "the groups do not differ" (Anderson and Goodman 1957).
+        groups: int64 `[G]`: the numbers of the groups, ascending; a single 0 if plans have no groups.
+        statistic: the likelihood-ratio statistic of the hypothesis that groups do not differ (Anderson and Goodman
+            1957).
         degrees_of_freedom: of its chi-square distribution.
         p_value: of that statistic; NaN without a test.
-        cell_p_values: float64 `[G, A, A]`: for each group and transition, the p-value of "after the first action this
-            group makes the transition as often as the others do", corrected for the number of cells. NaN where
-            there is nothing to compare: this group or all others never went on from the first action, or nobody made
-            the transition, or nobody any other from there.
-        test: where the p-values come from: "permutation" of the groups of whole plans; "chi-square" where there are
-            fewer than `FEWEST_DIVISIONS` ways of dividing the plans into such groups; "none" where no two groups can
-            be compared.
+        cell_p_values: float64 `[G, A, A]`: for each group and transition, the p-value of the hypothesis that the
+            transition has the same probability in this group as in the others, corrected for the number of cells. NaN
+            where there is nothing to compare: the first action is never followed by another in this group, or in all
+            others; or it is never, or always, followed by the second.
+        test: the origin of the p-values: "permutation" of the groups of whole plans; "chi-square" if there are fewer
+            than `FEWEST_DIVISIONS` ways of dividing the plans into such groups; "none" if no two groups are comparable.
         permutations: how many were made; 0 without any.
     """
 
@@ -63,7 +58,7 @@ class Transitions:
     permutations: int
 
     def probs(self) -> Tensor:
-        """`[A, A]`, float64: the probability of each action (column) after each (row); NaN after one never followed."""
+        """`[A, A]`, float64: the probability of each action (column) after each (row); NaN in rows without counts."""
         return _row_probs(self.counts)
 
     def group_probs(self) -> Tensor:
@@ -71,36 +66,45 @@ class Transitions:
         return _row_probs(self.group_counts)
 
 
-def transitions(plans: Plans, permutations: int = 999, generator: torch.Generator | None = None) -> Transitions:
+def transitions(
+    plans: Plans,
+    permutations: int = 999,
+    generator: torch.Generator | None = None,
+    *,
+    max_work: int = 10**9,
+    chunk_size: int = 2**21,
+) -> Transitions:
     """The transitions between successive actions within plans, and a test of whether the groups differ in them.
 
-    The null distribution is that of the same statistics after the groups of the plans were shuffled. Whole plans are
-    shuffled, so that it does not matter how actions depend on each other within a plan; what is tested is that the
-    plans of all groups, lengths included, come from one source. A p-value is (1 + shuffles that reach the statistic) /
-    (1 + shuffles). A cell's statistic is the signed root of the likelihood ratio of its 2 x 2 table (this group or the
-    others; this transition or others from there): a standardised difference, which keeps its scale where counts are
-    small. It is held against the largest of all cells in each shuffle (Westfall and Young 1993: single-step maxT).
+    The null distribution is that of the same statistics after the groups of the plans were permuted. Whole plans are
+    permuted, so that the test holds for any dependence of actions within a plan; the null hypothesis is that the plans
+    of all groups, lengths included, have the same distribution. A p-value is (1 + permutations that reach the
+    statistic) / (1 + permutations). A cell's statistic is the signed root of the likelihood ratio of its 2 x 2 table
+    (this group or the others; this transition or others from the same action): a standardised difference, whose scale
+    does not depend on the counts. It is compared to the largest of all cells in each permutation (Westfall and Young
+    1993: single-step maxT).
 
-    With too few plans for that the chi-square distribution takes its place, under which an action depends on nothing
-    but the one before (Anderson and Goodman 1957), and cells are corrected by Holm's procedure. That holds for many
-    actions a group only: with few, or where the order is higher, it finds differences that are none.
+    With too few plans for that, p-values are those of the chi-square distribution, which assumes a first-order Markov
+    chain (Anderson and Goodman 1957), and cells are corrected by Holm's procedure. That needs many actions in each
+    group; with few, or if the order is higher, it finds differences that do not exist.
 
     Args:
         plans: with a `group`; without, nothing is tested. An end symbol is an action like others.
-        permutations: at most so many shuffles; fewer, but at least `FEWEST_PERMUTATIONS`, where so many would touch
-            more than `WORK` numbers.
-        generator: draws the shuffles.
+        permutations: at most so many; see `max_work`.
+        generator: draws the permutations.
+        max_work: numbers that the permutations may access, some ten seconds on one core; fewer are made if need be, but
+            at least `FEWEST_PERMUTATIONS`.
+        chunk_size: numbers that are in memory at a time.
 
     Raises:
-        ValueError: `permutations` is below 1.
+        ValueError: `permutations`, `max_work` or `chunk_size` is below 1.
     """
-    if permutations < 1:
-        raise ValueError(f"permutations: an integer of at least 1 is expected, not {permutations}")
-    line, size = Line.of(plans), plans.num_actions
+    check_sizes(permutations=permutations, max_work=max_work, chunk_size=chunk_size)
+    flat, size = FlatPlans.of(plans), plans.num_actions
     group = torch.zeros(len(plans), dtype=torch.long) if plans.group is None else plans.group.long()
-    groups, group = group.to(line.actions.device).unique(return_inverse=True)
-    at = line.starts(2)
-    cell, plan = line.actions[at] * size + line.actions[at + 1], line.plan[at]
+    groups, group = group.to(flat.actions.device).unique(return_inverse=True)
+    at = flat.starts(2)
+    cell, plan = flat.actions[at] * size + flat.actions[at + 1], flat.plan[at]
     group_counts = (group[plan] * size**2 + cell).bincount(minlength=len(groups) * size**2).view(-1, size, size)
     cells = torch.full((len(groups), size**2), float("nan"), dtype=torch.double, device=cell.device)
     made, p_value = 0, float("nan")
@@ -108,8 +112,8 @@ def transitions(plans: Plans, permutations: int = 999, generator: torch.Generato
     test = _which_test(table, group[plan.unique()].bincount())
     if test == "permutation":
         taken = _PlanCounts.of(plan, cell, group, table)
-        made = min(permutations, max(WORK // _cost(table, taken), FEWEST_PERMUTATIONS))
-        p_value, found = _permutation_test(table, taken, made, generator_on(generator, cell.device))
+        made = min(permutations, max(max_work // _cost(table, taken), FEWEST_PERMUTATIONS))
+        p_value, found = _permutation_test(table, taken, made, chunk_size, generator_on(generator, cell.device))
     elif test == "chi-square":
         p_value, found = _chi_square_test(table)
     if test != "none":
@@ -129,7 +133,7 @@ def transitions(plans: Plans, permutations: int = 999, generator: torch.Generato
 
 
 class _Table(NamedTuple):
-    """The counts of the G groups that have transitions and the C transitions that somebody made, and what is fixed.
+    """The counts `[G, C]` of the G groups that have transitions and the C transitions that occurred, and fixed sums.
 
     Statistics take counts `[..., G, C]` with the same sums over groups.
     """
@@ -211,27 +215,27 @@ class _PlanCounts(NamedTuple):
 
 
 def _which_test(table: _Table, plans: Tensor) -> Test:
-    """The test for groups of `plans [G]` plans each, in whatever order."""
+    """The test for groups of `plans [G]` plans each."""
     if table.degrees_of_freedom() < 1:
         return "none"
     sizes = plans[plans > 0].double()
-    alike = sizes.long().bincount().double()  # groups of one size may be exchanged without a new division
-    divisions = torch.lgamma(sizes.sum() + 1) - torch.lgamma(sizes + 1).sum() - torch.lgamma(alike + 1).sum()
+    same_size = sizes.long().bincount().double()  # exchanging groups of one size gives no new division
+    divisions = torch.lgamma(sizes.sum() + 1) - torch.lgamma(sizes + 1).sum() - torch.lgamma(same_size + 1).sum()
     return "permutation" if float(divisions) > math.log(FEWEST_DIVISIONS - 0.5) else "chi-square"
 
 
 def _cost(table: _Table, taken: _PlanCounts) -> int:
-    """Numbers that a permutation touches; shuffling a plan and comparing a cell take several."""
+    """Numbers that a permutation accesses; shuffling a plan and comparing a cell take several."""
     return len(taken.times) + 6 * len(taken.label) + 8 * table.observed.numel()
 
 
 def _permutation_test(
-    table: _Table, taken: _PlanCounts, permutations: int, generator: torch.Generator
+    table: _Table, taken: _PlanCounts, permutations: int, chunk_size: int, generator: torch.Generator
 ) -> tuple[float, Tensor]:
-    """The p-value of all, and those `[G, C]` of the cells."""
+    """The p-value of the whole table, and those `[G, C]` of the cells."""
     observed, tie = table.overall(table.observed), table.tie()
     greatest, reached = [], 1
-    together = max(AT_ONCE // _cost(table, taken), 1)
+    together = max(chunk_size // _cost(table, taken), 1)
     num, device = len(taken.label), taken.label.device
     for at in range(0, permutations, together):
         part = range(at, min(at + together, permutations))
@@ -247,7 +251,7 @@ def _permutation_test(
 
 
 def _chi_square_test(table: _Table) -> tuple[float, Tensor]:
-    """The p-value of all, and those `[G, C]` of the cells."""
+    """The p-value of the whole table, and those `[G, C]` of the cells."""
     p_value = float(stats.chi2.sf(float(table.overall(table.observed)), table.degrees_of_freedom()))
     comparable = table.comparable()
     cells = table.cells(table.observed)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from neuroprior._files import versions, write_json, write_whole
-from neuroprior.analysis.comparison import Score, rivals, score, unit_name
+from neuroprior.analysis.comparison import Score, baselines, score, unit_name
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
 from neuroprior.priors import save
 from neuroprior.report.document import printed, records, table, write_frames
@@ -37,7 +37,7 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
     contexts = data.num_contexts if prior.takes_context else None
     with console.status("fitting baselines") as status:
         show = lambda what: status.update(f"fitting {what}")  # noqa: E731
-        for baseline in rivals(data.learned_from, data.chosen_on, contexts, show):
+        for baseline in baselines(data.learned_from, data.chosen_on, contexts, show):
             one = None if baseline.prior is None else score(baseline.model, baseline.prior, data.held_out)
             row = _row(trained, trained) if one is None else _row(one, trained)
             if one is None:  # its tables would be too large
@@ -99,7 +99,7 @@ def _row(one: Score, trained: Score) -> dict[str, Any]:
     taken, gap = one.bits_per_action(), one.minus(trained)
     return {
         "model": one.model,
-        "sees": one.sees,
+        "sees": one.inputs,
         "bits_per_action": taken.mean,
         "low": taken.low,
         "high": taken.high,
@@ -116,7 +116,7 @@ def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
     trained = frame.index[-1]
 
     def how(row: Any) -> str:
-        return ", ".join(part for part in (row.how, "context" * ("context" in str(row.sees))) if part)
+        return ", ".join(part for part in (row.how, "context" * ("context" in str(row.inputs))) if part)
 
     def bits(row: Any) -> str:
         known = not pd.isna(row.bits_per_action)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuroprior._version import __version__
 from neuroprior.analysis import Reliability, pieces, reliability
-from neuroprior.analysis.comparison import Score, action_bits, rivals, score_bits, units
+from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits, units
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
 from neuroprior.priors import GRUPrior, MarkovPrior, MixturePrior, Prior, StackedPrior, TransformerPrior
@@ -177,10 +177,10 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         training, validation = learned.split(VALIDATION, generator)
         if int(validation.mask().sum()) < FEWEST_UNITS:
             training, validation = learned.split(0.5, generator.manual_seed(seed))
-        for rival in rivals(training, validation, sizes.get("num_contexts"), always_see=True):
-            if rival.prior is not None:
+        for baseline in baselines(training, validation, sizes.get("num_contexts"), always_context=True):
+            if baseline.prior is not None:
                 # Chosen on the validation plans; then these are learned from as well.
-                yield rival.model, rival.how, rival.prior.fit(learned)
+                yield baseline.model, baseline.how, baseline.prior.fit(learned)
         return
     how = _training(design) | NEURAL[MIXED[0] if kind == "mixture" else kind][1]
     prior = _made(kind, learned.num_actions, seed=seed, **sizes)

@@ -14,7 +14,7 @@ from neuroprior.analysis import (
     by_group,
     by_plan,
     by_position,
-    likeness,
+    two_sample_tests,
     motifs,
     mutual_information,
     order_selection,
@@ -122,7 +122,7 @@ def lag_section(found: Evaluation) -> Part | None:
     skip = found.settings["skip"]
     lags = found.gains
     if int(found.plans.mask()[:, max(skip, 1) :].sum()) >= 2:
-        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles()))
+        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles())).rename(columns={"critical_value": "chance"})
         information = information.assign(what="mutual information", model="counts", sees=ACTIONS, units=None)
         lags = pd.concat([information, lags], ignore_index=True) if len(lags) else information
         lags = lags[["what", "model", "sees", "lag", "bits", "low", "high", "chance", "units"]]
@@ -350,12 +350,12 @@ def likeness_section(found: Evaluation) -> Part | None:
             continue
         real = found.sampled[: len(model.generated)]
         real = Plans(real.actions, real.num_actions, real.lengths)
-        results = likeness(real, Plans(model.generated, real.num_actions, real.lengths), generator=_shuffles())
+        results = two_sample_tests(real, Plans(model.generated, real.num_actions, real.lengths), generator=_shuffles())
         if results and shown is None:
             shown = model, real, results
         rows += [
             {"model": model.name, "sees": model.inputs, "statistic": one.statistic}
-            | {"distance": one.distance, "chance": one.chance}
+            | {"distance": one.distance, "chance": one.null_distance}
             | {"p_value": one.p_value if tested else None, "corrected": one.corrected if tested else None}
             for one in results
         ]
@@ -369,7 +369,7 @@ def likeness_section(found: Evaluation) -> Part | None:
     order = frame[["model", "sees"]].drop_duplicates()
     wide = cells.pivot(index=["model", "sees"], columns="statistic", values="cell").reset_index()
     wide = order.merge(wide, on=["model", "sees"])
-    wide.loc[len(wide)] = {"model": "same source", "sees": ""} | {one.statistic: f"{one.chance:.3f}" for one in results}
+    wide.loc[len(wide)] = {"model": "same source", "sees": ""} | {one.statistic: f"{one.null_distance:.3f}" for one in results}
     test = (
         "*: p < 0.05, permutation test over plans, corrected."
         if tested

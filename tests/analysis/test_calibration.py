@@ -6,7 +6,6 @@ import pytest
 import torch
 from scipy import stats
 
-from neuroprior.analysis import calibration
 from neuroprior.analysis.calibration import UNITS, reliability
 from neuroprior.analysis.statistics import ratio_difference, share_interval
 from tests.support.sources import FALSE_ALARM, refuses, seeded
@@ -60,16 +59,15 @@ def forecasts(places: int, num_actions: int, seed: int) -> tuple[torch.Tensor, t
     return log_probs, torch.multinomial(log_probs.exp(), 1, generator=generator)[:, 0]
 
 
-def test_folds_add_up(monkeypatch):
-    """In parts or at once, and whichever way the memory is bounded."""
+def test_folds_add_up():
+    """In parts or at once, and with any chunk size."""
     log_probs, actions = forecasts(500, 4, 0)
     unit = torch.arange(500) // 7
     whole = reliability(log_probs, actions, unit)
     cut = [reliability(log_probs[s], actions[s], unit[s]) for s in (slice(0, 123), slice(123, 500))]
     torch.testing.assert_close((cut[0] + cut[1]).sums, whole.sums)
-    monkeypatch.setattr(calibration, "AT_ONCE", 100)
-    torch.testing.assert_close(reliability(log_probs, actions, unit).sums, whole.sums)
-    torch.testing.assert_close(reliability(log_probs, actions, unit - 3 * UNITS).sums, whole.sums)
+    torch.testing.assert_close(reliability(log_probs, actions, unit, chunk_size=100).sums, whole.sums)
+    torch.testing.assert_close(reliability(log_probs, actions, unit - 3 * UNITS, chunk_size=100).sums, whole.sums)
     assert whole.sums.shape == (UNITS, 10, 3)
     assert whole.sums[..., 2].sum() == 2000
     assert whole.sums[..., 1].sum() == 500

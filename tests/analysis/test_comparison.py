@@ -1,4 +1,4 @@
-"""Scores with their intervals against closed forms, enumeration and simulated units; the count-based rivals."""
+"""Scores with their intervals against closed forms, enumeration and simulated units; the count-based baselines."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ from neuroprior.analysis.comparison import (
     DEPTH,
     ORDERS,
     action_bits,
-    rivals,
+    baselines,
     score,
     score_bits,
     unit_name,
@@ -80,9 +80,9 @@ def test_a_ratio_refuses(totals, sizes, word):
 
 
 def test_intervals_of_ratios_cover_at_their_level():
-    """2,000 samples of 40 units of 1 to 9 actions with unlike costs: hits of 95 % intervals.
+    """2,000 samples of 40 units of 1 to 9 actions with different costs: hits of 95 % intervals.
 
-    The interval is approximate, so its true level is let be between 0.925 and 0.965; of such binomials the bounds are
+    The interval is approximate, so its true level may be between 0.925 and 0.965; of such binomials the bounds are
     passed with a probability of `FALSE_ALARM`.
     """
     rng = np.random.default_rng(0)
@@ -119,8 +119,8 @@ def held_out(**more) -> Plans:
 @pytest.mark.parametrize("per", [None, "plan", "step"])
 @pytest.mark.parametrize("kind", ["markov", "gru", "tree"])
 def test_score_is_what_log_prob_says(kind, per):
-    seen = {None: None, "plan": torch.arange(12) % 2, "step": torch.randint(2, (12, 7), generator=seeded(1))}[per]
-    plans, contexts = held_out(context=seen), None if per is None else 2
+    context = {None: None, "plan": torch.arange(12) % 2, "step": torch.randint(2, (12, 7), generator=seeded(1))}[per]
+    plans, contexts = held_out(context=context), None if per is None else 2
     if kind == "gru":
         prior = GRUPrior(3, 8, num_contexts=contexts)
     else:
@@ -130,7 +130,7 @@ def test_score_is_what_log_prob_says(kind, per):
     keep = plans.lengths > 0
     bits = -prior.log_prob(plans).detach().double()[keep] / math.log(2)
     assert found.model == "it"
-    assert found.sees == ("actions" if per is None else "actions and context")
+    assert found.inputs == ("actions" if per is None else "actions and context")
     torch.testing.assert_close(found.bits, bits, rtol=1e-5, atol=1e-6)
     assert found.actions.tolist() == plans.lengths[keep].tolist()
     assert found.bits.dtype == found.actions.dtype == torch.float64
@@ -139,10 +139,10 @@ def test_score_is_what_log_prob_says(kind, per):
     assert total == ratio_difference(found.bits, found.actions)
 
 
-def test_a_prior_that_sees_nothing_leaves_context_aside():
+def test_a_prior_without_context_ignores_that_of_the_plans():
     plans = held_out(context=torch.arange(12), context_names=[f"c{n}" for n in range(12)])
     named = score("uniform", UniformPrior(3), plans)
-    assert named.sees == "actions"
+    assert named.inputs == "actions"
     assert named.bits_per_action().mean == pytest.approx(math.log2(3))
 
 
@@ -169,7 +169,7 @@ def test_groups_without_actions_do_not_count():
 @pytest.mark.parametrize("group", [None, torch.tensor([3, 3, 4])])
 @pytest.mark.parametrize("length", [2, 39, 40, 41, 100, 1003])
 def test_a_single_plan_is_cut_in_parts(length, group):
-    """Also where the others have no actions: consecutive parts, alike in size but for one action."""
+    """Also where the others have no actions: consecutive parts, whose sizes differ by one action at most."""
     plans = Plans(torch.arange(3 * length).view(3, length) % 3, 3, torch.tensor([0, length, 0]), group=group)
     assert unit_name(plans) == "parts of the plan"
     found = units(plans)
@@ -233,7 +233,7 @@ def test_minus_is_paired():
 
 
 def sources(matters: bool, num: int = 400, seed: int = 0) -> Plans:
-    """Plans whose context tells (or does not tell) whether an action is mostly repeated or mostly changed."""
+    """Plans whose context predicts (or does not predict) whether an action is mostly repeated or mostly changed."""
     context = torch.arange(num) % 2
     again = torch.rand(num, 8, generator=seeded(seed)) < torch.where(context == 1, 0.9, 0.1)[:, None]
     if not matters:
@@ -249,32 +249,32 @@ def bits(prior, plans: Plans) -> float:
 
 
 @pytest.mark.parametrize("num_contexts", [None, 2])
-def test_each_rival_is_the_best_of_what_was_tried(num_contexts):
+def test_each_baseline_is_the_best_of_what_was_tried(num_contexts):
     training, validation = sources(True, 150), sources(True, 60, seed=5)
-    told: list[str] = []
-    found = list(rivals(training, validation, num_contexts, told.append))
-    assert [rival.model for rival in found] == ["uniform", *(f"markov-{k}" for k in ORDERS), "context tree"]
-    assert told == [rival.model for rival in found[1:]]
+    fitted: list[str] = []
+    found = list(baselines(training, validation, num_contexts, fitted.append))
+    assert [baseline.model for baseline in found] == ["uniform", *(f"markov-{k}" for k in ORDERS), "context tree"]
+    assert fitted == [baseline.model for baseline in found[1:]]
     assert found[0].validation_bits == pytest.approx(math.log2(3))
     assert isinstance(found[0].prior, UniformPrior)
-    for order, rival in zip(ORDERS, found[1:-1], strict=True):
+    for order, baseline in zip(ORDERS, found[1:-1], strict=True):
         tried = {}
         for contexts in [None, num_contexts] if num_contexts else [None]:
             for backoff, smoothing in BACKOFFS_TRIED:
                 prior = MarkovPrior(3, order, smoothing, num_contexts=contexts, backoff=backoff).fit(training)
                 tried[contexts, backoff, smoothing] = prior
         costs = {key: bits(prior, validation) for key, prior in tried.items()}
-        assert rival.validation_bits == pytest.approx(min(costs.values()), abs=1e-6)
-        chosen = rival.prior.num_contexts, rival.prior.backoff, rival.prior.smoothing
+        assert baseline.validation_bits == pytest.approx(min(costs.values()), abs=1e-6)
+        chosen = baseline.prior.num_contexts, baseline.prior.backoff, baseline.prior.smoothing
         assert costs[chosen] == pytest.approx(min(costs.values()), abs=1e-6)
-        assert rival.how == f"{chosen[1]} {chosen[2]:g}"
-        assert rival.prior.order == order
+        assert baseline.how == f"{chosen[1]} {chosen[2]:g}"
+        assert baseline.prior.order == order
         # Counted once for all, and yet what `fit` alone makes.
         alone = tried[chosen]
-        assert rival.prior.config == alone.config
-        assert rival.prior.learned == alone.learned
+        assert baseline.prior.config == alone.config
+        assert baseline.prior.learned == alone.learned
         for name, value in alone.state_dict().items():
-            assert torch.equal(rival.prior.state_dict()[name], value)
+            assert torch.equal(baseline.prior.state_dict()[name], value)
     tree = found[-1].prior
     trees = [
         ContextTreePrior(3, DEPTH, num_contexts=c).fit(training) for c in {None: [None], 2: [None, 2]}[num_contexts]
@@ -285,50 +285,52 @@ def test_each_rival_is_the_best_of_what_was_tried(num_contexts):
 
 
 @pytest.mark.parametrize("matters", [True, False])
-def test_context_is_seen_where_it_helps(matters):
+def test_context_is_taken_where_it_helps(matters):
     training, validation = sources(matters), sources(matters, 200, seed=7)
-    if not matters:  # many contexts, so that what is lost by counting them apart is no matter of chance
+    if not matters:  # many contexts, so that what is lost by counting them apart is not random
         training, validation = (replace(p, context=torch.arange(len(p)) % 20) for p in (training, validation))
-    for rival in rivals(training, validation, 20):
-        if rival.model in ("markov-1", "markov-2", "context tree"):
-            sees = score(rival.model, rival.prior, validation).sees
-            assert ("context" in sees) == matters, rival.model
+    for baseline in baselines(training, validation, 20):
+        if baseline.model in ("markov-1", "markov-2", "context tree"):
+            inputs = score(baseline.model, baseline.prior, validation).inputs
+            assert ("context" in inputs) == matters, baseline.model
 
 
 def test_contexts_that_only_held_out_plans_have():
     """A context never met in training costs what some probabilities cost, and stops nothing."""
     training = sources(True)
     for validation in (replace(sources(True, 50, 3), context=torch.full((50,), 4)), sources(True, 50, 3)):
-        for rival in rivals(training, validation, 5):
-            assert rival.prior is not None
-            assert 0 < rival.validation_bits < 5
+        for baseline in baselines(training, validation, 5):
+            assert baseline.prior is not None
+            assert 0 < baseline.validation_bits < 5
             new = replace(validation, context=torch.full((50,), 3))
-            assert score(rival.model, rival.prior, new).bits_per_action().mean < 5
+            assert score(baseline.model, baseline.prior, new).bits_per_action().mean < 5
 
 
-def test_rivals_that_always_see():
-    """Also where the context tells nothing; the uniform prior, which cannot see, is left out."""
+def test_baselines_that_always_take_the_context():
+    """Also if the context does not help; the uniform prior, which cannot take it, is left out."""
     both = sources(False), sources(False, 50, 7)
     training, validation = (replace(plans, context=torch.arange(len(plans)) % 20) for plans in both)
-    found = list(rivals(training, validation, 20, always_see=True))
-    assert [rival.model for rival in found] == [*(f"markov-{k}" for k in ORDERS), "context tree"]
-    blind = {rival.model: rival for rival in rivals(training, validation)}
-    for rival in found:
-        assert rival.prior.num_contexts == 20
-        if rival.model in ("markov-1", "markov-2"):
-            assert rival.validation_bits > blind[rival.model].validation_bits
-    chosen = {rival.model: rival.validation_bits for rival in rivals(training, validation, 20)}
-    assert all(chosen[r.model] == min(r.validation_bits, blind[r.model].validation_bits) for r in found)
-    # Where there is none to see, nothing changes.
-    same = {rival.model: rival.validation_bits for rival in rivals(training, validation, always_see=True)}
-    assert same == {model: rival.validation_bits for model, rival in blind.items()}
+    found = list(baselines(training, validation, 20, always_context=True))
+    assert [baseline.model for baseline in found] == [*(f"markov-{k}" for k in ORDERS), "context tree"]
+    without = {baseline.model: baseline for baseline in baselines(training, validation)}
+    for baseline in found:
+        assert baseline.prior.num_contexts == 20
+        if baseline.model in ("markov-1", "markov-2"):
+            assert baseline.validation_bits > without[baseline.model].validation_bits
+    chosen = {baseline.model: baseline.validation_bits for baseline in baselines(training, validation, 20)}
+    assert all(chosen[r.model] == min(r.validation_bits, without[r.model].validation_bits) for r in found)
+    # Without a context nothing changes.
+    same = {
+        baseline.model: baseline.validation_bits for baseline in baselines(training, validation, always_context=True)
+    }
+    assert same == {model: baseline.validation_bits for model, baseline in without.items()}
 
 
-def test_rivals_that_are_too_large(monkeypatch):
-    """They have no prior, and those that are small enough go on; so do those that see no context."""
+def test_baselines_that_are_too_large(monkeypatch):
+    """They have no prior, and those that are small enough go on; so do those that take no context."""
     training, validation = sources(True), sources(True, 100, seed=3)
     monkeypatch.setattr(HistoryPrior, "max_table_bytes", 4 * 3 * 2 * 60)
-    found = {rival.model: rival for rival in rivals(training, validation)}
+    found = {baseline.model: baseline for baseline in baselines(training, validation)}
     assert len(found) == len(ORDERS) + 2
     for name in ("uniform", "markov-0", "markov-1", "markov-2"):
         assert found[name].prior is not None, name
@@ -336,14 +338,14 @@ def test_rivals_that_are_too_large(monkeypatch):
         assert (found[name].how, found[name].prior, found[name].validation_bits) == ("too large", None, math.inf), name
     # 1 + 3 histories and 1 opening fit, but not as often as there are contexts.
     monkeypatch.setattr(HistoryPrior, "max_table_bytes", 4 * 3 * (5 + 6))
-    alone = {rival.model: rival for rival in rivals(training, validation, 2)}
+    alone = {baseline.model: baseline for baseline in baselines(training, validation, 2)}
     assert alone["markov-1"].prior is not None
     assert alone["markov-1"].prior.num_contexts is None
     assert alone["markov-2"].prior is None
 
 
-def test_rivals_of_closed_plans_know_the_end():
+def test_baselines_of_closed_plans_know_the_end():
     training, validation = sources(False).with_end(), sources(False, 50, seed=3).with_end()
-    for rival in rivals(training, validation):
-        assert rival.prior.end == 3
-        assert rival.prior.log_prob(torch.tensor([[0, 3, 0]])).isneginf().all()
+    for baseline in baselines(training, validation):
+        assert baseline.prior.end == 3
+        assert baseline.prior.log_prob(torch.tensor([[0, 3, 0]])).isneginf().all()

@@ -9,8 +9,8 @@ import torch
 from scipy import stats
 
 from neuroprior import Plans
-from neuroprior.analysis import motifs, words
-from neuroprior.analysis.hypergeometric import two_sided
+from neuroprior.analysis import motifs
+from neuroprior.analysis.motifs import FEWEST, fisher_two_sided
 from neuroprior.plans.folds import BLOCKS
 from tests.support.chains import markov_plans, markov_probs, null_sets
 from tests.support.sources import FALSE_ALARM, refuses, seeded
@@ -31,7 +31,7 @@ def test_tails_are_those_of_scipy():
         for s, d in itertools.product(range(total + 1), repeat=2)
         for x in range(max(s + d - total, 0), min(s, d) + 1)
     ]
-    found = two_sided(*torch.tensor(tables).T)
+    found = fisher_two_sided(*torch.tensor(tables).T)
     assert found.tolist() == pytest.approx([fisher(*table) for table in tables], rel=1e-9)
 
 
@@ -41,7 +41,7 @@ def test_tails_are_those_of_scipy():
 def test_tails_of_large_tables(table):
     x, total, s, d = table
     upper, lower = stats.hypergeom.sf(x - 1, total, s, d), stats.hypergeom.cdf(x, total, s, d)
-    found = two_sided(*torch.tensor([table]).T)
+    found = fisher_two_sided(*torch.tensor([table]).T)
     assert float(found) == pytest.approx(min(2 * (upper if x * total > s * d else lower), 1), rel=1e-7)
 
 
@@ -68,9 +68,9 @@ def test_counts_tests_and_expectations_are_those_of_brute_force():
     tested = {}
     for n in (2, 3, 4, 5):
         for word, (count, total, head, tail) in brute_force(plans, n).items():
-            if min(head, tail) >= words.FEWEST and max(head, tail) < total:
+            if min(head, tail) >= FEWEST and max(head, tail) < total:
                 tested[word] = (count, total, head, tail)
-    listed = {w: c for w, c in tested.items() if c[0] > 0 or c[2] * c[3] / c[1] >= words.FEWEST}
+    listed = {w: c for w, c in tested.items() if c[0] > 0 or c[2] * c[3] / c[1] >= FEWEST}
     assert {m.actions for m in found} == set(listed)
     assert any(m.count == 0 for m in found)
     assert len(listed) < len(tested)
@@ -267,11 +267,9 @@ def test_the_order_of_the_list():
     assert motifs(planted(4, (0, 1, 2, 3, 0), 0), top=7) == found[:7]
 
 
-def test_how_many_pairs_are_looked_at_together_changes_nothing(monkeypatch):
+def test_chunks_change_nothing():
     plans = planted(4, (2, 2, 0, 1), 1)
-    found = motifs(plans)
-    monkeypatch.setattr(words, "PAIRS_AT_ONCE", 7)
-    assert motifs(plans) == found
+    assert motifs(plans, chunk_size=7) == motifs(plans)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Transitions and the tests of their differences against brute force, scipy, enumeration and null data."""
 
-import importlib
 import itertools
 from collections import Counter
 
@@ -207,19 +206,16 @@ def test_the_same_seed_gives_the_same_result():
     assert first.cell_p_values.equal(second.cell_p_values)
 
 
-def test_work_is_bounded(monkeypatch):
-    module = importlib.import_module("neuroprior.analysis.transitions")  # its name in the package is the function's
+def test_work_is_bounded():
     plans = null_plans(0, 3, 18, 20)
     full = transitions(plans, 300, seeded(0))
     assert full.permutations == 300
     # How many are made together changes nothing.
-    monkeypatch.setattr(module, "AT_ONCE", 1)
-    alone = transitions(plans, 300, seeded(0))
+    alone = transitions(plans, 300, seeded(0), chunk_size=1)
     assert alone.p_value == full.p_value
     assert alone.cell_p_values.equal(full.cell_p_values)
-    monkeypatch.setattr(module, "WORK", 1)
-    assert transitions(plans, 300, seeded(0)).permutations == FEWEST_PERMUTATIONS
-    assert transitions(plans, 20, seeded(0)).permutations == 20
+    assert transitions(plans, 300, seeded(0), max_work=1).permutations == FEWEST_PERMUTATIONS
+    assert transitions(plans, 20, seeded(0), max_work=1).permutations == 20
 
 
 def test_bad_input():

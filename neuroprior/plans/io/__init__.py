@@ -62,8 +62,9 @@ def read_plans(
 def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | None = None) -> None:
     """Write plans to a file, by its suffix: those that `read_plans` reads. An old file is replaced once it is whole.
 
-    `.npz` and `.jsonl` keep everything. CSV keeps names where there are any, else numbers, but not the number of actions:
-    give `num_actions` or `action_names` when reading it. Names of contexts and groups are then numbered in sorted order.
+    `.npz` and `.jsonl` keep everything. CSV keeps names where there are any, else numbers, but not how many actions are
+    possible: give `num_actions` or `action_names` when reading it. Names of contexts and groups are numbered in sorted
+    order then.
 
     Args:
         plans: at least one.

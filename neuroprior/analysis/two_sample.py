@@ -1,4 +1,4 @@
-"""Generated plans against real ones: which of their statistics tell them apart."""
+"""Generated plans against real ones: permutation tests of n-grams, run lengths and return times."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,49 +20,37 @@ ORDERS = range(1, 5)
 """Lengths of the n-grams that are compared."""
 
 LONGEST = 50
-"""Steps from which on run lengths and return times are one class."""
-
-MOST_PLANS = 20_000
-"""Plans of each kind that are compared; of more, as many are drawn."""
-
-MOST_ACTIONS = 2**20
-"""Actions of each kind that are compared, likewise."""
+"""Steps beyond which run lengths, and return times, form one class."""
 
 MOST_SHOWN = 20
-"""n-grams whose shares are told: the most frequent."""
+"""n-grams whose shares are returned: the most frequent ones."""
 
 FEWEST_WAYS = 120
-"""Ways to label the plans without which none of the six corrected p-values can reach 0.05: then plans are cut."""
-
-WORK = 10**9
-"""Additions that the permutations of one statistic may take."""
+"""Ways of labelling the plans below which none of the six corrected p-values could reach 0.05: then plans are cut."""
 
 FEWEST_PERMUTATIONS = 99
-"""Permutations that are made even so."""
-
-AT_ONCE = 2**23
-"""Counts held at once; bounds memory."""
+"""Permutations that are made whatever they cost."""
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness:
-    """How one statistic of generated plans differs from that of real ones.
+class TwoSampleTest:
+    """How the distribution of one statistic differs between generated and real plans.
 
     Attributes:
         statistic: "1-grams" to "4-grams", "run lengths" or "return times".
-        distance: the total variation between the two distributions, 0 (alike) to 1 (nothing in common).
-        chance: the mean distance of two such sets from one source.
-        p_value: of both being from one source.
-        corrected: the same, corrected for the number of statistics (`neuroprior.analysis.statistics.holm`).
+        distance: the total variation between the two distributions, from 0 (equal) to 1 (disjoint).
+        null_distance: the mean distance under the null hypothesis that both are samples of one distribution.
+        p_value: of that hypothesis.
+        corrected: the same, corrected for the number of statistics (`neuroprior.analysis.holm`).
         permutations: how many were made.
-        classes: of n-grams the actions of the `MOST_SHOWN` most frequent ones (in the mean of both distributions); else
-            (1,), (2,), ... steps, of which the last, `LONGEST` + 1, stands for all that are longer.
+        classes: for n-grams the actions of the `MOST_SHOWN` most frequent ones (in the mean of both distributions);
+            else (1,), (2,), ... steps, the last of which, `LONGEST` + 1, stands for all longer ones.
         real, generated: `[K]`, float64: the share of each of the K classes.
     """
 
     statistic: str
     distance: float
-    chance: float
+    null_distance: float
     p_value: float
     corrected: float
     permutations: int
@@ -80,39 +68,60 @@ class _Sequences:
     num_plans: int
 
 
-def likeness(
-    real: Plans, generated: Plans, permutations: int = 999, generator: torch.Generator | None = None
-) -> list[Likeness]:
+def two_sample_tests(
+    real: Plans,
+    generated: Plans,
+    permutations: int = 999,
+    generator: torch.Generator | None = None,
+    *,
+    max_plans: int = 20_000,
+    max_actions: int = 2**20,
+    max_work: int = 10**9,
+    chunk_size: int = 2**23,
+) -> list[TwoSampleTest]:
     """Compare the distributions of n-grams, run lengths and return times in generated and in real plans.
 
-    A run is a stretch of the same action; a return time is the number of steps until the same action comes again, where
-    it does in the same plan. Counts are pooled over plans, the distance is the total variation, and the p-value that
-    of a permutation test: where both are drawn from one source, whole plans may change their labels (Good 2005,
-    Permutation, parametric and bootstrap tests). So the plans of each kind must be independent of each other: plans of
-    few subjects, each with ways of its own, differ from plans of others by more than that. Generate plans as long as
-    the real ones: what comes again within a plan depends on its length.
+    A run is a maximal sequence of the same action; a return time is the number of steps until the same action is taken
+    again in the same plan. Counts are pooled over plans, the distance is the total variation, and the p-value that of a
+    permutation test: under the null hypothesis whole plans may exchange their labels (Good 2005, Permutation,
+    parametric and bootstrap tests). So the plans of either sample must be independent: the plans of a few subjects that
+    behave differently are not, and differ from those of other subjects by more than the test allows for. Generate plans
+    as long as the real ones, as return times depend on the length.
 
-    Where the plans could be labelled in fewer than `FEWEST_WAYS` ways (nine plans, say, or one among a hundred), all
-    are cut into consecutive pieces of the same length, about `BLOCKS` of the shorter kind, and pieces stand for plans.
-    Then what reaches across pieces must be small, and unlike plans of one kind count as a difference.
+    If the plans can be labelled in fewer than `FEWEST_WAYS` ways (nine plans, say, or one against a hundred), all are
+    cut into consecutive pieces of the same length, about `BLOCKS` of the smaller sample, and pieces take the place of
+    plans. That assumes that pieces are nearly independent, also those of the same plan.
 
     Args:
-        real: executed plans; at most `MOST_PLANS` plans and about `MOST_ACTIONS` actions are drawn from them.
-        generated: plans sampled from a prior, likewise.
-        permutations: at most so many; fewer, but `FEWEST_PERMUTATIONS`, where they would take longer than some seconds.
-        generator: draws the plans and the permutations.
+        real: executed plans.
+        generated: plans sampled from a prior.
+        permutations: at most so many; see `max_work`.
+        generator: draws the plans that are compared and the permutations.
+        max_plans: of more plans than these in either sample, so many are drawn.
+        max_actions: likewise; the last plan is cut where it exceeds them.
+        max_work: additions that the permutations of a statistic may take, some seconds; fewer are made if need be, but
+            at least `FEWEST_PERMUTATIONS`.
+        chunk_size: counts that are in memory at a time.
 
     Returns:
-        One for each statistic that occurs, in the order of `Likeness.statistic`.
+        One for each statistic that occurs, in the order of `TwoSampleTest.statistic`.
 
     Raises:
-        ValueError: unlike numbers of actions, plans without any action, or no permutations.
+        ValueError: different numbers of actions, plans without any action, or no permutations.
     """
-    check_sizes(permutations=permutations)
+    check_sizes(
+        permutations=permutations,
+        max_plans=max_plans,
+        max_actions=max_actions,
+        max_work=max_work,
+        chunk_size=chunk_size,
+    )
     if real.num_actions != generated.num_actions:
         raise ValueError(f"real plans have {real.num_actions} actions, generated ones {generated.num_actions}")
     draw = generator_on(generator, "cpu")
-    kinds = [_flat(name, plans, draw) for name, plans in (("real", real), ("generated", generated))]
+    kinds = [
+        _drawn(name, plans, max_plans, max_actions, draw) for name, plans in (("real", real), ("generated", generated))
+    ]
     if comb(sum(kind.num_plans for kind in kinds), kinds[0].num_plans) < FEWEST_WAYS:
         size = max(min(len(kind.actions) for kind in kinds) // BLOCKS, 1)
         kinds = [_cut(kind, size) for kind in kinds]
@@ -123,25 +132,25 @@ def likeness(
         first.num_plans + second.num_plans,
     )
     tested = [
-        _test(name, counts, values, first.num_plans, permutations, draw)
+        _test(name, counts, values, first.num_plans, permutations, max_work, chunk_size, draw)
         for name, counts, values in _statistics(both, real.num_actions)
     ]
     corrected = holm([one.p_value for one in tested])
     return [replace(one, corrected=float(p)) for one, p in zip(tested, corrected, strict=True)]
 
 
-def _flat(name: str, plans: Plans, generator: torch.Generator) -> _Sequences:
+def _drawn(name: str, plans: Plans, max_plans: int, max_actions: int, generator: torch.Generator) -> _Sequences:
     """The plans that have actions, in random order, as many as are compared."""
     lengths = plans.mask().sum(1).cpu()
     taken = lengths.nonzero()[:, 0]
     if len(taken) == 0:
         raise ValueError(f"{name}: plans with at least one action are expected")
-    taken = taken[torch.randperm(len(taken), generator=generator)][:MOST_PLANS]
-    taken = taken[lengths[taken].cumsum(0) - lengths[taken] < MOST_ACTIONS]
+    taken = taken[torch.randperm(len(taken), generator=generator)][:max_plans]
+    taken = taken[lengths[taken].cumsum(0) - lengths[taken] < max_actions]
     kept = plans[taken.to(plans.actions.device)]
     mask = kept.mask()
     plan = torch.arange(len(taken)).repeat_interleave(lengths[taken])
-    return _Sequences(kept.actions[mask].long().cpu()[:MOST_ACTIONS], plan[:MOST_ACTIONS], len(taken))
+    return _Sequences(kept.actions[mask].long().cpu()[:max_actions], plan[:max_actions], len(taken))
 
 
 def _cut(sequences: _Sequences, size: int) -> _Sequences:
@@ -153,7 +162,7 @@ def _cut(sequences: _Sequences, size: int) -> _Sequences:
 
 
 def _statistics(both: _Sequences, num_actions: int) -> Iterator[tuple[str, sparse.csr_matrix, Tensor]]:
-    """Each statistic that occurs: its name, counts `[K, N]` of its classes in the plans, and the classes `[K, n]`."""
+    """Of each statistic that occurs the name, the counts `[K, N]` of its classes in the plans, the classes `[K, n]`."""
     actions, plan = both.actions, both.plan
 
     def counts(kind: Tensor, at: Tensor, kinds: int) -> sparse.csr_matrix:
@@ -185,32 +194,39 @@ def _statistics(both: _Sequences, num_actions: int) -> Iterator[tuple[str, spars
 
 
 def _test(
-    name: str, counts: sparse.csr_matrix, classes: Tensor, num_real: int, permutations: int, generator: torch.Generator
-) -> Likeness:
+    name: str,
+    counts: sparse.csr_matrix,
+    classes: Tensor,
+    num_real: int,
+    permutations: int,
+    max_work: int,
+    chunk_size: int,
+    generator: torch.Generator,
+) -> TwoSampleTest:
     """The permutation test of one statistic; the first `num_real` plans are real. `corrected` is not known yet."""
     kinds, num = counts.shape
-    made = min(permutations, max(WORK // (counts.nnz + 4 * kinds), FEWEST_PERMUTATIONS))
+    made = min(permutations, max(max_work // (counts.nnz + 4 * kinds), FEWEST_PERMUTATIONS))
     total = np.asarray(counts.sum(1))
     observed = np.zeros((num, 1))
     observed[:num_real] = 1
     is_real = counts @ observed
     distance = float(_distances(is_real, total)[0])
     null = []
-    at_once = max(AT_ONCE // max(kinds, num), 1)
+    at_once = max(chunk_size // max(kinds, num), 1)
     for first in range(0, made, at_once):
         labels = np.zeros((num, min(at_once, made - first)))
         for column in labels.T:
             column[torch.randperm(num, generator=generator)[:num_real].numpy()] = 1
         null.append(_distances(counts @ labels, total))
-    chance = np.concatenate(null)
+    distances = np.concatenate(null)
     # Ties count, whatever their rounding.
-    p_value = (1 + int((chance >= distance - 1e-9).sum())) / (1 + made)
+    p_value = (1 + int((distances >= distance - 1e-9).sum())) / (1 + made)
     shares = [torch.from_numpy((part / max(part.sum(), 1))[:, 0]) for part in (is_real, total - is_real)]
     if classes.shape[1] > 1 or name == "1-grams":
         shown = (shares[0] + shares[1]).argsort(descending=True, stable=True)[:MOST_SHOWN]
         classes, shares = classes[shown], [share[shown] for share in shares]
     shown_classes = tuple(tuple(row) for row in classes.tolist())
-    return Likeness(name, distance, float(chance.mean()), p_value, p_value, made, shown_classes, *shares)
+    return TwoSampleTest(name, distance, float(distances.mean()), p_value, p_value, made, shown_classes, *shares)
 
 
 def _distances(is_real: NDArray[np.float64], total: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,6 +1,5 @@
-"""Likeness of plans against hand-made counts, all permutations, and chains that are alike or known not to be; Holm."""
+"""Two-sample tests against counts by loops, all permutations, and equal and unequal chains; Holm's correction."""
 
-import importlib
 import itertools
 import math
 from collections import Counter
@@ -11,11 +10,10 @@ import torch
 from scipy import stats
 
 from neuroprior import Plans
-from neuroprior.analysis.likeness import LONGEST, likeness
+from neuroprior.analysis import two_sample_tests
 from neuroprior.analysis.statistics import holm
+from neuroprior.analysis.two_sample import LONGEST
 from tests.support.sources import FALSE_ALARM, refuses, seeded
-
-module = importlib.import_module("neuroprior.analysis.likeness")  # the package has a function of that name
 
 NAMES = ["1-grams", "2-grams", "3-grams", "4-grams", "run lengths", "return times"]
 
@@ -57,7 +55,7 @@ def ragged(num: int, length: int, actions: int, seed: int) -> Plans:
 
 def test_distances_and_shares_by_loops():
     real, generated = ragged(12, 90, 3, 0), ragged(15, 70, 3, 1)
-    found = likeness(real, generated, 99, seeded(0))
+    found = two_sample_tests(real, generated, 99, seeded(0))
     assert [one.statistic for one in found] == NAMES
     for one in found:
         first, second = counted(real, one.statistic), counted(generated, one.statistic)
@@ -75,7 +73,7 @@ def test_distances_and_shares_by_loops():
 
 def test_long_runs_and_returns_are_one_class():
     stay, away = torch.zeros(10, 60).long(), torch.cat([torch.zeros(10, 1), torch.ones(10, 58), torch.zeros(10, 1)], 1)
-    found = {one.statistic: one for one in likeness(Plans(stay, 2), Plans(away.long(), 2), 99, seeded(0))}
+    found = {one.statistic: one for one in two_sample_tests(Plans(stay, 2), Plans(away.long(), 2), 99, seeded(0))}
     assert found["run lengths"].real[LONGEST] == 1
     assert found["run lengths"].generated[[0, LONGEST]].tolist() == pytest.approx([2 / 3, 1 / 3])
     assert found["return times"].generated[LONGEST] == pytest.approx(1 / 58)
@@ -88,7 +86,7 @@ def test_against_all_permutations():
     plans = plans[plans.lengths > 2][:9]
     assert len(plans) == 9
     made = 2000
-    for one in likeness(plans[:5], plans[5:], made, seeded(0))[:2]:
+    for one in two_sample_tests(plans[:5], plans[5:], made, seeded(0))[:2]:
         alone = [counted(plans[n : n + 1], one.statistic) for n in range(9)]
         distances = []
         for real in itertools.combinations(range(9), 5):
@@ -98,14 +96,14 @@ def test_against_all_permutations():
         spread = math.sqrt(share * (1 - share) / made)
         assert one.permutations == made
         assert abs(one.p_value - share) < 5 * spread + 1 / made
-        assert one.chance == pytest.approx(np.mean(distances), abs=5 * np.std(distances) / math.sqrt(made))
+        assert one.null_distance == pytest.approx(np.mean(distances), abs=5 * np.std(distances) / math.sqrt(made))
 
 
-def test_p_values_of_like_plans_are_uniform():
+def test_p_values_of_equal_distributions_are_uniform():
     """200 pairs of sets of one chain: each p-value is uniform over 1 / 40 to 1, but for ties."""
     p_values = []
     for seed in range(200):
-        found = likeness(chain(15, 10, 0.7, seed), chain(20, 10, 0.7, 1000 + seed), 39, seeded(seed))
+        found = two_sample_tests(chain(15, 10, 0.7, seed), chain(20, 10, 0.7, 1000 + seed), 39, seeded(seed))
         p_values.append([one.p_value for one in found])
     for column in np.array(p_values).T:
         assert sum(column <= 0.05) <= stats.binom.isf(FALSE_ALARM, 200, 0.05)
@@ -117,19 +115,21 @@ def test_pieces_of_one_long_plan_each():
     """60 pairs of single plans of one chain: cut, their p-values are about uniform."""
     p_values = []
     for seed in range(60):
-        found = likeness(chain(1, 800, 0.7, seed), chain(1, 1000, 0.7, 1000 + seed), 39, seeded(seed))
+        found = two_sample_tests(chain(1, 800, 0.7, seed), chain(1, 1000, 0.7, 1000 + seed), 39, seeded(seed))
         p_values.append([one.p_value for one in found])
-    # Neighbouring pieces are not quite independent: a level of up to 9 % is let be.
+    # Neighbouring pieces are not quite independent: a level of up to 9 % is allowed.
     assert (np.sum(np.array(p_values) <= 0.05, 0) <= stats.binom.isf(FALSE_ALARM, 60, 0.09)).all()
-    told = {one.statistic: one for one in likeness(chain(1, 1000, 0.7, 0), chain(1, 1000, 0.5, 1), 499, seeded(0))}
-    assert told["2-grams"].corrected < 0.02
-    assert told["1-grams"].corrected > 0.05
+    found = {
+        one.statistic: one for one in two_sample_tests(chain(1, 1000, 0.7, 0), chain(1, 1000, 0.5, 1), 499, seeded(0))
+    }
+    assert found["2-grams"].corrected < 0.02
+    assert found["1-grams"].corrected > 0.05
 
 
 def test_order_0_against_order_1():
-    """Bigrams tell them apart, by the known distance of 0.2, and unigrams do not."""
+    """Bigrams differ, by the known distance of 0.2, and unigrams do not."""
     real, generated = chain(300, 50, 0.7, 1), chain(300, 50, 0.5, 2)
-    found = {one.statistic: one for one in likeness(real, generated, 999, seeded(0))}
+    found = {one.statistic: one for one in two_sample_tests(real, generated, 999, seeded(0))}
     assert found["1-grams"].p_value > 0.05
     for name in NAMES[1:]:
         assert found[name].corrected == pytest.approx(0.006)
@@ -141,36 +141,34 @@ def test_order_0_against_order_1():
     assert found["run lengths"].generated[0] == pytest.approx(0.5, abs=0.02)
 
 
-def test_seeds_and_bounds(monkeypatch):
+def test_seeds_and_bounds():
     real, generated = chain(30, 20, 0.7, 1), chain(30, 20, 0.6, 2)
-    both = [likeness(real, generated, 99, seeded(0)) for _ in range(2)]
-    assert [one.p_value for one in both[0]] == [one.p_value for one in both[1]]
-    monkeypatch.setattr(module, "AT_ONCE", 700)
-    assert [one.p_value for one in likeness(real, generated, 99, seeded(0))] == [one.p_value for one in both[0]]
-    monkeypatch.setattr(module, "WORK", 1)
-    assert {one.permutations for one in likeness(real, generated, 999, seeded(0))} == {99}
-    monkeypatch.setattr(module, "MOST_PLANS", 20)
-    monkeypatch.setattr(module, "MOST_ACTIONS", 330)
-    few = likeness(real, generated, 99, seeded(0))
+
+    def p_values(**bounds) -> list[float]:
+        return [one.p_value for one in two_sample_tests(real, generated, 99, seeded(0), **bounds)]
+
+    assert p_values() == p_values() == p_values(chunk_size=700)
+    assert {one.permutations for one in two_sample_tests(real, generated, 999, seeded(0), max_work=1)} == {99}
+    few = two_sample_tests(real, generated, 99, seeded(0), max_plans=20, max_actions=330)
     # Of 17 plans each, the last cut: multiples of 1 / 330.
     assert (few[0].real * 330).tolist() == pytest.approx((few[0].real * 330).round().tolist())
 
 
 def test_what_does_not_occur_is_left_out():
     one, two = Plans(torch.arange(20)[:, None] % 3, 3), Plans(torch.arange(20)[:, None] % 2, 3)
-    assert [found.statistic for found in likeness(one, two, 99)] == ["1-grams", "run lengths"]
+    assert [found.statistic for found in two_sample_tests(one, two, 99)] == ["1-grams", "run lengths"]
 
 
 def test_what_cannot_be():
     plans = chain(20, 5, 0.5, 0)
     with refuses("2 actions", "3"):
-        likeness(plans, Plans(plans.actions, 3))
+        two_sample_tests(plans, Plans(plans.actions, 3))
     with refuses("generated", "at least one action"):
-        likeness(plans, Plans(plans.actions, 2, torch.zeros(20).long()))
+        two_sample_tests(plans, Plans(plans.actions, 2, torch.zeros(20).long()))
     with refuses("real"):
-        likeness(plans[:0], plans)
+        two_sample_tests(plans[:0], plans)
     with refuses("permutations"):
-        likeness(plans, plans, 0)
+        two_sample_tests(plans, plans, 0)
 
 
 def test_holm_by_hand():

@@ -1,4 +1,4 @@
-"""Plans laid end to end, so that all windows of so many actions can be counted at once, whatever the plans' lengths."""
+"""Plans laid end to end, so that sequences of actions are counted in all plans at once, whatever their lengths."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,13 @@ from neuroprior.plans import Plans
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
-    """The M actions of all plans, one plan after the other.
+class FlatPlans:
+    """The M actions of all plans in one row, plan after plan.
 
     Attributes:
         actions: int64 `[M]`.
         plan: int64 `[M]`, ascending: the plan of each action.
-        place: int64 `[M]`: the number of each action in `plans.actions` laid flat, `plan * L + step`.
+        place: int64 `[M]`: the index of each action in the flattened `plans.actions`, `plan * L + step`.
         num_actions: the number of actions, A.
     """
 
@@ -25,28 +25,29 @@ class Line:
     num_actions: int
 
     @staticmethod
-    def of(plans: Plans) -> "Line":
+    def of(plans: Plans) -> "FlatPlans":
         """The actions of `plans`; an end symbol is an action like others."""
         place = plans.mask().flatten().nonzero()[:, 0]
         plan = place.div(max(plans.max_length, 1), rounding_mode="floor")
-        return Line(plans.actions.flatten()[place].long(), plan, place, plans.num_actions)
+        return FlatPlans(plans.actions.flatten()[place].long(), plan, place, plans.num_actions)
 
-    def without_repeats(self) -> "Line":
+    def without_repeats(self) -> "FlatPlans":
         """The same plans with each run of one action merged into a single action."""
         new = torch.ones_like(self.actions, dtype=torch.bool)
         new[1:] = (self.actions[1:] != self.actions[:-1]) | (self.plan[1:] != self.plan[:-1])
-        return Line(self.actions[new], self.plan[new], self.place[new], self.num_actions)
+        return FlatPlans(self.actions[new], self.plan[new], self.place[new], self.num_actions)
 
     def starts(self, length: int) -> Tensor:
-        """`[W]`: where on the line `length` >= 1 consecutive actions of one plan begin, ascending."""
+        """`[W]`: where `length` >= 1 consecutive actions of one plan begin, ascending."""
         until = max(len(self.plan) - length + 1, 0)
         return (self.plan[:until] == self.plan[len(self.plan) - until :]).nonzero()[:, 0]
 
 
 def ranks(codes: Tensor) -> Tensor:
-    """The rank of each of `codes [n]` among the distinct ones, from 0: numbers that no further action makes too large.
+    """The rank, from 0, of each of `codes [n]` among the distinct ones.
 
-    A code of k actions in base A overflows where A**k does; the rank among at most n codes never does.
+    A sequence of k actions has the code of its first k - 1 times A plus the last. Codes of long sequences would
+    overflow; ranks, which take their place before the next action is added, do not.
     """
     found: Tensor = torch.unique(codes, return_inverse=True)[1]
     return found
