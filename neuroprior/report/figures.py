@@ -174,7 +174,7 @@ def order_figure(orders: pd.DataFrame, scores: pd.DataFrame) -> Figure:
         scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
     """
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
-    styles = iter(("--", ":", "-.", "--"))
+    styles = iter(("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1))))
     for sees, own in orders.groupby("sees", sort=False):
         for criterion in ("BIC", "AIC"):
             rows = own.assign(none=None)[["order", f"{criterion.lower()}_bits", "none", "none"]]

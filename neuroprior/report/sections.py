@@ -50,7 +50,7 @@ def file_section(found: Evaluation) -> Part:
     """What is in the file."""
     columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
     columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "sees"}
-    shown = table(pd.DataFrame([describe(found.plans)]), columns, align="r" * len(columns))
+    shown = table(pd.DataFrame([describe(found.plans)]), columns, align="rrrrrrl")
     return Part(Section("Plans", tables=[shown]), {})
 
 

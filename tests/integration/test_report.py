@@ -18,7 +18,7 @@ from neuroprior.report.document import records, results_of
 from tests.support.sources import seeded
 
 NAMES = ("left", "on", "right")
-SEEN = ("cold", "mild", "warm")
+CONTEXTS = ("cold", "mild", "warm")
 
 
 def some_plans(num_plans: int = 60, seed: int = 0, **more) -> Plans:
@@ -32,12 +32,12 @@ def some_plans(num_plans: int = 60, seed: int = 0, **more) -> Plans:
 
 
 def in_contexts(num_plans: int = 60, seed: int = 0, kind: str = "plan", contexts: int = 3) -> Plans:
-    """Plans whose first actions, or all of them, tell what is seen."""
+    """Plans whose first actions, or all of them, say what the context is."""
     shape = (num_plans,) if kind == "plan" else (num_plans, 6)
     plans = some_plans(num_plans, seed, context=torch.randint(contexts, shape, generator=seeded(seed + 3)))
-    seen = plans.context if kind == "step" else plans.context[:, None]
-    actions = (plans.actions.long() // 2 + seen) % 3
-    return replace(plans, actions=actions, context_names=SEEN[:contexts])
+    context = plans.context if kind == "step" else plans.context[:, None]
+    actions = (plans.actions.long() // 2 + context) % 3
+    return replace(plans, actions=actions, context_names=CONTEXTS[:contexts])
 
 
 def saved(prior: Prior, plans: Plans, folder: Path) -> str:
@@ -163,7 +163,7 @@ def test_ends(suffix, named, closed, tmp_path):
 def test_contexts_are_known_by_name(make, kind, tmp_path):
     """A CSV file of "warm" and "cold" alone numbers them 1 and 0; the prior knows warm as 2."""
     learned, new = in_contexts(kind=kind), in_contexts(40, 9, kind, contexts=2)
-    new = replace(new, context=2 * new.context, context_names=SEEN)
+    new = replace(new, context=2 * new.context, context_names=CONTEXTS)
     prior = make()
     prior = prior.fit(learned) if isinstance(prior, MarkovPrior) else prior.fit(learned, max_steps=30, progress=False)
     folder = str(save(prior, tmp_path / "prior"))
@@ -222,7 +222,7 @@ def test_a_context_that_is_missing_is_one_line(tmp_path, capsys):
 
 def test_ends_and_contexts_together(tmp_path):
     learned, new = in_contexts(kind="step"), in_contexts(40, 9, "step", contexts=2)
-    new = replace(new, context=2 * new.context, context_names=SEEN)
+    new = replace(new, context=2 * new.context, context_names=CONTEXTS)
     folder = saved(MarkovPrior(4, 1, num_contexts=3), learned.with_end(), tmp_path / "prior")
     write_plans(new, tmp_path / "new.csv")
     rows = evaluate(tmp_path / "new.csv", [folder])

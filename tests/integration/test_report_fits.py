@@ -27,13 +27,13 @@ def cost_after(probs: torch.Tensor, length: int, skip: int) -> float:
     size = probs.shape[1]
     pair = torch.full((size * size,), 1 / size**2, dtype=torch.double)
     entropy = -(probs * probs.log2()).sum(1)
-    told = []
+    means = []
     for t in range(2, length):
         if t >= skip:
-            told.append(float(pair @ entropy))
+            means.append(float(pair @ entropy))
         both = (pair[:, None] * probs).view(size, size, size)  # older, newer, next
         pair = both.sum(0).flatten()
-    return sum(told) / len(told)
+    return sum(means) / len(means)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_two_actions_back_and_no_further(second_order):
     assert min(orders, key=orders.__getitem__) == 2
 
 
-def test_plans_of_the_right_order_cannot_be_told_apart(second_order):
+def test_plans_of_the_right_order_do_not_differ(second_order):
     """Those of a GRU that was hardly trained can: by each of 999 permutations. Distances vary by a few percent only."""
     results, _ = second_order
     rows = results["likeness"]

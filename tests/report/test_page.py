@@ -70,8 +70,8 @@ def written(folder, page: Page) -> str:
     return (folder / "page.html").read_text(encoding="utf-8")
 
 
-def estimate(middle: float, half: float = 0.05) -> tuple[float, float, float]:
-    return middle, middle - half, middle + half
+def estimate(mean: float, half: float = 0.05) -> tuple[float, float, float]:
+    return mean, mean - half, mean + half
 
 
 def scores(models: list[str], context: bool) -> pd.DataFrame:
