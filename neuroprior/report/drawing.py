@@ -142,11 +142,11 @@ def dot(
     axes.plot(mean, at, "o", color=color, mfc=PAPER if hollow else color, ms=6.5, mew=1.6)
 
 
-def band(axes: Axes, rows: Iterable[Iterable[Any]], color: str, name: str, line: str) -> None:
+def band(axes: Axes, rows: Iterable[Iterable[Any]], color: str, name: str, line: Any) -> None:
     """A line through the means of (place, mean, low, high) with a band between low and high."""
     place, mean, low, high = floats(rows).reshape(-1, 4).T
     axes.fill_between(place, low, high, color=color, alpha=0.2, lw=0)
-    axes.plot(place, mean, line, color=color, marker="o", ms=4, lw=1.8, label=name)
+    axes.plot(place, mean, ls=line, color=color, marker="o", ms=4, lw=1.8, label=name)
 
 
 def names_down(axes: Axes, names: Sequence[str], places: ArrayLike | None = None) -> None:

@@ -37,23 +37,12 @@ from neuroprior.report.drawing import (
 )
 from neuroprior.report.page import INK, clean
 
-MOST_PLANS = 1000
-"""Plans drawn as points; of more, evenly spaced ones are drawn."""
-
-MOST_GROUPS = 40
-"""Groups drawn as a row each; of more, evenly spaced ones between the lowest and the highest."""
-
-NUMBERED = 8
-"""Actions up to which the cells of a matrix hold their numbers."""
-
-MOST_NAMES = 60
-"""Actions up to which each has its name beside the matrix; of more, every second or third one has."""
-
-MOST_PANELS = 12
-"""Groups drawn: of more, those that differ most."""
-
-MOST_STEPS = 400
-"""Actions of a sequence that are drawn, from its first."""
+MOST_PLANS = 1000  # drawn as points; of more, evenly spaced ones
+MOST_GROUPS = 40  # drawn as a row each; of more, evenly spaced ones between the lowest and the highest
+MOST_PANELS = 12  # groups drawn as a panel each; of more, those that differ most
+MOST_STEPS = 400  # actions of a sequence that are drawn, from its first
+NUMBERED = 8  # actions up to which the cells of a matrix hold their numbers
+MOST_NAMES = 60  # actions up to which each has its name beside the matrix; of more, every second or third one
 
 STRIPS = [
     "#3b82d6",
@@ -185,7 +174,7 @@ def order_figure(orders: pd.DataFrame, scores: pd.DataFrame) -> Figure:
         scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
     """
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
-    styles = iter(("--", ":", "-.", "--"))
+    styles = iter(("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1))))
     for sees, own in orders.groupby("sees", sort=False):
         for criterion in ("BIC", "AIC"):
             rows = own.assign(none=None)[["order", f"{criterion.lower()}_bits", "none", "none"]]

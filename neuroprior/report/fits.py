@@ -282,11 +282,11 @@ def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:
     table[pair] = after
     if not bool((table[pair] == after).all()) or len(pair) == 0:
         return None
-    legal = torch.zeros(num_contexts * actions, dtype=torch.bool)
-    legal[pair] = True
-    legal = legal.view(num_contexts, actions)
-    legal[~legal.any(1)] = True
-    return TabularWorld(table.view(num_contexts, actions), torch.zeros(1, num_contexts), legal)
+    legal_actions = torch.zeros(num_contexts * actions, dtype=torch.bool)
+    legal_actions[pair] = True
+    legal_actions = legal_actions.view(num_contexts, actions)
+    legal_actions[~legal_actions.any(1)] = True
+    return TabularWorld(table.view(num_contexts, actions), torch.zeros(1, num_contexts), legal_actions)
 
 
 def _generated(prior: Prior, scored: Plans, world: TabularWorld | None, seed: int) -> Tensor | None:

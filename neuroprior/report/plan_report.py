@@ -23,7 +23,7 @@ from neuroprior.report.scores import (
     evaluate_saved,
     jobs,
     learned_names,
-    numbers,
+    renumbered,
 )
 from neuroprior.report.sections import SECTIONS, describe
 
@@ -195,14 +195,15 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
 
 def _check(skip: int, max_steps: int, patience: float, seed: int, processes: int | None) -> None:
     """Raise ValueError, naming the argument, unless these can be."""
-    if skip < 0 or max_steps < 1:
-        raise ValueError(f"skip and max_steps: at least 0 and 1 are expected, not {skip} and {max_steps}")
-    if not 0 < patience <= 1:
-        raise ValueError(f"patience: a share of the steps, above 0 and at most 1, is expected, not {patience}")
-    if not 0 <= seed < 2**50:
-        raise ValueError(f"seed: an integer from 0 to 2**50 - 1 is expected, not {seed}")
-    if processes is not None and processes < 1:
-        raise ValueError(f"processes: at least 1 is expected, not {processes}")
+    for name, value, right, expected in (
+        ("skip", skip, skip >= 0, "at least 0 is"),
+        ("max_steps", max_steps, max_steps >= 1, "at least 1 is"),
+        ("patience", patience, 0 < patience <= 1, "a share of the steps, above 0 and at most 1, is"),
+        ("seed", seed, 0 <= seed < 2**50, "an integer from 0 to 2**50 - 1 is"),
+        ("processes", processes, processes is None or processes >= 1, "at least 1 is"),
+    ):
+        if not right:
+            raise ValueError(f"{name}: {expected} expected, not {value}")
 
 
 def _read(plans: Plans | str | Path, num_actions: int | None, names: Sequence[str] | None) -> Plans:
@@ -261,20 +262,12 @@ def _contexts_from_0(plans: Plans, test: Plans | None) -> tuple[Plans, Plans | N
 
 def _numbered_alike(plans: Plans, test: Plans, name: str) -> Plans:
     """The test plans with actions and contexts numbered as in those that are learned from."""
-    if _kind_of_context(plans) != _kind_of_context(test):
-        of_test, of_plans = _kind_of_context(test), _kind_of_context(plans)
+    of_plans, of_test = _kind_of_context(plans), _kind_of_context(test)
+    if of_plans != of_test:
         raise ValueError(f"{name}: {of_test}, but {of_plans} in the plans to learn from")
-    elsewhere = " is not in the plans to learn from; they have"
-    if plans.action_names is not None and test.action_names is not None:
-        number = numbers(plans.action_names, test.action_names, f"{name}: the action", elsewhere)
-        test = replace(test, actions=number[test.actions.long()], num_actions=plans.num_actions, action_names=None)
-    if test.num_actions > plans.num_actions:
+    if test.num_actions > plans.num_actions and (test.action_names is None or plans.action_names is None):
         raise ValueError(f"{name}: {test.num_actions} actions, but {plans.num_actions} in the plans to learn from")
-    test = replace(test, num_actions=plans.num_actions, action_names=plans.action_names)
-    if plans.context_names is not None and test.context_names is not None and test.context is not None:
-        number = numbers(plans.context_names, test.context_names, f"{name}: the context", elsewhere)
-        test = replace(test, context=number[test.context.long()], context_names=plans.context_names)
-    return test
+    return renumbered(test, plans.num_actions, plans.action_names, plans.context_names, name)
 
 
 def _kind_of_context(plans: Plans) -> str:

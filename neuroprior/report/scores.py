@@ -211,15 +211,7 @@ def _saved(name: str, prior: Prior, plans: Plans, skip: int) -> Model:
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
         raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")
-    names = learned_names(prior)
-    actions = plans.actions
-    if names is not None and plans.action_names is not None:
-        number = numbers(names, plans.action_names, f"{name}: does not know the action", "; it knows")
-        actions = number[actions.long()]
-    plans = replace(plans, actions=actions, num_actions=known, action_names=None)
-    if prior.context_names is not None and plans.context_names is not None and plans.context is not None:
-        number = numbers(prior.context_names, plans.context_names, f"{name}: does not know the context", "; it knows")
-        plans = replace(plans, context=number[plans.context.long()], context_names=None)
+    plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
     inputs = CONTEXT if prior.takes_context else ACTIONS
     if not prior.takes_context:
         plans = replace(plans, context=None, context_names=None)
@@ -239,6 +231,25 @@ def _saved(name: str, prior: Prior, plans: Plans, skip: int) -> Model:
 def learned_names(prior: Prior) -> list[str] | None:
     """The names of the actions that a prior has learned, without that of its end symbol; None for numbers."""
     return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
+
+
+def renumbered(
+    plans: Plans, num_actions: int, names: Sequence[str] | None, context_names: Sequence[str] | None, where: str
+) -> Plans:
+    """The plans with actions and contexts numbered as in these names; as they are where one side has no names.
+
+    Raises:
+        ValueError: a name is unknown, or there are too many actions; the message begins with `where`.
+    """
+    actions, context, unknown = plans.actions, plans.context, " is unknown; known are"
+    if names is not None and plans.action_names is not None:
+        actions = numbers(names, plans.action_names, f"{where}: the action", unknown)[actions.long()]
+    if context is None or context_names is None or plans.context_names is None:
+        context_names = plans.context_names
+    else:
+        context = numbers(context_names, plans.context_names, f"{where}: the context", unknown)[context.long()]
+    plans = replace(plans, actions=actions, num_actions=num_actions, action_names=names)
+    return replace(plans, context=context, context_names=context_names)
 
 
 def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:

@@ -29,26 +29,14 @@ from neuroprior.report.fits import ACTIONS, CONTEXT
 from neuroprior.report.page import FigureBox, Section
 from neuroprior.report.scores import Evaluation, Model
 
-MOST_ORDER, MOST_LAG = 6, 20
-
+MOST_ORDER, MOST_LAG, MOST_MACROS = 6, 20, 16
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-"""Lags in the table."""
-
-LISTED = 12
-"""Over-represented sequences, and actions in the table of drift."""
-
-DRAWN = 12
-"""Sequences drawn, real and generated."""
-
-MOST_MACROS = 16
-
+LISTED = 12  # over-represented sequences, and actions in the table of drift
+DRAWN = 12  # sequences, real and generated
 SIGNIFICANT = 0.05
-
-MANY_REPEATS = 0.2
-"""Share of actions that repeat the last one beyond which over-represented sequences are also sought without them."""
-
-ENOUGH_UNITS, LEAST = 5, 1e-9
-"""Units below which no gain is marked as significant, and bits below which a gain is 0 but for rounding."""
+MANY_REPEATS = 0.2  # of all actions: beyond, over-represented sequences are also sought with repeats merged
+ENOUGH_UNITS = 5  # below, no gain is marked as significant
+LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
 
 
 class Part(NamedTuple):
@@ -62,7 +50,7 @@ def file_section(found: Evaluation) -> Part:
     """What is in the file."""
     columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
     columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "sees"}
-    shown = table(pd.DataFrame([describe(found.plans)]), columns, align="r" * len(columns))
+    shown = table(pd.DataFrame([describe(found.plans)]), columns, align="rrrrrrl")
     return Part(Section("Plans", tables=[shown]), {})
 
 

@@ -13,10 +13,12 @@ from eval.__main__ import main
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, Prior, UniformPrior, load, save
 from neuroprior.analysis.comparison import score
 from neuroprior.plans import read_plans, write_plans
+from neuroprior.report import report
+from neuroprior.report.document import records, results_of
 from tests.support.sources import seeded
 
 NAMES = ("left", "on", "right")
-SEEN = ("cold", "mild", "warm")
+CONTEXTS = ("cold", "mild", "warm")
 
 
 def some_plans(num_plans: int = 60, seed: int = 0, **more) -> Plans:
@@ -30,24 +32,20 @@ def some_plans(num_plans: int = 60, seed: int = 0, **more) -> Plans:
 
 
 def in_contexts(num_plans: int = 60, seed: int = 0, kind: str = "plan", contexts: int = 3) -> Plans:
-    """Plans whose first actions, or all of them, tell what is seen."""
+    """Plans whose first actions, or all of them, say what the context is."""
     shape = (num_plans,) if kind == "plan" else (num_plans, 6)
     plans = some_plans(num_plans, seed, context=torch.randint(contexts, shape, generator=seeded(seed + 3)))
-    seen = plans.context if kind == "step" else plans.context[:, None]
-    actions = (plans.actions.long() // 2 + seen) % 3
-    return replace(plans, actions=actions, context_names=SEEN[:contexts])
+    context = plans.context if kind == "step" else plans.context[:, None]
+    actions = (plans.actions.long() // 2 + context) % 3
+    return replace(plans, actions=actions, context_names=CONTEXTS[:contexts])
 
 
 def saved(prior: Prior, plans: Plans, folder: Path) -> str:
     return str(save(prior.fit(plans), folder))
 
 
-def evaluate(file: Path, folders: list[str], out: Path, *more: str) -> list[dict]:
-    assert main(["plans", str(file), "--priors", *folders, "--out", str(out), *more]) == 0
-    results = json.loads((out / "results.json").read_text())
-    with open(out / "plans.csv") as table:
-        assert [row["model"] for row in csv.DictReader(table)] == folders
-    return results["rows"]
+def evaluate(file: Path, folders: list[str]) -> list[dict]:
+    return records(report(file, priors=folders, sections=["scores"]).tables["plans"])
 
 
 def cost(prior: Prior, plans: Plans) -> float:
@@ -67,17 +65,28 @@ def fails(capsys, file: Path, folders: list[str], out: Path, *words: str) -> Non
 
 
 @pytest.mark.parametrize("suffix", ["npz", "jsonl", "csv"])
-def test_scores_are_those_of_the_library(suffix, tmp_path, capsys):
+def test_scores_are_those_of_the_library(suffix, tmp_path):
     learned, new = some_plans(), some_plans(40, 9)
     write_plans(new, tmp_path / f"new.{suffix}")
     folders = [saved(MarkovPrior(3, 2), learned, tmp_path / "a"), saved(UniformPrior(3), learned, tmp_path / "b")]
-    rows = evaluate(tmp_path / f"new.{suffix}", folders, tmp_path / "out")
+    rows = evaluate(tmp_path / f"new.{suffix}", folders)
     for folder, row in zip(folders, rows, strict=True):
         assert row["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
         assert row["low"] < row["bits_per_action"] < row["high"] or row["bits_per_action"] == row["low"]
     assert rows[0]["more"] == 0
     gap = score("b", load(folders[1]), new).minus(score("a", load(folders[0]), new))
     assert (rows[1]["more"], rows[1]["more_low"], rows[1]["more_high"]) == pytest.approx(gap[:3])
+
+
+def test_the_command_prints_and_writes_scores(tmp_path, capsys):
+    learned = some_plans()
+    write_plans(some_plans(40, 9), tmp_path / "new.npz")
+    folders = [saved(MarkovPrior(3, 2), learned, tmp_path / "a"), saved(UniformPrior(3), learned, tmp_path / "b")]
+    assert main(["plans", str(tmp_path / "new.npz"), "--priors", *folders, "--out", str(tmp_path / "out")]) == 0
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
+    assert rows == evaluate(tmp_path / "new.npz", folders)
+    with open(tmp_path / "out" / "plans.csv") as table:
+        assert [row["model"] for row in csv.DictReader(table)] == folders
     assert f"{rows[0]['bits_per_action']:.4f}" in capsys.readouterr().out
 
 
@@ -90,7 +99,7 @@ def test_actions_are_known_by_name(suffix, tmp_path):
     place = order.argsort()
     names = tuple(NAMES[n] for n in order.tolist())
     write_plans(replace(new, actions=place[new.actions.long()], action_names=names), tmp_path / f"new.{suffix}")
-    rows = evaluate(tmp_path / f"new.{suffix}", [folder], tmp_path / "out")
+    rows = evaluate(tmp_path / f"new.{suffix}", [folder])
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
@@ -119,7 +128,7 @@ def test_fewer_actions_than_the_prior_knows(end, named, suffix, tmp_path):
     new = some_plans(40, 9)
     new = Plans(new.actions.clamp(max=1), 2, new.lengths)
     write_plans(new, tmp_path / f"new.{suffix}")
-    rows = evaluate(tmp_path / f"new.{suffix}", [folder], tmp_path / "out")
+    rows = evaluate(tmp_path / f"new.{suffix}", [folder])
     wide = replace(new, num_actions=3)
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), wide.with_end() if end else wide), abs=1e-6)
 
@@ -140,12 +149,12 @@ def test_ends(suffix, named, closed, tmp_path):
     folders = [saved(MarkovPrior(4, 2), learned.with_end(), tmp_path / "closed")]
     folders.append(saved(ContextTreePrior(3, 2), learned, tmp_path / "open"))
     write_plans(new.with_end() if closed else new, tmp_path / f"new.{suffix}")
-    rows = evaluate(tmp_path / f"new.{suffix}", folders, tmp_path / "out")
+    rows = evaluate(tmp_path / f"new.{suffix}", folders)
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folders[0]), new.with_end()), abs=1e-6)
     assert rows[1]["bits_per_action"] == pytest.approx(cost(load(folders[1]), new), abs=1e-6)
     # per action with and without ends: nothing to subtract
     assert rows[1]["more"] is rows[1]["more_low"] is rows[1]["more_high"] is None
-    again = evaluate(tmp_path / f"new.{suffix}", folders[::-1], tmp_path / "again")
+    again = evaluate(tmp_path / f"new.{suffix}", folders[::-1])
     assert [row["bits_per_action"] for row in again] == [row["bits_per_action"] for row in rows[::-1]]
 
 
@@ -154,13 +163,13 @@ def test_ends(suffix, named, closed, tmp_path):
 def test_contexts_are_known_by_name(make, kind, tmp_path):
     """A CSV file of "warm" and "cold" alone numbers them 1 and 0; the prior knows warm as 2."""
     learned, new = in_contexts(kind=kind), in_contexts(40, 9, kind, contexts=2)
-    new = replace(new, context=2 * new.context, context_names=SEEN)
+    new = replace(new, context=2 * new.context, context_names=CONTEXTS)
     prior = make()
     prior = prior.fit(learned) if isinstance(prior, MarkovPrior) else prior.fit(learned, max_steps=30, progress=False)
     folder = str(save(prior, tmp_path / "prior"))
     write_plans(new, tmp_path / "new.csv")
     assert read_plans(tmp_path / "new.csv").context_names == ("cold", "warm")
-    rows = evaluate(tmp_path / "new.csv", [folder], tmp_path / "out")
+    rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["sees"] == "actions and context"
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
@@ -174,7 +183,7 @@ def test_contexts_of_any_integer_type(kind, dtype, tmp_path):
     turned = replace(new, context=((new.context + 1) % 3).to(dtype), context_names=("warm", "cold", "mild"))
     write_plans(turned, tmp_path / "new.npz")
     assert read_plans(tmp_path / "new.npz").context.dtype == dtype
-    rows = evaluate(tmp_path / "new.npz", [folder], tmp_path / "out")
+    rows = evaluate(tmp_path / "new.npz", [folder])
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
@@ -182,7 +191,7 @@ def test_contexts_without_names_are_numbers(tmp_path):
     learned, new = in_contexts(), replace(in_contexts(40, 9), context_names=None)
     folder = saved(MarkovPrior(3, 1, num_contexts=3), learned, tmp_path / "prior")
     write_plans(new, tmp_path / "new.csv")
-    rows = evaluate(tmp_path / "new.csv", [folder], tmp_path / "out")
+    rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new), abs=1e-6)
 
 
@@ -199,7 +208,7 @@ def test_a_prior_that_sees_nothing_needs_no_known_context(tmp_path):
     learned, new = in_contexts(), replace(in_contexts(40, 9), context_names=("cold", "hot", "warm"))
     folder = saved(MarkovPrior(3, 1), learned, tmp_path / "prior")
     write_plans(new, tmp_path / "new.csv")
-    rows = evaluate(tmp_path / "new.csv", [folder], tmp_path / "out")
+    rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["sees"] == "actions"
     alone = replace(new, context=None, context_names=None)
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), alone), abs=1e-6)
@@ -213,20 +222,20 @@ def test_a_context_that_is_missing_is_one_line(tmp_path, capsys):
 
 def test_ends_and_contexts_together(tmp_path):
     learned, new = in_contexts(kind="step"), in_contexts(40, 9, "step", contexts=2)
-    new = replace(new, context=2 * new.context, context_names=SEEN)
+    new = replace(new, context=2 * new.context, context_names=CONTEXTS)
     folder = saved(MarkovPrior(4, 1, num_contexts=3), learned.with_end(), tmp_path / "prior")
     write_plans(new, tmp_path / "new.csv")
-    rows = evaluate(tmp_path / "new.csv", [folder], tmp_path / "out")
+    rows = evaluate(tmp_path / "new.csv", [folder])
     assert rows[0]["bits_per_action"] == pytest.approx(cost(load(folder), new.with_end()), abs=1e-6)
 
 
-def test_units_are_told(tmp_path):
+def test_units_are_named(tmp_path):
     folder = saved(UniformPrior(3), some_plans(), tmp_path / "prior")
     grouped = some_plans(group=torch.arange(60) // 20, group_names=("x", "y", "z"))
     for name, plans, unit in (("a.npz", some_plans(), "plans"), ("b.csv", grouped, "groups")):
         write_plans(plans, tmp_path / name)
-        evaluate(tmp_path / name, [folder], tmp_path / "out")
-        assert json.loads((tmp_path / "out" / "results.json").read_text())["unit"] == unit
+        made = report(tmp_path / name, priors=[folder], sections=["scores"])
+        assert results_of(made.document)["unit"] == unit
 
 
 @pytest.mark.parametrize("priors", [["missing"], ["."]])

@@ -17,7 +17,7 @@ from neuroprior import MarkovPrior, Plans
 from neuroprior.analysis.comparison import BACKOFFS_TRIED
 from neuroprior.plans import write_plans
 from tests.support.chains import markov_plans, markov_probs
-from tests.support.reports import QUICK, bits, fails, report
+from tests.support.reports import QUICKLY, bits, fails, report
 from tests.support.sessions import interrupted
 from tests.support.sources import seeded
 
@@ -27,13 +27,13 @@ def cost_after(probs: torch.Tensor, length: int, skip: int) -> float:
     size = probs.shape[1]
     pair = torch.full((size * size,), 1 / size**2, dtype=torch.double)
     entropy = -(probs * probs.log2()).sum(1)
-    told = []
+    means = []
     for t in range(2, length):
         if t >= skip:
-            told.append(float(pair @ entropy))
+            means.append(float(pair @ entropy))
         both = (pair[:, None] * probs).view(size, size, size)  # older, newer, next
         pair = both.sum(0).flatten()
-    return sum(told) / len(told)
+    return sum(means) / len(means)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,7 @@ def second_order(tmp_path_factory) -> tuple[dict[str, Any], torch.Tensor]:
     probs = markov_probs(3, 2, 0, 1.5)
     folder = tmp_path_factory.mktemp("second_order")
     plans = markov_plans(probs, 400, 30, 1)
-    options = ("--skip", "2", "--folds", "2", "--models", "counts", "gru")
-    return report(plans, folder, *options, drawn=True), probs
+    return report(plans, folder, skip=2, folds=2, models=["counts", "gru"]), probs
 
 
 def test_the_entropy_rate_is_reached(second_order):
@@ -77,7 +76,8 @@ def test_the_entropy_rate_is_reached(second_order):
 def test_a_mixture_is_as_good_as_its_experts(second_order, tmp_path):
     """Its stacked expert knows the chain by counts, the large GRU has hardly learned in 20 steps."""
     plans = markov_plans(second_order[1], 400, 30, 1)
-    own = bits(report(plans, tmp_path, "--skip", "2", "--folds", "2", "--models", "mixture", "--max-steps", "20"))
+    options = {"skip": 2, "folds": 2, "models": ["mixture"], "max_steps": 20, "sections": ["scores"]}
+    own = bits(report(plans, tmp_path, **options))
     known = bits(second_order[0])
     assert list(own) == ["mixture"]
     assert own["mixture"] < known["markov-2"] + 0.01
@@ -98,7 +98,7 @@ def test_two_actions_back_and_no_further(second_order):
     assert min(orders, key=orders.__getitem__) == 2
 
 
-def test_plans_of_the_right_order_cannot_be_told_apart(second_order):
+def test_plans_of_the_right_order_do_not_differ(second_order):
     """Those of a GRU that was hardly trained can: by each of 999 permutations. Distances vary by a few percent only."""
     results, _ = second_order
     rows = results["likeness"]
@@ -120,11 +120,13 @@ def test_a_planted_difference_of_groups_is_found(tmp_path):
     parts = [markov_plans(one if n < 2 else other, 20, 15, n).actions for n in range(4)]
     group = torch.arange(4).repeat_interleave(20)
     plans = Plans(torch.cat(parts), 3, group=group, group_names=("<i>", "[/b]", "ü", "d"), action_names=("a", "b", "c"))
-    results = report(plans, tmp_path, "--folds", "2")
+    results = report(plans, tmp_path, folds=2, sections=["scores", "transitions"])
     assert results["unit"] == "groups"
     cells = [row for row in results["transitions"] if row["group"] != "all"]
     assert min(row["p_value"] for row in cells) == pytest.approx(0.001)
-    assert "4 groups: they differ (p = 0.001" in (tmp_path / "out" / "report.html").read_text()
+    (test,) = results["transition_test"]
+    assert (test["groups"], test["test"]) == (4, "permutation")
+    assert test["p_value"] == pytest.approx(0.001)
     counts = torch.zeros(3, 3)
     for a, b in zip(plans.actions[:, :-1].flatten().tolist(), plans.actions[:, 1:].flatten().tolist(), strict=True):
         counts[a, b] += 1
@@ -133,7 +135,7 @@ def test_a_planted_difference_of_groups_is_found(tmp_path):
             a, b = ("abc".index(row[end]) for end in ("from", "to"))
             assert row["count"] == counts[a, b]
             assert row["probability"] == pytest.approx(float(counts[a, b] / counts[a].sum()))
-    alike = report(replace(plans, group=torch.arange(80) % 4), tmp_path, "--folds", "2")
+    alike = report(replace(plans, group=torch.arange(80) % 4), tmp_path, folds=2, sections=["scores", "transitions"])
     assert min(row["p_value"] for row in alike["transitions"] if row["group"] != "all") > 0.001
 
 
@@ -143,7 +145,7 @@ def test_a_test_file_by_name(tmp_path):
     learned = markov_plans(markov_probs(3, 1, 0, 2.0), 30, 6, 1, action_names=names)
     test = markov_plans(markov_probs(2, 1, 3, 2.0), 12, 9, 2)
     write_plans(replace(test, action_names=("right", "left")), tmp_path / "test.npz")
-    found = bits(report(learned, tmp_path, "--test", str(tmp_path / "test.npz"), "--skip", "1"))
+    found = bits(report(learned, tmp_path, test=tmp_path / "test.npz", skip=1, sections=["scores"]))
     renamed = torch.tensor([2, 0])[test.actions.long()]
     training, validation = learned.split(0.1, seeded(0))
     for order in (0, 1, 2):
@@ -175,19 +177,23 @@ def test_test_files_of_another_kind(learned, test, words, tmp_path, capsys):
     write_plans(replace(plans, **learned), tmp_path / "learned.npz")
     write_plans(replace(plans, **test), tmp_path / "test.npz")
     paths = [str(tmp_path / name) for name in ("learned.npz", "test.npz", "out")]
-    fails([paths[0], "--test", paths[1], "--out", paths[2], *QUICK], capsys, paths[1], *words)
+    fails([paths[0], "--test", paths[1], "--out", paths[2], *QUICKLY], capsys, paths[1], *words)
     assert not list(tmp_path.rglob("fold*.npz"))
 
 
 INTERRUPTED = ("--models", "counts", "--max-steps", "3", "--folds", "6")
+WRITTEN = ("results.json", "plans.csv", "lags.csv", "likeness.csv")
 
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory) -> Path:
     """A folder with a file of plans, and in `alone` a report that one process made without a break."""
     folder = tmp_path_factory.mktemp("interrupted")
-    report(markov_plans(markov_probs(3, 1, 0), 24, 8, 1), folder, "--folds", "6")
-    return (folder / "out").rename(folder / "alone").parent
+    write_plans(markov_plans(markov_probs(3, 1, 0), 24, 8, 1), folder / "new.npz")
+    assert (
+        main(["plans", str(folder / "new.npz"), *INTERRUPTED, "--processes", "1", "--out", str(folder / "alone")]) == 0
+    )
+    return folder
 
 
 def program(plans: Path, out: Path) -> subprocess.Popen[str]:
@@ -215,8 +221,8 @@ def test_an_interrupted_run_goes_on(how, alone):
     output, said = interrupted(running, how, lambda: list(out.rglob("fold*-*.npz")))
     if how == signal.SIGINT:
         assert running.returncode == 130
-        assert said.startswith(f"interrupted; fits that were finished are kept in {out}")
-        assert said.count("\n") == 1
+        assert said.splitlines()[-1].startswith(f"interrupted; finished jobs are kept in {out}")
+        assert all(line.startswith("fits: ") for line in said.splitlines()[:-1])
     assert "Traceback" not in output + said
     finished = {path: path.stat().st_mtime_ns for path in out.rglob("fold*-*.npz")}
     assert 0 < len(finished) < 7
@@ -224,5 +230,5 @@ def test_an_interrupted_run_goes_on(how, alone):
     assert main(["plans", str(alone / "new.npz"), *INTERRUPTED, "--processes", "1", "--out", str(out)]) == 0
     assert finished.items() <= {path: path.stat().st_mtime_ns for path in out.rglob("fold*-*.npz")}.items()
     assert len(list(out.rglob("fold*-*.npz"))) == 7
-    for name in ("results.json", "plans.csv", "lags.csv", "likeness.csv"):
+    for name in WRITTEN:
         assert (out / name).read_bytes() == (alone / "alone" / name).read_bytes()

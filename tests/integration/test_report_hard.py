@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -11,7 +12,7 @@ from eval.__main__ import main
 from neuroprior import Plans
 from neuroprior.plans import write_plans
 from tests.support.chains import markov_plans, markov_probs
-from tests.support.reports import QUICK, bits, fails, report
+from tests.support.reports import FROM_ELSEWHERE, QUICKLY, bits, fails, report
 from tests.support.sources import seeded
 
 
@@ -50,7 +51,7 @@ HARD = {
 def test_hard_files_have_a_report(what, tmp_path, recwarn):
     plans = HARD[what]
     closed = int(plans.end is not None)
-    results = report(plans, tmp_path, "--folds", "2")
+    results = report(plans, tmp_path, folds=2)
     found = bits(results)
     assert found["uniform"] == pytest.approx(math.log2(plans.num_actions - closed), abs=1e-6)
     assert len(found) == 9
@@ -61,7 +62,7 @@ def test_hard_files_have_a_report(what, tmp_path, recwarn):
 
 
 def test_long_plans_of_many_actions(tmp_path):
-    assert len(bits(report(chain(2, 2500, 57), tmp_path, "--folds", "2"))) == 9
+    assert len(bits(report(chain(2, 2500, 57), tmp_path, folds=2))) == 9
 
 
 def test_names_are_text(tmp_path, capsys):
@@ -71,11 +72,14 @@ def test_names_are_text(tmp_path, capsys):
     plans = chain(12, 6, 4, action_names=names, group=torch.arange(12) % 3, group_names=groups)
     folder = tmp_path / "[/x] <b> $y$"
     folder.mkdir(parents=True)
-    results = report(plans, folder, "--models", "counts", "gru", name="[red]plans <i>.csv", drawn=True)
-    said = capsys.readouterr().out
-    assert str(folder / "out" / "report.html") in said
+    file, out = folder / "[red]plans <i>.csv", folder / "out"
+    write_plans(plans, file)
+    assert main(["plans", str(file), "--out", str(out), *QUICKLY, "--folds", "2"]) == 0
+    assert str(out / "report.html") in capsys.readouterr().out
+    results = json.loads((out / "results.json").read_text())
     assert {row["from"] for row in results["transitions"]} == set(names)
-    page = (folder / "out" / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert not re.search(FROM_ELSEWHERE, page)
     for text in ('<b>"x"</b>', "<i>.csv", "</td>.</td>"):
         assert text not in page
     assert "&lt;b&gt;" in page
@@ -107,21 +111,21 @@ BAD = {
 def test_what_cannot_be_taken_is_one_line(what, tmp_path, capsys):
     plans, options, words = BAD[what]
     write_plans(plans, tmp_path / "new.npz")
-    fails([str(tmp_path / "new.npz"), "--out", str(tmp_path / "out"), *QUICK, *options], capsys, *words)
+    fails([str(tmp_path / "new.npz"), "--out", str(tmp_path / "out"), *QUICKLY, *options], capsys, *words)
     assert not (tmp_path / "out" / "results.json").exists()
 
 
 @pytest.mark.parametrize("text", ["", "action_1,action_2\n", 'action_1\n"', "plan,action\n1,left\n1,\n", "\x00\x01"])
 def test_damaged_files_are_one_line(text, tmp_path, capsys):
     (tmp_path / "new.csv").write_text(text)
-    fails([str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICK], capsys, "new.csv")
+    fails([str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICKLY], capsys, "new.csv")
 
 
 def test_a_csv_file_of_names(tmp_path):
     """Names and groups of a CSV file, one plan a row, with empty cells after the ends."""
     rows = [f"{'left' if n % 2 else 'right'},on,{'' if n % 3 else 'left'},mouse {n % 4}" for n in range(24)]
     (tmp_path / "new.csv").write_text("action_1,action_2,action_3,group\n" + "\n".join(rows) + "\n")
-    assert main(["plans", str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICK]) == 0
+    assert main(["plans", str(tmp_path / "new.csv"), "--out", str(tmp_path / "out"), *QUICKLY]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     assert results["unit"] == "groups"
     assert results["file"]["groups"] == 4

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,20 +16,18 @@ from matplotlib.figure import Figure
 from neuroprior.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, colors, drawn, lines, short
 from neuroprior.report.figures import (
     MOST_PLANS,
-    calibration_figure,
-    distribution_figure,
-    drift_figure,
-    lag_figure,
-    motif_figure,
-    order_figure,
-    score_figure,
-)
-from neuroprior.report.matrix_figures import (
     MOST_STEPS,
     OTHER,
     STRIPS,
+    calibration_figure,
+    distribution_figure,
+    drift_figure,
     group_transition_figure,
+    lag_figure,
+    motif_figure,
+    order_figure,
     raster_figure,
+    score_figure,
     transition_figure,
 )
 from neuroprior.report.page import INK, PAPER, FigureBox, Page, Section, Table, clean, svg, write_page
@@ -62,7 +61,7 @@ class Reader(HTMLParser):
 def page_of(name: str, boxes: list[FigureBox] = ()) -> Page:
     """A page in which `name` stands wherever a text can."""
     table = Table([name, "bits"], [[name, "1.5"], ["other", name]], name)
-    section = Section(name, [name, name], [table], [FigureBox(box.svg, name, name) for box in boxes])
+    section = Section(name, [name, name], [table], [FigureBox(box.figure, name, name) for box in boxes])
     return Page(name, name, name, {name: name, "names": [name]}, [section, Section("last")])
 
 
@@ -71,16 +70,34 @@ def written(folder, page: Page) -> str:
     return (folder / "page.html").read_text(encoding="utf-8")
 
 
-def estimate(middle: float, half: float = 0.05) -> tuple[float, float, float]:
-    return middle, middle - half, middle + half
+def estimate(mean: float, half: float = 0.05) -> tuple[float, float, float]:
+    return mean, mean - half, mean + half
 
 
-def scores(models: list[str], context: bool) -> list[dict]:
-    return [
-        {"model": model, "sees": sees, "bits_per_action": 1 + n / 10, "low": 0.9 + n / 10, "high": 1.1 + n / 10}
+def scores(models: list[str], context: bool) -> pd.DataFrame:
+    rows = [
+        (model, sees, 1 + n / 10, 0.9 + n / 10, 1.1 + n / 10)
         for n, model in enumerate(models)
         for sees in ("actions", "actions and context")[: 1 + context]
     ]
+    return pd.DataFrame(rows, columns=["model", "sees", "bits_per_action", "low", "high"])
+
+
+def of_chains(*estimates: tuple) -> pd.DataFrame:
+    """Held-out scores of Markov chains of order 0, 1 and so on."""
+    rows = [(f"markov-{order}", "actions", *one) for order, one in enumerate(estimates)]
+    return pd.DataFrame(rows, columns=["model", "sees", "bits_per_action", "low", "high"])
+
+
+def criteria(*bits: float | None, sees: str = "actions") -> pd.DataFrame:
+    """Both criteria of chains of order 0, 1 and so on."""
+    return pd.DataFrame({"order": range(len(bits)), "sees": sees, "bic_bits": bits, "aic_bits": None})
+
+
+def lags(curves: dict[str, list[tuple]], floor: dict[int, float] | None = None) -> pd.DataFrame:
+    rows = [("gain", model, "actions", *row, None) for model, rows in curves.items() for row in rows]
+    rows += [("mutual information", "counts", "actions", lag, None, None, None, b) for lag, b in (floor or {}).items()]
+    return pd.DataFrame(rows, columns=["what", "model", "sees", "lag", "bits", "low", "high", "chance"])
 
 
 def matrix(names: list[str], seed: int = 0) -> np.ndarray:
@@ -98,25 +115,27 @@ def sequences(names: list[str], number: int, length: int) -> np.ndarray:
 def figures(names: list[str], models: list[str], groups: list[str], context: bool) -> dict[str, Figure]:
     """Every figure, with values missing here and there."""
     by_group = np.stack([matrix(names, seed) for seed in range(len(groups))])
-    missing = [{"model": "not scored", "sees": "actions", "bits_per_action": None, "low": None, "high": None}]
-    motifs = [
-        {"sequence": " > ".join(names[:6]), "ratio": ratio, "low": 0 if ratio == 0 else None, "high": 4, "count": 1200}
-        for ratio in (8.0, 0.5, 0.0, None, float("inf"))
-    ]
+    ranked = scores(models, context)
+    if len(models) > 1:
+        ranked.loc[len(ranked)] = {"model": "not scored", "sees": "actions"}
+    motifs = pd.DataFrame({"ratio": (8.0, 0.5, 0.0, None, float("inf")), "low": (None, None, 0, None, None), "high": 4})
     curve = [(0.1, 0.12, 0.1, 0.14, 900), (0.9, 0.85, None, None, 20), (None, None, None, None, 0)]
-    plans = [(group, n, None if n == 3 else 1 + n / 100) for group in groups for n in range(20)]
-    lags = [(lag, *estimate(0.5**lag, 0.01)) for lag in range(1, 9)]
-    held_out = {model: [(0, *estimate(1.5)), (1, *estimate(1.2)), (2, None, None, None)] for model in models}
+    plans = [(n, None if n == 3 else 1 + n / 100) for _ in groups for n in range(20)]
+    steps = [*((lag, *estimate(0.5**lag, 0.01)) for lag in range(1, 9)), (9, None, None, None)]
+    bins = pd.DataFrame(curve * len(models), columns=["forecast", "taken", "low", "high", "number"])
+    drift = [("place", "", *estimate(1)), ("place", "", None, None, None), ("group", "x", None, None, None)]
+    drift += [("group", group, *estimate(1)) for group in groups]
     return {
-        "score": score_figure(scores(models, context) + missing * (len(models) > 1)),
-        "lag": lag_figure({model: [*lags, (9, None, None, None)] for model in models}, [(1, 0.01), (9, None)]),
-        "one lag": lag_figure({models[0]: [(1, 0.0, -0.1, 0.1)]}),
-        "order": order_figure({"BIC": [(0, 1.5), (1, 1.3), (2, 1.4), (3, 40.0), (4, None)]}, held_out),
-        "calibration": calibration_figure(dict.fromkeys(models, curve)),
-        "motif": motif_figure(motifs),
+        "score": score_figure(ranked),
+        "lag": lag_figure(lags(dict.fromkeys(models, steps), {1: 0.01})),
+        "one lag": lag_figure(lags({models[0]: [(1, 0.0, -0.1, 0.1)]})),
+        "order": order_figure(criteria(1.5, 1.3, 1.4, 40.0, None), of_chains(estimate(1.5), estimate(1.2), [None] * 3)),
+        "calibration": calibration_figure(bins.assign(model=np.repeat(models, 3), sees="actions")),
+        "motif": motif_figure(motifs.assign(sequence=" > ".join(names[:6]), count=1200)),
         "distribution": distribution_figure({"run length": ([0.5, None, 0.0, 0.1], [0.6, 0.4])}),
         "drift": drift_figure(
-            [estimate(1), (None, None, None)], plans, [(group, *estimate(1)) for group in groups] + [("x", *[None] * 3)]
+            pd.DataFrame(drift, columns=["what", "name", "bits", "low", "high"]),
+            pd.DataFrame(plans, columns=["index", "bits"]),
         ),
         "transition": transition_figure(matrix(names), names, names[0]),
         "group": group_transition_figure(by_group, matrix(names), names, groups, by_group > 0.9),
@@ -133,9 +152,17 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def drawings() -> dict[str, dict[str, str]]:
-    """The SVG of every figure in every case."""
-    return {case: {name: svg(figure) for name, figure in figures(*given).items()} for case, given in CASES.items()}
+def boxes() -> dict[str, FigureBox]:
+    """Every figure in every case."""
+    made = {f"{case} {name}": figure for case, given in CASES.items() for name, figure in figures(*given).items()}
+    return {name: FigureBox(figure, "caption", "alt") for name, figure in made.items()}
+
+
+@pytest.fixture(scope="module")
+def page(boxes, tmp_path_factory) -> str:
+    """A page with all of them, the first of them twice."""
+    name = f"http://evil.org <img src=x> {'averylongnamewithoutanyspaces' * 4}"
+    return written(tmp_path_factory.mktemp("page"), page_of(name, [*boxes.values(), *[*boxes.values()][:1]]))
 
 
 @settings(max_examples=30, deadline=None)
@@ -162,10 +189,10 @@ def test_names_stand_in_figures_as_they_are(name):
     assert [" ".join(text.text.split()) for text in root.iter(f"{SVG}text")] == [clean(f"{name}.")]
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_figures_are_valid_and_follow_the_page(case, drawings):
+def test_figures_are_valid_and_follow_the_page(boxes, page):
     """Valid XML; no black and no white, one of which would be lost on one of the pages; no text left out of letters."""
-    for name, text in drawings[case].items():
+    drawings = re.findall("<svg.*?</svg>", page, re.DOTALL)
+    for name, text in zip([*boxes, "again"], drawings, strict=True):
         root = ElementTree.fromstring(text)
         # What is black has no colour in the file at all.
         shown = [one for group in root.iter(f"{SVG}g") for one in group if one.tag in (f"{SVG}path", f"{SVG}use")]
@@ -177,30 +204,27 @@ def test_figures_are_valid_and_follow_the_page(case, drawings):
         assert not re.search(r"<style|<metadata|<!--", text), name
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_pages_need_nothing_from_outside(case, drawings, tmp_path):
-    boxes = [FigureBox(text, "caption", "alt") for text in drawings[case].values()]
-    text = written(tmp_path, page_of("http://evil.org <img src=x>", [*boxes, boxes[0]]))
-    reader = Reader(text)
+def test_pages_need_nothing_from_outside(boxes, page):
+    reader = Reader(page)
     links = [link for name in ("src", "href", "xlink:href", "action", "data") for link in reader.values(name)]
     assert len(links) > len(boxes)
     assert all(link.startswith(("#", "data:")) for link in links)
     opened = [value for _, tag in reader.tags for name, value in tag.items() if not name.startswith(("xmlns", "aria-"))]
     assert not [value for value in opened if re.search(r"https?:|^//", value or "")]
-    assert all(place.startswith("#") for place in re.findall(r"url\(([^)]*)\)", text))
+    assert all(place.startswith("#") for place in re.findall(r"url\(([^)]*)\)", page))
     assert not {"script", "link", "img", "iframe"} & {tag for tag, of in reader.tags if of.get("rel") != "icon"}
-    assert "@import" not in text
+    assert "@import" not in page
     ids = reader.values("id")
     assert len(ids) == len(set(ids))
-    inside = [link[1:] for link in links if link[0] == "#"] + re.findall(r"url\(#([^)]*)\)", text)
+    inside = [link[1:] for link in links if link[0] == "#"] + re.findall(r"url\(#([^)]*)\)", page)
     assert set(inside) <= set(ids)
 
 
-def test_the_same_results_give_the_same_bytes(drawings, tmp_path):
-    again = {name: svg(figure) for name, figure in figures(*CASES["one"]).items()}
-    assert again == drawings["one"]
-    boxes = [FigureBox(text, "", "") for text in again.values()]
-    first, second = (written(tmp_path, page_of("x", boxes)) for _ in range(2))
+def test_the_same_results_give_the_same_bytes(tmp_path):
+    first, second = (
+        written(tmp_path, page_of("x", [FigureBox(figure, "", "") for figure in figures(*CASES["one"]).values()]))
+        for _ in range(2)
+    )
     assert first == second
     assert not list(tmp_path.glob(".*"))
 
@@ -269,31 +293,31 @@ def test_names_are_cut_in_the_middle():
 
 def test_scores_stand_where_they_are():
     rows = scores(["gru", "markov-1", "markov-2", "transformer"], True)
-    rows.append({"model": "uniform", "sees": "actions", "bits_per_action": 9.0, "low": 9.0, "high": 9.0})
+    rows.loc[len(rows)] = ["uniform", "actions", 9.0, 9.0, 9.0]
     axes = score_figure(rows).axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()][::-1] == [row["model"] for row in rows[::2]]
+    assert [label.get_text() for label in axes.get_yticklabels()][::-1] == list(rows["model"][::2])
     at = {(line.get_xdata()[0], line.get_marker()) for line in axes.lines if line.get_marker() in ("o", ">")}
     edge = 1 + 5 * (1.2 - 1)
     assert at == {(1.0, "o"), (1.1, "o"), (1.2, "o"), (1.3, "o"), (edge, ">")}
     spans = sorted(tuple(line.get_xdata()) for line in axes.lines if len(line.get_xdata()) == 2)
-    assert spans == sorted((row["low"], row["high"]) for row in rows[:-1])
+    assert spans == sorted(rows[:-1][["low", "high"]].itertuples(index=False, name=None))
     assert [text.get_text() for text in axes.texts][-1] == "1.000, 1.000"
     unknown = score_figure(scores(["this", "that"], False)).axes[0]
     assert [line.get_color() for line in unknown.lines if line.get_marker() == "o"] == SPARE[1::-1]
 
 
 def test_lags_are_on_a_linear_axis_unless_they_span_decades():
-    narrow = lag_figure({"counts": [(1, 0.5, 0.4, 0.6), (2, 0.4, 0.3, 0.5)]})
-    wide = lag_figure({"counts": [(1, 0.5, 0.4, 0.6), (2, -0.0001, -0.001, 0.001)]}, [(1, 0.001)])
+    narrow = lag_figure(lags({"counts": [(1, 0.5, 0.4, 0.6), (2, 0.4, 0.3, 0.5)]}))
+    wide = lag_figure(lags({"counts": [(1, 0.5, 0.4, 0.6), (2, -0.0001, -0.001, 0.001)]}, {1: 0.001}))
     assert [figure.axes[0].get_yscale() for figure in (narrow, wide)] == ["linear", "symlog"]
     assert wide.axes[0].lines[0].get_xydata().tolist() == [[1, 0.5], [2, -0.0001]]
     low, high = wide.axes[0].get_ylim()
     assert low <= -0.001 < 0.6 <= high
 
 
-def test_the_least_of_every_criterion_is_ringed():
-    held_out = {"markov": [(0, *estimate(2)), (1, *estimate(1.5)), (2, *estimate(1.2)), (3, *estimate(1.3))]}
-    axes = order_figure({"BIC": [(0, 2.0), (1, 1.4), (2, 1.6), (3, 50.0)]}, held_out).axes[0]
+def test_the_least_of_each_criterion_is_ringed():
+    held_out = of_chains(*map(estimate, (2, 1.5, 1.2, 1.3)))
+    axes = order_figure(criteria(2.0, 1.4, 1.6, 50.0), held_out).axes[0]
     assert [tuple(line.get_xydata()[0]) for line in axes.lines if line.get_markersize() == 13] == [(1, 1.4), (2, 1.2)]
     assert axes.get_ylim()[0] < 1.2
     assert 2 < axes.get_ylim()[1] < 50
@@ -350,7 +374,7 @@ def test_motifs_and_lengths_stand_where_they_are():
         {"sequence": "a > b", "ratio": 4.0, "low": 2.0, "high": 5.0, "count": 10},
         {"sequence": "b > a", "ratio": 0.0, "low": 0.0, "high": 0.5, "count": 0},
     ]
-    axes = motif_figure(rows).axes[0]
+    axes = motif_figure(pd.DataFrame(rows)).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["b > a", "a > b"]
     marks = {line.get_marker(): line for line in axes.lines}
     assert (marks["o"].get_xdata()[0], marks["o"].get_color()) == (4.0, MORE)
@@ -360,8 +384,10 @@ def test_motifs_and_lengths_stand_where_they_are():
 
 
 def test_many_plans_are_thinned_and_groups_ranked():
-    plans = [("a", n, n / 1000) for n in range(50_000)]
-    figure = drift_figure([estimate(1)] * 10, plans, [("low", *estimate(1)), ("high", *estimate(2))])
+    plans = pd.DataFrame({"index": range(50_000), "bits": np.arange(50_000) / 1000})
+    drift = [("place", f"part {n}", *estimate(1)) for n in range(10)]
+    drift += [("group", "low", *estimate(1)), ("group", "high", *estimate(2))]
+    figure = drift_figure(pd.DataFrame(drift, columns=["what", "name", "bits", "low", "high"]), plans)
     within, between, below = figure.axes
     assert [axes.get_title(loc="left") for axes in (within, below)] == ["within plans", "groups"]
     assert len(between.lines[0].get_xdata()) == MOST_PLANS
@@ -372,9 +398,8 @@ def test_many_plans_are_thinned_and_groups_ranked():
 @pytest.mark.parametrize("make", [score_figure, lag_figure, calibration_figure, motif_figure, distribution_figure])
 def test_nothing_to_draw_is_an_error(make):
     with pytest.raises(ValueError, match="at least one is expected"):
-        make([] if make in (score_figure, motif_figure) else {})
+        make({} if make is distribution_figure else pd.DataFrame())
 
 
-def test_a_browser_shows_the_page_on_a_phone_and_a_desktop(drawings, tmp_path):
-    boxes = [FigureBox(text, "caption", "alt") for case in drawings.values() for text in case.values()]
-    check_in_browser(written(tmp_path, page_of("averylongnamewithoutanyspaces" * 4, boxes)), tmp_path)
+def test_a_browser_shows_the_page_on_a_phone_and_a_desktop(page, tmp_path):
+    check_in_browser(page, tmp_path)

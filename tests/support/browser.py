@@ -25,15 +25,15 @@ addEventListener("load", () => {
 GATHER = """<iframe src="page.html#phone" width="390" height="800"></iframe>
 <iframe src="page.html#desktop" width="1280" height="800"></iframe>
 <iframe src="wide.html#control" width="390" height="800"></iframe><pre></pre><script>
-const told = {};
+const measured = {};
 addEventListener("message", e => {
-  told[e.data.name.slice(1)] = e.data; document.querySelector("pre").textContent = JSON.stringify(told);
+  measured[e.data.name.slice(1)] = e.data; document.querySelector("pre").textContent = JSON.stringify(measured);
 });
 </script>"""
 
 
 def check_in_browser(page: str, folder: Path) -> None:
-    """A page is never wider than the window, and nothing is amiss; a page that is too wide is told apart."""
+    """A page is never wider than the window, and nothing is amiss; a page that is too wide is noticed."""
     browser = shutil.which("chromium")
     if browser is None:
         pytest.skip("needs chromium on PATH")
@@ -44,11 +44,11 @@ def check_in_browser(page: str, folder: Path) -> None:
     command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}"]
     command += ["--virtual-time-budget=10000", "--enable-logging=stderr", "--dump-dom"]
     run = subprocess.run([*command, (folder / "gather.html").as_uri()], capture_output=True, text=True, timeout=120)
-    told = json.loads(re.search("<pre>(.*)</pre>", run.stdout)[1])
-    assert (told["phone"]["width"], told["desktop"]["width"]) == (390, 1280)
-    assert told["control"]["needs"] > 600
+    measured = json.loads(re.search("<pre>(.*)</pre>", run.stdout)[1])
+    assert (measured["phone"]["width"], measured["desktop"]["width"]) == (390, 1280)
+    assert measured["control"]["needs"] > 600
     assert ":CONSOLE" not in run.stderr
-    for one in (told["phone"], told["desktop"]):
+    for one in (measured["phone"], measured["desktop"]):
         assert one["needs"] <= one["width"]
         assert one["errors"] == []
         assert one["follows"]

@@ -1,8 +1,7 @@
-"""Reports that `python -m eval plans` writes, for tests: run quickly, read back, and checked for what all have."""
+"""Reports on plans, for tests: made quickly, and checked for what all have in common."""
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,37 +10,33 @@ import pytest
 from eval.__main__ import main
 from neuroprior import Plans
 from neuroprior.plans import write_plans
-from neuroprior.report import page
+from neuroprior.report import report as report_on
+from neuroprior.report.document import results_of
 
-QUICK = ("--models", "counts", "--max-steps", "3", "--processes", "1")
+QUICK: dict[str, Any] = {"models": ["counts"], "max_steps": 3, "processes": 1}
 
+QUICKLY = ("--models", "counts", "--max-steps", "3", "--processes", "1")
+"""The same as options of the command."""
 
 FROM_ELSEWHERE = r"<(script|img|iframe)|<link (?!rel=.icon. href=.data:,.)|(src|href)=.?(https?:)?//|url\(.?http"
 """What a page that stands alone does not have."""
 
 
-def report(plans: Plans, folder: Path, *more: str, name: str = "new.npz", drawn: bool = False) -> dict[str, Any]:
-    """What `results.json` says; every report must have the same shape. Figures take most of the time."""
-    write_plans(plans, folder / name)
-    out = folder / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (page,) * (not drawn):
-            patch.setattr(module, "svg", lambda figure: "<svg></svg>")
-        assert main(["plans", str(folder / name), "--out", str(out), *QUICK, *more]) == 0
-    results = json.loads((out / "results.json").read_text())
+def report(plans: Plans, folder: Path, **options: Any) -> dict[str, Any]:
+    """What `results.json` of a report on a file of plans would hold; every report must have the same shape."""
+    write_plans(plans, folder / "new.npz")
+    results = json.loads(json.dumps(results_of(report_on(folder / "new.npz", **(QUICK | options)).document)))
     for row in results["rows"]:
         assert row["nats_per_action"] == pytest.approx(row["bits_per_action"] * math.log(2))
         assert row["perplexity"] == pytest.approx(2 ** row["bits_per_action"])
         assert row["low"] <= row["bits_per_action"] <= row["high"]
         assert row["sees"] in ("actions", "actions and context")
     assert min(row["more"] for row in results["rows"]) == 0
-    html = (out / "report.html").read_text()
-    assert not re.search(FROM_ELSEWHERE, html)
     return results
 
 
-def bits(results: dict[str, Any], sees: str = "actions") -> dict[str, float]:
-    return {row["model"]: row["bits_per_action"] for row in results["rows"] if row["sees"] == sees}
+def bits(results: dict[str, Any], inputs: str = "actions") -> dict[str, float]:
+    return {row["model"]: row["bits_per_action"] for row in results["rows"] if row["sees"] == inputs}
 
 
 def fails(arguments: list[str], capsys: Any, *words: str) -> None:

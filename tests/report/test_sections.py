@@ -1,0 +1,115 @@
+"""The sections of a report on plans, and the report as a function."""
+
+import pandas as pd
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from neuroprior.plans import Plans
+from neuroprior.priors import MarkovPrior, UniformPrior, learn_macros
+from neuroprior.report import FigureBox, Report, report
+from neuroprior.report.fits import counted
+from neuroprior.report.scores import evaluate_saved
+from neuroprior.report.sections import SECTIONS, macro_section
+from tests.support.chains import markov_plans, markov_probs
+from tests.support.reports import QUICK
+from tests.support.sources import refuses, seeded
+
+
+def found_in(plans: Plans):
+    return evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, plans, 0)
+
+
+def test_macro_actions_have_the_bits_that_they_save():
+    """The table holds what `learn_macros` found, in names, and adds up."""
+    words = torch.tensor([[0, 1, 2, 0], [3, 2, 2, 1]])
+    plans = Plans(words[torch.randint(2, (300, 5), generator=seeded(0))].flatten(1), 4, action_names=list("abcd"))
+    section, frames = macro_section(found_in(plans))
+    rows = frames["macros"]
+    assert {"a b c a", "d c c b"} <= set(rows["macro"])
+    macros, recoded = learn_macros(plans, 16, "compression")
+    assert rows["count"].tolist() == [macro.count for macro in macros]
+    assert (rows["gain_bits"] > 0).all()
+    # Bits before and after, counted anew: after, the definitions, two of log2(kinds) each, come on top.
+    bits = []
+    for symbols in (plans.actions, recoded.actions[recoded.mask()]):
+        counts = symbols.flatten().long().bincount()
+        share = counts[counts > 0] / counts.sum()
+        bits.append(float(-(counts[counts > 0] * share.log2()).sum()))
+    bits[1] += sum(2 * torch.tensor(4.0 + k).log2().item() for k in range(len(macros)))
+    shown = section.tables[0].rows
+    for row, value in ((shown[0], bits[0]), (shown[-1], bits[1])):
+        assert row[-1] == f"{value / plans.actions.numel():.3f}"
+    assert rows["bits_per_action"].iloc[-1] == pytest.approx(bits[1] / plans.actions.numel(), rel=1e-4)
+    assert bits[0] - bits[1] == pytest.approx(sum(macro.gain for macro in macros), rel=1e-4)
+
+
+def test_where_nothing_repeats_there_is_no_section():
+    plans = Plans(torch.randint(20, (10, 4), generator=seeded(0)), 20)
+    assert macro_section(found_in(plans)) is None
+
+
+@pytest.fixture(scope="module")
+def made() -> Report:
+    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 3)
+    return report(plans, folds=2, **QUICK)
+
+
+def test_a_report_has_its_tables_and_figures(made):
+    assert {*made.tables, "motifs", "macros"} == {
+        *("plans", "lags", "orders", "calibration", "transitions", "transition_test", "motifs", "macros"),
+        *("likeness", "drift", "drift_tests", "action_drift"),
+    }
+    assert all(isinstance(frame, pd.DataFrame) for frame in made.tables.values())
+    names = {"scores", "lags", "orders", "calibration", "transitions", "group_transitions", "raster", "distributions"}
+    assert {*names, "drift"} <= set(made.figures)
+    assert all(isinstance(figure, Figure) for figure in made.figures.values())
+    boxes = [box for section in made.document.sections for box in section.figures]
+    assert all(isinstance(box, FigureBox) and box.caption and box.alt and box.name for box in boxes)
+    assert len(made.document.sections) >= len(SECTIONS) - 2
+
+
+def test_the_lead_names_the_best_model(made):
+    best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
+    assert made.document.lead == (
+        f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per action"
+        f" (95 % interval {best.low:.3f} to {best.high:.3f} over groups)."
+    )
+
+
+def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
+    from neuroprior.plans import write_plans
+
+    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 3)
+    write_plans(plans, tmp_path / "plans.npz")
+    again = report(tmp_path / "plans.npz", folds=2, sections=["scores"], out=tmp_path / "out", **QUICK)
+    pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
+
+
+def test_priors_by_name_are_scored():
+    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1)
+    chain = MarkovPrior(3, 1).fit(plans)
+    scores = report(plans, priors={"mine": chain, "none": UniformPrior(3)}, sections=["scores"]).tables["plans"]
+    assert scores["model"].tolist() == ["mine", "none"]
+    bits = -chain.log_prob(plans.actions).sum() / torch.tensor(2.0).log() / counted(plans, 0).sum()
+    assert scores["bits_per_action"][0] == pytest.approx(float(bits), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"models": []}, ("models", "none")),
+        ({"inputs": ["nodes"]}, ("inputs", "nodes")),
+        ({"inputs": ["context"]}, ("inputs", "no context")),
+        ({"sections": ["weather"]}, ("sections", "weather")),
+        ({"patience": 0.0}, ("patience",)),
+        ({"num_actions": 3}, ("num_actions", "files")),
+        ({"priors": {}}, ("priors", "at least one")),
+        ({"priors": {"a": UniformPrior(3)}, "folds": 2}, ("priors", "folds")),
+        ({"test": markov_plans(markov_probs(3, 1, 0), 4, 5, 1), "folds": 2}, ("folds", "test")),
+    ],
+)
+def test_what_cannot_be_reported_is_refused(options, words):
+    with refuses(*words):
+        report(markov_plans(markov_probs(3, 1, 0), 8, 5, 1), **options)
