@@ -121,7 +121,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: "Design", seed: in
         for rival in rivals(training, validation, sizes.get("num_contexts"), always_see=True):
             if rival.prior is not None:
                 # Chosen on the validation plans; then these are learned from as well.
-                yield rival.model, rival.how, rival.prior.fit(learned)  # type: ignore[operator]
+                yield rival.model, rival.how, rival.prior.fit(learned)
         return
     if kind in ("stacked", "mixture") and "context_size" in sizes:
         return  # their experts count
@@ -195,7 +195,7 @@ def _by_lag(learned: Plans, scored: Plans, design: "Design", seed: int) -> dict[
     if held_out.group is None or len(held_out.group.unique()) < FEWEST_UNITS:
         return {}
     neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
-    neural.fit(divisible(short), generator, batch_size=PIECES_A_STEP, **_training(design))
+    neural.fit(divisible(short), generator=generator, batch_size=PIECES_A_STEP, **_training(design))
     found = {"gru": [_of_last(neural, held_out, known) for known in range(reach + 1)]}
     if "context_size" not in sizes:
         found[COUNTED] = _chains(learned, held_out, reach, sizes.get("num_contexts"))
