@@ -103,7 +103,7 @@ class FitCLI(LightningCLI):
         if not (fit.resume or fit.out):
             raise ValueError("out: the name of a folder is expected")
         self.folder = Path(fit.resume or fit.out)
-        if rank_zero_only.rank != 0:
+        if getattr(rank_zero_only, "rank", 0) != 0:
             return
         if fit.resume is None:
             if any((self.folder / name).exists() for name in (CONFIG, "model.safetensors")):
@@ -174,6 +174,7 @@ class FitCLI(LightningCLI):
         write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
 
     def _train(self, model: PriorModel, data: PlansData) -> None:
+        assert isinstance(model.prior, NeuralPrior)
         model.prior.prepare(data.learned_from, data.settings.window)
         last = self.folder / LAST
         try:

@@ -126,6 +126,8 @@ class PriorModel(PriorModule):
         ValueError: the prior cannot take the context of the plans, or an argument is out of range.
     """
 
+    prior: Prior
+
     def __init__(
         self,
         prior: Callable[[int], Prior],

@@ -134,8 +134,8 @@ def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
         "difference": difference,
     }
     caption = (
-        f"± : 95 % interval over {unit}. difference: from {frame.model[trained]}, paired by {unit}.\n"
-        "*: the best baseline on the validation plans, on which settings were chosen."
+        f"±: 95 % interval over {unit}. difference: from the last row.\n"
+        "*: best on the validation plans, which chose the settings."
     )
     title = f"Bits per action on {len(data.held_out):,} held-out plans ({actions:,} actions)"
     return printed(title, table(frame, columns, caption, align="llrr"))

@@ -154,6 +154,66 @@ def test_two_processes_learn_what_one_does(tmp_path):
         assert one["validation_bits"] == pytest.approx(other["validation_bits"], abs=1e-4)
 
 
+@pytest.fixture(scope="module")
+def plans_file(tmp_path_factory) -> str:
+    place = tmp_path_factory.mktemp("plans") / "plans.npz"
+    write_plans(some_plans(60), place)
+    return str(place)
+
+
+INSIDE = '[{"prior": "MarkovPrior", "config": {"num_actions": 3}}, {"prior": "GRUPrior", "config": {"num_actions": 3}}]'
+INNER = '{"prior": "GRUPrior", "config": {"num_actions": 5, "hidden_size": 8}}'
+MADE_OF_PRIORS = {
+    "StackedPrior": ["--model.prior.hidden_size", "8", "--model.prior.depth", "2"],
+    "MixturePrior": ["--model.prior.experts", INSIDE],
+    "MacroPrior": ["--model.prior.inner", INNER],
+}
+
+
+@pytest.mark.parametrize("name", MADE_OF_PRIORS)
+def test_the_settings_of_a_recipe_reach_the_networks_inside_other_priors(name, plans_file, tmp_path, monkeypatch):
+    """The steps of training are those of `--trainer.max_steps`; the seed and the learning rate change the weights."""
+    step, steps = PriorModule.training_step, []
+    monkeypatch.setattr(PriorModule, "training_step", lambda self, *batch: steps.append(1) or step(self, *batch))
+
+    def weights(*more: str) -> bytes:
+        out = tmp_path / str(len(list(tmp_path.iterdir())))
+        arguments = ["--model.prior", name, *MADE_OF_PRIORS[name], "--data.file", plans_file, "--out", str(out)]
+        assert main(["fit", *arguments, "--trainer.max_steps", "3", *more]) == 0
+        return (out / "model.safetensors").read_bytes()
+
+    first = weights()
+    assert len(steps) == 3
+    assert weights("--trainer.max_steps", "5") != first
+    assert len(steps) == 8
+    if name == "MixturePrior":
+        assert weights("--model.learning_rate", "0.1") != first
+        assert weights("--seed_everything", "1") != first
+
+
+def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans_file, tmp_path, capsys):
+    arguments = ["fit", "--model.prior", "StackedPrior", "--data.file", plans_file, "--out", str(tmp_path / "run")]
+    assert main([*arguments, "--trainer.precision", "bf16-mixed"]) == 2
+    said = capsys.readouterr().err
+    assert "trainer.precision" in said
+    assert said.count("\n") == 1
+    assert not list((tmp_path / "run").rglob("*.*"))
+
+
+def test_a_recipe_by_name(plans_file, tmp_path, capsys, monkeypatch):
+    """In any folder; where there is no such recipe the known ones are listed."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["fit", "--config", "markov", "--data.file", plans_file, "--out", "run"]) == 0
+    assert load("run").order == 3
+    capsys.readouterr()
+    for arguments in (["--config", "markof"], ["--config=markof"]):
+        assert main(["fit", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "'markof'" in said
+        assert "gru, markov, transformer" in said
+
+
 LONG = ["--data.check_every", "5", "--trainer.max_steps", "200", "--trainer.patience", "200"]
 LONG += ["--model.prior.dropout", "0.1"]
 

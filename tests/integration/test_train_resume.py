@@ -19,7 +19,7 @@ CUT = ["--data.check_every", "5"]
 DRIVER = """
 import os, resource, signal, sys
 import neuroprior.cli.fit, neuroprior.cli.fit_report
-from neuroprior.training.fitting import WholeCheckpoints
+from neuroprior.training.trainer import WholeCheckpoints
 from train.__main__ import main
 
 def die(*_):

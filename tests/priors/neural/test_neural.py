@@ -95,7 +95,8 @@ def test_lengths_mask_the_loss(kind):
     """Beyond a plan's length nothing is learned: there action 0 is stored, but 1 and 2 are all that is ever done."""
     actions = torch.randint(1, 3, (400, 6), generator=seeded(0))
     lengths = torch.randint(7, (400,), generator=seeded(1))
-    prior = small(kind).fit(Plans(actions, 3, lengths), generator=seeded(0), max_steps=60, learning_rate=0.03, progress=False)
+    settings = {"max_steps": 60, "learning_rate": 0.03, "progress": False}
+    prior = small(kind).fit(Plans(actions, 3, lengths), generator=seeded(0), **settings)
     with torch.no_grad():
         first = prior(torch.randint(1, 3, (50, 6), generator=seeded(2))).softmax(-1)[..., 0]
     assert first.max() < 0.05

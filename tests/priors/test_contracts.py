@@ -1,0 +1,162 @@
+"""What holds for every prior: settings of `fit`, `repr`, plans or actions alone, and fitting in one call."""
+
+from dataclasses import fields
+from functools import partial
+
+import pytest
+import torch
+
+from neuroprior import priors
+from neuroprior.plans import Plans
+from neuroprior.priors import (
+    ContextTreePrior,
+    GRUPrior,
+    MacroPrior,
+    MarkovPrior,
+    MixturePrior,
+    Prior,
+    StackedPrior,
+    TransformerPrior,
+    UniformPrior,
+    fit,
+)
+from neuroprior.training import Settings
+from tests.support.sources import refuses, seeded
+
+A, C = 3, 4
+QUICK = {"max_steps": 2, "progress": False}
+SETTINGS = {field.name for field in fields(Settings)}
+COUNTS = {
+    "uniform": lambda: UniformPrior(A),
+    "markov": lambda: MarkovPrior(A, 2, smoothing=0.3, initial="lower", backoff="dirichlet"),
+    "markov context": lambda: MarkovPrior(A, 1, num_contexts=C),
+    "tree": lambda: ContextTreePrior(A, 3, beta=0.25, alpha=0.5, base="uniform"),
+    "macro of counts": lambda: MacroPrior(A, MarkovPrior(A + 2, 1), by="compression"),
+}
+NETWORKS = {
+    "gru": lambda: GRUPrior(A, 8, num_layers=2, window=3, lags=2, dropout=0.1),
+    "gru context": lambda: GRUPrior(A, 8, num_contexts=C),
+    "transformer": lambda: TransformerPrior(A, 16, num_heads=2, context_size=2),
+    "stacked": lambda: StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C),
+    "mixture": lambda: MixturePrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8), MacroPrior(A, GRUPrior(A + 1, 8))]),
+    "nested mixture": lambda: MixturePrior(A, [MixturePrior(A, [StackedPrior(A, 8, depth=2)]), UniformPrior(A)]),
+    "macro": lambda: MacroPrior(A, GRUPrior(A + 2, 8)),
+}
+ALL = COUNTS | NETWORKS
+
+
+def plans_for(prior: Prior, num: int = 40) -> Plans:
+    actions = torch.randint(A, (num, 6), generator=seeded(0))
+    context = None
+    if prior.num_contexts is not None:
+        context = torch.randint(C, (num, 6), generator=seeded(1))
+    elif prior.context_size is not None:
+        context = torch.randn(num, 6, 2, generator=seeded(1))
+    return Plans(actions, A, context=context)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_repr_makes_a_prior_of_the_same_configuration(name):
+    prior = ALL[name]()
+    text = repr(prior)
+    assert "\n" not in text
+    assert (
+        text.startswith(f"{type(prior).__name__}(num_actions={A}, ")
+        if name != "uniform"
+        else text == "UniformPrior(num_actions=3)"
+    )
+    again = eval(text, vars(priors))
+    assert type(again) is type(prior)
+    assert again.config == prior.config
+    assert repr(again) == text
+
+
+def test_repr_by_hand():
+    assert repr(MarkovPrior(4, 2, num_contexts=3)) == (
+        "MarkovPrior(num_actions=4, order=2, smoothing=1.0, initial='joint', num_contexts=3, backoff='kneser-ney')"
+    )
+    mixture = MixturePrior(2, [UniformPrior(2), UniformPrior(2)])
+    assert (
+        repr(mixture)
+        == "MixturePrior(num_actions=2, experts=[UniformPrior(num_actions=2), UniformPrior(num_actions=2)])"
+    )
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_settings_of_fit(name):
+    """All take a generator; networks take the settings of training, and priors that count take none."""
+    prior = ALL[name]()
+    plans = plans_for(prior)
+    assert set(prior.fit_settings) == (SETTINGS if name in NETWORKS else set())
+    with refuses("max_step", type(prior).__name__):
+        prior.fit(plans, generator=seeded(0), max_step=3)
+    if name in COUNTS:
+        with refuses("max_steps", "takes none"):
+            prior.fit(plans, max_steps=3)
+        assert prior.fit(plans, generator=seeded(0)) is prior
+    else:
+        with refuses("learning_rate"):
+            prior.fit(plans, learning_rate=-1.0)
+        assert prior.fit(plans, generator=seeded(0), **QUICK) is prior
+
+
+def test_a_mixture_that_counts_takes_the_share_for_its_weights_alone():
+    prior = MixturePrior(A, [MarkovPrior(A, 1), UniformPrior(A)])
+    assert prior.fit_settings == ("validation",)
+    prior.fit(plans_for(prior), generator=seeded(0), validation=0.3)
+    with refuses("max_steps"):
+        prior.fit(plans_for(prior), max_steps=3)
+
+
+@pytest.mark.parametrize("name", ["stacked", "mixture", "macro"])
+def test_settings_reach_the_networks_inside(name):
+    """The seed, the number of steps and the learning rate all change what is learned; the same ones give the same."""
+
+    def weights(seed: int = 0, **settings: float) -> torch.Tensor:
+        prior = ALL[name]()
+        prior.fit(plans_for(prior), generator=seeded(seed), **(QUICK | settings))
+        return torch.cat([weight.detach().flatten() for weight in prior.parameters()])
+
+    first = weights()
+    assert torch.equal(first, weights())
+    assert not torch.equal(first, weights(seed=1))
+    assert not torch.equal(first, weights(max_steps=4))
+    assert not torch.equal(first, weights(learning_rate=1e-4))
+
+
+@pytest.mark.parametrize("name", ["markov", "gru", "macro of counts"])
+def test_actions_alone_are_plans_without_context(name):
+    prior = ALL[name]()
+    plans = plans_for(prior)
+    for method in (prior.log_prob, prior.action_log_probs):
+        assert torch.equal(method(plans.actions.long()), method(plans))
+    with refuses("context"):
+        MarkovPrior(A, 1, num_contexts=C).log_prob(plans.actions)
+
+
+@pytest.mark.parametrize("name", ["uniform", "markov", "context-tree", "gru", "transformer", "stacked", "mixture"])
+def test_fit_by_name(name):
+    plans = plans_for(COUNTS["markov context"]())
+    quick = QUICK if name in ("gru", "transformer", "stacked", "mixture") else {}
+    prior = fit(plans, name, generator=seeded(0), **quick)
+    assert prior.num_actions == A
+    assert prior.num_contexts == (None if name == "uniform" else C)
+    assert prior.log_prob(plans if prior.takes_context else plans.actions).isfinite().all()
+
+
+def test_fit_makes_a_prior_for_the_plans():
+    features = plans_for(NETWORKS["transformer"]())
+    made = fit(features, partial(GRUPrior, hidden_size=8), generator=seeded(0), **QUICK)
+    assert (made.hidden_size, made.context_size, made.num_contexts) == (8, 2, None)
+    assert not fit(features, MarkovPrior).takes_context  # features cannot be counted
+    named = Plans(features.actions, A, context=torch.zeros(40).long(), context_names=("a", "b"))
+    assert (
+        fit(named, lambda num_actions, num_contexts: MarkovPrior(num_actions, 2, num_contexts=num_contexts)).order == 2
+    )
+    assert fit(named, MarkovPrior).num_contexts == 2
+    assert fit([[0, 1, 4]], MarkovPrior).num_actions == 5
+    assert isinstance(fit(features.actions, generator=seeded(0), **QUICK), GRUPrior)
+    with refuses("markof", "context-tree"):
+        fit(features, "markof")
+    with refuses("max_steps", "MarkovPrior"):
+        fit(features, "markov", max_steps=3)
