@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import pkgutil
 import re
 import shlex
@@ -29,9 +30,8 @@ def blocks(page: Path, language: str) -> list[str]:
 
 def run(code: str, folder: Path) -> None:
     (folder / "example.py").write_text(code, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "example.py"], cwd=folder, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
-    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "example.py"], cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -43,35 +43,36 @@ def test_example(page: Path, number: int, tmp_path: Path) -> None:
     run(blocks(page, "python")[number], tmp_path)
 
 
-class TestOwnData:
-    """The report of the page on one's own data finds what its example put into the data."""
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report that the page on one's own data makes on the data that it makes up."""
+    folder = tmp_path_factory.mktemp("docs")
+    run("".join(blocks(OWN_DATA, "python")), folder)
+    return folder / "runs/counts"
 
-    @pytest.fixture(scope="class")
-    def report(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        folder = tmp_path_factory.mktemp("docs")
-        for example in blocks(OWN_DATA, "python"):
-            run(example, folder)
-        return folder / "runs/counts"
 
-    def rows(self, folder: Path, name: str) -> list[dict[str, str]]:
-        with open(folder / f"{name}.csv", newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+def rows(folder: Path, name: str) -> list[dict[str, str]]:
+    with open(folder / f"{name}.csv", newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
-    def test_order(self, report: Path) -> None:
-        scores = json.loads((report / "results.json").read_text())["rows"]
-        chains = {row["model"]: row["bits_per_action"] for row in scores if row["model"].startswith("markov")}
-        assert min(chains, key=chains.__getitem__) == "markov-2"
 
-    def test_sequence(self, report: Path) -> None:
-        first = self.rows(report, "motifs")[0]
-        assert first["sequence"] == "sniff rear groom"
-        assert float(first["low"]) > 1
+def test_the_order_that_was_put_in(report: Path) -> None:
+    scores = json.loads((report / "results.json").read_text())["rows"]
+    chains = {row["model"]: row["bits_per_action"] for row in scores if row["model"].startswith("markov")}
+    assert min(chains, key=chains.__getitem__) == "markov-2"
 
-    def test_difference(self, report: Path) -> None:
-        """Only what follows walking differs between animals."""
-        marked = [row for row in self.rows(report, "transitions") if row["p_value"] and float(row["p_value"]) < 0.05]
-        assert marked
-        assert {row["from"] for row in marked} == {"walk"}
+
+def test_the_sequence_that_was_put_in(report: Path) -> None:
+    first = rows(report, "motifs")[0]
+    assert first["sequence"] == "sniff rear groom"
+    assert float(first["low"]) > 1
+
+
+def test_the_difference_that_was_put_in(report: Path) -> None:
+    """Only what follows walking differs between animals."""
+    marked = [row for row in rows(report, "transitions") if row["p_value"] and float(row["p_value"]) < 0.05]
+    assert marked
+    assert {row["from"] for row in marked} == {"walk"}
 
 
 def test_readme_is_short() -> None:
@@ -102,7 +103,7 @@ def test_every_picture_is_shown() -> None:
 
 def test_every_page_is_listed() -> None:
     pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    assert pages == set(re.findall(r"^\| \[.*?\]\(([\w\-]+\.md)\)", (ROOT / "docs/index.md").read_text(), re.MULTILINE))
+    assert pages <= set(re.findall(r"\]\(([\w\-]+\.md)\)", (ROOT / "docs/index.md").read_text(encoding="utf-8")))
 
 
 def exists(dotted: str) -> bool:
