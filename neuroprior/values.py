@@ -2,14 +2,14 @@
 
 The ways in which a planner's values can be wrong (Hyvärinen, second simulation), and what gives them:
 
-- learned or computed too little: `q_learning(world, goal).amax(-1)`, `value_iteration(world, goal=goal, sweeps=5)`;
+- learned or computed incompletely: `q_learning(world, goal).amax(-1)`, `value_iteration(world, goal=goal, sweeps=5)`;
 - the rewards changed after learning: `value_iteration(world, goal=old_goal)`, used where another goal holds;
 - generalised: `tile_approximation` or `network_approximation` of the true values over coordinates.
 
-With a goal, the reward is 1 for reaching it and 0 for all else, whatever rewards the world has. A cell at distance d is
-then worth discount ** (d - 1), and the goal itself 1 / discount: a planner that is scored by the value of the cell it
-ends in must find the goal better than the cells beside it. Put 0 there (`values[:, goal] = 0`) where the reward of
-reaching the goal is added up apart.
+With a goal, the reward is 1 for reaching it and 0 otherwise, whatever rewards the world has. A cell at distance d then
+has the value discount ** (d - 1), and the goal itself 1 / discount: a planner that maximises the value of the final
+cell must prefer the goal to the cells beside it. Put 0 there (`values[:, goal] = 0`) where the reward of reaching the
+goal is counted separately.
 """
 
 import itertools
@@ -37,23 +37,23 @@ def q_learning(
     generator: torch.Generator | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Tensor:
-    """Action values that independent agents learn while they look for a goal (Hyvärinen, second simulation).
+    """Action values that independent agents learn while they search for a goal (Hyvärinen, second simulation).
 
-    An agent starts in a random cell and always takes the action it values most; on reaching the goal it bounces to a
-    random cell. With `epsilon` 0 its random initial values are all that makes it explore. The update is Q-learning's
-    (Watkins & Dayan 1992); reaching the goal is terminal. State values are the result's `.amax(-1)`.
+    An agent starts in a random cell and takes the action of the highest value; on reaching the goal it restarts in a
+    random cell. With `epsilon` 0, its random initial values are the only source of exploration. The update is
+    Q-learning's (Watkins & Dayan 1992); reaching the goal is terminal. State values are the result's `.amax(-1)`.
 
     Args:
         world: gives the transitions and the legal actions; its own rewards are not used (see the module).
         goal: the goal's cell.
-        num_agents: number of agents, N, none of which sees what another does.
+        num_agents: number of independent agents, N.
         steps: steps that each agent takes.
         step_size: how far a value moves towards its target, above 0 and at most 1.
-        discount: what a reward one step later is worth, between 0 and 1 exclusive.
+        discount: the factor for a reward one step later, between 0 and 1 exclusive.
         initial_scale: initial values are uniform between 0 and this.
-        epsilon: share of steps whose action is drawn from all legal ones. Without it values need never become right.
-        generator: draws initial values, starts and bounces (uniform over all cells but the goal), and which of the
-            actions of exactly equal value is taken (hardly ever needed, unless `initial_scale` is 0).
+        epsilon: probability of an action drawn uniformly from the legal ones. With 0, values need not converge.
+        generator: draws initial values, starts and restarts (uniform over all cells but the goal), and breaks ties
+            between actions of equal value.
         progress: called after every step with the number of steps done and `steps`.
 
     Returns:
@@ -81,7 +81,7 @@ def q_learning(
         here = values[agent, cell]
         action = _choose(here, epsilon, generator)
         after, _ = world.step(cell, action, generator)
-        # The goal is worth 1 / discount, so that the target is 1 there, the reward, without a case of its own.
+        # The value of the goal is 1 / discount, so that the target of reaching it is the reward, 1.
         values[agent, cell, action] = here[agent, action].lerp(discount * values[agent, after].amax(1), step_size)
         cell = torch.where(after == goal, _other_cells(goal, world.num_states, num_agents, generator), after)
         if progress is not None:
@@ -90,7 +90,7 @@ def q_learning(
 
 
 def _choose(values: Tensor, epsilon: float, generator: torch.Generator) -> Tensor:
-    """An action `[N]` of the largest value in each row `[N, A]`; in a share `epsilon` of the rows, any legal one."""
+    """An action `[N]` of the largest value in each row `[N, A]`; with probability `epsilon`, any legal one."""
     candidate = values == values.amax(1, keepdim=True)
     if epsilon > 0:
         explore = torch.rand(len(values), 1, generator=generator, device=values.device) < epsilon
@@ -113,17 +113,17 @@ def value_iteration(
     sweeps: int | None = None,
     tolerance: float = 1e-9,
 ) -> Tensor:
-    """Optimal state values, exact or cut short.
+    """Optimal state values, exact or after some sweeps.
 
     Args:
         world: gives the transitions, the legal actions and, without a goal, the rewards of its W reward maps.
-        discount: what a reward one step later is worth: at least 0 (with a goal: above 0) and below 1.
-        goal: the goal's cell, for the values of reaching it (see the module); None: the world's own rewards, unending.
+        discount: the factor for a reward one step later: at least 0 (with a goal: above 0) and below 1.
+        goal: the goal's cell, for the values of reaching it (see the module); None: the world's own rewards, for ever.
         sweeps: stop after so many synchronous sweeps from values of 0: with a goal, cells farther from it than that
-            are then still worth 0. None goes on to the end.
-        tolerance: the end, without a goal, is where no value changes by more than this; values are then within
-            tolerance * discount / (1 - discount) of the true ones. With a goal it is where nothing changes at all, but
-            in a world with chance the same as without a goal.
+            then still have the value 0. None: until convergence.
+        tolerance: converged is when no value changes by more than this; values are then within
+            tolerance * discount / (1 - discount) of the true ones. With a goal in a deterministic world, when no value
+            changes at all.
 
     Returns:
         `[W, S]` float64; with a goal `[1, S]`.
@@ -146,7 +146,7 @@ def value_iteration(
         before, values = values, (rewards + discount * world.mean_after(values)).amax(-1)
         if goal is not None:
             values[:, goal] = 1 / discount
-        # Each sweep shrinks the largest change by the discount at least, which rounding must not hide forever.
+        # Each sweep shrinks the largest change at least by the discount; rounding must not hide that.
         most = min(float((values - before).abs().max()), most * discount)
         if sweeps is None and not most > tolerance:
             break
@@ -164,7 +164,7 @@ def _action_rewards(world: TabularWorld, none: bool) -> Tensor:
 
 
 def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, within: bool = False) -> Tensor:
-    """Which starts can reach the goal at all: the ceiling for every planner, by dynamic programming over the table.
+    """Which starts can reach the goal at all: the upper bound for all planners, by dynamic programming in the table.
 
     Args:
         world: gives the transitions and the legal actions.
@@ -178,11 +178,11 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
         `[B]` bool.
 
     Raises:
-        ValueError: an argument is out of range, or the world has chance.
+        ValueError: an argument is out of range, or the world is stochastic.
     """
     world.check_state(state)
     goal = _check_goal(world, goal)
-    _require(not world.stochastic, "world", "one without chance", "one in which no plan is sure of where it leads")
+    _require(not world.stochastic, "world", "a deterministic one", "a stochastic one")
     _require(length >= 0, "length", "a number of steps that is not negative", length)
     cells = torch.arange(world.num_states, device=world.device)
     ends, legal = cells == goal, world.legal_actions(cells)
@@ -194,14 +194,14 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
 
 @torch.no_grad()
 def tile_approximation(values: Tensor, coordinates: Tensor, tile_size: float, num_tilings: int = 1) -> Tensor:
-    """The closest to given values, in least squares, that a linear function of tile features can come.
+    """The least-squares approximation of given values by a linear function of tile features.
 
     Args:
         values: floating point `[K, S]`: K functions, each approximated by itself.
         coordinates: numbers `[S, D]`: where the S cells are, as from `GridWorld.coordinates`.
         tile_size: side of a tile, in units of the coordinates. The first tiling starts at their least values.
-        num_tilings: number of tilings, each moved by tile_size / num_tilings along every axis from the one before. One
-            gives each cell the mean of its tile, and so the values themselves where a tile holds one cell.
+        num_tilings: number of tilings, each shifted by tile_size / num_tilings along every axis from the last. One
+            tiling gives each cell the mean of its tile.
 
     Returns:
         Approximate values `[K, S]`, of the dtype of `values`. Time grows as S times the square of the number of tiles.
@@ -216,7 +216,7 @@ def tile_approximation(values: Tensor, coordinates: Tensor, tile_size: float, nu
     tilings = [(place + tiling / num_tilings).floor() for tiling in range(num_tilings)]
     tiles = [torch.unique(tiling, dim=0, return_inverse=True)[1] for tiling in tilings]
     active = torch.cat([torch.nn.functional.one_hot(tile) for tile in tiles], 1).double()
-    # Tilings are linearly dependent: a GPU's lstsq forbids that, and a cut-off as small as rounding would miss it.
+    # Tilings are linearly dependent, which a GPU's lstsq does not allow, and a cut-off near rounding would miss.
     weights = torch.linalg.lstsq(active, values.double().cpu().T, rcond=1e-9, driver="gelsd").solution
     return torch.mm(active, weights).T.to(values)
 
@@ -231,13 +231,13 @@ def network_approximation(
     learning_rate: float = 0.01,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """What small neural networks (two hidden layers of tanh units) learn of given values, in float32 by Adam.
+    """Approximations of given values by small neural networks (two hidden layers of tanh units), in float32 by Adam.
 
     Args:
         values: floating point `[K, S]`: K functions, each approximated by a network of its own; all learn at once.
         coordinates: numbers `[S, D]`: where the S cells are, as from `GridWorld.coordinates`.
         hidden_size: units in a hidden layer.
-        steps: gradient steps on the mean squared error over all cells; few leave the values smooth and wrong.
+        steps: gradient steps on the mean squared error over all cells; after few, values are smooth and wrong.
         learning_rate: of Adam.
         generator: draws the initial weights; the same seed gives the same approximation.
 

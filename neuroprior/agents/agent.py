@@ -1,4 +1,4 @@
-"""An agent that lives: it plans, executes, and learns from what it executed, again and again."""
+"""Online learning: an agent plans, executes, and fits its prior to what it executed, again and again."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,43 +13,39 @@ from neuroprior.planners import Decision, Execution, Planner
 from neuroprior.planners.execution import Change, executed_steps, follow, join_executions, observations
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
-from neuroprior.priors import Prior, UniformPrior
-from neuroprior.priors.counts import HistoryPrior
-from neuroprior.priors.neural import NeuralPrior
+from neuroprior.priors import Prior
 from neuroprior.worlds.world import World
 
 
 class Agent:
-    """Plans, executes the first actions, and plans anew, as long as it lives; meanwhile its prior learns from that.
+    """Plans, executes the first actions, replans, and so on; meanwhile its prior is fitted to what was executed.
 
-    B agents in as many states, each on its own, share one prior: what one of them did, all learn from. What they have
-    executed is cut into plans of `plan_length` actions, which go into a `Replay`. Every `learn_every` steps, some of
-    what is remembered is forgotten, and the prior learns (by its `fit`) from the rest: priors that count do so anew, so
-    that their counts are counts with forgetting; neural ones go on from the weights that they have. The prior learns in
-    place, so that a planner that proposes from it goes along. From fewer than two plans it learns nothing.
+    B agents, each in a state of its own, share one prior and learn from one another. What they execute is cut into
+    plans of `plan_length` actions, which go into a `Replay`. Every `learn_every` steps some of the stored plans are
+    forgotten, and the prior is fitted to the rest: count-based priors anew, so that their counts decay exponentially;
+    neural ones from their present weights. The prior is fitted in place, so that a planner with the same prior changes
+    along. It is not fitted to fewer than two plans.
 
     Args:
-        world: where.
-        planner: plans of at least `replan_every` actions.
-        prior: what learns; usually that of the planner. It also says how the rest of a plan goes on.
-        state: `[B, ...]`: where the agents are; None: one agent in a state that `world.reset` draws.
-        replan_every: actions that are executed before planning anew.
-        change: what happens after each step besides, unforeseen by planners, such as `ForagingWorld.regrow`: rewards that
-            move.
-        warm_start: the rest of the last plan, as the prior would go on with it, is one of the candidates.
-        num_rollouts: of that one and of the planner's best in a world with chance, where they are then tried together.
-        learn_every: steps after which the prior learns; a multiple of `plan_length`. None: it never does.
-        plan_length: actions in a plan to learn from; a multiple of `replan_every`.
-        retention: what is remembered is kept with this probability at each learning, see `Replay`.
-        min_score: only plans whose rewards sum to more than this are remembered; None: all are.
+        world: the world.
+        planner: its plans have at least `replan_every` actions.
+        prior: the prior that learns, usually the planner's. It also continues the rest of the last plan.
+        state: `[B, ...]`: the states of the agents; None: one agent in a state that `world.reset` draws.
+        replan_every: actions that are executed before replanning.
+        change: applied to the states after each step, such as `ForagingWorld.regrow`; planners do not foresee it.
+        warm_start: the rest of the last plan, continued by the prior, is one of the candidates.
+        num_rollouts: of this candidate and of the planner's best one in a stochastic world, where they are compared.
+        learn_every: steps after which the prior is fitted; a multiple of `plan_length`. None: never.
+        plan_length: actions in a stored plan; a multiple of `replan_every`.
+        retention: the probability with which a stored plan is kept before each fit, see `Replay`.
+        min_score: only plans whose rewards sum to more than this are stored; None: all.
         generator: draws everything that is random.
-        training: passed on to the prior's `fit`, together with the generator, such as `{"max_steps": 50}`; None for
-            priors that count.
+        training: settings of the prior's `fit`, such as `{"max_steps": 50}`; None: none.
 
     Attributes:
         world, planner, prior, state: as given; the state is the present one.
-        time: steps lived.
-        replay: what is remembered.
+        time: steps so far.
+        replay: the stored plans.
 
     Raises:
         ValueError: an argument is out of range, or prior and world do not fit one another.
@@ -87,29 +83,22 @@ class Agent:
         self.state = world.reset(1, self.generator) if state is None else state
         world.check_state(self.state)
         self.world, self.planner, self.prior, self.replay = world, planner, prior, Replay(retention)
-        self.replan_every, self.change, self.warm_start, self.num_rollouts = (
-            replan_every,
-            change,
-            warm_start,
-            num_rollouts,
-        )
-        self.learn_every, self.plan_length, self.min_score = learn_every, plan_length, min_score
-        if training is not None and isinstance(prior, HistoryPrior | UniformPrior):
-            raise ValueError(f"training: a {type(prior).__name__} counts, and is not trained; leave it out")
-        self.training = dict(training or {}) if training is not None or isinstance(prior, NeuralPrior) else None
-        self.time = 0
-        self.last: Decision | None = None  # what is left of the last plan
-        self.recent: list[Execution] = []  # since a plan was remembered last
+        self.replan_every, self.change, self.warm_start = replan_every, change, warm_start
+        self.num_rollouts, self.learn_every, self.plan_length = num_rollouts, learn_every, plan_length
+        self.min_score, self.training, self.time = min_score, dict(training or {}), 0
+        prior.check_settings(self.training)
+        self.last: Decision | None = None  # the rest of the last plan
+        self.recent: list[Execution] = []  # since a plan was stored last
         self.before = self.state  # the state then
 
     def run(self, num_steps: int) -> Execution:
-        """Live for so many steps more, a multiple of `replan_every`.
+        """Go on for `num_steps` steps, a multiple of `replan_every`.
 
         Returns:
-            What was done: actions, rewards and states, `[B, num_steps]` each (and the states' own dimensions).
+            What was executed: actions, rewards and states, `[B, num_steps]` each (and the states' own dimensions).
 
         Raises:
-            ValueError: another number of steps, plans that are too short, or what the prior cannot learn from.
+            ValueError: another number of steps, plans that are too short, or plans that the prior cannot be fitted to.
         """
         check_sizes(num_steps=num_steps)
         if num_steps % self.replan_every:
@@ -120,7 +109,7 @@ class Agent:
         for _ in range(num_steps // self.replan_every):
             decision = self._decide()
             done = follow(decision, self.world, self.state, self.replan_every, self.generator, self.change)
-            self.state, self.last = done.states[:, -1], self._left(decision)
+            self.state, self.last = done.states[:, -1], self._rest(decision)
             self.time += self.replan_every
             parts.append(done)
             self._learn(done)
@@ -130,49 +119,39 @@ class Agent:
         decision = self.planner.plan(self.world, self.state, self.generator)
         if not self.warm_start or self.last is None or self.last.plan.shape[1] == 0:
             return decision
-        last, lengths = self.last, self.last.lengths
+        rest, lengths = self.last.plan, self.last.lengths
         if lengths is None:
-            lengths = torch.full_like(last.plan[:, 0], last.plan.shape[1], dtype=torch.long)
-        return with_rest(
-            self.planner,
-            self.prior,
-            self.world,
-            self.state,
-            decision,
-            last.plan,
-            lengths,
-            self.num_rollouts,
-            self.generator,
-        )
+            lengths = torch.full_like(rest[:, 0], rest.shape[1], dtype=torch.long)
+        warm = (self.prior, self.world, self.state, decision, rest, lengths, self.num_rollouts, self.generator)
+        return with_rest(self.planner, *warm)
 
-    def _left(self, decision: Decision) -> Decision:
-        """What is left of a plan of which `replan_every` actions were executed."""
+    def _rest(self, decision: Decision) -> Decision:
+        """The rest of a plan of which `replan_every` actions were executed."""
         lengths = None if decision.lengths is None else decision.lengths - self.replan_every
         return decision._replace(plan=decision.plan[:, self.replan_every :], lengths=lengths)
 
     def _learn(self, done: Execution) -> None:
-        """Remember what was done, and learn from it, where it is time to."""
+        """Store what was executed, and fit the prior, when it is time to."""
         if self.learn_every is None:
             return
         self.recent.append(done)
         if self.time % self.plan_length:
             return
-        self._remember(join_executions(self.recent))
+        self._store(join_executions(self.recent))
         self.recent, self.before = [], self.state
         if self.time % self.learn_every == 0:
             self.replay.forget(self.generator)
             if self.replay.plans is not None and len(self.replay) > 1:
-                settings = {} if self.training is None else self.training | {"generator": self.generator}
-                self.prior.fit(self.replay.plans, **settings)
+                self.prior.fit(self.replay.plans, generator=self.generator, **self.training)
 
-    def _remember(self, done: Execution) -> None:
-        """Put a plan that was executed from the state `before` into the replay."""
+    def _store(self, done: Execution) -> None:
+        """Store the plans that were executed from the states `before`."""
         before = torch.cat([self.before[:, None], done.states[:, :-1]], 1)
         lengths = executed_steps(self.world, before)
         kept = lengths > 0
         if self.min_score is not None:
             kept &= done.rewards.sum(1) > self.min_score
-        seen = observations(self.world, before, self.prior.context_per)
-        plans = Plans(done.actions, self.world.num_actions, lengths, self.world.action_names, seen)
+        context = observations(self.world, before, self.prior.context_per)
+        plans = Plans(done.actions, self.world.num_actions, lengths, self.world.action_names, context)
         if kept.any():
             self.replay.add(plans[kept])

@@ -1,4 +1,4 @@
-"""Checkpoints of agents: folders from which an interrupted life goes on as if it had not been interrupted."""
+"""Checkpoints of agents: folders from which an interrupted run continues as if it had not been interrupted."""
 
 import hashlib
 import json
@@ -18,29 +18,29 @@ from neuroprior._files import read_json, write_whole
 from neuroprior.agents.agent import Agent
 from neuroprior.planners import Decision, Execution
 from neuroprior.plans import Plans
-from neuroprior.priors import serialization as folders
+from neuroprior.priors import serialization
 
 FORMAT, VERSION = "neuroprior agent", 1
 
 PARTS = ("actions", "rewards", "states")
-"""Of what was done since a plan was remembered last."""
+"""Of what was executed since a plan was stored last."""
 
 
 def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
-    """Save an agent to a folder, made if need be: where it is, what it remembers, its prior and its random numbers.
+    """Save an agent to a folder, made if need be: its state, replay, prior and random generator.
 
-    Files are named after what is in them, and `agent.json`, which names those that belong to it, is written last: the
-    folder holds the last whole checkpoint at all times. What the one before named is then removed, and nothing else.
+    Files are named by a hash of their content, and `agent.json`, which lists them, is written last: the folder holds
+    the last complete checkpoint at all times. The files of the checkpoint before are then removed, and nothing else.
     World and planner are not saved.
 
     Raises:
         OSError: the folder cannot be written.
-        ValueError: the `agent.json` that is there is of something else.
+        ValueError: the folder's `agent.json` is not of an agent.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     before = _read(folder / "agent.json") if (folder / "agent.json").exists() else {}
-    partial = folders.save(agent.prior, folder / f".prior.{os.getpid()}.partial")
+    partial = serialization.save(agent.prior, folder / f".prior.{os.getpid()}.partial")
     of_prior = _digest(partial)
     prior = f"prior-{of_prior[:16]}"
     if (folder / prior).exists():  # the same, saved before
@@ -51,10 +51,10 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
     digest = hashlib.sha256(data).hexdigest()
     weights = f"agent-{digest[:16]}.safetensors"
     write_whole(folder / weights, data)
-    told = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent)}
-    told |= {"prior": prior, "prior_sha256": of_prior, "weights": weights, "sha256": digest}
-    told |= {"recent": [done.model_steps for done in agent.recent]}
-    write_whole(folder / "agent.json", (json.dumps(told, indent=2) + "\n").encode())
+    document = {"format": FORMAT, "version": VERSION, "time": agent.time, "agent": _settings(agent)}
+    document |= {"prior": prior, "prior_sha256": of_prior, "weights": weights, "sha256": digest}
+    document |= {"recent": [done.model_steps for done in agent.recent]}
+    write_whole(folder / "agent.json", (json.dumps(document, indent=2) + "\n").encode())
     if before and before["weights"] != weights:
         (folder / before["weights"]).unlink(missing_ok=True)
     if before and before["prior"] != prior:
@@ -63,63 +63,66 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
 
 
 def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
-    """Let an agent go on where another one, made in the same way, was saved; returns it.
+    """Let an agent continue where another one with the same arguments was saved; returns it.
 
     Args:
-        agent: made anew with the same world, planner, kind of prior and arguments; its prior takes over what was
-            learned, in place. Of world and planner no more can be checked than that states and class fit.
+        agent: a new one with the same world, planner, kind of prior and arguments; its prior is restored in place.
+            World and planner are not saved, so that only the planner's class and the shape of the states are checked.
         folder: where `save_agent` saved.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
-        ValueError: a file is damaged, or the agent was made in another way. The agent is as it was before.
+        ValueError: a file is damaged, or the agent has other arguments. The agent is then unchanged.
     """
     folder = Path(folder)
-    told = _read(folder / "agent.json")
-    if told["agent"] != _settings(agent):
-        other = [name for name, value in _settings(agent).items() if told["agent"].get(name) != value]
-        raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; make this one in the same way")
-    path = folder / told["weights"]
+    document = _read(folder / "agent.json")
+    own, saved = _settings(agent), document["agent"]
+    saved = saved | {"training": saved.get("training") or {}}  # was None for some priors
+    if saved != own:
+        other = [name for name, value in own.items() if saved.get(name) != value]
+        raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; give this one the same")
+    path = folder / document["weights"]
     data = path.read_bytes()
-    if hashlib.sha256(data).hexdigest() != told["sha256"] or _digest(folder / told["prior"]) != told["prior_sha256"]:
-        raise ValueError(f"{folder}: {path.name} or {told['prior']} is truncated, changed, or of another checkpoint")
+    if (
+        hashlib.sha256(data).hexdigest() != document["sha256"]
+        or _digest(folder / document["prior"]) != document["prior_sha256"]
+    ):
+        raise ValueError(
+            f"{folder}: {path.name} or {document['prior']} is truncated, changed, or of another checkpoint"
+        )
     try:
         tensors = read_tensors(data)
     except SafetensorError as error:
         raise ValueError(f"{path}: not a file of tensors ({error})") from error
-    if sum(name.startswith("recent.") for name in tensors) != len(PARTS) * len(told["recent"]):
+    if sum(name.startswith("recent.") for name in tensors) != len(PARTS) * len(document["recent"]):
         raise ValueError(f"{folder / 'agent.json'}: 'recent' does not fit {path.name}")
-    prior = folders.load(folder / told["prior"], agent.prior.device)
+    prior = serialization.load(folder / document["prior"], agent.prior.device)
     agent.world.check_state(tensors["state"].to(agent.state.device))
     agent.prior.restore(prior.learned)
     agent.prior.load_state_dict(prior.state_dict())
-    agent.time = told["time"]
-    _take(agent, tensors, told["recent"])
+    agent.time = document["time"]
+    _take(agent, tensors, document["recent"])
     return agent
 
 
 def _digest(prior: Path) -> str:
-    """Of both files of a saved prior."""
-    return hashlib.sha256(b"".join((prior / name).read_bytes() for name in folders.FILES)).hexdigest()
+    """A hash of both files of a saved prior."""
+    return hashlib.sha256(b"".join((prior / name).read_bytes() for name in serialization.FILES)).hexdigest()
 
 
 def _settings(agent: Agent) -> dict[str, Any]:
-    """What decides how an agent lives, beside its world and planner; as JSON gives it back."""
-    told = {name: getattr(agent, name) for name in ("replan_every", "warm_start", "num_rollouts", "learn_every")}
-    told |= {name: getattr(agent, name) for name in ("plan_length", "min_score", "training")}
-    told |= {
-        "retention": agent.replay.retention,
-        "agents": list(agent.state.shape),
-        "planner": type(agent.planner).__name__,
-    }
-    told |= {"prior": type(agent.prior).__name__, "config": agent.prior.config}
-    settings = json.loads(json.dumps(told, default=str))
+    """What determines an agent's run, besides world and planner; as read back from JSON."""
+    names = ("replan_every", "warm_start", "num_rollouts", "learn_every", "plan_length", "min_score", "training")
+    found = {name: getattr(agent, name) for name in names} | {"retention": agent.replay.retention}
+    found |= {"agents": list(agent.state.shape), "planner": type(agent.planner).__name__}
+    found |= {"prior": type(agent.prior).__name__, "config": agent.prior.config}
+    settings = json.loads(json.dumps(found, default=str))
     assert isinstance(settings, dict)
     return settings
 
 
 def _tensors(agent: Agent) -> dict[str, Tensor]:
-    """All that is not the prior's."""
+    """All tensors except the prior's."""
     found = {"state": agent.state, "before": agent.before, "generator": agent.generator.get_state()}
     if agent.last is not None:
         found |= {"last.plan": agent.last.plan}
@@ -130,13 +133,13 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
 
 
 def _take(agent: Agent, tensors: dict[str, Tensor], steps: Sequence[int]) -> None:
-    """Take over what `_tensors` gave."""
+    """Restore what `_tensors` gave."""
     on = {name: value.to(agent.state.device) for name, value in tensors.items() if name != "generator"}
     agent.generator.set_state(tensors["generator"])
     agent.state, agent.before = on["state"], on["before"]
     agent.last = None
     if "last.plan" in on:
-        # Of what is left of a plan only its actions are looked at.
+        # Only the actions of the rest of a plan are used.
         nothing = torch.empty(0, device=agent.state.device)
         agent.last = Decision(on["last.plan"], nothing, nothing, 0, on.get("last.lengths"))
     agent.recent = []
@@ -151,8 +154,8 @@ def _take(agent: Agent, tensors: dict[str, Tensor], steps: Sequence[int]) -> Non
 
 
 def _read(path: Path) -> dict[str, Any]:
-    told = read_json(path)
-    if not isinstance(told, dict) or told.get("format") != FORMAT or told.get("version") != VERSION:
+    document = read_json(path)
+    if not isinstance(document, dict) or document.get("format") != FORMAT or document.get("version") != VERSION:
         raise ValueError(f'{path}: not a checkpoint of an agent ("format": "{FORMAT}", "version": {VERSION})')
     kinds = {
         "time": int,
@@ -164,8 +167,8 @@ def _read(path: Path) -> dict[str, Any]:
         "recent": list,
     }
     for key, kind in kinds.items():
-        if not isinstance(told.get(key), kind):
-            raise ValueError(f"{path}: {key!r} is missing or of another kind than it was saved")
-    if not all(isinstance(steps, int) for steps in told["recent"]):
-        raise ValueError(f"{path}: 'recent': whole numbers are expected")
-    return told
+        if not isinstance(document.get(key), kind):
+            raise ValueError(f"{path}: {key!r} is missing or of a wrong type")
+    if not all(isinstance(steps, int) for steps in document["recent"]):
+        raise ValueError(f"{path}: 'recent': integers are expected")
+    return document

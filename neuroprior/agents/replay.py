@@ -1,4 +1,4 @@
-"""Replay: the executed plans that an agent learns from, the older the fewer."""
+"""Replay: the executed plans that an agent learns from, forgotten at random with time."""
 
 import torch
 from torch import Tensor
@@ -9,16 +9,15 @@ from neuroprior.plans import Plans
 class Replay:
     """Executed plans that are forgotten at random.
 
-    Each time `forget` is called, each plan is kept with probability `retention`, so that one that has been there for n of
-    these calls is still there with probability `keep ** n`. What counts on it are counts with exponential forgetting
-    (in the mean; whole numbers, as every way to smooth them needs), and what trains on it is trained the more on what
-    is new; neither needs to know.
+    Each call of `forget` keeps each plan with probability `retention`, so that after n calls a plan is still there with
+    probability `retention ** n`. Counts of these plans decay exponentially (in expectation; they stay integers, which
+    smoothing methods need), and networks are trained mostly on recent plans; no prior needs to know of it.
 
     Args:
         retention: above 0, at most 1: nothing is forgotten.
 
     Attributes:
-        plans: what is remembered; None: nothing yet.
+        plans: the stored plans; None: none yet.
 
     Raises:
         ValueError: `retention` is out of range.
@@ -40,10 +39,10 @@ class Replay:
             self.plans = self.plans[(draws < self.retention).to(self.plans.actions.device)]
 
     def add(self, plans: Plans) -> None:
-        """Remember more plans.
+        """Store more plans.
 
         Raises:
-            ValueError: they have not as many actions as those before, or contexts of another kind.
+            ValueError: they do not have as many actions as those before, or another kind of context.
         """
         if self.plans is None:
             self.plans = plans
@@ -51,12 +50,12 @@ class Replay:
         before = self.plans
         if (before.num_actions, before.max_length) != (plans.num_actions, plans.max_length):
             raise ValueError(
-                f"plans: {before.max_length} of {before.num_actions} actions are remembered,"
+                f"plans: {before.max_length} of {before.num_actions} actions are stored,"
                 f" {plans.max_length} of {plans.num_actions} cannot be added"
             )
         kinds = [None if one.context is None else (one.context.dtype, one.context.shape[1:]) for one in (before, plans)]
         if kinds[0] != kinds[1]:
-            raise ValueError("plans: their context is of another kind than that of the plans that are remembered")
+            raise ValueError("plans: their context is of another kind than that of the stored plans")
         lengths = None
         if before.lengths is not None or plans.lengths is not None:
             lengths = torch.cat([before.mask().sum(1), plans.mask().sum(1)])
@@ -67,7 +66,7 @@ class Replay:
         self.plans = Plans(actions, plans.num_actions, lengths, plans.action_names, context)
 
     def tensors(self) -> dict[str, Tensor]:
-        """What is remembered, by name; for files."""
+        """The stored plans as tensors by name, for files."""
         if self.plans is None:
             return {}
         found = {"actions": self.plans.actions, "lengths": self.plans.lengths, "context": self.plans.context}

@@ -65,7 +65,7 @@ def extend_horizon(
         temperatures: candidates are drawn at one of these: before each round, the one with the highest mean score from
             some starts is chosen. A prior fitted to few plans is often overconfident, and finds longer plans only at a
             temperature above 1.
-        generator: draws starts and candidates, and is passed on to the prior's `fit` where there are settings.
+        generator: draws starts and candidates, and is passed on to the prior's `fit`.
         **settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
 
     Yields:
@@ -78,10 +78,8 @@ def extend_horizon(
         raise ValueError(f"lengths: at least 1 is expected each, not {list(lengths)}")
     if not temperatures:
         raise ValueError("temperatures: at least one is expected")
-    if settings:
-        settings |= {"generator": generator}
     goal: Objective = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
-    prior.fit(plans, **settings)
+    prior.fit(plans, generator=generator, **settings)
     yield HorizonRound(plans.max_length, plans)
     for length in lengths:
         planners = [
@@ -90,7 +88,7 @@ def extend_horizon(
         ]
         planner = _best(planners, world, min(num_starts, STARTS_PER_TEMPERATURE), generator)
         plans = collect(planner, world, num_starts, context=prior.context_per, min_score=min_score, generator=generator)
-        prior.fit(plans, **settings)
+        prior.fit(plans, generator=generator, **settings)
         yield HorizonRound(length, plans)
 
 

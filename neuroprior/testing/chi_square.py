@@ -1,4 +1,4 @@
-"""Chi-square tests of drawn numbers, for the conformance suites."""
+"""Chi-square tests of random draws, for the conformance suites."""
 
 from itertools import pairwise
 
@@ -7,20 +7,20 @@ from torch import Tensor
 
 
 def chi_square(counts: Tensor, expected: Tensor) -> float:
-    """The p-value of Pearson's test of `counts [K]` against `expected [K]`; the rarest cells are taken together."""
+    """The p-value of Pearson's test of `counts [K]` against `expected [K]`; the rarest cells are pooled."""
     order = expected.argsort()
     counts, expected = counts[order].double(), expected[order].double()
-    # Cells below 5 expected counts go together, as the test's approximation needs.
+    # Cells with an expected count below 5 are pooled, as the test's approximation needs.
     pooled = int((expected < 5).sum())
     while 0 < pooled < len(expected) and float(expected[:pooled].sum()) < 5:
         pooled += 1
     groups = [slice(0, pooled), *(slice(a, b) for a, b in pairwise(range(pooled, len(expected) + 1)))]
     if pooled == 0:
         groups = groups[1:]
-    seen, wanted = (torch.stack([v[g].sum() for g in groups]) for v in (counts, expected))
+    observed, due = (torch.stack([v[g].sum() for g in groups]) for v in (counts, expected))
     if len(groups) < 2:
         return 1.0
-    statistic = ((seen - wanted) ** 2 / wanted).sum()
+    statistic = ((observed - due) ** 2 / due).sum()
     return float(torch.special.gammaincc(torch.tensor((len(groups) - 1) / 2).double(), statistic / 2))
 
 
@@ -38,14 +38,14 @@ def alike(first: Tensor, second: Tensor, group: Tensor, num_bins: int = 8) -> fl
     pairs, which, counts = (group.repeat(2) * len(distinct) + value).unique(return_inverse=True, return_counts=True)
     owner = pairs.div(len(distinct), rounding_mode="floor")
     total = torch.zeros(int(group.max()) + 1, dtype=torch.long).index_add(0, owner, counts)
-    # How many in the same group are smaller, and half of those that are equal.
+    # The number of smaller values in the same group, and half of the equal ones.
     rank = counts.cumsum(0) - counts / 2 - (total.cumsum(0) - total)[owner]
     bins = owner * num_bins + (rank * num_bins / total[owner]).long()
     table = torch.stack([bins[part].bincount(minlength=len(total) * num_bins) for part in which.view(2, -1)]).double()
     both = table.sum(0)
     rare = both < 10
     free = int((~rare).sum())
-    # Both samples have as many numbers in a group, so that what it lacks in one bin it has in another.
+    # Both samples have equally many numbers in a group, which takes one degree of freedom.
     free -= int((((both == 0) | ~rare).view(-1, num_bins).all(1) & (both.view(-1, num_bins).sum(1) > 0)).sum())
     if free < 1:
         return 1.0

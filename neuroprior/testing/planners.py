@@ -18,15 +18,15 @@ Make = Callable[[Prior, int, int], Planner]
 def check_planner(make: Make, enough: int = 512, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless a planner does what a planner must.
 
-    In small random tables, with and without actions that do not exist everywhere: a decision has the shapes that it
-    should have, its plan is legal, scores what is said and ends where is said; it never beats the oracle, and equals it
-    where the budget is large; it counts exactly the steps of the world that it takes; the same seed gives the same
-    decision, and torch's global generator is left alone; no starts are no trouble; of equally good plans each is chosen
-    equally often (a chi-square test with a false alarm of 1e-6); what does not fit is refused.
+    In small random tables, where all or only some actions are legal: a decision has the right shapes, its plan is legal
+    and has the score and the final state that it says; it never beats the oracle, and equals it with a large budget;
+    its model steps are exactly the simulator steps that it takes; the same seed gives the same decision, and torch's
+    global generator is not used; it plans for no starts at all; ties are broken uniformly at random (a chi-square test
+    with a false-alarm probability of 1e-6); states that are not the world's raise ValueError.
 
     Args:
-        make: `make(prior, length, num_plans)` gives the planner. One that takes no prior, or no number of plans, leaves
-            it aside. All must optimise the same.
+        make: `make(prior, length, num_plans)` returns the planner; one that takes no prior, or no number of plans,
+            ignores it. All must have the same objective.
         enough: a number of plans with which it must find the best of 16.
         seed: draws worlds, starts and decisions.
 
@@ -53,7 +53,7 @@ def check_planner(make: Make, enough: int = 512, seed: int = 0) -> None:
 
 
 def _random_table(actions: int, legal: bool, seed: int) -> TabularWorld:
-    """Twelve states with all different rewards."""
+    """Twelve states, all with different rewards."""
     generator = torch.Generator().manual_seed(seed)
     table = torch.randint(12, (12, actions), generator=generator)
     allowed = torch.rand(12, actions, generator=generator) < 0.6
@@ -62,7 +62,7 @@ def _random_table(actions: int, legal: bool, seed: int) -> TabularWorld:
 
 
 def _check_decision(planner: Planner, world: TabularWorld, state: Tensor, decision: Decision, length: int) -> None:
-    """Its shapes, and what becomes of its plan when it is tried step by step."""
+    """Its shapes, and its plan when it is executed step by step."""
     shapes = (decision.plan.shape, decision.score.shape, decision.final_state.shape)
     batch = len(state)
     require(
@@ -75,34 +75,26 @@ def _check_decision(planner: Planner, world: TabularWorld, state: Tensor, decisi
     now, rewards, states = state, [], []
     for t in range(length):
         action = decision.plan[:, t].long()
-        there = world.legal_actions(now).gather(1, action[:, None])[:, 0] | (last <= t)
-        require(bool(there.all()), f"plan: its action {t} does not exist where it is taken")
+        legal = world.legal_actions(now).gather(1, action[:, None])[:, 0] | (last <= t)
+        require(bool(legal.all()), f"plan: its action {t} is not legal where it is taken")
         now, reward = world.step(now, action)
         rewards.append(reward)
         states.append(now)
-    row, course = torch.arange(batch), torch.stack(states, 1)
-    prefixes = planner.prefix_scores(torch.stack(rewards, 1), course)
+    row, trajectory = torch.arange(batch), torch.stack(states, 1)
+    prefixes = planner.prefix_scores(torch.stack(rewards, 1), trajectory)
     # The planner's own sums may be in another order.
     near = torch.isclose(decision.score.double(), prefixes[row, last - 1].double(), rtol=1e-4, atol=1e-5)
-    require(bool(near.all()), "score: another than the plan has when it is tried")
-    require(course[row, last - 1].equal(decision.final_state), "final_state: another than the plan ends in")
+    require(bool(near.all()), "score: not that of the plan when it is executed")
+    require(trajectory[row, last - 1].equal(decision.final_state), "final_state: not where the plan ends")
 
 
 def _check_against_oracle(
     planner: Planner, world: TabularWorld, state: Tensor, decision: Decision, length: int, must: bool
 ) -> None:
-    best = oracle(
-        world,
-        state,
-        length,
-        objective=planner.objective,
-        discount=planner.discount,
-        value=planner.value,
-        any_prefix=planner.any_prefix,
-    )
+    best = oracle(world, state, length, **planner.goal)
     gap = best.double() - decision.score.double()
-    require(bool((gap >= -1e-5).all()), f"score: {float(-gap.min())} above what the oracle says is possible")
-    require(not must or bool((gap <= 1e-5).all()), f"score: {float(gap.max())} below the best, with plans enough")
+    require(bool((gap >= -1e-5).all()), f"score: {float(-gap.min())} above the optimum")
+    require(not must or bool((gap <= 1e-5).all()), f"score: {float(gap.max())} below the best, with enough plans")
 
 
 def _check_seed(planner: Planner, world: TabularWorld, state: Tensor, decision: Decision, seed: int) -> None:
@@ -115,17 +107,17 @@ def _check_seed(planner: Planner, world: TabularWorld, state: Tensor, decision: 
 
 
 def _check_steps(planner: Planner, world: TabularWorld, state: Tensor, seed: int) -> None:
-    """The steps that are counted are those that are taken, for a single start."""
+    """The model steps are the simulator steps taken, for a single start."""
     counting = _Counting(world)
     decision = planner.plan(counting, state, torch.Generator().manual_seed(seed))
     require(
         counting.steps == decision.model_steps,
-        f"model_steps: {decision.model_steps} were counted, but {counting.steps} steps of the world taken",
+        f"model_steps: {decision.model_steps} are given, but {counting.steps} simulator steps were taken",
     )
 
 
 def _check_ties(planner: Planner, seed: int) -> None:
-    """Nine plans of two actions, each to a cell of its own, which are all worth the same."""
+    """Nine equally good plans of two actions, each to a cell of its own."""
     if planner.value is not None:
         return
     world = TabularWorld(torch.arange(39).view(13, 3).add(1).clamp(max=12), torch.ones(13))
@@ -140,7 +132,7 @@ def _check_ties(planner: Planner, seed: int) -> None:
 
 
 class _Counting(World):
-    """A table that counts its steps."""
+    """A table that counts the steps taken in it."""
 
     def __init__(self, world: TabularWorld) -> None:
         self.world, self.num_actions, self.steps = world, world.num_actions, 0

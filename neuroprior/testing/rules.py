@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 FALSE_ALARM = 1e-6
-"""The probability with which right code fails one of the tests on samples."""
+"""The probability with which correct code fails one of the tests of random draws."""
 
 
 def require(condition: bool, message: str) -> None:

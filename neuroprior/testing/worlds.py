@@ -14,11 +14,11 @@ from neuroprior.worlds import TabularWorld, World
 def check_world(world: World, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `world` does what a world must.
 
-    `reset`, `step`, `observe` and `legal_actions` return what the interface says; `step` leaves its arguments alone and treats
-    each state of a batch by itself; the same seed gives the same course; `rollout` equals stepping and refuses plans of
-    a wrong shape, dtype or range. A world with chance says so (`stochastic`), and its rollouts have the distribution of
-    its steps (chi-square tests, together with a false alarm of 1e-6); those of a table let all plans of a start meet
-    the same chance.
+    `reset`, `step`, `observe`, `legal_actions` and `terminated` return what the interface says; `step` does not change
+    its arguments and treats each state of a batch independently; the same seed gives the same trajectory; `rollout`
+    equals stepping and raises ValueError for plans of a wrong shape, dtype or range. A stochastic world says so, and
+    its rollouts have the distribution of its steps (chi-square tests, with a false-alarm probability of 1e-6 together);
+    those of a table use common random numbers for all plans of a start.
 
     Args:
         world: the world to check.
@@ -37,20 +37,20 @@ def check_world(world: World, num_states: int = 50, length: int = 6, seed: int =
     actions = world.num_actions
     plans = torch.randint(actions, (num_states, 3, length), generator=generator).to(state.device)
     _check_step(world, state, plans[:, 0, 0], seed)
-    _check_views(world, state)
-    by_steps, rewards, chance = _step_through(world, state, plans, seed)
+    _check_queries(world, state)
+    by_steps, rewards, random = _step_through(world, state, plans, seed)
     rollout = world.rollout(state, plans, torch.Generator().manual_seed(seed))
     require(
         rollout.rewards.shape == plans.shape, f"rollout: rewards {list(rollout.rewards.shape)}, not {list(plans.shape)}"
     )
     shape = (num_states, 3, *state.shape[1:])
     require(rollout.final_state.shape == shape, f"rollout: final_state {list(rollout.final_state.shape)}, not {shape}")
-    if not chance:
+    if not random:
         require(same(rollout.final_state, by_steps), "rollout ends in other states than stepping")
         require(same(rollout.rewards, rewards), "rollout gives other rewards than stepping")
     else:
-        require(world.stochastic, "step: chance was seen, but the world's `stochastic` is False")
-        _check_chance(world, state, plans[:, 0], seed)
+        require(world.stochastic, "step: its outcomes are random, but the world's `stochastic` is False")
+        _check_distribution(world, state, plans[:, 0], seed)
     none = world.rollout(state, plans[:, :, :0])
     require(none.final_state[:, 0].equal(state), "rollout of plans of length 0 must end where it starts")
     for wrong, what in (
@@ -77,47 +77,47 @@ def _check_step(world: World, state: Tensor, action: Tensor, seed: int) -> None:
     require(after.equal(again), "step: the same seed gave other states")
 
 
-def _check_views(world: World, state: Tensor) -> None:
-    """`observe` and `legal_actions`."""
-    seen = world.observe(state)
-    index = is_integer(seen) and seen.dim() == 1
+def _check_queries(world: World, state: Tensor) -> None:
+    """`observe`, `terminated` and `legal_actions`."""
+    observed = world.observe(state)
+    fits = (is_integer(observed) and observed.dim() == 1) or (observed.is_floating_point() and observed.dim() == 2)
     require(
-        len(seen) == len(state) and (index or (seen.is_floating_point() and seen.dim() == 2)),
-        f"observe must give indices [N] or floating point features [N, C], not {seen.dtype} {list(seen.shape)}",
+        len(observed) == len(state) and fits,
+        f"observe must give indices [N] or floating point features [N, C], not {observed.dtype} {list(observed.shape)}",
     )
-    over = world.terminated(state)
-    require(over.dtype == torch.bool and over.shape == state.shape[:1], f"is_over must be bool [{len(state)}]")
+    ended = world.terminated(state)
+    require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
     legal = world.legal_actions(state)
     shape = [len(state), world.num_actions]
-    require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal must be bool {shape}")
-    require(bool(legal.any(1).all()), "legal: a state without any legal action")
+    require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal_actions must be bool {shape}")
+    require(bool(legal.any(1).all()), "legal_actions: a state without any legal action")
     if world.all_legal:
-        require(bool(legal.all()), "all_legal is True, but legal leaves actions out")
+        require(bool(legal.all()), "all_legal is True, but legal_actions leaves some out")
 
 
 def _step_through(world: World, state: Tensor, plans: Tensor, seed: int) -> tuple[Tensor, Tensor, bool]:
-    """Final states `[B, P]` and rewards `[B, P, L]` of single steps, each start alone; and whether chance was seen."""
+    """Final states `[B, P]` and rewards `[B, P, L]` of single steps, and whether their outcomes are random."""
     batch, num_plans, length = plans.shape
     finals, rewards = [], []
-    chance = False
+    random = False
     for p in range(num_plans):
         now, row = state, []
         for t in range(length):
             after, reward = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed))
             other, _ = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed + 1))
-            chance = chance or not other.equal(after)
-            if not chance:
+            random = random or not other.equal(after)
+            if not random:
                 half, _ = world.step(now[batch // 2 :], plans[batch // 2 :, p, t])
                 require(same(half, after[batch // 2 :]), "step: what happens in a state depends on its batch")
             now = after
             row.append(reward)
         finals.append(now)
         rewards.append(torch.stack(row, -1))
-    return torch.stack(finals, 1), torch.stack(rewards, 1), chance
+    return torch.stack(finals, 1), torch.stack(rewards, 1), random
 
 
-def _check_chance(world: World, state: Tensor, plans: Tensor, seed: int, times: int = 200) -> None:
-    """Rollouts in a world with chance against steps, `times` from each start `[N, ...]` by its plan `[N, L]`."""
+def _check_distribution(world: World, state: Tensor, plans: Tensor, seed: int, times: int = 200) -> None:
+    """Rollouts in a stochastic world against steps, `times` from each start `[N, ...]` by its plan `[N, L]`."""
     generator = torch.Generator().manual_seed(seed)
     group = torch.arange(len(state)).repeat_interleave(times)
     now, plans = state.repeat_interleave(times, 0), plans.repeat_interleave(times, 0)
@@ -136,4 +136,6 @@ def _check_chance(world: World, state: Tensor, plans: Tensor, seed: int, times: 
         require(p > FALSE_ALARM / seen.shape[1], f"{what} of rollout do not fit those of steps: p = {p:.2g}")
     if isinstance(world, TabularWorld):
         twice = world.rollout(state, plans[::times, None].expand(-1, 2, -1), generator)
-        require(twice.rewards[:, 0].equal(twice.rewards[:, 1]), "rollout: the same plan twice met different chance")
+        require(
+            twice.rewards[:, 0].equal(twice.rewards[:, 1]), "rollout: the same plan twice had different random numbers"
+        )

@@ -1,11 +1,10 @@
-"""Worlds: batched simulators in which planners try plans."""
+"""Worlds: batched simulators in which planners try plans; grids, mazes, puzzles, foraging, Gymnasium environments."""
 
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.foraging import ForagingWorld, patches
 from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridworld, local_view
-from neuroprior.worlds.gymnasium.stepping import SteppedWorld
-from neuroprior.worlds.gymnasium.worlds import from_gymnasium
+from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
 from neuroprior.worlds.tabular import TabularWorld

@@ -1,28 +1,20 @@
-"""Rollouts in tables without chance by a compiled loop: `TabularWorld` takes it where numba is installed."""
+"""Rollouts in deterministic tables by a compiled loop, for `TabularWorld.rollout`; importing this loads numba."""
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
-MANY = 2**20
-"""Steps of a rollout that are worth loading numba, and compiling the loop where it was not kept from before."""
-
-
-def worth_compiling(plans: Tensor, reward: Tensor) -> bool:
-    """Whether the loop is there for plans `[B, P, L]`, and quicker even when it has to be loaded first."""
-    plain = reward.dtype in (torch.float32, torch.float64) and not reward.requires_grad
-    return plans.numel() >= MANY and plain and plans.device.type == "cpu" and _loop() is not None
+Array = np.ndarray[Any, Any]
 
 
 def rollout(
     table: Tensor, reward: Tensor, cell: Tensor, offset: Tensor, plans: Tensor, keep_states: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Follow plans through a table, each by itself.
+    """Follow plans through a deterministic table.
 
     Args:
         table: int32 `[S * A]`: the cell that each action leads to.
@@ -35,8 +27,6 @@ def rollout(
     Returns:
         The final states `[B, P]`, int64, the rewards `[B, P, L]`, and the states `[B, P, L]` or None.
     """
-    loop = _loop()
-    assert loop is not None
     (batch, num_plans, length), rows = plans.shape, plans.shape[:2].numel()
     actions_of = (plans if plans.dtype == torch.uint8 else plans.long()).reshape(rows, length)
     threads = torch.get_num_threads()
@@ -50,21 +40,48 @@ def rollout(
     sizes = num_plans, len(table) // reward.shape[1], reward.dim() == 2
 
     def part(begin: int, end: int) -> None:
-        loop(*given, *sizes, begin, end, *written)
+        _follow(*given, *sizes, begin, end, *written)
 
     edges = [batch * k // threads for k in range(threads + 1)]
-    with ThreadPoolExecutor(threads) as pool:  # the loop lets go of Python's lock
+    with ThreadPoolExecutor(threads) as pool:  # the loop releases Python's lock
         list(pool.map(part, edges[:-1], edges[1:]))
     shaped = [x.view(*plans.shape[:2], *x.shape[1:]) for x in (last, gained, states)]
     return shaped[0], shaped[1], shaped[2] if keep_states else None
 
 
-@cache
-def _loop() -> Any:
-    """The loop; None where numba is not installed, or does not work here."""
-    if find_spec("numba") is None:
-        return None
-    try:
-        return import_module("neuroprior.worlds.compiled_loop").follow
-    except Exception:  # one that does not go with this numpy, or finds no place for what it compiles
-        return None
+def _loop(
+    table: Array,
+    reward: Array,
+    cell: Array,
+    offset: Array,
+    plans: Array,
+    num_plans: int,
+    actions: int,
+    on_arrival: bool,
+    begin: int,
+    end: int,
+    last: Array,
+    gained: Array,
+    states: Array,
+) -> None:
+    """Follow the plans of the starts from `begin` to `end`, of which each has `num_plans`; see `rollout`.
+
+    Writes to `last [N]`, `gained [N, L]` and, unless it is empty, `states [N, L]`.
+    """
+    keep = states.shape[1] > 0
+    each = np.uintp(actions)
+    for start in range(begin, end):
+        # Unsigned integers are faster to index with.
+        first, more = np.uintp(cell[start]), np.uintp(offset[start])
+        for row in range(start * num_plans, (start + 1) * num_plans):
+            now = first
+            for t in range(plans.shape[1]):
+                taken = now * each + np.uintp(plans[row, t])
+                now = np.uintp(table[taken])
+                gained[row, t] = reward[now + more] if on_arrival else reward[taken + more * each]
+                if keep:
+                    states[row, t] = now + more
+            last[row] = now + more
+
+
+_follow: Any = njit(nogil=True, cache=True)(_loop)

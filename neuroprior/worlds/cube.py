@@ -90,9 +90,9 @@ class PocketCube(World):
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         after = self._after(state, action)
         if self.absorbing:
-            over = state == 0
-            after = after.masked_fill(over, 0)
-            gained = (after == 0) & ~over if self.reward_kind == "solved" else -self._distances[after]
+            ended = state == 0
+            after = after.masked_fill(ended, 0)
+            gained = (after == 0) & ~ended if self.reward_kind == "solved" else -self._distances[after]
             return after, gained.float()
         if self.reward_kind == "solved":
             return after, (after == 0).float()
@@ -138,7 +138,7 @@ class PocketCube(World):
         return torch.cat([self._permutation_features[permutation], self._orientation_features[orientation]], -1)
 
     def terminated(self, state: Tensor) -> Tensor:
-        """Where the cube is solved, if that is the end."""
+        """Where the cube is solved, if `absorbing`."""
         return (state == 0) & self.absorbing
 
     def check_state(self, state: Tensor) -> None:
@@ -165,7 +165,7 @@ def cube(
         scramble: `reset` makes so many random moves from the solved state.
         reward: "solved": 1 for a move that arrives at the solved state, else 0. "distance": minus the exact number of
             moves that are left after the move.
-        absorbing: the solved state ends it all: every move leads from there to there, without reward.
+        absorbing: the solved state is terminal: all moves stay there, without reward.
 
     Raises:
         ValueError: an argument is out of range.

@@ -1,4 +1,4 @@
-"""Tables of environments in which episodes begin somewhere and may end: start states, absorbing ends, layouts."""
+"""Tables of episodic environments: start states, absorbing terminal states, layouts."""
 
 from collections.abc import Sequence
 
@@ -10,21 +10,21 @@ from neuroprior.worlds.tabular import TabularWorld
 
 
 class EpisodicWorld(TabularWorld):
-    """A `TabularWorld` with start states and absorbing ends, and any number of disjoint layouts side by side.
+    """A `TabularWorld` with start states, absorbing terminal states, and any number of disjoint layouts.
 
     Args:
         next_state, reward, action_names, probability: see `TabularWorld`.
         starts: floating point `[S]`: the probability that an episode starts there.
-        ended: `[S]` bool: where the episode is over: every action stays there, without reward.
+        ended: `[S]` bool: terminal states, in which every action stays, without reward.
         layouts: integers `[S]`: the layout that each state belongs to; None: there is one.
-        features: floating point `[S, C]`: what `observe` returns; None: the number of the cell.
+        features: floating point `[S, C]`: the observations; None: `observe` gives the number of the cell.
 
     Attributes:
-        starts, ended, features: the same.
+        starts, ended, features: as given.
         num_layouts: number of layouts.
 
     Raises:
-        ValueError: a shape or value is wrong, as `TabularWorld` says, or an action leads away from an end.
+        ValueError: a shape or value is wrong, see `TabularWorld`, or an action leaves a terminal state.
     """
 
     def __init__(
@@ -83,16 +83,16 @@ class EpisodicWorld(TabularWorld):
         return super().observe(state) if self.features is None else self.features[self.cell(state)]
 
     def start_anywhere(self) -> "EpisodicWorld":
-        """Let episodes start, with equal probability, in any state that can be reached and is no end; returns self."""
+        """Let episodes start, with equal probability, in any reachable state that is not terminal; returns self."""
         reached = self.starts > 0
         possible = None if self.probability is None else self.probability > 0
         while True:
             after = self.next_state[reached]
             after = after.flatten() if possible is None else after[possible[reached]]
-            grown = reached.index_fill(0, after, True)
-            if grown.equal(reached):
+            extended = reached.index_fill(0, after, True)
+            if extended.equal(reached):
                 break
-            reached = grown
+            reached = extended
         anywhere = (reached & ~self.ended).double()
         self.starts = anywhere / anywhere.sum()
         return self

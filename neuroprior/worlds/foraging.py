@@ -1,4 +1,4 @@
-"""Foraging: food that is eaten where the agent arrives, and grows again elsewhere, in patches that move."""
+"""Foraging: food is eaten where the agent arrives, and regrows elsewhere, in patches that change with the season."""
 
 import torch
 from torch import Tensor
@@ -11,27 +11,25 @@ from neuroprior.worlds.world import World
 
 
 class ForagingWorld(World):
-    """Items of food in a table: arriving where some lie eats them, each for a reward of 1.
+    """Items of food in a table: arriving at items eats them, each for a reward of 1.
 
-    A state is int64 `[N, 2 + K]`: the cell, the time (steps since the beginning), and the places of the K items; an
-    item that is eaten is at place `num_places`, which is nowhere. What comes next hangs on the state alone, so that
-    every planner can plan here.
+    A state is int64 `[N, 2 + K]`: the cell, the time (steps since `reset`), and the places of the K items; eaten items
+    are at place `num_places`, which is nowhere. The state is Markov, so that every planner can plan here.
 
-    Planners know where food lies, but not where it will grow: for them what is eaten is gone. It comes back by `regrow`,
-    which is for what happens beside the agent's own steps (`execute`, `Agent`): what was eaten grows again elsewhere,
-    at random places of the season, and where a new season begins all items are at new places.
+    Planners know where food is, but not where it will regrow: in the steps that they try, eaten food is gone. It comes
+    back by `regrow`, which `execute` and `Agent` apply after each executed step (their argument `change`): eaten items
+    regrow at random places of the season, and at the beginning of a new season all items move to new places.
 
     Args:
-        table: where the agent moves, of one layout; its rewards count for nothing.
-        growth: floating point `[E, places]`: how probable each place is to grow food in each of E seasons, which come
-            one after another and then again; need not sum to one.
+        table: the table in which the agent moves, of one layout; its rewards are not used.
+        growth: floating point `[E, places]`: the unnormalised probabilities of the places at which food grows, in each
+            of E seasons, which follow one another cyclically.
         period: steps in a season.
         num_items: K.
 
     Attributes:
-        num_places: number of places in which food can be: the squares of a grid (`GridWorld.square`), of another table
-            its cells.
-        table, growth, period, num_items: as they came.
+        num_places: number of places for food: the squares of a grid (`GridWorld.square`), the cells of another table.
+        table, growth, period, num_items: as given.
 
     Raises:
         ValueError: an argument is out of range.
@@ -42,7 +40,7 @@ class ForagingWorld(World):
         if not isinstance(table, TabularWorld):
             raise ValueError(f"table: a TabularWorld is expected, not a {type(table).__name__}")
         if table.num_layouts > 1:
-            raise ValueError(f"table: one layout is expected, not {table.num_layouts}, of which one has all the food")
+            raise ValueError(f"table: one layout is expected, not {table.num_layouts}")
         self.place = places(table)
         self.num_places = int(self.place.max()) + 1
         growth = torch.as_tensor(growth, device=table.device)
@@ -58,7 +56,7 @@ class ForagingWorld(World):
         self.all_legal, self.stochastic = table.all_legal, table.stochastic
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """States `[batch_size, 2 + K]` at time 0: in any cell, with food as the first season grows it."""
+        """States `[batch_size, 2 + K]` at time 0: random cells, with food at random places of the first season."""
         generator = generator_on(generator, self.table.device)
         cell = self.table.cell(self.table.reset(batch_size, generator))
         nowhere = cell.new_full((batch_size, self.num_items), self.num_places)
@@ -72,13 +70,13 @@ class ForagingWorld(World):
         return torch.cat([cell[:, None], state[:, 1:2] + 1, left], 1), eaten.sum(1).float()
 
     def regrow(self, state: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """What planners do not foresee: the same `state [N, 2 + K]`, with food grown again."""
+        """`state [N, 2 + K]` after food has regrown; planners do not foresee this."""
         generator = generator_on(generator, self.table.device)
         time, items = state[:, 1], state[:, 2:]
         season = self.season(state)
         up_to = self.growth.double().cumsum(1)
         height = torch.rand(items.shape, generator=generator, device=state.device, dtype=torch.float64)
-        # Places of probability 0 are never drawn: above a height comes the next place that has some.
+        # Places of probability 0 are never drawn: `right` finds the next place of a probability above 0.
         grown = torch.searchsorted(up_to[season], height * up_to[season, -1:], right=True)
         new = (items == self.num_places) | (time % self.period == 0)[:, None]
         return torch.cat([state[:, :2], torch.where(new, grown.clamp(max=self.num_places - 1), items)], 1)
@@ -88,7 +86,7 @@ class ForagingWorld(World):
         return state[:, 1].div(self.period, rounding_mode="floor") % len(self.growth)
 
     def observe(self, state: Tensor) -> Tensor:
-        """What the table shows in the cell: not where food lies."""
+        """The table's observation of the cell; food is not observed."""
         return self.table.observe(state[:, 0])
 
     def legal_actions(self, state: Tensor) -> Tensor:
@@ -112,23 +110,23 @@ def places(table: TabularWorld) -> Tensor:
 
 
 def patches(table: TabularWorld, num_seasons: int, radius: int, generator: torch.Generator | None = None) -> Tensor:
-    """Growth for `ForagingWorld`: in each season food grows in one patch, all around a random cell.
+    """Growth for `ForagingWorld`: in each season food grows in one patch around a random cell.
 
     Args:
-        table: without chance.
+        table: a deterministic table.
         num_seasons: E.
-        radius: a patch is all places that can be reached from its middle with so many actions.
-        generator: draws the middles, as `table.reset` draws starts.
+        radius: a patch is all places that can be reached from its centre with so many actions.
+        generator: draws the centres, as `table.reset` draws starts.
 
     Returns:
         `[E, places]` float32: 1 in the patch, 0 elsewhere.
 
     Raises:
-        ValueError: an argument is out of range, or the table has chance.
+        ValueError: an argument is out of range, or the table is stochastic.
     """
     check_sizes(num_seasons=num_seasons, radius=radius)
     if table.stochastic:
-        raise ValueError("table: one without chance is expected")
+        raise ValueError("table: a deterministic one is expected")
     generator = generator_on(generator, table.device)
     reached = torch.zeros(num_seasons, table.num_states, device=table.device)
     reached.scatter_(1, table.cell(table.reset(num_seasons, generator))[:, None], 1.0)

@@ -9,7 +9,6 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
-from neuroprior.worlds.views import check_view, view_table
 
 MOVES = ("up", "right", "down", "left")
 """The four moves in the order of their numbers; the reversal of move a is (a + 2) % 4."""
@@ -30,10 +29,10 @@ class GridWorld(TabularWorld):
     Args:
         height, width, edges: see `gridworld`.
         reward: floating point `[W, M * H * W]`: the rewards of arriving in each square, for W reward maps. With a
-            heading a step that turns arrives too, in the square where the agent is.
+            heading, a turn counts as arriving in the agent's square.
         walls: bool `[M, H, W]`: which squares are walls; None: one layout without any.
         egocentric: the actions are turning left, turning right and going forward, instead of the four moves.
-        view: the agent sees which squares up to so many rows and columns away are free, instead of which cell it is in.
+        view: `observe` gives which squares up to so many rows and columns away are free, instead of the cell.
 
     Attributes:
         height, width: size of a layout in squares.
@@ -57,7 +56,7 @@ class GridWorld(TabularWorld):
         egocentric: bool = False,
         view: int | None = None,
     ) -> None:
-        check_view(view)
+        _check_view(view)
         if walls is None:
             walls = torch.zeros(1, height, width, dtype=torch.bool, device=reward.device)
         _check_walls(walls, height, width)
@@ -66,10 +65,10 @@ class GridWorld(TabularWorld):
         table = _moves(walls, edges)
         if egocentric:
             table, reward = _turns_and_moves(table), reward.repeat_interleave(4, -1)
-        # One map cannot be mistaken for rewards of actions, as four maps of four cells could be.
+        # Only one map: several could be mistaken for rewards of actions (four maps of four cells).
         super().__init__(table, reward[:1], action_names=TURNS if egocentric else MOVES)
         self._set_maps(reward)
-        self._seen = None if view is None else view_table(walls, edges, view, egocentric)
+        self._views = None if view is None else _view_table(walls, edges, view, egocentric)
         # The cells in which planning may start; None where that is all of them.
         self._free = (
             (~walls.view(-1)).repeat_interleave(4 if egocentric else 1).nonzero()[:, 0] if walls.any() else None
@@ -79,7 +78,7 @@ class GridWorld(TabularWorld):
         """Move the tables to `device`; returns self."""
         super().to(device)
         self.walls = self.walls.to(device)
-        self._seen = None if self._seen is None else self._seen.to(device)
+        self._views = None if self._views is None else self._views.to(device)
         self._free = None if self._free is None else self._free.to(device)
         return self
 
@@ -92,10 +91,10 @@ class GridWorld(TabularWorld):
         return self._free[draw % free] + draw.div(free, rounding_mode="floor") * self.num_states
 
     def observe(self, state: Tensor) -> Tensor:
-        """The cell of each state; with a `view` what is seen there, see `local_view`."""
-        if self._seen is None:
+        """The cell of each state; with a `view` the free squares around it, see `local_view`."""
+        if self._views is None:
             return super().observe(state)
-        return self._seen.index_select(0, self.cell(state)).float()
+        return self._views.index_select(0, self.cell(state)).float()
 
     def square(self, state: Tensor) -> Tensor:
         """The square of each state among all layouts' squares, `layout * height * width + row * width + column`."""
@@ -113,7 +112,7 @@ class GridWorld(TabularWorld):
     def heading(self, state: Tensor) -> Tensor:
         """The heading of each state: 0 up, 1 right, 2 down, 3 left; ValueError where agents have none."""
         if not self.egocentric:
-            raise ValueError("heading: only in an egocentric grid has the agent one; see egocentric()")
+            raise ValueError("heading: agents have one only in an egocentric grid; see egocentric()")
         return self.cell(state) % 4
 
 
@@ -151,7 +150,7 @@ def gridworld(
 def egocentric(world: GridWorld) -> GridWorld:
     """The same grid for an agent with a heading, whose actions are turning left, turning right and going forward.
 
-    A turn stays in the square and is rewarded as an arrival there. What the agent sees with a `view` turns with it.
+    A turn stays in the square and is rewarded as an arrival there. A `view` turns with the agent.
 
     Raises:
         ValueError: the agents of `world` have headings already.
@@ -164,11 +163,11 @@ def egocentric(world: GridWorld) -> GridWorld:
 
 
 def local_view(world: GridWorld, radius: int = 2) -> Callable[[Tensor], Tensor]:
-    """What an agent sees around itself, as features for a prior: which squares near it are free.
+    """The squares around an agent, as features for a prior: which of them are free.
 
     Args:
         world: a grid.
-        radius: how many rows and columns away it sees, through walls too.
+        radius: how many rows and columns the view reaches, through walls too.
 
     Returns:
         A function from states `[N]` to float32 `[N, C]`, C = (2 * radius + 1) ** 2 - 1: 1 for a free square, 0 for a
@@ -178,8 +177,8 @@ def local_view(world: GridWorld, radius: int = 2) -> Callable[[Tensor], Tensor]:
     Raises:
         ValueError: the radius is not at least 1.
     """
-    check_view(radius)
-    table = view_table(world.walls, world.edges, radius, world.egocentric)
+    _check_view(radius)
+    table = _view_table(world.walls, world.edges, radius, world.egocentric)
     return lambda state: table.index_select(0, world.cell(state)).float()
 
 
@@ -203,7 +202,7 @@ def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
     reward = world.reward[:, ::4] if world.egocentric else world.reward
     goal = reward.view(world.num_maps, world.num_layouts, area).argmax(-1)
 
-    def seen(state: Tensor) -> Tensor:
+    def direction(state: Tensor) -> Tensor:
         square = goal[world.reward_map(state), world.layout(state)]
         where = torch.stack([square.div(world.width, rounding_mode="floor"), square % world.width], -1)
         away = where - world.coordinates(state)
@@ -211,7 +210,40 @@ def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
         compass = _ROW_COLUMN.to(state.device)
         return torch.stack([(away * compass[(heading + turn) % 4]).sum(-1) for turn in (0, 1)], -1).float()
 
-    return seen
+    return direction
+
+
+def _check_view(view: int | None) -> None:
+    """Raise ValueError unless `view` is a radius of at least 1, or None."""
+    if view is not None and (isinstance(view, bool) or not isinstance(view, int) or view < 1):
+        raise ValueError(f"view: a radius of at least 1 square is expected, not {view!r}")
+
+
+def _view_table(walls: Tensor, edges: Literal["wall", "torus"], radius: int, egocentric: bool) -> Tensor:
+    """Which squares around each cell are free.
+
+    Args:
+        walls: bool `[M, H, W]`.
+        edges: what is beyond the edge: "wall": walls. "torus": the other side.
+        radius: how many squares the view reaches in each direction.
+        egocentric: the agent has one of four headings in each square, and what is ahead comes first.
+
+    Returns:
+        Bool `[M * H * W, C]`, with headings `[M * H * W * 4, C]`: C = (2 * radius + 1) ** 2 - 1 squares, row by row
+        from the top left (with the heading up), without the agent's own.
+    """
+    _, height, width = walls.shape
+    size = 2 * radius + 1
+    if edges == "torus":
+        rows, columns = (torch.arange(-radius, n + radius, device=walls.device) % n for n in (height, width))
+        free = ~walls[:, rows[:, None], columns]
+    else:
+        free = torch.nn.functional.pad(~walls, [radius] * 4)
+    around = free.unfold(1, size, 1).unfold(2, size, 1).reshape(-1, size, size)
+    if egocentric:
+        around = torch.stack([around.rot90(heading, (1, 2)) for heading in range(4)], 1)
+    around = around.reshape(-1, size * size)
+    return torch.cat([around[:, : size * size // 2], around[:, size * size // 2 + 1 :]], 1)
 
 
 def _moves(walls: Tensor, edges: str) -> Tensor:
@@ -246,4 +278,4 @@ def _check_walls(walls: Tensor, height: int, width: int) -> None:
         )
     full = walls.flatten(1).all(1).nonzero()
     if len(full):
-        raise ValueError(f"walls[{int(full[0])}]: this layout has no free square; every one needs some")
+        raise ValueError(f"walls[{int(full[0])}]: this layout has no free square; every layout needs one")

@@ -1,4 +1,4 @@
-"""The labyrinth in which Rosenberg et al. let mice run: a binary tree of corridors with one water port."""
+"""The labyrinth of Rosenberg et al.'s mice: a binary tree of corridors with one water port."""
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ def labyrinth(absorbing: bool = False) -> TabularWorld:
     legal; at node 0 both moves out lead to the home cage and back. The reward is 1 for arriving at the water, node 116.
 
     Args:
-        absorbing: the water ends it all: every move leads from there to there, without reward, and is legal.
+        absorbing: the water is terminal: there all moves are legal, stay, and give no reward.
 
     Returns:
         A world of 127 states, 4 moves and one reward map.
@@ -44,7 +44,7 @@ def labyrinth(absorbing: bool = False) -> TabularWorld:
     if absorbing:
         next_node[WATER], legal[WATER], reward[WATER] = WATER, True, 0.0
     else:
-        reward[WATER] = 0.0  # a move that does not exist arrives nowhere
+        reward[WATER] = 0.0  # an illegal move does not arrive
     return TabularWorld(next_node, reward[None], legal, MOVES)
 
 

@@ -21,10 +21,10 @@ def four_rooms(
     egocentric: bool = False,
     view: int | None = None,
 ) -> GridWorld:
-    """Four rooms joined by four doors.
+    """Four rooms connected by four doors.
 
-    After Sutton, Precup and Singh, "Between MDPs and semi-MDPs" (Artificial Intelligence 112, 181-211, 1999), but that
-    the inner walls cross in the middle, and each of their four arms has its door at a random place.
+    After Sutton, Precup and Singh, "Between MDPs and semi-MDPs" (Artificial Intelligence 112, 181-211, 1999), except
+    that the inner walls cross in the middle, and the door in each of their four arms is at a random place.
 
     Args:
         height, width: size in squares, the outer walls among them; at least 5.
@@ -32,7 +32,7 @@ def four_rooms(
         num_worlds: number of reward maps over them, W.
         reward: "random": of arriving in each free square, as in `gridworld`. "goal": 1 for arriving in one free square
             of each layout, drawn for each reward map, and 0 elsewhere; being in the goal and staying there arrives.
-        reward_power: see `gridworld`; for random rewards alone.
+        reward_power: see `gridworld`; only for random rewards.
         seed: gives the same layouts and rewards again.
         egocentric, view: see `GridWorld`.
 
@@ -72,13 +72,13 @@ def maze(
 ) -> GridWorld:
     """Random mazes with corridors one square wide.
 
-    A depth-first walk through the squares of odd row and column digs each maze, going on to a random neighbour that it
-    has not been to, and back where there is none, so that one way leads from any square to any other. Then some of the
-    walls that are left between neighbours are opened.
+    A depth-first walk through the squares of odd row and column carves each maze: on to a random unvisited neighbour,
+    and back where there is none, so that exactly one path connects any two squares. Then some of the remaining walls
+    between neighbours are opened.
 
     Args:
         height, width: size in squares, the outer walls among them; odd, at least 3.
-        loops: the share of the remaining inner walls that are opened, from 0 (one way alone) to 1 (none is left).
+        loops: the share of the remaining inner walls that is opened, from 0 (a single path) to 1 (no wall is left).
         num_layouts, num_worlds, reward, reward_power, seed: see `four_rooms`.
         egocentric, view: see `GridWorld`.
 
@@ -99,7 +99,7 @@ def maze(
 
 
 def _dig(height: int, width: int, num_layouts: int, generator: torch.Generator) -> Tensor:
-    """Walls `[M, H, W]` of perfect mazes: a depth-first walk in all of them at once."""
+    """Walls `[M, H, W]` of mazes without loops: a depth-first walk in all of them at once."""
     walls = torch.ones(num_layouts, height * width, dtype=torch.bool)
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     # Up, right, down, left: where a neighbour is two squares away, and the step that leads half the way.
@@ -112,14 +112,14 @@ def _dig(height: int, width: int, num_layouts: int, generator: torch.Generator) 
     start = torch.randint(num_rooms, (num_layouts,), generator=generator)
     path[:, 0] = (2 * start.div(width // 2, rounding_mode="floor") + 1) * width + 2 * (start % (width // 2)) + 1
     walls[layout, path[:, 0]] = False
-    # Each neighbour is gone to once, and back from at most once.
+    # Each square is entered once, and left backwards at most once.
     for _ in range(2 * (num_rooms - 1)):
         here = path[layout, depth]
         new = inside[here]
         new &= walls.gather(1, torch.where(new, here[:, None] + 2 * step, 0))
         way = torch.where(new, torch.rand(new.shape, generator=generator), -1.0).argmax(1)
         on = new.any(1)
-        # Who cannot go on digs where it stands, which changes nothing.
+        # A walk that cannot go on carves its own square again.
         by = torch.where(on, step[way], 0)
         walls[layout, here + by] = False
         walls[layout, here + 2 * by] = False
@@ -133,7 +133,7 @@ def _open_some(walls: Tensor, loops: float, generator: torch.Generator) -> None:
     between = torch.zeros_like(walls[0])
     between[1:-1:2, 2:-1:2] = between[2:-1:2, 1:-1:2] = True
     closed = (walls & between).flatten(1)
-    number = round(loops * int(closed[0].sum()))  # as many are left in every perfect maze
+    number = round(loops * int(closed[0].sum()))  # the same number in every maze without loops
     draws = torch.where(closed, torch.rand(closed.shape, generator=generator), -1.0)
     walls.view(len(walls), -1).scatter_(1, draws.topk(number, 1).indices, False)
 
@@ -144,8 +144,7 @@ def _rewards(walls: Tensor, num_worlds: int, kind: str, power: float, generator:
     uniform = torch.rand(num_worlds, *free.shape, generator=generator).where(free, 0.0)
     if kind == "random":
         return uniform.pow(power).flatten(1)
-    # The largest of independent draws is in each free square equally often; all of them 0 is not to be feared, but
-    # would put the goal into a wall.
+    # The largest of independent draws is uniform over the free squares; where all draws are 0 it must be no wall.
     goal = torch.where(free, uniform, -1.0).argmax(-1, keepdim=True)
     return torch.zeros_like(uniform).scatter_(-1, goal, 1.0).flatten(1)
 
@@ -157,4 +156,4 @@ def _check(name: str, num_layouts: int, num_worlds: int, reward: str, reward_pow
     if not 0 < reward_power < float("inf"):
         raise ValueError(f"{name}: reward_power must be positive and finite, not {reward_power}")
     if reward == "goal" and reward_power != 1:
-        raise ValueError(f'{name}: reward_power has no part in reward="goal"; use reward="random"')
+        raise ValueError(f'{name}: reward_power has no effect with reward="goal"; use reward="random"')

@@ -1,14 +1,16 @@
 """Worlds that are tables: a transition table and any number of reward maps over it, all evaluated in one call."""
 
 from collections.abc import Sequence
+from functools import cache
+from importlib import import_module
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_range, is_integer
 from neuroprior._random import generator_on
-from neuroprior.worlds import compiled
-from neuroprior.worlds.chance import Chance
+from neuroprior.worlds.outcomes import Outcomes
 from neuroprior.worlds.world import Rollout, World, check_plans, join_states
 
 
@@ -18,24 +20,27 @@ class TabularWorld(World):
     A state is one integer, `reward_map * S + cell`: a start chooses its map, and a batch may mix maps. With one map
     (W = 1) a state is just its cell.
 
-    Each action leads to one cell, or, where there are `probability`, to one of K cells by chance. `rollout` then lets
-    all plans of a start meet the same chance (common random numbers), so that their differences are less noisy: one
-    uniform number a start and step draws the same quantile of what may come of each plan's action.
+    Each action leads to one cell, or, with `probability`, to one of K random outcomes. `rollout` then uses common
+    random numbers for all plans of a start, which makes their differences less noisy: one uniform number for each start
+    and step draws the same quantile of the outcomes of each plan's action.
 
     Args:
-        next_state: integers `[S, A]`: the cell that each action leads to. With chance `[S, A, K]`: its K outcomes.
+        next_state: integers `[S, A]`: the cell that each action leads to. With `probability`, `[S, A, K]`: K outcomes.
         reward: floating point. `[S]`: the reward of arriving in a cell. `[S, A]`: the reward of an action in a cell.
-            With chance also `[S, A, K]`: the reward of an outcome. `[W, S]`, `[W, S, A]` and `[W, S, A, K]`: the same
-            for W reward maps. Where a shape could mean two of these (S = A), give all dimensions, or `[1, S]`.
-        legal_actions: `[S, A]` bool: which actions exist; None where all do. Every cell needs at least one. With chance every
-            action must exist everywhere.
+            With `probability` also `[S, A, K]`: the reward of an outcome. `[W, S]`, `[W, S, A]` and `[W, S, A, K]`: the
+            same for W reward maps. Where a shape could mean two of these (S = A), give all dimensions, or `[1, S]`.
+        legal_actions: `[S, A]` bool: which actions are legal; None: all. Every cell needs at least one. With
+            `probability` every action must be legal everywhere.
         action_names: A names, for tables and figures.
         probability: floating point `[S, A, K]`: the probability of each outcome; the K of an action sum to 1 within
-            1e-6. What has probability 0 is never drawn. None: no chance.
+            1e-6. Outcomes of probability 0 are never drawn. None: the world is deterministic.
 
     Attributes:
-        next_state, reward: as they came, `reward` always with a dimension for the maps.
-        probability: `[S, A, K]` float64, or None.
+        next_state, reward: as given, `reward` always with a dimension for the maps.
+        legal_table: `[S, A]` bool, or None where all actions are legal.
+        outcomes: draws the outcomes; None for a deterministic world.
+        compile_from: rollouts of at least so many steps go through a compiled loop, where numba is installed: loading
+            it, and compiling the loop the first time, is worth it only for many.
         num_layouts: number of layouts, see `layout`; 1 unless a subclass has more.
 
     Raises:
@@ -43,6 +48,7 @@ class TabularWorld(World):
     """
 
     num_layouts: int = 1
+    compile_from: int = 2**20
 
     def __init__(
         self,
@@ -57,8 +63,8 @@ class TabularWorld(World):
         _check_shapes(next_state, probability, legal_actions)
         self.num_states, self.num_actions = next_state.shape[:2]
         check_range("next_state", next_state, self.num_states, "states")
-        self.chance = None if probability is None else Chance(torch.as_tensor(probability), next_state.device)
-        self.stochastic = self.chance is not None
+        self.outcomes = None if probability is None else Outcomes(torch.as_tensor(probability), next_state.device)
+        self.stochastic = self.outcomes is not None
         self._set_maps(_reward_maps(torch.as_tensor(reward, device=next_state.device), next_state.shape))
         self.next_state = next_state.long().contiguous()
         self.legal_table = (
@@ -73,15 +79,15 @@ class TabularWorld(World):
         """Take over `reward`: `[W, S]` (on arrival), `[W, S, A]` (on acting) or `[W, S, A, K]` (of an outcome)."""
         self.reward, self.num_maps = reward, len(reward)
         size = self.num_maps * self.num_states * self.num_actions
-        if self.chance is not None:
-            size = max(size, self.chance.table_size, reward.numel())
+        if self.outcomes is not None:
+            size = max(size, self.outcomes.table_size, reward.numel())
         if size >= 2**31:
             raise ValueError("reward: maps x states x actions must be below 2**31; use fewer maps in one world")
 
     @property
     def probability(self) -> Tensor | None:
-        """The probabilities of the outcomes, `[S, A, K]` float64; None where there is no chance."""
-        return None if self.chance is None else self.chance.probability
+        """The probabilities of the outcomes, `[S, A, K]` float64; None for a deterministic world."""
+        return None if self.outcomes is None else self.outcomes.probability
 
     @property
     def device(self) -> torch.device:
@@ -93,8 +99,8 @@ class TabularWorld(World):
         self.next_state, self.reward = self.next_state.to(device), self.reward.to(device)
         if self.legal_table is not None:
             self.legal_table = self.legal_table.to(device)
-        if self.chance is not None:
-            self.chance.to(device)
+        if self.outcomes is not None:
+            self.outcomes.to(device)
         return self
 
     def state(self, cell: Tensor, reward_map: Tensor | int = 0) -> Tensor:
@@ -112,11 +118,11 @@ class TabularWorld(World):
         return state.div(self.num_states, rounding_mode="floor")
 
     def layout(self, state: Tensor) -> Tensor:
-        """The layout of each state, between 0 and `num_layouts` - 1: parts of a table that no action joins."""
+        """The layout of each state, between 0 and `num_layouts` - 1: parts of a table that no action connects."""
         return torch.zeros_like(state)
 
     def group(self, state: Tensor) -> Tensor | None:
-        """The world that each state is in, `reward_map * num_layouts + layout`; None where there is but one."""
+        """The world that each state is in, `reward_map * num_layouts + layout`; None where there is only one."""
         if self.num_maps * self.num_layouts == 1:
             return None
         return self.reward_map(state) * self.num_layouts + self.layout(state)
@@ -131,21 +137,20 @@ class TabularWorld(World):
         offset = state - cell
         taken = cell * self.num_actions + action
         outcome = taken
-        if self.chance is not None:
+        if self.outcomes is not None:
             generator = generator_on(generator, self.device)
             uniform = torch.rand(taken.shape, generator=generator, device=self.device, dtype=torch.float32)
-            outcome = self.chance.draw(taken, uniform)
+            outcome = self.outcomes.draw(taken, uniform)
         after = self.next_state.view(-1)[outcome]
         return after + offset, self.reward.view(-1)[self._reward_index(offset, taken, outcome, after)]
 
     def rollout(
         self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
     ) -> Rollout:
-        """See `World.rollout`. One gather a step for the transitions and one for the rewards, on int32 tables.
+        """See `World.rollout`. In a stochastic world `generator` draws one uniform number for each start and step.
 
-        Many plans without chance go through a compiled loop, where numba is installed; it gives the same.
-
-        With chance, `generator` gives one uniform number a start and step, however many plans there are.
+        Each step is one gather for the transitions and one for the rewards, on int32 tables. Many steps in a
+        deterministic world go through a compiled loop (see `compile_from`), which gives the same.
         """
         self.check_state(state)
         check_plans(plans, state.shape[0], self.num_actions)
@@ -153,7 +158,7 @@ class TabularWorld(World):
         actions = self.num_actions
         table, flat_reward = self.next_state.int().view(-1), self.reward.view(-1)
         cell = self.cell(state)
-        if self.chance is None and compiled.worth_compiling(plans, self.reward):
+        if (compiled := self._compiled(plans)) is not None:
             return Rollout(*compiled.rollout(table, self.reward, cell, state - cell, plans, keep_states))
         offset = (state - cell).int()[:, None]
         cell = cell.int()[:, None].expand(batch, num_plans)
@@ -163,28 +168,34 @@ class TabularWorld(World):
         for t in range(length):
             taken = torch.add(plans[:, :, t].int(), cell, alpha=actions)
             outcome = taken
-            if self.chance is not None:
+            if self.outcomes is not None:
                 same = uniform[t, :, None].expand(batch, num_plans).reshape(-1)
-                outcome = self.chance.draw(taken.reshape(-1), same).view(batch, num_plans)
+                outcome = self.outcomes.draw(taken.reshape(-1), same).view(batch, num_plans)
             cell = table.index_select(0, outcome.reshape(-1)).view(batch, num_plans)
             at = self._reward_index(offset, taken, outcome, cell)
             torch.index_select(flat_reward, 0, at.reshape(-1), out=rewards[t].view(-1))
             if keep_states:
                 cells.append(cell)
-        course = None
+        states = None
         if keep_states:
-            course = join_states(cells, state, (batch, num_plans)).to(state) + (state - self.cell(state))[:, None, None]
-        return Rollout((cell + offset).long(), rewards.permute(1, 2, 0), course)
+            states = join_states(cells, state, (batch, num_plans)).to(state) + (state - self.cell(state))[:, None, None]
+        return Rollout((cell + offset).long(), rewards.permute(1, 2, 0), states)
 
     def _uniform(self, length: int, batch: int, generator: torch.Generator | None) -> Tensor:
-        """What chance makes of a rollout, `[L, B]`; nothing is drawn where there is none."""
-        if self.chance is None:
+        """What the outcomes of a rollout are drawn by, `[L, B]`; empty in a deterministic world."""
+        if self.outcomes is None:
             return torch.empty(0)
         generator = generator_on(generator, self.device)
         return torch.rand(length, batch, generator=generator, device=self.device, dtype=torch.float32)
 
+    def _compiled(self, plans: Tensor) -> Any:
+        """The module with the compiled loop, where it can roll out `plans [B, P, L]` and is worth it; else None."""
+        able = self.outcomes is None and self.reward.dtype in (torch.float32, torch.float64)
+        able = able and plans.device.type == "cpu"
+        return _load_compiled() if able and plans.numel() >= self.compile_from else None
+
     def _reward_index(self, offset: Tensor, taken: Tensor, outcome: Tensor, after: Tensor) -> Tensor:
-        """Where the rewards of steps to the cells `after` stand among all rewards; `offset` is the reward map * S."""
+        """The indices of the rewards of steps to the cells `after`; `offset` is the reward map * S."""
         if self.reward.dim() == 2:
             return after + offset
         if self.reward.dim() == 3:
@@ -192,9 +203,9 @@ class TabularWorld(World):
         return outcome + offset * (self.num_actions * self.next_state.shape[2])
 
     def mean_after(self, values: Tensor) -> Tensor:
-        """The mean of `values [W, S]` over the cells that each action leads to, `[W, S, A]`, for sums over chance."""
+        """The mean of `values [W, S]` over the cells that each action leads to: `[W, S, A]`."""
         after = values[:, self.next_state]
-        return after if self.chance is None else self._mean(after)
+        return after if self.outcomes is None else self._mean(after)
 
     def mean_reward(self) -> Tensor:
         """The mean reward of each action in each cell, `[W, S, A]`."""
@@ -202,14 +213,14 @@ class TabularWorld(World):
             return self.mean_after(self.reward)
         return self.reward if self.reward.dim() == 3 else self._mean(self.reward)
 
-    def _mean(self, outcomes: Tensor) -> Tensor:
-        """The mean `[W, S, A]` of `outcomes [W, S, A, K]`; one that cannot occur has no part in it, infinite or not."""
-        assert self.chance is not None
-        probability = self.chance.probability
-        return (outcomes * probability).masked_fill(probability == 0, 0).sum(-1).to(outcomes.dtype)
+    def _mean(self, values: Tensor) -> Tensor:
+        """The mean `[W, S, A]` of `values [W, S, A, K]` over outcomes; impossible ones do not count, even infinite."""
+        assert self.outcomes is not None
+        probability = self.outcomes.probability
+        return (values * probability).masked_fill(probability == 0, 0).sum(-1).to(values.dtype)
 
     def observe(self, state: Tensor) -> Tensor:
-        """The cell of each state: an agent sees where it is, not which reward map holds."""
+        """The cell of each state; the reward map is not observed."""
         return self.cell(state)
 
     def legal_actions(self, state: Tensor) -> Tensor:
@@ -218,15 +229,15 @@ class TabularWorld(World):
         return self.legal_table[self.cell(state)]
 
     def terminated(self, state: Tensor) -> Tensor:
-        """Where every action stays, without reward."""
+        """Where every action stays in the cell, without reward."""
         cell = self.cell(state)
-        over = (self.next_state[cell].flatten(1) == cell[:, None]).all(1)
-        here = over.nonzero()[:, 0]
+        ended = (self.next_state[cell].flatten(1) == cell[:, None]).all(1)
+        here = ended.nonzero()[:, 0]
         gains = self.reward[self.reward_map(state[here]), cell[here]]
-        if gains.dim() == 3 and self.chance is not None:
-            gains = gains.masked_fill(self.chance.probability[cell[here]] == 0, 0)
-        over[here] = (gains == 0).unsqueeze(-1).flatten(1).all(1)
-        return over
+        if gains.dim() == 3 and self.outcomes is not None:
+            gains = gains.masked_fill(self.outcomes.probability[cell[here]] == 0, 0)
+        ended[here] = (gains == 0).unsqueeze(-1).flatten(1).all(1)
+        return ended
 
     def check_state(self, state: Tensor) -> None:
         if state.dim() != 1:
@@ -238,8 +249,17 @@ class TabularWorld(World):
         check_range("state", state, self.num_maps * self.num_states, "states (reward maps x cells)")
 
 
+@cache
+def _load_compiled() -> Any:
+    """The module with the compiled loop; None where numba is not installed, or does not work here."""
+    try:
+        return import_module("neuroprior.worlds.compiled")
+    except Exception:  # a numba that does not fit numpy may fail in any way
+        return None
+
+
 def _check_shapes(next_state: Tensor, probability: Tensor | None, legal: Tensor | None) -> None:
-    """Raise ValueError unless the tables fit one another; what is in them is not looked at."""
+    """Raise ValueError unless the shapes of the tables fit one another."""
     if probability is None:
         if next_state.dim() != 2 or 0 in next_state.shape:
             raise ValueError(
@@ -255,7 +275,7 @@ def _check_shapes(next_state: Tensor, probability: Tensor | None, legal: Tensor 
             f" not {str(probability.dtype).removeprefix('torch.')} of shape {list(probability.shape)}"
         )
     if legal is not None:
-        raise ValueError("legal_actions: with probability every action must exist in every cell; leave it out")
+        raise ValueError("legal_actions: with probability every action must be legal in every cell; leave it out")
 
 
 def _reward_maps(reward: Tensor, table: torch.Size) -> Tensor:

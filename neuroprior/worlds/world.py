@@ -10,12 +10,12 @@ from neuroprior._checks import check_range
 
 
 class Rollout(NamedTuple):
-    """What happened when plans were tried: B starts, P plans a start, L steps.
+    """What plans led to: B starts, P plans for each start, L steps.
 
     Attributes:
         final_state: `[B, P]` (and the state's own dimensions, if it has any): where each plan ended.
         rewards: `[B, P, L]` floating point: the reward of each step.
-        states: `[B, P, L]` (and the state's own dimensions): where each step led; None where it was not asked for.
+        states: `[B, P, L]` (and the state's own dimensions): the state after each step; None where not asked for.
     """
 
     final_state: Tensor
@@ -26,13 +26,13 @@ class Rollout(NamedTuple):
 class World(ABC):
     """A batched simulator with a finite set of actions, numbered from 0.
 
-    A state is one tensor whose first dimensions are the batch; what the others mean is the world's own affair.
+    A state is one tensor whose first dimension is the batch; what its other dimensions mean is up to the world.
     A subclass sets `num_actions` and writes `reset` and `step`; the rest has defaults.
 
     Attributes:
         num_actions: the number of actions, A.
-        all_legal: True where every action exists in every state, so that nobody need ask `legal_actions`.
-        stochastic: True where chance decides what comes of an action, so that one try of a plan says little of it.
+        all_legal: True where every action is legal in every state, so that `legal_actions` need not be called.
+        stochastic: True where the outcome of an action is random, so that one rollout of a plan is not enough.
         action_names: names of the actions, where there are any.
     """
 
@@ -43,7 +43,7 @@ class World(ABC):
 
     @abstractmethod
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """`batch_size` random states from which planning may start: `[batch_size, ...]`."""
+        """Random states to plan from, `[batch_size, ...]`."""
 
     @abstractmethod
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
@@ -52,7 +52,7 @@ class World(ABC):
         Args:
             state: `[N, ...]`.
             action: int64 `[N]` between 0 and A - 1.
-            generator: draws what is random in the world.
+            generator: draws what is random.
 
         Returns:
             The next state `[N, ...]` and the reward of the step, `[N]` floating point.
@@ -63,13 +63,13 @@ class World(ABC):
     ) -> Rollout:
         """Try P plans from each of B starts. Shapes, dtypes and ranges are checked once, here, not at every step.
 
-        In a world with chance this default draws for each plan by itself. A world may let all plans of a start meet
-        the same chance instead (common random numbers, as `TabularWorld` does); starts are always independent.
+        In a stochastic world this default draws for each plan independently. A world may use common random numbers for
+        all plans of a start instead (as `TabularWorld` does); starts are always independent.
 
         Args:
             state: `[B, ...]`.
             plans: integers `[B, P, L]` between 0 and A - 1.
-            generator: draws what is random in the world.
+            generator: draws what is random.
             keep_states: also return the state after each step.
 
         Raises:
@@ -86,29 +86,26 @@ class World(ABC):
             if keep_states:
                 states.append(now)
         shape = (batch, num_plans, *state.shape[1:])
-        course = join_states(states, state, shape) if keep_states else None
-        return Rollout(now.view(shape), torch.cat(rewards, -1), course)
+        kept = join_states(states, state, shape) if keep_states else None
+        return Rollout(now.view(shape), torch.cat(rewards, -1), kept)
 
     def observe(self, state: Tensor) -> Tensor:
-        """What an agent sees in `state [N, ...]`: integers `[N]` (indices) or floating point `[N, C]` (features).
+        """The observation in `state [N, ...]`: integers `[N]` (indices) or floating point `[N, C]` (features).
 
         Default: the state itself.
         """
         return state
 
     def legal_actions(self, state: Tensor) -> Tensor:
-        """Which actions exist in `state [N, ...]`: `[N, A]` bool, at least one a row. Default: all."""
+        """Which actions are legal in `state [N, ...]`: `[N, A]` bool, at least one in each row. Default: all."""
         return torch.ones(state.shape[0], self.num_actions, dtype=torch.bool, device=state.device)
 
     def terminated(self, state: Tensor) -> Tensor:
-        """Where nothing can happen any more in `state [N, ...]`, so that no action is executed: `[N]` bool.
-
-        Default: nowhere.
-        """
+        """Which of `state [N, ...]` are final, so that no action is executed there: `[N]` bool. Default: none."""
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def group(self, state: Tensor) -> Tensor | None:
-        """Which of several independent worlds each state is in, int64 `[N]`; None (the default) where there is one."""
+        """The number of the independent world that each state is in, int64 `[N]`; None (the default): there is one."""
         return None
 
     def check_state(self, state: Tensor) -> None:
@@ -129,6 +126,6 @@ def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:
     if plans.dim() != 3 or plans.shape[0] != batch_size:
         raise ValueError(
             f"plans: shape [B, P, L] with B = {batch_size} starts is expected, not {list(plans.shape)}"
-            " (for one plan a start, use plans[:, None])"
+            " (for one plan per start, use plans[:, None])"
         )
     check_range("plans", plans, num_actions, "actions")

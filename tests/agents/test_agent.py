@@ -28,7 +28,7 @@ from tests.support.sources import corridor, every_plan, refuses, seeded
 TRAINING = {"max_steps": 4, "progress": False}
 
 
-def home(period=100):
+def foraging(period=100):
     table = gridworld(6, 6, edges="torus")
     return ForagingWorld(table, patches(table, 3, 1, seeded(0)), period, 3)
 
@@ -38,7 +38,7 @@ def sampler(prior, length=6, num_plans=8, **more):
 
 
 def agent(prior=None, world=None, number=5, seed=1, planner=None, **more):
-    prior, world = prior or MarkovPrior(4, 2), world or home()
+    prior, world = prior or MarkovPrior(4, 2), world or foraging()
     settings = {"replan_every": 2, "change": world.regrow, "learn_every": 12, "plan_length": 6, "retention": 0.9} | more
     return Agent(
         world, planner or sampler(prior), prior, world.reset(number, seeded(7)), generator=seeded(seed), **settings
@@ -46,7 +46,7 @@ def agent(prior=None, world=None, number=5, seed=1, planner=None, **more):
 
 
 def test_without_learning_and_warm_starts_it_executes():
-    world, prior = home(), UniformPrior(4)
+    world, prior = foraging(), UniformPrior(4)
     one = agent(prior, world, learn_every=None, warm_start=False)
     done = one.run(10)
     due = execute(sampler(prior), world, world.reset(5, seeded(7)), 10, 2, seeded(1), world.regrow)
@@ -72,8 +72,8 @@ def test_it_learns_from_what_it_did():
 
 
 @pytest.mark.parametrize("per", ["plan", "step"])
-def test_it_remembers_what_it_saw(per):
-    prior, world = MarkovPrior(4, 1, num_contexts=36), home()
+def test_it_stores_what_it_observed(per):
+    prior, world = MarkovPrior(4, 1, num_contexts=36), foraging()
     prior.context_per = per
     one = agent(prior, world, retention=1.0)
     start = one.state
@@ -83,7 +83,7 @@ def test_it_remembers_what_it_saw(per):
     assert prior.context_per == per
 
 
-def test_only_what_was_rewarded():
+def test_it_stores_only_what_was_rewarded():
     one = agent(retention=1.0, min_score=0.0)
     done = one.run(60)
     rewarded = done.rewards.view(5, 10, 6).sum(2).T.flatten() > 0
@@ -92,7 +92,7 @@ def test_only_what_was_rewarded():
     assert torch.equal(one.replay.plans.actions.long(), plans[rewarded])
 
 
-def test_plans_end_where_it_is_over():
+def test_plans_end_where_the_world_terminates():
     """Cell 3 of a corridor is the end of everything; an agent there executes nothing."""
     table = corridor()
     table.next_state[3] = 3
@@ -119,20 +119,20 @@ def test_plans_end_where_it_is_over():
 
 def test_forgetting_follows_the_food():
     """Food moves to another patch: what an agent has learned there helps it to find the next, once it has forgotten."""
-    world = home(period=160)
+    world = foraging(period=160)
     prior = MarkovPrior(4, 1, num_contexts=36)
     online = agent(prior, world, number=16, min_score=0.0).run(480).rewards.double()
     table_free = agent(UniformPrior(4), world, number=16, learn_every=None).run(480).rewards.double()
     assert online.mean() > 1.1 * table_free.mean()
 
 
-@pytest.mark.parametrize("kind", ["blind", "seeing", "gru", "prefixes"])
+@pytest.mark.parametrize("kind", ["no context", "context", "gru", "prefixes"])
 @pytest.mark.parametrize("at", [8, 12, 14])
 def test_a_pause_changes_nothing(kind, at, tmp_path):
     def made():
         if kind == "gru":
             return agent(GRUPrior(4, hidden_size=8), training=TRAINING)
-        if kind == "seeing":
+        if kind == "context":
             return agent(MarkovPrior(4, 1, num_contexts=36), min_score=0.0)
         prior = MarkovPrior(4, 2)
         return (
@@ -159,12 +159,12 @@ def test_a_pause_changes_nothing(kind, at, tmp_path):
 
 def test_networks_are_trained_from_its_generator():
     """Whatever torch's own generator is at."""
-    lives = []
+    runs = []
     for seed in (1, 2):
         torch.manual_seed(seed)
         one = agent(GRUPrior(4, hidden_size=4), training={"max_steps": 2, "progress": False})
-        lives.append((one.run(24).actions, one.prior.log_prob(every_plan(4, 2))))
-    for first, second in zip(*lives, strict=True):
+        runs.append((one.run(24).actions, one.prior.log_prob(every_plan(4, 2))))
+    for first, second in zip(*runs, strict=True):
         assert torch.equal(first, second)
     assert agent(GRUPrior(4, hidden_size=4)).training == {}
 
@@ -191,8 +191,8 @@ def test_what_others_put_there_stays(tmp_path):
     load(tmp_path / "prior-mine")
 
 
-def test_another_life_that_is_cut_off_leaves_the_last(tmp_path, monkeypatch):
-    """Two agents at the same time of their lives, one of which is not saved whole."""
+def test_another_run_that_is_cut_off_leaves_the_last(tmp_path, monkeypatch):
+    """Two agents at the same time of their runs, the second of which is not saved completely."""
     one, other = agent(seed=1), agent(seed=2)
     for some in (one, other):
         some.run(12)
@@ -270,13 +270,13 @@ def test_damaged_checkpoints(tmp_path):
 @pytest.mark.parametrize(
     ("given", "word"),
     [
-        ({"replan_every": 0}, "every"),
-        ({"plan_length": 5}, "plan_length: a multiple of every = 2"),
+        ({"replan_every": 0}, "replan_every"),
+        ({"plan_length": 5}, "plan_length: a multiple of replan_every = 2"),
         ({"learn_every": 8}, "learn_every: a multiple of plan_length = 6"),
         ({"num_rollouts": 0}, "num_rollouts"),
-        ({"retention": 0.0}, "keep"),
+        ({"retention": 0.0}, "retention"),
         ({"learn_every": "12"}, "learn_every"),
-        ({"training": {"max_steps": 5}}, "training: a MarkovPrior counts"),
+        ({"training": {"max_steps": 5}}, "max_steps"),
         ({"prior": MarkovPrior(3, 1)}, "3 actions, the world 4"),
     ],
 )
@@ -285,8 +285,8 @@ def test_bad_agents(given, word):
         agent(**given)
 
 
-def test_bad_lives():
-    with refuses("num_steps: a multiple of every = 2"):
+def test_bad_runs():
+    with refuses("num_steps: a multiple of replan_every = 2"):
         agent().run(5)
     with refuses("num_steps"):
         agent().run(0)
@@ -294,10 +294,10 @@ def test_bad_lives():
     with refuses("fewer"):
         agent(prior, planner=sampler(prior, length=1)).run(4)
     with refuses("state"):
-        Agent(home(), sampler(prior), prior, torch.zeros(3, dtype=torch.long))
+        Agent(foraging(), sampler(prior), prior, torch.zeros(3, dtype=torch.long))
 
 
-def test_alone_it_starts_anywhere():
-    world, prior = home(), MarkovPrior(4, 1)
+def test_without_states_it_is_one_agent():
+    world, prior = foraging(), MarkovPrior(4, 1)
     one = Agent(world, sampler(prior), prior, generator=seeded(0))
     assert one.run(3).actions.shape == (1, 3)

@@ -38,10 +38,10 @@ def test_nothing_is_forgotten_where_all_is_kept():
     assert set(replay.tensors()) == {"actions", "context"}
 
 
-@pytest.mark.parametrize("keep", [0, -1, 1.5, float("nan")])
-def test_bad_keep(keep):
-    with refuses("keep"):
-        Replay(keep)
+@pytest.mark.parametrize("retention", [0, -1, 1.5, float("nan")])
+def test_bad_retention(retention):
+    with refuses("retention"):
+        Replay(retention)
 
 
 def test_what_does_not_fit_is_refused():

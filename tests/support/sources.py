@@ -219,7 +219,7 @@ CORRIDOR = torch.tensor([[0, 1], [0, 2], [1, 3], [2, 3]])  # four cells in a row
 
 
 def corridor(reward=(0.0, 0.0, 0.0, 0.0), legal=None):
-    return TabularWorld(CORRIDOR, torch.as_tensor(reward), legal)
+    return TabularWorld(CORRIDOR.clone(), torch.as_tensor(reward), legal)
 
 
 def distances(height, width, goal, torus):

@@ -99,7 +99,7 @@ def spoiled(**changes):
         (spoiled(score=lambda score: score[:, None]), "shapes"),
         (spoiled(final_state=lambda state: (state + 1) % 12), "final_state"),
         (spoiled(model_steps=lambda steps: steps - 1), "model_steps"),
-        (spoiled(plan=lambda plan: 1 - plan), "score|does not exist"),
+        (spoiled(plan=lambda plan: 1 - plan), "score|not legal"),
         (spoiled(lengths=lambda lengths: torch.zeros(20, dtype=torch.long)), "lengths"),
         (lambda prior, length, number: SamplingPlanner(prior, length, 1), "below the best"),
         (Careless, "global generator"),

@@ -111,7 +111,7 @@ def test_bad_worlds():
         "above it": lambda: ForagingWorld(table, growth * 0, 5),
         "one layout": lambda: ForagingWorld(maze(7, 7, num_layouts=2), growth, 5),
         "radius": lambda: patches(table, 1, 0),
-        "without chance": lambda: patches(stochastic_world(0), 1, 1),
+        "deterministic": lambda: patches(stochastic_world(0), 1, 1),
     }.items():
         with refuses(word):
             make()
@@ -155,12 +155,13 @@ def test_the_oracle_breaks_ties_at_random():
     assert p_value(2 * plan[:, 0] + plan[:, 1], torch.ones(4)) > FALSE_ALARM
 
 
-def test_many_starts_are_planned_for_in_parts(monkeypatch):
+def test_many_starts_are_planned_for_in_parts():
     world = forage(gridworld(4, 4))
     state = world.reset(20, seeded(0))
     whole = ForagingOracle(6).plan(world, state, seeded(0))
-    monkeypatch.setattr("neuroprior.planners.planner.STEPS_AT_ONCE", 2000)
-    parts = ForagingOracle(6).plan(world, state, seeded(0))
+    planner = ForagingOracle(6)
+    planner.steps_at_once = 2000
+    parts = planner.plan(world, state, seeded(0))
     assert torch.equal(whole.score, parts.score)
     assert whole.model_steps == parts.model_steps == 6 * 2**3 * 16 * 4
 
@@ -175,7 +176,7 @@ def test_no_starts_are_no_trouble():
 def test_where_the_oracle_cannot_be_asked():
     many = ForagingWorld(corridor(), torch.ones(1, 4), 5, 13)
     for world in (random_world(0), many):
-        with refuses("ForagingWorld without chance, of at most 12 items"):
+        with refuses("deterministic ForagingWorld of at most 12 items"):
             ForagingOracle(3).plan(world, world.reset(2, seeded(0)))
 
 

@@ -6,7 +6,6 @@ import torch
 
 from neuroprior import SamplingPlanner, SteppedWorld, UniformPrior, from_gymnasium
 from neuroprior.testing import check_world
-from neuroprior.worlds.gymnasium import stepping as gymnasium_stepping
 from tests.support import environments
 from tests.support.sources import every_plan, refuses, seeded
 
@@ -73,12 +72,12 @@ def test_an_end_is_kept():
 
 
 @pytest.mark.parametrize("kept", [1, 5])
-def test_what_is_not_kept_is_found_again(kept, monkeypatch):
+def test_what_is_not_kept_is_found_again(kept):
     plans = every_plan(2, 6)[None]
     first, second = (from_gymnasium("CartPole-v1", horizon=12) for _ in range(2))
     one = first.rollout(first.reset(1), plans, keep_states=True)
     shown = first.observe(one.final_state[0])
-    monkeypatch.setattr(gymnasium_stepping, "MOST_KEPT", kept)
+    second.max_kept = kept
     other = second.rollout(second.reset(1), plans, keep_states=True)
     assert one.states.equal(other.states)
     assert one.rewards.equal(other.rewards)
@@ -102,13 +101,12 @@ def test_replayed_and_copied_environments_go_the_same_way(env):
 
 
 @pytest.mark.parametrize("kept", [1, 4096])
-def test_replays_go_on_only_from_their_own_history(kept, monkeypatch):
-    monkeypatch.setattr(gymnasium_stepping, "MOST_KEPT", kept)
-    world = from_gymnasium(environments.Forgetful(), method="step", horizon=10)
+def test_replays_go_on_only_from_their_own_history(kept):
+    world, other = (from_gymnasium(environments.Forgetful(), method="step", horizon=10) for _ in range(2))
+    world.max_kept = other.max_kept = kept
     plans = torch.randint(2, (1, 12, 8), generator=seeded(6))
     whole = world.rollout(world.reset(1), plans, keep_states=True)
     seen = world.observe(whole.states[0].flatten(0, 1)).view(12, 8, -1)
-    other = from_gymnasium(environments.Forgetful(), method="step", horizon=10)
     state = other.reset(12)
     for t in range(8):  # step by step, the last row's environment is there when the first row's is needed
         state, reward = other.step(state, plans[0, :, t])
@@ -155,11 +153,11 @@ def test_reset_draws_seeds():
 
 
 def test_refusals():
-    with refuses("differs between two courses of the same actions from seed 0", "cannot be replayed"):
+    with refuses("differs between two trajectories of the same actions from seed 0", "cannot be replayed"):
         from_gymnasium(environments.Unseeded(), method="step")
     world = from_gymnasium(environments.Corridor(), method="step", horizon=3)
     state = world.rollout(world.reset(1), torch.zeros(1, 1, 3, dtype=torch.long)).final_state[:, 0]
-    with refuses("it has 3 actions behind it", "longer horizon"):
+    with refuses("it holds 3 actions", "longer horizon"):
         world.step(state, torch.tensor([0]))
     for wrong, words in (
         (torch.zeros(1, 5, dtype=torch.long), "shape [B, 6]"),

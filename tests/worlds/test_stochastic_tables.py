@@ -1,4 +1,4 @@
-"""Tables with chance: draws against their probabilities, rollouts against enumerated courses, and what is refused."""
+"""Stochastic tables: draws against probabilities, rollouts against enumerated trajectories, and what is refused."""
 
 import itertools
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from neuroprior import TabularWorld
 from neuroprior.testing import check_world
 from neuroprior.values import can_reach, q_learning, value_iteration
-from neuroprior.worlds.chance import Chance
+from neuroprior.worlds.outcomes import Outcomes
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded, stochastic_world, trajectories
 
 KINDS = ("S", "SA", "SAK", "WS", "WSA", "WSAK")
@@ -22,13 +22,13 @@ def test_draws_are_quantiles(outcomes):
     weight = torch.randint(4, (6, outcomes), generator=seeded(outcomes)).double()
     weight[:, torch.randint(outcomes, (), generator=seeded(0))] += 1
     upper = weight.cumsum(-1) / weight.sum(-1, keepdim=True)
-    chance = Chance((weight / weight.sum(-1, keepdim=True)).view(3, 2, outcomes), torch.device("cpu"))
+    outcomes_of = Outcomes((weight / weight.sum(-1, keepdim=True)).view(3, 2, outcomes), torch.device("cpu"))
     edges = upper.float().flatten()
     uniform = torch.cat([edges, edges - 2**-24, torch.arange(64) / 64, torch.tensor([1 - 2**-24])])
     uniform = uniform[(uniform >= 0) & (uniform < 1)]
     for row in range(6):
         for dtype in (torch.int32, torch.int64):
-            drawn = chance.draw(torch.full((len(uniform),), row, dtype=dtype), uniform)
+            drawn = outcomes_of.draw(torch.full((len(uniform),), row, dtype=dtype), uniform)
             assert drawn.dtype == dtype
             want = (upper[row].float() <= uniform[:, None]).sum(-1)
             assert (drawn - row * outcomes).tolist() == want.tolist()
@@ -39,10 +39,10 @@ def test_rounding_cannot_draw_past_the_last_outcome():
     """n times 1 / n need not sum to 1 in floating point; the last one, of probability 0, must not be drawn."""
     for n in (3, 10, 49, 1000):
         probability = torch.tensor([1 / n] * n + [0.0] * 3).view(1, 1, n + 3)
-        chance = Chance(probability, torch.device("cpu"))
-        assert chance.draw(torch.tensor([0]), torch.tensor([1 - 2**-24])).tolist() == [n - 1]
-    chance = Chance(torch.tensor([[[0.5, 0.5 - 9e-7, 0.0]]], dtype=torch.float64), torch.device("cpu"))
-    assert chance.draw(torch.tensor([0]), torch.tensor([1 - 2**-24])).tolist() == [1]
+        outcomes_of = Outcomes(probability, torch.device("cpu"))
+        assert outcomes_of.draw(torch.tensor([0]), torch.tensor([1 - 2**-24])).tolist() == [n - 1]
+    outcomes_of = Outcomes(torch.tensor([[[0.5, 0.5 - 9e-7, 0.0]]], dtype=torch.float64), torch.device("cpu"))
+    assert outcomes_of.draw(torch.tensor([0]), torch.tensor([1 - 2**-24])).tolist() == [1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -221,7 +221,7 @@ def test_a_cube_of_rewards_is_ambiguous():
 
 
 def test_nobody_is_sure_to_reach_a_goal_by_chance():
-    with refuses("chance"):
+    with refuses("deterministic"):
         can_reach(stochastic_world(0), torch.tensor([0]), 1, 3)
 
 

@@ -1,12 +1,15 @@
 """Worlds: transitions by hand, fast rollouts against stepping, reward maps, legal actions, and what is refused."""
 
+import sys
+from types import ModuleType
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Rollout, TabularWorld, World, gridworld
-from neuroprior.worlds import compiled
+from neuroprior.worlds import tabular
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
 
 UP, RIGHT, DOWN, LEFT = range(4)
@@ -109,11 +112,11 @@ def test_step_by_hand(kind):
 @pytest.mark.parametrize("layout", ["uint8", "int32", "int64", "strided", "permuted", "broadcast"])
 @pytest.mark.parametrize("size", [(4, 5, 6), (1, 1, 1), (4, 5, 0), (4, 0, 3), (0, 3, 2)])
 @pytest.mark.parametrize("by", ["tensors", "loop"])
-def test_rollout_is_stepping(monkeypatch, kind, layout, size, by):
+def test_rollout_is_stepping(kind, layout, size, by):
     if by == "loop":
         pytest.importorskip("numba")
-    monkeypatch.setattr(compiled, "MANY", 0 if by == "loop" else 2**60)
     world = random_world(1, kind)
+    world.compile_from = 0 if by == "loop" else 2**60
     batch, num_plans, length = size
     state = world.reset(batch, seeded(0))
     plans = torch.randint(3, size, generator=seeded(1))
@@ -143,7 +146,7 @@ def test_each_thread_follows_plans_of_its_own(monkeypatch, threads):
     world = random_world(1, "WS")
     state, plans = world.reset(3, seeded(0)), torch.randint(3, (3, 7, 4), generator=seeded(1))
     want = world.rollout(state, plans)
-    monkeypatch.setattr(compiled, "MANY", 0)
+    world.compile_from = 0
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     got = world.rollout(state, plans)
     assert torch.equal(got.final_state, want.final_state)
@@ -152,28 +155,39 @@ def test_each_thread_follows_plans_of_its_own(monkeypatch, threads):
 
 def test_the_loop_is_for_what_it_can_do(monkeypatch):
     pytest.importorskip("numba")
-    few, reward = torch.zeros(1, 1, 1, dtype=torch.uint8), torch.zeros(1, 1)
-    assert not compiled.worth_compiling(few, reward)
-    assert compiled.worth_compiling(few.expand(1, compiled.MANY, 1), reward)
-    monkeypatch.setattr(compiled, "MANY", 0)
-    assert compiled.worth_compiling(few, reward.double())
-    assert not compiled.worth_compiling(few, reward.half())
-    assert not compiled.worth_compiling(few, reward.requires_grad_())
-    monkeypatch.setattr(compiled, "_loop", lambda: None)
-    assert not compiled.worth_compiling(few, torch.zeros(1, 1))
+    from neuroprior.worlds import compiled
+
+    compiled_sizes, rollout = [], compiled.rollout
+    monkeypatch.setattr(compiled, "rollout", lambda *given: compiled_sizes.append(given[4].numel()) or rollout(*given))
+    table, state = torch.zeros(1, 1, dtype=torch.long), torch.zeros(1, dtype=torch.long)
+    few = torch.zeros(1, 1, 1, dtype=torch.uint8)
+    world = TabularWorld(table, torch.zeros(1))
+    world.rollout(state, few)
+    assert compiled_sizes == []
+    world.rollout(state, few.expand(1, world.compile_from, 1))
+    assert compiled_sizes == [world.compile_from]
+    for reward, times in ((torch.ones(1).double(), 2), (torch.ones(1).half(), 2)):
+        world = TabularWorld(table, reward)
+        world.compile_from = 0
+        assert world.rollout(state, few).rewards.dtype == reward.dtype
+        assert len(compiled_sizes) == times
 
 
-def test_a_numba_that_does_not_work_is_left_alone(monkeypatch):
-    monkeypatch.setattr(compiled, "find_spec", lambda name: object())
-    monkeypatch.setattr(compiled, "import_module", lambda name: {}["Numba needs another NumPy"])
-    monkeypatch.setattr(compiled, "MANY", 0)
-    compiled._loop.cache_clear()
+@pytest.mark.parametrize("error", [ImportError, KeyError])
+def test_a_numba_that_does_not_work_is_left_alone(monkeypatch, error):
+    class Wrong(ModuleType):
+        def __getattr__(self, name):
+            raise error(name)
+
+    monkeypatch.setitem(sys.modules, "numba", Wrong("numba"))
+    monkeypatch.delitem(sys.modules, "neuroprior.worlds.compiled", raising=False)
+    tabular._load_compiled.cache_clear()
     world = random_world(1, "WS")
+    world.compile_from = 0
     try:
-        assert not compiled.worth_compiling(torch.zeros(1, 1, 1, dtype=torch.uint8), torch.zeros(1, 1))
         assert world.rollout(world.reset(2, seeded(0)), torch.zeros(2, 3, 4).long()).rewards.shape == (2, 3, 4)
     finally:
-        compiled._loop.cache_clear()
+        tabular._load_compiled.cache_clear()
 
 
 def test_rollout_takes_stored_actions():

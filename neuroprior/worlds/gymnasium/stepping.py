@@ -9,20 +9,17 @@ from torch import Tensor
 
 from neuroprior._checks import check_range, is_integer
 from neuroprior._random import generator_on
-from neuroprior.worlds.gymnasium.opening import GOES_ON, Episode, Seen, action_names, stacked
-from neuroprior.worlds.gymnasium.snapshots import exact_copier, unlike_itself
+from neuroprior.worlds.gymnasium.environment import RUNNING, Episode, Transition, action_names, stacked
+from neuroprior.worlds.gymnasium.states import exact_copier, nondeterminism
 from neuroprior.worlds.world import Rollout, World, check_plans
-
-MOST_KEPT = 4096
-"""How many histories are kept with what they showed and a copy of the environment there."""
 
 _SEED, _LENGTH, _ENDED, _ACTIONS = 0, 1, 2, 3
 
 
 class _Kept(NamedTuple):
-    """What a history led to."""
+    """The last transition of a history, and a copy of the environment there."""
 
-    seen: Seen
+    last: Transition
     saved: Any
 
 
@@ -30,33 +27,35 @@ class SteppedWorld(World):
     """A Gymnasium environment that is stepped, not tabulated; see `from_gymnasium`.
 
     A state is a history, int64 `[3 + horizon]`: the number of its seed, how many actions were taken, whether the
-    episode has ended (0 or 1), and the actions, filled up with zeros. So states are plain data: they can be kept,
-    compared and moved. Histories that were met lately are kept together with copies of the environment there; the same
-    history is never stepped twice while it is kept.
+    episode has ended (0 or 1), and the actions, filled up with zeros. So states are plain data: they can be stored,
+    compared and moved. Recent histories are cached with copies of the environment there, and not stepped again.
 
     Args:
         env: a Gymnasium environment with discrete actions.
         seeds: episodes start from one of these.
-        horizon: the most actions that a state may have behind it.
+        horizon: the most actions that a state may hold.
 
     Attributes:
-        copies: whether copies of the environment go on as it does, and are used; else histories are replayed.
+        copies: whether copies of the environment behave as it does, and are used; else histories are replayed.
         seeds, horizon: as given.
         num_layouts: number of seeds.
-        action_names: what the environment calls its actions, or None.
+        action_names: the names of the actions, or None.
+        max_kept: the most histories that are cached.
 
     Raises:
         ValueError: the environment does not repeat itself from a seed; the message says what differed.
     """
 
+    max_kept: int = 4096
+
     def __init__(self, env: Any, seeds: list[int], horizon: int) -> None:
         self._episode = Episode(env)
         for seed in seeds:
-            difference = unlike_itself(self._episode, seed)
+            difference = nondeterminism(self._episode, seed)
             if difference is not None:
                 raise ValueError(
-                    f"env: {difference} differs between two courses of the same actions from seed {seed}:"
-                    " it cannot be replayed, and no plan be tried in it"
+                    f"env: {difference} differs between two trajectories of the same actions from seed"
+                    f" {seed}: it cannot be replayed, so no plan can be tried in it"
                 )
         self.seeds, self.num_layouts, self.horizon = tuple(seeds), len(seeds), horizon
         self.num_actions, self.action_names = self._episode.num_actions, action_names(env)
@@ -67,17 +66,17 @@ class SteppedWorld(World):
         self._kept: OrderedDict[tuple[int, ...], _Kept] = OrderedDict()
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """States `[batch_size, 3 + horizon]` without actions behind them, with equal probability for each seed."""
+        """States `[batch_size, 3 + horizon]` before the first action, with equal probability for each seed."""
         generator = generator_on(generator, "cpu")
         state = torch.zeros(batch_size, _ACTIONS + self.horizon, dtype=torch.long)
         state[:, _SEED] = torch.randint(len(self.seeds), (batch_size,), generator=generator)
         return state
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """See `World.step`. `generator` draws nothing: what is random is settled by the seed.
+        """See `World.step`. `generator` draws nothing: what is random is determined by the seed.
 
         Raises:
-            ValueError: a state has `horizon` actions behind it already.
+            ValueError: a state holds `horizon` actions already.
         """
         after, rewards = self._try(state, action[:, None])
         return after[:, 0], rewards[:, 0]
@@ -85,7 +84,7 @@ class SteppedWorld(World):
     def rollout(
         self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
     ) -> Rollout:
-        """See `World.rollout`. Plans with the same beginning are stepped through it once."""
+        """See `World.rollout`. Prefixes that plans share are stepped once."""
         self.check_state(state)
         check_plans(plans, len(state), self.num_actions)
         batch, num_plans, length = plans.shape
@@ -99,12 +98,12 @@ class SteppedWorld(World):
         )
 
     def observe(self, state: Tensor) -> Tensor:
-        """What the environment showed after each history: float32 `[N, C]`, texts left out."""
+        """The environment's observation after each history: float32 `[N, C]`, texts left out."""
         if len(state) == 0:
             return self.observe(self.reset(1).to(state.device))[:0]
         distinct, which = state.cpu().unique(dim=0, return_inverse=True)
-        seen = [self._meet(history).features for history in self._histories(distinct)]
-        return stacked(seen).to(state.device)[which.to(state.device)]
+        found = [self._last(history).features for history in self._histories(distinct)]
+        return stacked(found).to(state.device)[which.to(state.device)]
 
     def layout(self, state: Tensor) -> Tensor:
         """The number of the seed from which each state `[..., 3 + horizon]` comes, between 0 and num_layouts - 1."""
@@ -140,18 +139,18 @@ class SteppedWorld(World):
     def _follow(self, start: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
         """The rewards of `plans [N, L]`, and whether the episode has ended after each action: `[N, L]`."""
         rewards, ended = np.zeros(plans.shape, np.float32), np.ones(plans.shape, bool)
-        over = start[:, _ENDED].tolist()
-        # The environment is foreign and knows one episode at a time.
+        already = start[:, _ENDED].tolist()
+        # An environment runs one episode at a time.
         for row, (history, plan) in enumerate(zip(self._histories(start), plans.tolist(), strict=True)):
-            for t, action in enumerate([] if over[row] else plan):
+            for t, action in enumerate([] if already[row] else plan):
                 if len(history) > self.horizon:
                     raise ValueError(
-                        f"state: it has {self.horizon} actions behind it, which is all that it can hold;"
+                        f"state: it holds {self.horizon} actions, which is all that it can;"
                         " give from_gymnasium a longer horizon"
                     )
                 history = (*history, action)
-                seen = self._meet(history)
-                rewards[row, t], ended[row, t] = seen.reward, seen.end != GOES_ON
+                last = self._last(history)
+                rewards[row, t], ended[row, t] = last.reward, last.end != RUNNING
                 if ended[row, t]:
                     break
         return torch.from_numpy(rewards), torch.from_numpy(ended)
@@ -160,22 +159,22 @@ class SteppedWorld(World):
         """The number of the seed and the actions since, of each state."""
         return [(row[_SEED], *row[_ACTIONS : _ACTIONS + row[_LENGTH]]) for row in state.tolist()]
 
-    def _meet(self, history: tuple[int, ...]) -> Seen:
-        """What the last step of a history showed."""
+    def _last(self, history: tuple[int, ...]) -> Transition:
+        """The last transition of a history."""
         kept = self._kept.get(history)
         if kept is None:
-            seen, saved = self._reach(history), None
-            if self._copier is not None and seen.end == GOES_ON:
+            last, saved = self._reach(history), None
+            if self._copier is not None and last.end == RUNNING:
                 saved = self._copier.save(self._episode.env)
-            kept = self._kept[history] = _Kept(seen, saved)
-            if len(self._kept) > MOST_KEPT:
+            kept = self._kept[history] = _Kept(last, saved)
+            if len(self._kept) > self.max_kept:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(history)
-        return kept.seen
+        return kept.last
 
-    def _reach(self, history: tuple[int, ...]) -> Seen:
-        """Bring the environment to the end of a history, from as near as it can be had."""
-        seen, done = None, 0
+    def _reach(self, history: tuple[int, ...]) -> Transition:
+        """Bring the environment to the end of a history, from the nearest cached state; the last transition."""
+        last, done = None, 0
         if self._copier is not None:
             for length in range(len(history) - 1, 0, -1):
                 kept = self._kept.get(history[:length])
@@ -186,12 +185,12 @@ class SteppedWorld(World):
             done = len(self._at)
         if not done:
             self._episode.env, done = self._env, 1
-            seen = Seen(self._episode.reset(self.seeds[history[0]]), 0.0, GOES_ON)
+            last = Transition(self._episode.reset(self.seeds[history[0]]), 0.0, RUNNING)
         for action in history[done:]:
-            seen = self._episode.step(action)
+            last = self._episode.step(action)
         self._at = history
-        assert seen is not None
-        return seen
+        assert last is not None
+        return last
 
 
 def _append(state: Tensor, action: Tensor, ended: Tensor) -> Tensor:

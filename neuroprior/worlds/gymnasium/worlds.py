@@ -1,24 +1,20 @@
 """`from_gymnasium`: Gymnasium environments as worlds."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from neuroprior.worlds.gymnasium.enumeration import enumerate_states
-from neuroprior.worlds.gymnasium.opening import import_gymnasium, open_environment
+from neuroprior.worlds.gymnasium.environment import import_gymnasium, open_environment
 from neuroprior.worlds.gymnasium.stepping import SteppedWorld
-from neuroprior.worlds.gymnasium.tables import has_table, read_table
+from neuroprior.worlds.gymnasium.tables import enumerate_states, has_table, read_table
 from neuroprior.worlds.world import World
-
-if TYPE_CHECKING:
-    import gymnasium
 
 METHODS = ("auto", "table", "enumerate", "step")
 
 
 def from_gymnasium(
-    env: "str | gymnasium.Env[Any, Any]",
+    env: Any,
     *,
     method: Literal["auto", "table", "enumerate", "step"] = "auto",
     max_states: int = 100_000,
@@ -32,38 +28,38 @@ def from_gymnasium(
 ) -> World:
     """A Gymnasium environment with discrete actions as a world to plan in.
 
-    Three ways, by `method`:
+    Three methods:
 
-    - "table": toy texts (Taxi, CliffWalking, FrozenLake), whose transitions are read from their attribute `P`, with
-      their probabilities where there is chance. The result is a `TabularWorld`.
-    - "enumerate": any environment without chance (MiniGrid, say). All states that can be reached are found breadth
-      first, by copies of the environment, and told apart by all attributes of it and its wrappers; the result is a
-      `TabularWorld`. Attributes that only count steps are set back to their first value before each step: there is no
-      limit of time, and where a reward falls with the number of steps (MiniGrid: 1 - 0.9 * steps / max_steps), it is
-      the reward of a first step. What was found is checked: transitions are repeated under other random numbers (those
-      of the first 100 states and of every tenth), and random walks compared with the environment.
+    - "table": toy texts (Taxi, CliffWalking, FrozenLake), whose transitions and their probabilities are read from their
+      attribute `P`. The result is a `TabularWorld`.
+    - "enumerate": any deterministic environment (such as MiniGrid). All reachable states are found breadth first, by
+      copies of the environment, and compared by all attributes of it and its wrappers; the result is a `TabularWorld`.
+      Attributes that only count steps are set back to their first value before each step: there is no time limit, and
+      where a reward decreases with the number of steps (MiniGrid: 1 - 0.9 * steps / max_steps), it is the reward of a
+      first step. The result is checked: transitions are repeated under other random numbers (those of the first 100
+      states and of every tenth), and random walks are compared with the environment.
     - "step": any environment, by stepping copies of it, slowly. A state is the history of actions since the start,
-      which is replayed where copies cannot be trusted; the result is a `SteppedWorld`. Chance is whatever the seed
-      makes of it: plans are tried on the very course that they would take.
+      which is replayed where the environment cannot be copied; the result is a `SteppedWorld`. What is random is
+      determined by the seed: a plan that is executed gives what it gave when it was tried.
 
     "auto" takes a table where there is one, steps where observations are real numbers, and enumerates otherwise.
 
-    An episode that has ended stays as it is, without rewards. Limits of time that are wrappers (`TimeLimit`) are taken
-    off: plans have a length of their own.
+    An episode that has ended stays in its last state, without rewards. Time limits that are wrappers (`TimeLimit`) are
+    removed: plans have a length of their own.
 
     Args:
-        env: the name of an environment, or one, which is then reset, stepped and copied.
+        env: the name of an environment, or a `gymnasium.Env`, which is then reset, stepped and copied.
         method: see above.
         max_states: for "enumerate": the most states that may be found.
-        horizon: for "step": the most actions that a state may have behind it.
-        starts: "initial": `reset` draws how episodes start. "any": any state that can be reached and is no end, with
-            equal probability; for tables.
-        observations: for "enumerate": `observe` returns the environment's observations, float32 `[N, C]` (texts left
-            out), rather than the number of the state. "step" always does; the toy texts show the number of the state.
+        horizon: for "step": the most actions that a state may hold.
+        starts: for tables: "initial": `reset` draws the initial states of episodes; "any": any reachable state that is
+            not terminal, with equal probability.
+        observations: for "enumerate": `observe` gives the environment's observations, float32 `[N, C]` (texts left
+            out), instead of the number of the state. "step" always does; toy texts give the number of the state.
         progress: for "enumerate": show a bar on a terminal (needs rich).
-        seed: of the environment's `reset`; for all but "table", which draws starts itself.
-        seeds: several of them, instead of `seed`: layouts, disjoint and side by side in one world, that `reset` draws
-            from equally. `world.layout(state)` tells which.
+        seed: of the environment's `reset`; not for "table", which draws starts itself.
+        seeds: several of them, instead of `seed`: disjoint layouts in one world, which `reset` draws with equal
+            probability; see `world.layout(state)`.
         **make_options: for `gymnasium.make`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Opening Gymnasium environments: without time limits, with named actions, and their observations as features."""
+"""Gymnasium environments: opened without time limits, with named actions, and observations as features."""
 
 import copy
 from enum import Enum
@@ -14,13 +14,12 @@ NAMES = {
     "CliffWalkingEnv": ("up", "right", "down", "left"),
     "FrozenLakeEnv": ("left", "down", "right", "up"),
 }
-"""What the actions of the toy texts mean, which they do not say themselves."""
+"""Names of the actions of the toy texts, which do not give them."""
 
 REGISTERED_BY = {"MiniGrid": "minigrid", "BabyAI": "minigrid"}
 """Modules that must be imported before Gymnasium knows their environments."""
 
-
-GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
+RUNNING, TERMINATED, TRUNCATED = 0, 1, 2
 
 
 def open_environment(env: Any, options: dict[str, Any]) -> Any:
@@ -78,7 +77,7 @@ def _without_limits(gymnasium: Any, env: Any) -> Any:
 
 
 def layers(env: Any) -> list[Any]:
-    """The wrappers of an environment from outside in, and last itself."""
+    """The wrappers of an environment from the outermost inwards, and the environment itself."""
     found = [env]
     while "env" in vars(found[-1]):
         found.append(found[-1].env)
@@ -86,7 +85,7 @@ def layers(env: Any) -> list[Any]:
 
 
 def action_names(env: Any) -> tuple[str, ...] | None:
-    """What the environment calls its actions, where that is known."""
+    """The names of the actions, where they are known."""
     base, number = env.unwrapped, int(env.action_space.n)
     names = NAMES.get(type(base).__name__, ())
     actions = getattr(base, "actions", None)
@@ -95,8 +94,8 @@ def action_names(env: Any) -> tuple[str, ...] | None:
     return names if len(names) == number else None
 
 
-class Seen(NamedTuple):
-    """What one step shows: the observation, float32 `[C]`, the reward, and whether and how the episode ends."""
+class Transition(NamedTuple):
+    """What one step gives: the observation, float32 `[C]`, the reward, and whether and how the episode ended."""
 
     features: np.ndarray[Any, Any]
     reward: float
@@ -121,18 +120,18 @@ class Episode:
         self._spaces = import_gymnasium().spaces
 
     def reset(self, seed: int) -> np.ndarray[Any, Any]:
-        """Start anew from `seed`; the observation, float32 `[C]`."""
+        """Reset from `seed`; the observation, float32 `[C]`."""
         observation, _ = self.env.reset(seed=seed)
         return self._features(self._space, observation)
 
-    def step(self, action: int) -> Seen:
-        """What comes of an action."""
+    def step(self, action: int) -> Transition:
+        """Take an action."""
         observation, reward, terminated, truncated, _ = self.env.step(action + self._first)
-        end = TERMINATED if terminated else TRUNCATED if truncated else GOES_ON
-        return Seen(self._features(self._space, observation), float(reward), end)
+        end = TERMINATED if terminated else TRUNCATED if truncated else RUNNING
+        return Transition(self._features(self._space, observation), float(reward), end)
 
     def _features(self, space: Any, observation: Any) -> np.ndarray[Any, Any]:
-        """Numbers of any space, one after another; texts and what else has no fixed length are left out."""
+        """The numbers in an observation of any space, concatenated, without texts and all that has no fixed length."""
         spaces = self._spaces
         if isinstance(space, spaces.Dict):
             parts = [self._features(inner, observation[key]) for key, inner in space.spaces.items()]
@@ -146,10 +145,10 @@ class Episode:
 
 
 def _is_flat(space: Any) -> bool:
-    """Whether elements of a space are a fixed number of numbers."""
+    """Whether each element of a space has the same number of numbers."""
     try:
         return bool(space.is_np_flattenable)
-    except NotImplementedError:  # spaces of others' making need not say
+    except NotImplementedError:  # custom spaces need not say
         return False
 
 

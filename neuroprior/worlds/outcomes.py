@@ -1,4 +1,4 @@
-"""Chance in a table: what may come of each action in each cell, with which probability, and how it is drawn."""
+"""Random outcomes in tables: drawing one of the outcomes of each action in each cell."""
 
 import torch
 from torch import Tensor
@@ -6,15 +6,16 @@ from torch import Tensor
 SUM_TOLERANCE = 1e-6
 
 
-class Chance:
+class Outcomes:
     """Draws one of K outcomes of each action in each cell, by the inverse of their distribution function.
 
     Args:
         probability: floating point `[S, A, K]`, each row of which sums to 1 within 1e-6.
-        device: where to draw.
+        device: where the tables are.
 
     Attributes:
         probability: the same in float64, each row divided by its sum.
+        num_outcomes: K.
 
     Raises:
         ValueError: a probability is negative or not a number, or a row does not sum to 1.
@@ -25,23 +26,23 @@ class Chance:
         probability = probability.to(device).double()
         self.probability = probability / probability.sum(-1, keepdim=True)
         self.num_outcomes = probability.shape[-1]
-        # Summed in float64 and then rounded, the last outcome of any probability ends at exactly 1, which no number
-        # drawn is past.
+        # Summed in float64 and then rounded, the last possible outcome ends at exactly 1, and all numbers drawn are
+        # below.
         upper = self.probability.cumsum(-1).float()
-        # Searching halves a power of two; what fills it up is never reached.
+        # The binary search needs a power of two; what fills it up is never reached.
         width = 1 << (self.num_outcomes - 1).bit_length()
         self._steps = [width >> n for n in range(1, width.bit_length())]
         self._width = width
         self._upper = torch.nn.functional.pad(upper, (0, width - self.num_outcomes), value=1.0).view(-1)
 
-    def to(self, device: torch.device | str) -> "Chance":
+    def to(self, device: torch.device | str) -> "Outcomes":
         """Move the tables to `device`; returns self."""
         self.probability, self._upper = self.probability.to(device), self._upper.to(device)
         return self
 
     @property
     def table_size(self) -> int:
-        """How many numbers the table that is searched has."""
+        """Numbers in the table that is searched."""
         return len(self._upper)
 
     def draw(self, taken: Tensor, uniform: Tensor) -> Tensor:
