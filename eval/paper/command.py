@@ -1,8 +1,7 @@
 """`python -m eval paper`: the simulations of the paper, its figures beside ours."""
 
 from collections.abc import Callable
-from dataclasses import asdict, fields
-from functools import partial
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,9 +10,9 @@ from jsonargparse.typing import NonNegativeFloat, NonNegativeInt, PositiveInt
 from rich.console import Console
 
 from eval.paper import figures, first_simulation, second_simulation, value_quality
-from eval.paper.first_simulation import PAPER_BEST, PAPER_MATRIX, PAPER_STRUCTURE, PROTOCOLS, FirstSettings, Protocol
-from eval.paper.planners import ANY_PREFIX
-from eval.paper.second_simulation import PAPER_REACHED, SCALES, SecondSettings
+from eval.paper.first_simulation import PAPER_BEST, PAPER_MATRIX, PAPER_STRUCTURE
+from eval.paper.planners import ANY_PREFIX, PaperSettings
+from eval.paper.second_simulation import PAPER_REACHED
 from neuroprior._files import versions, write_json
 from neuroprior._jobs import Progress
 from neuroprior.report.document import Column, printed, records, table, write_figures, write_frames
@@ -79,24 +78,19 @@ def paper(
     for name in ("size", "value_functions"):
         if settings[name] < 2:
             raise ValueError(f"{name}: an integer of at least 2 is expected, not {settings[name]}")
-    first = FirstSettings(**{field.name: settings[field.name] for field in fields(FirstSettings)})
-    second = SecondSettings(**{field.name: settings[field.name] for field in fields(SecondSettings)})
+    own = PaperSettings(**{name: value for name, value in settings.items() if name not in ("protocols", "out")})
     folder, console = Path(out), Console()
     folder.mkdir(parents=True, exist_ok=True)
     results = {"settings": settings, "versions": versions(), "seed": seed}
-    if protocols == "all":
-        parts = partial(_all_protocols, first), partial(_all_scales, second)
-    else:
-        parts = partial(_first, first, Protocol(edges, ties, learn_from)), partial(_second, second)
-    for part in parts:
-        results |= part(console, folder)
+    for part in (_all_protocols, _all_scales) if protocols == "all" else (_first, _second):
+        results |= part(own, console, folder)
         write_json(folder / "results.json", results)  # an error in the second part does not lose the first
     console.print(f"written to {folder}")
 
 
-def _first(settings: FirstSettings, protocol: Protocol, console: Console, folder: Path) -> dict[str, Any]:
+def _first(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
     with Progress("first simulation", 11, 11) as progress:
-        result = first_simulation.simulate(protocol, settings, neural=True, finished=progress.advance)
+        result = first_simulation.simulate(settings, neural=True, finished=progress.advance)
     rows, paired, matrix = result.table(), result.paired(), result.matrix()
     columns: dict[str, Column] = {
         "planner": "planner",
@@ -112,7 +106,7 @@ def _first(settings: FirstSettings, protocol: Protocol, console: Console, folder
         "best: at least as good as each of the paper's four planners; ties count for each. normalised score: reward /"
         " that of the oracle, which tries all plans. optimal: starts with a plan as good as the oracle's."
     )
-    title = f"Table 1 ({protocol}; {_amount(settings)})"
+    title = f"Table 1 ({settings.protocol}; {_amount(settings)})"
     console.print(printed(title, table(rows, columns, caption)))
     if len(paired):
         console.print(printed("Table 1, paired over worlds: optimal, points", _paired_table(paired)))
@@ -129,11 +123,12 @@ def _first(settings: FirstSettings, protocol: Protocol, console: Console, folder
         "world": figures.plans_in_world(result),
     }
     write_figures(folder, pictures)
-    found = {"protocol": asdict(protocol), "rows": records(rows), "paired": records(paired)}
+    protocol = {"edges": settings.edges, "ties": settings.ties, "learn_from": settings.learn_from}
+    found = {"protocol": protocol, "rows": records(rows), "paired": records(paired)}
     return {"simulation_1": found | {"transition_matrix": learned.tolist()}}
 
 
-def _second(settings: SecondSettings, console: Console, folder: Path) -> dict[str, Any]:
+def _second(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
     with Progress("second simulation", 23, 23) as progress:
         result, priors = second_simulation.simulate(settings, full=True, finished=progress.advance)
         quality = value_quality.measure(settings, priors, progress.advance)
@@ -173,8 +168,8 @@ def _second(settings: SecondSettings, console: Console, folder: Path) -> dict[st
     return {"simulation_2": found | {"value_quality": records(quality)}}
 
 
-def _all_protocols(settings: FirstSettings, console: Console, folder: Path) -> dict[str, Any]:
-    with Progress("protocols", len(PROTOCOLS), len(PROTOCOLS)) as progress:
+def _all_protocols(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
+    with Progress("protocols", 8, 8) as progress:
         rows = first_simulation.all_protocols(settings, progress.advance)
     repeat, turn, reverse, _ = PAPER_STRUCTURE
     own = {"edges": "paper", **PAPER_BEST, "repeat": repeat, "turn": turn, "reverse": reverse}
@@ -194,13 +189,13 @@ def _all_protocols(settings: FirstSettings, console: Console, folder: Path) -> d
     for what in ("table", "matrix"):
         best = records(rows.nsmallest(1, f"{what}_distance")[["edges", "ties", "learn_from"]])[0]
         nearest[what] = best
-        console.print(f"nearest to the paper's {what}: [bold]{Protocol(**best)}[/bold]")
+        console.print(f"nearest to the paper's {what}: [bold]{replace(settings, **best).protocol}[/bold]")
     write_frames(folder, {"protocols": rows})
     return {"protocols": records(rows), "nearest": nearest}
 
 
-def _all_scales(settings: SecondSettings, console: Console, folder: Path) -> dict[str, Any]:
-    with Progress("initial values", 2 * len(SCALES), 2 * len(SCALES)) as progress:
+def _all_scales(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
+    with Progress("initial values", 8, 8) as progress:
         rows = second_simulation.all_scales(settings, progress.advance)
     columns: dict[str, Column] = {"edges": "edges", "initial\nvalues": "initial_scale:g"}
     columns |= {SHORT[name]: _percent(name) for name in PAPER_REACHED}
@@ -216,7 +211,7 @@ def _all_scales(settings: SecondSettings, console: Console, folder: Path) -> dic
     return {"scales": records(rows), "nearest_scale": best}
 
 
-def _amount(settings: FirstSettings) -> str:
+def _amount(settings: PaperSettings) -> str:
     worlds = "1 world" if settings.worlds == 1 else f"{settings.worlds} worlds"
     return f"{worlds} x {settings.starts:,} starts, {settings.num_plans} plans of {settings.length} moves"
 

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from eval.paper.first_simulation import FirstResult
-from eval.paper.planners import ANY_PREFIX
-from eval.paper.second_simulation import SecondResult, SecondSettings
+from eval.paper.planners import ANY_PREFIX, PaperSettings
+from eval.paper.second_simulation import SecondResult
 from neuroprior import GridWorld
 from neuroprior.worlds.grid import MOVES
 
@@ -66,37 +66,36 @@ def matrices(named: dict[str, Tensor]) -> Figure:
 def plans_in_world(result: FirstResult) -> Figure:
     """A world with its rewards, a start, and the plan of each planner from there."""
     world = result.world
-    row, column = _dividing_start(result)
-    start = result.states[row, column]
+    chosen = _dividing_start(result)
+    start = result.states.flatten()[chosen]
     figure = Figure(figsize=(7.4, 5.2))
     axes = figure.subplots()
     rewards = world.reward[int(world.reward_map(start))].view(world.height, world.width)
     picture = axes.imshow(rewards.numpy(), cmap="Greys_r", vmin=0, vmax=1)
     figure.colorbar(picture, ax=axes, label="reward", shrink=0.8)
-    count = len(result.names)
-    for k, name in enumerate(result.names):
-        plan = result.plans[k, row, column]
-        score = float(result.scores[k, row, column])
-        shift = (k - (count - 1) / 2) / 14
-        _draw_plan(axes, world, start, plan[plan >= 0], COLORS[name], f"{name}: {score:.3f}", shift)
+    for k, (name, decision) in enumerate(result.decisions.items()):
+        shift = (k - (len(result.decisions) - 1) / 2) / 14
+        label = f"{name}: {float(decision.score[chosen]):.3f}"
+        _draw_plan(axes, world, start, decision.plan[chosen].long(), COLORS[name], label, shift)
     y, x = world.coordinates(start).tolist()
     axes.plot(x, y, "o", color="white", markeredgecolor="black", markersize=9, zorder=5)
-    axes.set_title(f"start and chosen plans (best possible: {float(result.oracle[row, column]):.3f})")
+    axes.set_title(f"start and chosen plans (best possible: {float(result.oracle.flatten()[chosen]):.3f})")
     axes.set(xticks=[], yticks=[])
     axes.legend(loc="center left", bbox_to_anchor=(1.25, 0.5), frameon=False, title="reward at the end")
     return figure
 
 
-def _dividing_start(result: FirstResult) -> tuple[int, int]:
+def _dividing_start(result: FirstResult) -> int:
     """The first start, well inside the grid, where the most planners found different rewards."""
-    scores = result.scores.sort(0).values
+    decisions, world = result.decisions.values(), result.world
+    scores = torch.stack([decision.score for decision in decisions]).sort(0).values
     different = (scores[1:] > scores[:-1]).sum(0)
-    places = result.world.coordinates(result.states)
-    sides = torch.tensor([result.world.height, result.world.width])
+    places = world.coordinates(result.states.flatten())
+    sides = torch.tensor([world.height, world.width])
     margin = torch.minimum(places, sides - 1 - places).amin(-1)
-    reach = result.plans.shape[-1]
-    different[margin < min(reach, (int(sides.min()) - 1) // 2)] -= len(result.names)
-    return divmod(int(different.argmax()), result.states.shape[1])
+    reach = max(decision.plan.shape[1] for decision in decisions)
+    different[margin < min(reach, (int(sides.min()) - 1) // 2)] -= len(decisions)
+    return int(different.argmax())
 
 
 def _draw_plan(axes: Axes, world: GridWorld, start: Tensor, plan: Tensor, color: str, label: str, shift: float) -> None:
@@ -113,26 +112,24 @@ def _draw_plan(axes: Axes, world: GridWorld, start: Tensor, plan: Tensor, color:
     axes.plot(*places[-1:].T.flip(0).numpy(), "s", color=color, markersize=5)
 
 
-def values_and_stuck(result: SecondResult, settings: SecondSettings) -> Figure:
+def values_and_stuck(result: SecondResult, settings: PaperSettings) -> Figure:
     """The first approximate value function, the exact one, and where each planner gets stuck.
 
     Only starts count that can end on the goal with whole plans.
     """
-    names = [name for name in result.names if not name.endswith(ANY_PREFIX)]
+    whole = {name: done for name, done in result.pursuits.items() if not name.endswith(ANY_PREFIX)}
     figure = Figure(figsize=(11, 7.6))
     panels = figure.subplots(3, 3).flatten()
-    size, exact = settings.size, result.exact
+    size, exact, able = settings.size, result.exact, result.ceiling[0]
     maps = {"approximate values": result.values[0], "exact values": exact}
     for axes, (title, values) in zip(panels, maps.items(), strict=False):
         values = values.clone()
         values[settings.goal] = exact[exact < exact[settings.goal]].max()
         axes.imshow(values.view(size, size).numpy(), cmap="Greys_r", vmin=0)
         axes.set_title(title)
-    for axes, name in zip(panels[len(maps) :], names, strict=True):
-        k = result.names.index(name)
-        able = result.ceiling[0]
-        stuck = able & ~result.reached[k, 0]
-        cells = result.world.cell(result.final_state[k, 0][stuck]).bincount(minlength=size**2)
+    for axes, (name, done) in zip(panels[len(maps) :], whole.items(), strict=True):
+        stuck = able & ~done.reached[: len(able)]
+        cells = result.world.cell(done.final_state[: len(able)][stuck]).bincount(minlength=size**2)
         axes.imshow((cells / able.sum()).sqrt().view(size, size).numpy(), cmap="Reds", vmin=0, vmax=0.5)
         axes.set_title(f"{name}: {100 * int(stuck.sum()) / max(int(able.sum()), 1):.0f} % stuck")
     for axes in panels:

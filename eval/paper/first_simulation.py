@@ -1,14 +1,15 @@
 """The paper's first simulation: planners on a grid of random rewards, with and without behavioural priors."""
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import replace
+from itertools import product
+from typing import Any, NamedTuple
 
 import pandas as pd
 import torch
 from torch import Tensor
 
-from eval.paper.planners import Finished, GridSettings, fit_priors, groups, make_planners, over_groups
-from neuroprior import ExhaustivePlanner, GridWorld, MarkovPrior, Plans, gridworld, oracle
+from eval.paper.planners import Finished, PaperSettings, fit_priors, groups, make_planners, over_groups
+from neuroprior import Decision, ExhaustivePlanner, GridWorld, MarkovPrior, Plans, gridworld, oracle
 from neuroprior.analysis.statistics import best_of, paired_difference
 from neuroprior.plans import all_plans
 
@@ -21,76 +22,40 @@ PAPER_STRUCTURE = (0.60, 0.20, 0.0, 0.20)
 PAPER_MATRIX = torch.tensor([[PAPER_STRUCTURE[(b - a) % 4] for b in range(4)] for a in range(4)])
 
 
-@dataclass(frozen=True)
-class Protocol:
-    """What the paper leaves open."""
-
-    edges: Literal["wall", "torus"]
-    ties: Literal["uniform", "first"]
-    learn_from: Literal["all", "shortest"]
-
-    def __str__(self) -> str:
-        return f"{self.edges}, {self.ties} ties, learn from {self.learn_from}"
-
-
-PROTOCOLS = [
-    Protocol(edges, ties, learn_from)
-    for edges in ("torus", "wall")
-    for ties in ("uniform", "first")
-    for learn_from in ("all", "shortest")
-]
-
-
-@dataclass(frozen=True, kw_only=True)
-class FirstSettings(GridSettings):
-    """Settings of the first simulation; see `paper`."""
-
-    worlds: int
-    reward_power: float
-
-
 class FirstResult(NamedTuple):
-    """The first simulation under one protocol: K planners, W worlds, n starts in each.
+    """The first simulation under one protocol, in W worlds with n starts in each.
 
     Attributes:
-        names: of the planners.
-        scores: `[K, W, n]`.
-        oracle: `[W, n]`: the best of any plan.
-        plans: `[K, W, n, L]`, padded with -1 where a planner's plans are shorter.
-        states: `[W, n]`: the starts.
         world: in which the planners were compared.
-        model_steps: single simulator steps for each start, by planner.
+        states: `[W, n]`: the starts.
+        decisions: of each planner, for the starts flattened.
+        oracle: `[W, n]`: the best of any plan.
         transition_matrix: `[A, A]` of the Markov prior of order 1.
     """
 
-    names: list[str]
-    scores: Tensor
-    oracle: Tensor
-    plans: Tensor
-    states: Tensor
     world: GridWorld
-    model_steps: list[int]
+    states: Tensor
+    decisions: dict[str, Decision]
+    oracle: Tensor
     transition_matrix: Tensor
 
     def table(self) -> pd.DataFrame:
         """Table 1: in what share of the starts each planner was best of the paper's four, and its rewards."""
-        best = best_of(torch.cat([self.scores, self.oracle[None]]), [self.names.index(name) for name in PAPER_BEST])
+        scores = {name: decision.score.view(self.states.shape) for name, decision in self.decisions.items()}
+        scores["oracle"] = self.oracle
+        best = best_of(torch.stack(list(scores.values())), [list(scores).index(name) for name in PAPER_BEST])
         rows = []
-        for k, (name, scores) in enumerate([*zip(self.names, self.scores, strict=True), ("oracle", self.oracle)]):
-            share = over_groups(best[k])
-            rows.append(
-                {
-                    "planner": name,
-                    "best": share.mean,
-                    "low": share.low,
-                    "high": share.high,
-                    "paper": PAPER_BEST.get(name),
-                    "mean_reward": float(scores.double().mean()),
-                    "oracle_share": float(scores.double().sum() / self.oracle.double().sum()),
-                    "at_oracle": float((scores >= self.oracle).double().mean()),
-                    "model_steps": None if name == "oracle" else self.model_steps[k],
-                }
-            )
+        for (name, own), hits in zip(scores.items(), best, strict=True):
+            share = over_groups(hits)
+            row = {"planner": name, "best": share.mean, "low": share.low, "high": share.high}
+            row |= {
+                "paper": PAPER_BEST.get(name),
+                "mean_reward": float(own.double().mean()),
+                "oracle_share": float(own.double().sum() / self.oracle.double().sum()),
+                "at_oracle": float((own >= self.oracle).double().mean()),
+                "model_steps": None if name == "oracle" else self.decisions[name].model_steps,
+            }
+            rows.append(row)
         return pd.DataFrame(rows, dtype=object)
 
     def paired(self) -> pd.DataFrame:
@@ -100,7 +65,10 @@ class FirstResult(NamedTuple):
         """
         if len(self.oracle) < 2:
             return pd.DataFrame()
-        optimal = dict(zip(self.names, (self.scores >= self.oracle).double().mean(2), strict=True))
+        optimal = {
+            name: (decision.score.view(self.states.shape) >= self.oracle).double().mean(1)
+            for name, decision in self.decisions.items()
+        }
         markov = max((name for name in optimal if "markov" in name), key=lambda name: float(optimal[name].mean()))
         pairs = [(name, markov) for name in ("gru", "transformer")]
         return pd.DataFrame(
@@ -134,78 +102,57 @@ class FirstResult(NamedTuple):
         }
 
 
-def simulate(protocol: Protocol, settings: FirstSettings, neural: bool, finished: Finished) -> FirstResult:
+def simulate(settings: PaperSettings, neural: bool, finished: Finished) -> FirstResult:
     """Collect plans, fit the priors, and let all planners plan from the same starts.
 
     With one world the priors learn in the world where they are used; with more, in as many other ones.
 
     Args:
-        protocol: what the paper leaves open.
-        settings: how much.
+        settings: see `paper`.
         neural: also fit a GRU and a transformer.
         finished: is called 11 times, without neural priors 7 times.
     """
     worlds, starts = settings.worlds, settings.starts
     generator = torch.Generator().manual_seed(settings.seed)
     more = worlds if worlds > 1 else 0
-    world = gridworld(
-        settings.size,
-        settings.size,
-        protocol.edges,
-        reward_power=settings.reward_power,
-        num_worlds=worlds + more,
-        seed=settings.seed,
-    )
+    side, power = settings.size, settings.reward_power
+    world = gridworld(side, side, settings.edges, reward_power=power, num_worlds=worlds + more, seed=settings.seed)
     cells = world.num_states
     learn_in = more * cells + torch.randint(worlds * cells, (settings.training_plans,), generator=generator)
-    plans = training_plans(world, learn_in, settings.depth, protocol, generator)
+    plans = training_plans(world, learn_in, settings, generator)
     finished("collecting plans")
     planners = make_planners(fit_priors(plans, settings.seed, neural, generator, finished), settings)
     start = torch.randint(cells, (worlds, starts), generator=generator)
     states = start + torch.arange(worlds)[:, None] * cells
-    decisions = []
+    decisions = {}
     for name, planner in planners.items():
-        decisions.append(planner.plan(world, states.flatten(), generator))
+        decisions[name] = planner.plan(world, states.flatten(), generator)
         finished(f"planning: {name}")
-    width = max(decision.plan.shape[1] for decision in decisions)
-    chosen = [
-        torch.nn.functional.pad(decision.plan.long(), (0, width - decision.plan.shape[1]), value=-1)
-        for decision in decisions
-    ]
-    best = oracle(world, states.flatten(), settings.length)
+    best = oracle(world, states.flatten(), settings.length).view(states.shape)
     finished("planning: oracle")
-    shape = (len(planners), worlds, starts)
-    return FirstResult(
-        list(planners),
-        torch.stack([decision.score for decision in decisions]).view(shape),
-        best.view(shape[1:]),
-        torch.stack(chosen).view(*shape, width),
-        states,
-        world,
-        [decision.model_steps for decision in decisions],
-        MarkovPrior(4, 1).fit(plans).transition_matrix(),
-    )
+    return FirstResult(world, states, decisions, best, MarkovPrior(4, 1).fit(plans).transition_matrix())
 
 
-def all_protocols(settings: FirstSettings, finished: Finished) -> pd.DataFrame:
-    """Table 1 under every protocol, with the Markov priors alone; `finished` is called once for each of `PROTOCOLS`."""
+def all_protocols(settings: PaperSettings, finished: Finished) -> pd.DataFrame:
+    """Table 1 under every protocol, with the Markov priors alone; `finished` is called 8 times."""
     rows: list[dict[str, Any]] = []
-    for protocol in PROTOCOLS:
-        rows.append(asdict(protocol) | simulate(protocol, settings, neural=False, finished=lambda _: None).summary())
-        finished(str(protocol))
+    for choice in product(("torus", "wall"), ("uniform", "first"), ("all", "shortest")):
+        protocol: dict[str, Any] = dict(zip(("edges", "ties", "learn_from"), choice, strict=True))
+        changed = replace(settings, **protocol)
+        rows.append(protocol | simulate(changed, neural=False, finished=lambda _: None).summary())
+        finished(changed.protocol)
     return pd.DataFrame(rows)
 
 
-def training_plans(
-    world: GridWorld, states: Tensor, depth: int, protocol: Protocol, generator: torch.Generator
-) -> Plans:
+def training_plans(world: GridWorld, states: Tensor, settings: PaperSettings, generator: torch.Generator) -> Plans:
     """The executed plans of the deterministic planner that the priors learn from."""
+    depth = settings.depth
     decision = ExhaustivePlanner(depth).plan(world, states, generator)
     actions = decision.plan.long()
-    if protocol.ties == "first":
+    if settings.ties == "first":
         actions = _first_of_equals(world, states, decision.score, depth)
     kept = torch.ones(len(states), dtype=torch.bool)
-    if protocol.learn_from == "shortest":
+    if settings.learn_from == "shortest":
         gap = (world.coordinates(states) - world.coordinates(decision.final_state)).abs()
         if world.edges == "torus":
             gap = torch.minimum(gap, torch.tensor([world.height, world.width]) - gap)

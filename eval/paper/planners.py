@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -28,17 +28,36 @@ Finished = Callable[[str], None]
 """Is called with the name of each part of a simulation that is finished."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridSettings:
-    """Settings of either simulation; see `paper`."""
+@dataclass(frozen=True)
+class PaperSettings:
+    """The options of `paper`, which explains them."""
 
+    worlds: int
     starts: int
     training_plans: int
     size: int
+    edges: Literal["torus", "wall"]
+    ties: Literal["uniform", "first"]
+    learn_from: Literal["all", "shortest"]
+    reward_power: float
+    value_functions: int
+    q_steps: int
+    initial_scale: float
+    max_plans: int
     depth: int
     length: int
     num_plans: int
     seed: int
+
+    @property
+    def protocol(self) -> str:
+        """What the paper leaves open of its first simulation."""
+        return f"{self.edges}, {self.ties} ties, learn from {self.learn_from}"
+
+    @property
+    def goal(self) -> int:
+        """The goal's cell of the second simulation, in the middle."""
+        return self.size // 2 * self.size + self.size // 2
 
 
 def fit_priors(
@@ -61,7 +80,7 @@ def fit_priors(
 
 def make_planners(
     priors: dict[str, Prior],
-    settings: GridSettings,
+    settings: PaperSettings,
     value: Callable[[Tensor], Tensor] | None = None,
     any_prefix: bool = False,
 ) -> dict[str, Planner]:

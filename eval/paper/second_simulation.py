@@ -1,14 +1,14 @@
 """The paper's second simulation: planning on values that are only approximately right."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
 import pandas as pd
 import torch
 from torch import Tensor
 
-from eval.paper.planners import ANY_PREFIX, Finished, GridSettings, fit_priors, groups, make_planners, over_groups
+from eval.paper.planners import ANY_PREFIX, Finished, PaperSettings, fit_priors, groups, make_planners, over_groups
 from neuroprior import ExhaustivePlanner, GridWorld, Planner, Plans, Prior
 from neuroprior.analysis.statistics import Interval, paired_difference
 from neuroprior.values import can_reach, q_learning, value_iteration
@@ -18,22 +18,6 @@ PAPER_REACHED = {"deterministic": 0.2422, "random": 0.3952, "markov-1": 0.4961, 
 
 SCALES = (1e-4, 0.01, 0.1, 1.0)
 """Scales of Q-learning's initial values that are compared."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SecondSettings(GridSettings):
-    """Settings of the second simulation; see `paper`."""
-
-    edges: Literal["wall", "torus"]
-    value_functions: int
-    q_steps: int
-    initial_scale: float
-    max_plans: int
-
-    @property
-    def goal(self) -> int:
-        """The goal's cell, in the middle."""
-        return self.size // 2 * self.size + self.size // 2
 
 
 class Pursuit(NamedTuple):
@@ -57,37 +41,37 @@ class Pursuit(NamedTuple):
 
 
 class SecondResult(NamedTuple):
-    """The second simulation: K planners, V value functions, n starts for each.
+    """The second simulation: V value functions with n starts for each.
 
     Attributes:
-        names: of the planners.
-        reached: `[K, V, n]` bool.
-        final_state: `[K, V, n]`.
+        world: with a map of rewards, all 0, for each value function.
+        states: `[V, n]`: the starts.
+        pursuits: of each planner, from the starts flattened.
         ceiling: `[V, n]` bool: starts that can end on the goal at all.
         prefix_ceiling: the same for planners that may end a plan after any action.
         values: `[V, S]`: the value functions, without the goal's infinity.
         exact: `[S]`: the true values.
-        world: with a map of rewards, all 0, for each value function.
-        model_steps: single simulator steps for each plan, by planner.
     """
 
-    names: list[str]
-    reached: Tensor
-    final_state: Tensor
+    world: GridWorld
+    states: Tensor
+    pursuits: dict[str, Pursuit]
     ceiling: Tensor
     prefix_ceiling: Tensor
     values: Tensor
     exact: Tensor
-    world: GridWorld
-    model_steps: list[int]
+
+    def reached(self) -> dict[str, Tensor]:
+        """From which starts each planner reached the goal: `[V, n]` bool."""
+        return {name: done.reached.view(self.states.shape) for name, done in self.pursuits.items()}
 
     def table(self) -> pd.DataFrame:
         """Table 2: the share of starts from which each planner reached the goal, and its simulator steps a plan."""
         rows = []
-        for name, reached, steps in zip(self.names, self.reached, self.model_steps, strict=True):
+        for name, reached in self.reached().items():
             share = over_groups(reached)
             row = {"planner": name, "reached": share.mean, "low": share.low, "high": share.high}
-            rows.append(row | {"paper": PAPER_REACHED.get(name), "model_steps": steps})
+            rows.append(row | {"paper": PAPER_REACHED.get(name), "model_steps": self.pursuits[name].model_steps})
         return pd.DataFrame(rows)
 
     def ceilings(self) -> dict[str, float]:
@@ -100,7 +84,8 @@ class SecondResult(NamedTuple):
 
         The interval is a bootstrap's, over value functions: the distance is no mean of independent values.
         """
-        shares = torch.stack([self.reached[self.names.index(name)].double().mean(1) for name in PAPER_REACHED])
+        reached = self.reached()
+        shares = torch.stack([reached[name].double().mean(1) for name in PAPER_REACHED])
         paper = torch.tensor(list(PAPER_REACHED.values()), dtype=torch.double)[:, None]
         functions = shares.shape[1]
         again = torch.randint(functions, (resamples, functions), generator=torch.Generator().manual_seed(0))
@@ -110,7 +95,7 @@ class SecondResult(NamedTuple):
 
     def paired(self) -> pd.DataFrame:
         """Priors compared with none, and neural ones with the best Markov prior, paired over value functions."""
-        share = dict(zip(self.names, self.reached.double().mean(2), strict=True))
+        share = {name: reached.double().mean(1) for name, reached in self.reached().items()}
         rows = []
         for suffix in ("", ANY_PREFIX):
             best = max((f"markov-{k}" for k in (1, 2, 3)), key=lambda name: float(share[name + suffix].mean()))
@@ -149,7 +134,7 @@ def pursue(
     )
 
 
-def empty_world(settings: SecondSettings, num_maps: int) -> GridWorld:
+def empty_world(settings: PaperSettings, num_maps: int) -> GridWorld:
     """The grid, without rewards, once for each value function."""
     return GridWorld(settings.size, settings.size, settings.edges, torch.zeros(num_maps, settings.size**2))
 
@@ -162,7 +147,7 @@ def objective(values: Tensor, goal: int) -> Callable[[Tensor], Tensor]:
     return lambda state: flat[state]
 
 
-def random_starts(settings: SecondSettings, num_maps: int, number: int, generator: torch.Generator) -> Tensor:
+def random_starts(settings: PaperSettings, num_maps: int, number: int, generator: torch.Generator) -> Tensor:
     """`number` states for each of `num_maps` value functions, uniform over all cells but the goal: `[V, n]`."""
     cell = torch.randint(settings.size**2 - 1, (num_maps, number), generator=generator)
     cell = cell + (cell >= settings.goal)
@@ -170,7 +155,7 @@ def random_starts(settings: SecondSettings, num_maps: int, number: int, generato
 
 
 def learn(
-    settings: SecondSettings, values: Tensor, neural: bool, generator: torch.Generator, finished: Finished
+    settings: PaperSettings, values: Tensor, neural: bool, generator: torch.Generator, finished: Finished
 ) -> dict[str, Prior]:
     """The priors that learn from the whole plans that the deterministic planner executes under `values [V, S]`."""
     world = empty_world(settings, len(values))
@@ -187,7 +172,7 @@ def learn(
     return fit_priors(plans, settings.seed, neural, generator, finished)
 
 
-def simulate(settings: SecondSettings, full: bool, finished: Finished) -> tuple[SecondResult, dict[str, Prior]]:
+def simulate(settings: PaperSettings, full: bool, finished: Finished) -> tuple[SecondResult, dict[str, Prior]]:
     """Learn value functions, collect plans under some of them, and pursue the goal under the others.
 
     Args:
@@ -217,29 +202,22 @@ def simulate(settings: SecondSettings, full: bool, finished: Finished) -> tuple[
     planners = make_planners(priors, settings, value)
     if full:
         planners |= make_planners(priors, settings, value, any_prefix=True)
-    pursuits = []
+    pursuits = {}
     for name, planner in planners.items():
-        pursuits.append(pursue(planner, world, states.flatten(), settings.goal, settings.max_plans, generator))
+        pursuits[name] = pursue(planner, world, states.flatten(), settings.goal, settings.max_plans, generator)
         finished(f"planning: {name}")
-    return SecondResult(
-        list(planners),
-        torch.stack([done.reached.view(states.shape) for done in pursuits]),
-        torch.stack([done.final_state.view(states.shape) for done in pursuits]),
-        ceiling(world, states, settings),
-        ceiling(world, states, settings, any_prefix=True),
-        values,
-        value_iteration(world, goal=settings.goal)[0],
-        world,
-        [done.model_steps for done in pursuits],
-    ), priors
+    ceilings = ceiling(world, states, settings), ceiling(world, states, settings, any_prefix=True)
+    exact = value_iteration(world, goal=settings.goal)[0]
+    return SecondResult(world, states, pursuits, *ceilings, values, exact), priors
 
 
-def all_scales(settings: SecondSettings, finished: Finished) -> pd.DataFrame:
+def all_scales(settings: PaperSettings, finished: Finished) -> pd.DataFrame:
     """Table 2 with both edges and all `SCALES`, with the Markov priors alone; `finished` is called 8 times."""
     rows: list[dict[str, Any]] = []
+    edges: Literal["torus", "wall"]
     for edges in ("torus", "wall"):
         for scale in SCALES:
-            changed = SecondSettings(**(asdict(settings) | {"edges": edges, "initial_scale": scale}))
+            changed = replace(settings, edges=edges, initial_scale=scale)
             result, _ = simulate(changed, full=False, finished=lambda _: None)
             table = result.table()
             distance, low, high = result.distance()
@@ -249,7 +227,7 @@ def all_scales(settings: SecondSettings, finished: Finished) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def ceiling(world: GridWorld, states: Tensor, settings: SecondSettings, any_prefix: bool = False) -> Tensor:
+def ceiling(world: GridWorld, states: Tensor, settings: PaperSettings, any_prefix: bool = False) -> Tensor:
     """Which starts can end on the goal at all, with plans of either length: bool, in the shape of `states`.
 
     With whole plans, that is after some number of them; with any prefix of plans, after at most all their moves.

@@ -7,8 +7,8 @@ import torch
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from eval.paper.planners import Finished, make_planners, over_groups
-from eval.paper.second_simulation import SecondSettings, ceiling, empty_world, objective, pursue, random_starts
+from eval.paper.planners import Finished, PaperSettings, make_planners, over_groups
+from eval.paper.second_simulation import ceiling, empty_world, objective, pursue, random_starts
 from neuroprior import Prior
 from neuroprior.values import network_approximation, q_learning, tile_approximation, value_iteration
 
@@ -19,7 +19,7 @@ AGENTS = 20
 """Value functions of each kind and level that is random; they share the starts."""
 
 
-def families(settings: SecondSettings, generator: torch.Generator) -> dict[str, dict[str, Tensor]]:
+def families(settings: PaperSettings, generator: torch.Generator) -> dict[str, dict[str, Tensor]]:
     """Value functions `[V, S]` of each kind, from what should be worse to better: kind -> level -> values."""
     world = empty_world(settings, 1)
     exact = value_iteration(world, goal=settings.goal)
@@ -54,7 +54,7 @@ def families(settings: SecondSettings, generator: torch.Generator) -> dict[str, 
     }
 
 
-def measure(settings: SecondSettings, priors: dict[str, Prior], finished: Finished) -> pd.DataFrame:
+def measure(settings: PaperSettings, priors: dict[str, Prior], finished: Finished) -> pd.DataFrame:
     """Success of each planner under each value function, and how good the value functions are.
 
     Intervals are over value functions, or over starts where there is but one. `finished` is called for each of five

@@ -13,9 +13,10 @@ import pytest
 import torch
 
 from eval.__main__ import main
-from eval.paper.first_simulation import PAPER_BEST, Protocol, training_plans
+from eval.paper.first_simulation import PAPER_BEST, training_plans
+from eval.paper.planners import PaperSettings
 from eval.paper.second_simulation import PAPER_REACHED
-from neuroprior import gridworld
+from neuroprior import Plans, gridworld
 from neuroprior._files import write_json
 
 SMALL = ["--worlds=3", "--starts=20", "--training-plans=200", "--size=8", "--num-plans=16"]
@@ -98,15 +99,19 @@ def test_protocols_choose_the_plans_they_say(edges: str) -> None:
     world = gridworld(9, 9, edges, num_worlds=2, seed=3)
     states = world.reset(300, torch.Generator().manual_seed(0))
     generator = torch.Generator().manual_seed(1)
-    first = training_plans(world, states, 3, Protocol(edges, "first", "all"), generator)
-    uniform = training_plans(world, states, 3, Protocol(edges, "uniform", "all"), generator)
+
+    def chosen(ties: str, learn_from: str) -> Plans:
+        settings = PaperSettings(2, 300, 300, 9, edges, ties, learn_from, 1.0, 2, 0, 0.01, 1, 3, 3, 16, 0)
+        return training_plans(world, states, settings, generator)
+
+    first, uniform = chosen("first", "all"), chosen("uniform", "all")
     for plans in (first, uniform):
         rewards = world.rollout(states, plans.actions[:, None]).rewards[:, 0, -1]
         every = torch.cartesian_prod(*[torch.arange(4)] * 3)
         scores = world.rollout(states, every.expand(300, -1, -1)).rewards[..., -1]
         assert rewards.equal(scores.amax(1))
     assert first.actions.long().equal(every[(scores == scores.amax(1, keepdim=True)).int().argmax(1)])
-    shortest = training_plans(world, states, 3, Protocol(edges, "uniform", "shortest"), generator)
+    shortest = chosen("uniform", "shortest")
     assert 0 < len(shortest) < 300
     # A plan of three moves is a shortest one exactly if it never reverses a move that it made (or bumps).
     for plan in shortest.actions.tolist():

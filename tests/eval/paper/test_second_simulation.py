@@ -5,7 +5,8 @@ import itertools
 import pytest
 import torch
 
-from eval.paper.second_simulation import SecondSettings, ceiling, empty_world, objective, pursue, random_starts
+from eval.paper.planners import PaperSettings
+from eval.paper.second_simulation import ceiling, empty_world, objective, pursue, random_starts
 from eval.paper.value_quality import families, quality
 from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, oracle
 from neuroprior.testing import FALSE_ALARM
@@ -13,9 +14,13 @@ from neuroprior.testing.chi_square import chi_square
 from neuroprior.values import can_reach, value_iteration
 
 
-def settings(**changes: object) -> SecondSettings:
+def settings(**changes: object) -> PaperSettings:
     small: dict[str, object] = {
+        "worlds": 1,
         "edges": "torus",
+        "ties": "uniform",
+        "learn_from": "all",
+        "reward_power": 1.0,
         "value_functions": 3,
         "starts": 40,
         "size": 6,
@@ -28,7 +33,7 @@ def settings(**changes: object) -> SecondSettings:
         "num_plans": 32,
         "seed": 0,
     }
-    return SecondSettings(**(small | changes))
+    return PaperSettings(**(small | changes))
 
 
 def generator(seed: int = 0) -> torch.Generator:
