@@ -49,7 +49,9 @@ def test_other_code_does_not_find_old_results(tmp_path: Path, monkeypatch: pytes
     environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}", "PYTHONDONTWRITEBYTECODE": "1"}
 
     def found() -> str:
-        done = subprocess.run([*how, program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [*how, program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        )
         return done.stdout.strip()
 
     assert found() == "1"
@@ -91,7 +93,9 @@ def test_a_damaged_result_is_named(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
-    program = "from tests.support.jobs import *; from neuroprior._jobs import JobRun; from pathlib import Path; import sys\n"
+    program = (
+        "from tests.support.jobs import *; from neuroprior._jobs import JobRun; from pathlib import Path; import sys\n"
+    )
     program += "try: JobRun(slow_square, Path(sys.argv[1]), {}).do(list(range(40)), processes=2)\n"
     program += "except KeyboardInterrupt as error: sys.exit(str(error))"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

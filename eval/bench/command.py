@@ -1,47 +1,31 @@
 """`python -m eval bench`: speed against what a user would take in place of the library, in the same run."""
 
-import time
-from collections.abc import Iterator
-from importlib.util import find_spec
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
-from statistics import median
-from typing import Any
+from typing import Any, Literal
 
+import pandas as pd
 import torch
+from jsonargparse.typing import PositiveInt
 from rich.console import Console
 
-from eval.bench import gpu as bench_gpu
-from eval.bench import limits as bench_limits
-from eval.bench import sizes as bench_sizes
+from eval.bench import limits, sizes
 from eval.bench.figures import peers_figure, sizes_figure
-from eval.bench.jobs import JOBS, Job
-from eval.bench.tables import gpu_table, limits_table, peers_table, sizes_table
-from eval.bench.timing import import_seconds, seconds
-from eval.paper.figures import save
-from neuroprior._files import versions, write_csv, write_json
+from eval.bench.jobs import JOBS, ON_DEVICES, against_peers, on_device
+from eval.bench.timing import Rows, import_times
+from neuroprior._files import versions, write_json
+from neuroprior._jobs import Progress
+from neuroprior.report.document import Column, printed, table, write_figures, write_frames
+from neuroprior.report.page import Table
 
-PARTS = ("peers", "sizes", "limits", "imports", "gpu")
-
-LISTS: dict[str, dict[str, Any]] = {
-    "parts": {
-        "default": list(PARTS),
-        "choices": PARTS,
-        "help": "against peers; cost against size; share of the machine's limit; time to import; a GPU; default: all",
-    },
-    "jobs": {"default": list(JOBS), "choices": tuple(JOBS), "help": "what to measure against peers; all by default"},
-}
-"""Options that take several words."""
-
-GOAL = 1.1
-"""`import neuroprior` should take no more than so many times as long as `import torch`."""
-
-Rows = list[dict[str, Any]]
+Part = Literal["peers", "sizes", "limits", "imports", "gpu"]
 
 
 def bench(
-    parts: list[str] = list(PARTS),  # noqa: B006
-    jobs: list[str] = list(JOBS),  # noqa: B006
-    repetitions: int = 5,
+    parts: Sequence[Part] = ("peers", "sizes", "limits", "imports", "gpu"),
+    jobs: Sequence[str] = tuple(JOBS),
+    repetitions: PositiveInt = 5,
     scale: float = 1.0,
     out: str = "runs/bench",
 ) -> None:
@@ -56,113 +40,129 @@ def bench(
         scale: share of each job that is done, and of the largest size; the goals are for 1.
         out: folder to write to.
     """
-    if repetitions < 1:
-        raise ValueError(f"repetitions: at least 1 is expected, not {repetitions}")
+    for name in set(jobs) - set(JOBS):
+        raise ValueError(f"jobs: some of {', '.join(JOBS)} are expected, not {name}")
     if not 0 < scale <= 1:
         raise ValueError(f"scale: a number above 0 and at most 1 is expected, not {scale}")
     console, folder = Console(), Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     settings = {"repetitions": repetitions, "scale": scale, "threads": torch.get_num_threads()}
+    works: list[tuple[str, str, Callable[[], Iterable[dict[str, Any]]]]] = []
+    if "peers" in parts:
+        works += [("peers", name, partial(against_peers, name, scale, repetitions, console.print)) for name in jobs]
+    if "sizes" in parts:
+        works += [
+            ("sizes", f"by {name}", partial(sizes.measured, name, sweep, scale * sweep.sizes[-1]))
+            for name, sweep in sizes.SWEEPS.items()
+        ]
+    if "limits" in parts:
+        works.append(("limits", "limits", lambda: limits.measured(limits.works(scale), repetitions)))
+    if "imports" in parts:
+        works.append(("imports", "imports", partial(import_times, repetitions)))
+    if "gpu" in parts and torch.cuda.is_available():
+        measure = partial(on_device, device=torch.device("cuda"), scale=scale, repetitions=repetitions)
+        works += [("gpu", f"{name} on the GPU", partial(measure, name)) for name in ON_DEVICES]
+    elif "gpu" in parts:
+        console.print("gpu: left out, there is no CUDA device")
     found: dict[str, Rows] = {}
-    with console.status("") as status:
-        for what, row in _all_rows(parts, jobs, settings, console, status.update):
-            found.setdefault(what, []).append(row)
-            # After each: nothing that was measured is lost.
-            write_csv(folder / f"{what}.csv", found[what])
-            parts_found = {"rows" if part == "peers" else part: rows for part, rows in found.items()}
-            write_json(folder / "results.json", {"versions": versions(), "settings": settings, **parts_found})
-    _show(found, settings, console, folder)
+    with Progress("bench", len(works), len(works)) as progress:
+        for part, name, work in works:
+            try:
+                for row in work():
+                    found.setdefault(part, []).append(row)
+                    # After each, so that nothing that was measured is lost.
+                    write_frames(folder, {part: pd.DataFrame(found[part])})
+                    keyed = {"rows" if part == "peers" else part: rows for part, rows in found.items()}
+                    write_json(folder / "results.json", {"versions": versions(), "settings": settings, **keyed})
+            except ValueError as error:
+                console.print(f"{name}: left out, {error}")
+            progress.advance(name)
+    for each in tables(found, settings):
+        console.print(printed(each.title, each))
+    figures = {"peers": peers_figure, "sizes": sizes_figure}
+    write_figures(folder, {part: draw(found[part]) for part, draw in figures.items() if part in found})
     console.print(f"written to {folder}")
 
 
-def _all_rows(
-    parts: list[str], jobs: list[str], settings: dict[str, Any], console: Console, says: Any
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Each row with the part that it belongs to."""
-    repetitions, scale = settings["repetitions"], settings["scale"]
-    for name in jobs if "peers" in parts else ():
-        says(name)
-        try:
-            yield from (("peers", row) for row in measured(name, JOBS[name](scale), repetitions, console))
-        except ValueError as error:
-            console.print(f"{name}: left out, {error}")
-    for name, sweep in bench_sizes.SWEEPS.items() if "sizes" in parts else ():
-        says(f"by {name}")
-        yield from (("sizes", row) for row in bench_sizes.measured(name, sweep, scale * sweep.sizes[-1]))
-    if "limits" in parts:
-        says("limits")
-        yield from (("limits", row) for row in bench_limits.measured(scale, repetitions))
-    if "imports" in parts:
-        says("imports")
-        yield "imports", _imports(repetitions)
-    if "gpu" in parts and torch.cuda.is_available():
-        says("gpu")
-        yield from (("gpu", row) for row in bench_gpu.measured(torch.device("cuda"), scale, repetitions))
-    elif "gpu" in parts:
-        console.print("gpu: left out, there is no CUDA device")
-
-
-def measured(name: str, job: Job, repetitions: int, console: Console) -> Iterator[dict[str, Any]]:
-    """A row for each peer of a job that is there: how many times as long it takes."""
-    if missing(job.needs):
-        console.print(f"{name}: left out, {job.needs} is not installed")
-        return
-    threads, begin = torch.get_num_threads(), time.perf_counter()
-    ours = job.make(torch.device("cpu"))
-    setup = time.perf_counter() - begin
-    for peer in job.peers:
-        if missing(peer.needs):
-            console.print(f"{name}: {peer.name} left out, {peer.needs} is not installed")
-            continue
-        theirs = peer.make()
-        ours(), theirs()  # what is first is slow
-        torch.set_num_threads(threads)  # packages change it when they are loaded
-        times = [(seconds(ours), seconds(theirs) / peer.share) for _ in range(repetitions)]
-        yield {
-            "job": name,
-            "about": job.about,
-            "setup_seconds": setup,
-            "seconds": median(ours for ours, _ in times),
-            "peer": peer.name,
-            "peer_seconds": median(theirs for _, theirs in times),
-            "share": peer.share,
-            **_ratios([theirs / ours for ours, theirs in times]),
-            "goal": peer.goal,
-        }
-
-
-def missing(package: str | None) -> bool:
-    """Whether a package is not installed."""
-    return package is not None and find_spec(package) is None
-
-
-def _imports(repetitions: int) -> dict[str, Any]:
-    """The row of the time to import the library, as a ratio to that of torch."""
-    pair = ("torch", "neuroprior")
-    times = [[import_seconds(package) for package in pair] for _ in range(repetitions + 1)]
-    del times[0]  # which read files from the disk
-    ratios = _ratios([ours / torchs for torchs, ours in times])
-    return {"seconds": median(ours for _, ours in times), "torch_seconds": median(t for t, _ in times), **ratios} | {
-        "goal": GOAL
+def tables(found: dict[str, Rows], settings: dict[str, Any]) -> list[Table]:
+    """The tables of what was measured: rows by part."""
+    shown: dict[str, Callable[[pd.DataFrame], Table]] = {
+        "peers": partial(_peers, settings),
+        "sizes": _sizes,
+        "limits": _limits,
+        "gpu": _gpu,
+        "imports": _imports,
     }
+    return [make(pd.DataFrame(found[part])) for part, make in shown.items() if part in found]
 
 
-def _ratios(ratios: list[float]) -> dict[str, float]:
-    return {"ratio": median(ratios), "low": min(ratios), "high": max(ratios)}
+def _peers(settings: dict[str, Any], rows: pd.DataFrame) -> Table:
+    met = "" if settings["scale"] < 1 else (rows.ratio >= rows.goal).map({True: "yes", False: "no"})
+    columns: dict[str, Column] = {"job: peer": "name", "seconds": "seconds:.3g"}
+    columns |= {heading: _short(name) for heading, name in RATIO.items()} | {"goal": _short("goal"), "met": "met"}
+    title = f"Speed with {settings['threads']} threads of torch (ratio: peer's time / ours)"
+    return table(rows.assign(name=rows.job + ": " + rows.peer, met=met), columns, "Medians; least and most.", title)
 
 
-def _show(found: dict[str, Rows], settings: dict[str, Any], console: Console, folder: Path) -> None:
-    """Print the tables and draw the figures of all that was measured."""
-    if "peers" in found:
-        console.print(peers_table(found["peers"], settings))
-        save(peers_figure(found["peers"]), folder / "peers.png")
-    if "sizes" in found:
-        console.print(sizes_table(found["sizes"]))
-        save(sizes_figure(found["sizes"]), folder / "sizes.png")
-    if "limits" in found:
-        console.print(limits_table(found["limits"]))
-    if "gpu" in found:
-        console.print(gpu_table(found["gpu"]))
-    for row in found.get("imports", ()):
-        told = f"{row['ratio']:.3f} times as long as torch ({row['low']:.3f} to {row['high']:.3f}; goal: {row['goal']})"
-        console.print(f"import neuroprior: {row['seconds']:.2f} s, {told}")
+RATIO = {"ratio": "ratio", "min": "low", "max": "high"}
+
+
+def _imports(rows: pd.DataFrame) -> Table:
+    columns: dict[str, Column] = {"": "what", "seconds": "seconds:.2f", "torch, s": "torch_seconds:.2f"}
+    columns |= {heading: f"{name}:.3f" for heading, name in RATIO.items()} | {"goal": "goal"}
+    return table(rows.assign(what="import neuroprior:"), columns, title="Time to import (ratio: to that of torch)")
+
+
+def _sizes(rows: pd.DataFrame) -> Table:
+    """The smallest and the largest of each kind."""
+    kinds = rows.groupby("growing", sort=False)
+    ends = kinds.first().add_suffix("_first").join(kinds.last().add_suffix("_last")).reset_index()
+    ends["slope"] = [sizes.slope(rows[rows.growing == kind].to_dict("records")) for kind in ends.growing]
+    columns: dict[str, Column] = {
+        "size": "growing",
+        "from": "size_first:,",
+        "to": "size_last:,",
+        "seconds\nfrom": "seconds_first:.2g",
+        "\nto": "seconds_last:.2g",
+        "slope": "slope:.2f",
+        "peak\nMiB": _mebi("peak_bytes_last"),
+        "result\nMiB": _mebi("result_bytes_last"),
+    }
+    caption = " ".join(f"{end.growing}: {end.about_first}." for end in ends.itertuples())
+    caption += " peak: of the process at the largest size, beyond what it held before."
+    title = "Cost against size: time increases as size to the power of `slope` over the last decades"
+    return table(ends, columns, caption, title)
+
+
+def _limits(rows: pd.DataFrame) -> Table:
+    rates = {name: rows[name] / rows.seconds / 1e9 for name in ("moved", "operations")}
+    columns: dict[str, Column] = {
+        "work": "work",
+        "seconds": "seconds:.3g",
+        "GB/s": _rate("moved"),
+        "Gop/s": _rate("operations"),
+        "share": "share:.1%",
+        "limit": "bound",
+    }
+    caption = (
+        "GB/s: bytes that have to be moved to or from memory at the least; Gop/s: operations of matrix products."
+        " copy and product: what the machine does at its best, and so the limit."
+    )
+    return table(rows.assign(**rates), columns, caption, "Share of the machine's limit")
+
+
+def _gpu(rows: pd.DataFrame) -> Table:
+    columns: dict[str, Column] = {"job": "about", "seconds": "seconds:.3g", "peak MiB": _mebi("peak_bytes")}
+    return table(rows, columns, title=f"On {rows.device.iloc[0]}")
+
+
+def _mebi(name: str) -> Column:
+    return lambda row: "" if pd.isna(row[name]) else f"{row[name] / 2**20:,.0f}"
+
+
+def _rate(name: str) -> Column:
+    return lambda row: f"{row[name]:.2g}" if row[name] < 10 else f"{row[name]:.0f}"
+
+
+def _short(name: str) -> Column:
+    return lambda row: f"{row[name]:,.0f}" if row[name] >= 100 else f"{row[name]:.3g}"

@@ -1,14 +1,11 @@
 """The figures of `python -m eval bench`."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from eval.bench.sizes import slope
+from eval.bench.timing import Rows
 from neuroprior.report.drawing import FEWER, MORE, at_edges, names_down, panels
-
-Rows = list[dict[str, Any]]
 
 ACROSS = 4
 """Panels beside each other."""
@@ -28,12 +25,13 @@ def peers_figure(rows: Rows) -> Figure:
     names_down(axes, [f"{row['job']}: {row['peer']}" for row in reversed(rows)])
     axes.axvline(1, color="black", lw=0.6, ls=":")
     axes.set_xscale("log")
+    axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel("peer's time / ours (dots and lines: median, least and most; black: the goal)")
     return figure
 
 
 def sizes_figure(rows: Rows) -> Figure:
-    """Seconds and memory against size, a panel for each size that grows."""
+    """Seconds and memory against size, a panel for each size that increases."""
     kinds = list(dict.fromkeys(row["growing"] for row in rows))
     figure, cells = panels(-(-len(kinds) // ACROSS), ACROSS, (11, 2.7 * -(-len(kinds) // ACROSS)))
     seconds = _decades([row["seconds"] for row in rows])

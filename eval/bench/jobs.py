@@ -1,21 +1,27 @@
 """The jobs of `python -m eval bench`: what the library does in each, its peers, and how far ahead it should be."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
+from itertools import product
+from statistics import median
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from eval.bench import packages as bench_packages
-from eval.bench import peers as bench_peers
-from eval.bench.packages import Run
-from eval.bench.training import TrainingRace
-from eval.paper.first_simulation import Protocol, Size, simulate
+from eval.bench import peers
+from eval.bench.timing import Run, compared, median_seconds, seconds
 from neuroprior import (
     ContextTreePrior,
+    ExhaustivePlanner,
+    GridWorld,
     GRUPrior,
     MarkovPrior,
+    Planner,
+    Prior,
     SamplingPlanner,
     TransformerPrior,
     UniformPrior,
@@ -33,8 +39,8 @@ class Peer:
     Attributes:
         name: as in the tables.
         make: prepares it; what it returns is timed.
-        share: of the job's work that it does, for peers that would take minutes for all of it.
         goal: how many times as long it should take as the library.
+        share: of the job's work that it does, for peers that would take minutes for all of it.
         needs: the package without which it is left out; None: it is always there.
     """
 
@@ -52,7 +58,7 @@ class Job:
     Attributes:
         about: as in the tables.
         make: prepares it on a device; what it returns is timed.
-        peers: the rivals in the same run, which know the CPU alone.
+        peers: the baselines in the same run, which run on the CPU alone.
         needs: the package without which it is left out; None: it is always there.
     """
 
@@ -60,6 +66,78 @@ class Job:
     make: Callable[[torch.device], Run]
     peers: tuple[Peer, ...]
     needs: str | None = None
+
+
+def missing(package: str | None) -> bool:
+    """Whether a package is not installed."""
+    return package is not None and find_spec(package) is None
+
+
+def against_peers(
+    name: str,
+    scale: float,
+    repetitions: int,
+    say: Callable[[str], Any],
+    missing: Callable[[str | None], bool] = missing,
+) -> Iterator[dict[str, Any]]:
+    """A row for each peer of a job: how many times as long it takes.
+
+    Args:
+        name: of the job, in `JOBS`.
+        scale: share of the job that is done.
+        repetitions: how often it is timed, in turn with its peers.
+        say: is called with what is left out, and why.
+        missing: whether a package is not installed.
+    """
+    job = JOBS[name](scale)
+    if missing(job.needs):
+        say(f"{name}: left out, {job.needs} is not installed")
+        return
+    threads, begin = torch.get_num_threads(), time.perf_counter()
+    ours = job.make(torch.device("cpu"))
+    setup = time.perf_counter() - begin
+    for peer in job.peers:
+        if missing(peer.needs):
+            say(f"{name}: {peer.name} left out, {peer.needs} is not installed")
+            continue
+        theirs = peer.make()
+        ours(), theirs()  # the first run is slow
+        torch.set_num_threads(threads)  # packages change it when they are loaded
+        times = [(seconds(ours), seconds(theirs) / peer.share) for _ in range(repetitions)]
+        own, other = map(list, zip(*times, strict=True))
+        yield {
+            "job": name,
+            "about": job.about,
+            "setup_seconds": setup,
+            "seconds": median(own),
+            "peer": peer.name,
+            "peer_seconds": median(other),
+            "share": peer.share,
+            **compared(own, other),
+            "goal": peer.goal,
+        }
+
+
+def on_device(name: str, device: torch.device, scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
+    """The row of a job on an accelerator, without peers: seconds, and bytes of the device at the peak."""
+    cuda = device.type == "cuda"
+    job = JOBS[name](scale)
+    run = job.make(device)
+
+    def finished() -> None:
+        run()
+        if cuda:  # which has only been given its orders when `run` returns
+            torch.cuda.synchronize(device)
+
+    if cuda:
+        torch.cuda.reset_peak_memory_stats(device)
+    yield {
+        "job": name,
+        "about": job.about,
+        "device": torch.cuda.get_device_name(device) if cuda else device.type,
+        "seconds": median_seconds(finished, repetitions),
+        "peak_bytes": torch.cuda.max_memory_allocated(device) if cuda else None,
+    }
 
 
 def sample_short(scale: float) -> Job:
@@ -74,28 +152,25 @@ def sample_long(scale: float) -> Job:
 
 def _against_generate(number: int, length: int, batches: list[int], goal: float) -> Job:
     """A transformer samples, against one of another package in batches of several sizes."""
-    peers = [
-        Peer(
-            f"transformers generate, {batch:,} at once",
-            partial(bench_packages.transformers_generate, 4, length, batch),
-            goal,
-            batch / number,
-            "transformers",
-        )
-        for batch in sorted(set(batches))
-    ]
-    about = f"sample {number:,} plans of length {length}, transformer"
-    return Job(about, lambda device: partial(TransformerPrior(4).to(device).sample, number, length), tuple(peers))
+
+    def peer(batch: int) -> Peer:
+        make = partial(peers.transformers_generate, 4, length, batch)
+        return Peer(f"transformers generate, {batch:,} at once", make, goal, batch / number, "transformers")
+
+    return Job(
+        f"sample {number:,} plans of length {length}, transformer",
+        lambda device: partial(TransformerPrior(4).to(device).sample, number, length),
+        tuple(map(peer, sorted(set(batches)))),
+    )
 
 
 def sample_gru(scale: float) -> Job:
     """Long plans of a GRU."""
     number = scaled(8192, scale)
-    plain = Peer("plain PyTorch", lambda: partial(bench_peers.PlainGRU(4).eval().sample, number, 64), 3)
     return Job(
         f"sample {number:,} plans of length 64, GRU",
         lambda device: partial(GRUPrior(4, lags=1).to(device).sample, number, 64),
-        (plain,),
+        (Peer("plain PyTorch", lambda: partial(peers.PlainGRU(4).eval().sample, number, 64), 3),),
     )
 
 
@@ -105,18 +180,13 @@ def sample_markov(scale: float) -> Job:
     prior = MarkovPrior(4, 2).fit(plans)
     tables = prior.log_probs.exp().double().numpy(), prior.next_node.numpy(), int(prior.start_node)
     few = min(10_000, number)
+    pomegranate = partial(peers.pomegranate_sample, plans, 2, few, 8)
     return Job(
         f"sample {number:,} plans of length 8, Markov-2",
         lambda device: partial(prior.to(device).sample, number, 8),
         (
-            Peer("numpy", lambda: partial(bench_peers.numpy_sample, *tables, number, 8), 20),
-            Peer(
-                "pomegranate",
-                partial(bench_packages.pomegranate_sample, plans, 2, few, 8),
-                20,
-                few / number,
-                "pomegranate",
-            ),
+            Peer("numpy", lambda: partial(peers.numpy_sample, *tables, number, 8), 20),
+            Peer("pomegranate", pomegranate, 20, few / number, "pomegranate"),
         ),
     )
 
@@ -129,9 +199,9 @@ def fit_markov(scale: float) -> Job:
         f"fit Markov-2 on {len(plans):,} plans of length 32",
         lambda device: lambda: MarkovPrior(4, 2).fit(plans),
         (
-            Peer("numpy bincount", lambda: partial(bench_peers.numpy_counts, array, 4, 2), 3),
-            Peer("numpy add.at", lambda: partial(bench_peers.numpy_add_at, array, 4, 2), 3),
-            Peer("pomegranate", partial(bench_packages.pomegranate_fit, plans, 2), 3, needs="pomegranate"),
+            Peer("numpy bincount", lambda: partial(peers.numpy_counts, array, 4, 2), 3),
+            Peer("numpy add.at", lambda: partial(peers.numpy_add_at, array, 4, 2), 3),
+            Peer("pomegranate", partial(peers.pomegranate_fit, plans, 2), 3, needs="pomegranate"),
         ),
     )
 
@@ -139,18 +209,18 @@ def fit_markov(scale: float) -> Job:
 def fit_tree(scale: float) -> Job:
     """Context trees of one long sequence."""
     plan = chain_plans(1, scaled(1_000_000, scale))
-    rust = Peer("vlmc (Rust)", partial(bench_packages.vlmc_fit, plan[0].tolist(), 4, 10), 1, needs="vlmc")
     return Job(
         f"fit context trees, depth 10, {plan.numel():,} actions",
         lambda device: lambda: ContextTreePrior(4, 10).fit(plan),
-        (rust,),
+        (Peer("vlmc (Rust)", partial(peers.vlmc_fit, plan[0].tolist(), 4, 10), 1, needs="vlmc"),),
     )
 
 
 def evaluate(scale: float) -> Job:
     """Candidate plans tried in a table."""
     starts = scaled(10_000, scale)
-    world, generator = gridworld(20, 20, "torus", num_worlds=10), torch.Generator().manual_seed(0)
+    world = gridworld(20, 20, "torus", num_worlds=10)
+    generator = torch.Generator().manual_seed(0)
     state = world.reset(starts, generator)
     plans = UniformPrior(4).sample(starts * 256, 8, generator=generator).view(starts, 256, 8)
     given = world.next_state, world.reward, state, plans
@@ -158,38 +228,103 @@ def evaluate(scale: float) -> Job:
         f"evaluate {starts:,} starts x 256 plans x 8 steps",
         lambda device: partial(world.to(device).rollout, state.to(device), plans.to(device)),
         (
-            Peer("plain torch indexing", lambda: partial(bench_peers.torch_rollout, *given), 5),
-            Peer("numba, parallel", partial(bench_packages.numba_rollout, *given), 1, needs="numba"),
+            Peer("plain torch indexing", lambda: partial(peers.torch_rollout, *given), 5),
+            Peer("numba, parallel", partial(peers.numba_rollout, *given), 1, needs="numba"),
         ),
     )
 
 
 def table_1(scale: float) -> Job:
     """The paper's first table without its neural priors."""
-    starts = scaled(10_000, scale)
-    size = Size(1, starts, starts, 20, 1.0, 4, 8, 256, 0)
+    starts, size = scaled(10_000, scale), (256, 8, 4, (1, 2, 3))
     world = gridworld(20, 20, "torus")
     start = world.reset(starts, torch.Generator().manual_seed(0))
-    script = partial(bench_peers.numpy_table_1, world.reward[0].numpy(), start.numpy(), 256, 8, 4, (1, 2, 3))
+    script = partial(peers.numpy_table_1, world.reward[0].numpy(), start.numpy(), *size)
     return Job(
         f"the paper's Table 1, Markov rows, {starts:,} starts",
-        lambda device: partial(simulate, Protocol("torus", "uniform", "all"), size, False, lambda what: None),
+        lambda device: partial(our_table_1, world, start, *size),
         (Peer("numpy script", lambda: script, 20),),
     )
 
 
+def our_table_1(
+    world: GridWorld, start: Tensor, num_plans: int, length: int, depth: int, orders: tuple[int, ...]
+) -> dict[str, Tensor]:
+    """What `peers.numpy_table_1` does, with the library: scores `[n]` by planner."""
+    generator, deterministic = torch.Generator().manual_seed(0), ExhaustivePlanner(depth)
+    learned = deterministic.plan(world, world.reset(len(start), generator), generator).plan
+    priors: dict[str, Prior] = {"random": UniformPrior(4)}
+    priors |= {f"markov-{order}": MarkovPrior(4, order).fit(learned) for order in orders}
+    planners: dict[str, Planner] = {"deterministic": deterministic}
+    planners |= {name: SamplingPlanner(prior, length, num_plans) for name, prior in priors.items()}
+    return {name: planner.plan(world, start, generator).score for name, planner in planners.items()}
+
+
 def train(scale: float) -> Job:
-    """A GRU trained until it is within 1 % of the entropy rate."""
-    race = TrainingRace(source(), chain_plans(scaled(100_000, scale), 16))
+    """A GRU of 64 units, trained until it is within 1 % of the entropy rate of the plans' known source.
+
+    Both sides choose their batch size, learning rate and number of steps; what is timed is the training alone, without
+    the search for its settings.
+    """
+    chain, plans = source(), chain_plans(scaled(100_000, scale), 16)
+    held_out = chain.sample(10_000, plans.shape[1], generator=torch.Generator().manual_seed(2))
+
+    def ours(batch_size: int, learning_rate: float, steps: int) -> nn.Module:
+        how = {"batch_size": batch_size, "learning_rate": learning_rate, "max_steps": steps}
+        prior, generator = GRUPrior(4, lags=1), torch.Generator().manual_seed(0)
+        return prior.fit(plans, generator=generator, progress=False, **how)
+
+    def close(model: nn.Module) -> bool:
+        return excess(model, chain, held_out) <= 1.01
+
     return Job(
-        f"train GRU-64 to 1 % of the entropy rate, {len(race.plans):,} plans of length 16",
-        lambda device: race.ours(),
-        (Peer("plain PyTorch, DataLoader", race.theirs, 3),),
+        f"train GRU-64 to 1 % of the entropy rate, {len(plans):,} plans of length 16",
+        lambda device: quickest(ours, close),
+        (Peer("plain PyTorch, DataLoader", lambda: quickest(partial(peers.plain_training, plans, 4), close), 3),),
     )
 
 
+@torch.no_grad()
+def excess(model: nn.Module, source: MarkovPrior, held_out: Tensor) -> float:
+    """Nats a plan that a model takes for plans of a source, divided by what the source itself takes."""
+    nats = nn.functional.cross_entropy(model(held_out).flatten(0, 1), held_out.flatten().long())
+    return float(nats) * held_out.shape[1] / float(-source.log_prob(held_out).mean())
+
+
+def quickest(
+    train: Callable[[int, float, int], nn.Module],
+    close: Callable[[nn.Module], bool],
+    clock: Callable[[], float] = time.perf_counter,
+) -> Run:
+    """The training that comes close enough in the least time.
+
+    Args:
+        train: trains a model; takes batch size, learning rate and number of gradient steps.
+        close: whether a model is close enough.
+        clock: the time in seconds.
+
+    Raises:
+        ValueError: none is.
+    """
+    settings, numbers = list(product((64, 256, 1024), (1e-3, 3e-3, 1e-2))), (25, 50, 100, 200, 400, 800)
+    train(*settings[0], numbers[0])  # the first run is slow
+    enough: dict[tuple[int, float, int], float] = {}
+    for setting in settings:
+        for steps in numbers:
+            begin = clock()
+            model = train(*setting, steps)
+            taken = clock() - begin
+            if close(model):
+                enough[*setting, steps] = taken
+            if enough and taken >= min(enough.values()):
+                break
+    if not enough:
+        raise ValueError(f"train: no training of {numbers[-1]} steps came within 1% of the entropy rate")
+    return partial(train, *min(enough, key=lambda how: enough[how]))
+
+
 def shoot(scale: float) -> Job:
-    """Random shooting in a Gymnasium environment; its table is made before, which `setup_seconds` tells."""
+    """Random shooting in a Gymnasium environment; its table is made before, which takes `setup_seconds`."""
     starts, few = scaled(100, scale), scaled(32, scale)
     uniform = UniformPrior(7)
     plans = uniform.sample(256, 16)
@@ -199,22 +334,13 @@ def shoot(scale: float) -> Job:
         state = world.reset(starts, torch.Generator().manual_seed(0))
         return partial(SamplingPlanner(uniform, 16, 256, objective="return").plan, world, state)
 
+    copies, envs = partial(peers.deep_copies, FOUR_ROOMS, plans[:few]), partial(peers.vector_env, FOUR_ROOMS, plans)
     return Job(
         f"random shooting in MiniGrid FourRooms, {starts} starts x 256 plans x 16 steps",
         make,
         (
-            Peer(
-                "deepcopy of the environment",
-                partial(bench_packages.deep_copies, FOUR_ROOMS, plans[:few]),
-                1000,
-                few / 256 / starts,
-            ),
-            Peer(
-                "gymnasium vector environment",
-                partial(bench_packages.vector_env, FOUR_ROOMS, plans),
-                1000,
-                1 / starts,
-            ),
+            Peer("deepcopy of the environment", copies, 1000, few / 256 / starts),
+            Peer("gymnasium vector environment", envs, 1000, 1 / starts),
         ),
         "minigrid",
     )
@@ -225,43 +351,35 @@ def decide(scale: float) -> Job:
     starts, steps, simulations = scaled(4096, scale), 256 * 8, 256
     world = gridworld(20, 20, "torus", num_worlds=10)
     state = world.reset(starts, torch.Generator().manual_seed(0))
-    given = world.next_state, world.reward, state, simulations, 8
+    search = partial(peers.mctx_search, world.next_state, world.reward, state, simulations, 8)
 
     def make(device: torch.device) -> Run:
         prior = MarkovPrior(4, 2).fit(chain_plans(10_000, 16)).to(device)
         return partial(SamplingPlanner(prior, 8, 256, objective="return").plan, world.to(device), state.to(device))
 
+    kinds = {"MuZero": False, "Gumbel MuZero": True}
     return Job(
         f"one decision with 256 candidates of 8 steps from {starts:,} starts",
         make,
         tuple(
-            Peer(
-                f"mctx, {name}",
-                partial(bench_packages.mctx_search, *given, gumbel),
-                3,
-                simulations / steps,
-                "mctx",
-            )
-            for name, gumbel in (("MuZero", False), ("Gumbel MuZero", True))
+            Peer(f"mctx, {name}", partial(search, gumbel), 3, simulations / steps, "mctx")
+            for name, gumbel in kinds.items()
         ),
     )
 
 
 JOBS: dict[str, Callable[[float], Job]] = {
-    make.__name__: make
-    for make in (
-        sample_short,
-        sample_long,
-        sample_gru,
-        sample_markov,
-        fit_markov,
-        fit_tree,
-        evaluate,
-        table_1,
-        train,
-        shoot,
-        decide,
-    )
+    "sample_short": sample_short,
+    "sample_long": sample_long,
+    "sample_gru": sample_gru,
+    "sample_markov": sample_markov,
+    "fit_markov": fit_markov,
+    "fit_tree": fit_tree,
+    "evaluate": evaluate,
+    "table_1": table_1,
+    "train": train,
+    "shoot": shoot,
+    "decide": decide,
 }
 """By name; each makes its job at a scale: 1 is the size of the goals."""
 

@@ -1,6 +1,6 @@
 """How near work comes to what the machine can do, in `python -m eval bench`: bytes moved and operations done."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -8,8 +8,7 @@ from typing import Any
 import torch
 
 from eval.bench.jobs import JOBS, scaled
-from eval.bench.packages import Run
-from eval.bench.timing import seconds_again
+from eval.bench.timing import Run, median_seconds
 from neuroprior import GRUPrior, MarkovPrior, TransformerPrior
 
 COPIED, SIDE = 2**28, 2048
@@ -44,30 +43,33 @@ def works(scale: float) -> Iterator[Work]:
     yield _plan_by_plan(scaled(8192, scale))
 
 
-def measured(scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
+def measured(
+    works: Iterable[Work], repetitions: int, timed: Callable[[Run, int], float] = median_seconds
+) -> Iterator[dict[str, Any]]:
     """A row for the machine's copies, its matrix products, and each work: seconds and the share of the limit.
 
     The limit is the time that the bytes, or the operations, would take at the machine's measured rates, whichever is
     longer (the roofline: Williams, Waterman and Patterson 2009).
+
+    Args:
+        works: what is measured.
+        repetitions: how often each is timed.
+        timed: how long work takes.
     """
     copied, factor = torch.zeros(COPIED // FLOAT), torch.randn(SIDE, SIDE)
     target, product = torch.empty_like(copied), torch.empty_like(factor)
-    machine = (
-        Work("copy", lambda: target.copy_(copied), 2 * copied.nbytes),
-        Work("product", lambda: torch.mm(factor, factor, out=product), 0, 2 * SIDE**3),
-    )
-    taken = [seconds_again(work.run, repetitions) for work in machine]
-    rates = {"memory": machine[0].moved / taken[0], "arithmetic": machine[1].operations / taken[1]}
-    yield from (_row(work, seconds, rates) for work, seconds in zip(machine, taken, strict=True))
-    for work in works(scale):
-        yield _row(work, seconds_again(work.run, repetitions), rates)
-
-
-def _row(work: Work, seconds: float, rates: dict[str, float]) -> dict[str, Any]:
-    least = {"memory": work.moved / rates["memory"], "arithmetic": work.operations / rates["arithmetic"]}
-    bound = max(least, key=lambda what: least[what])
-    row = {"work": work.about, "seconds": seconds, "moved": work.moved, "operations": work.operations}
-    return row | {"share": least[bound] / seconds, "bound": bound}
+    copy = Work("copy", lambda: target.copy_(copied), 2 * copied.nbytes)
+    multiply = Work("product", lambda: torch.mm(factor, factor, out=product), 0, 2 * SIDE**3)
+    taken = {work.about: timed(work.run, repetitions) for work in (copy, multiply)}
+    for work in (copy, multiply, *works):
+        seconds = taken.get(work.about) or timed(work.run, repetitions)
+        least = {
+            "memory": work.moved / (copy.moved / taken["copy"]),
+            "arithmetic": work.operations / (multiply.operations / taken["product"]),
+        }
+        bound = max(least, key=lambda what: least[what])
+        row = {"work": work.about, "seconds": seconds, "moved": work.moved, "operations": work.operations}
+        yield row | {"share": least[bound] / seconds, "bound": bound}
 
 
 def _evaluate(scale: float) -> Work:
@@ -96,7 +98,7 @@ def _tree_transformer(number: int) -> Work:
 
 
 def _plan_by_plan(number: int) -> Work:
-    """The memory of each plan is read and written at each step, and multiplied; an input is a row of a table."""
+    """The hidden state of each plan is read and written at each step, and multiplied; an input is a row of a table."""
     prior, length = GRUPrior(4, lags=1), 64
     width = prior.hidden_size
     moved = number * length * (2 * width * FLOAT + ACTION)

@@ -1,4 +1,4 @@
-"""Cost against size in `python -m eval bench`: seconds and memory as one size grows, all others fixed."""
+"""Cost against size in `python -m eval bench`: seconds and memory as one size increases, all others fixed."""
 
 import ctypes
 import gc
@@ -14,23 +14,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from eval.bench.packages import Run
-from eval.bench.timing import seconds
+from eval.bench.timing import Rows, Run, seconds
 from neuroprior import MarkovPrior, SamplingPlanner, UniformPrior, gridworld
 
 REPETITIONS = 3
-"""Of each size; the median is told."""
+"""Of each size; the median counts."""
 
 LAST = 2
-"""Decades over which the slope is told, the largest ones: below, what every call costs hides it."""
-
-HIGH_WATER, RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-"""Where Linux tells the most memory that a process had, and where that is set back."""
+"""Decades over which the slope is taken, the largest ones: below, what every call costs hides it."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A piece of work whose cost is measured as one size grows.
+    """A piece of work whose cost is measured as one size increases.
 
     Attributes:
         about: what is done, and what is fixed.
@@ -48,56 +44,60 @@ def decades(first: int, last: int) -> tuple[int, ...]:
     return tuple(10**k for k in range(first, last + 1))
 
 
-def by_starts(starts: int) -> Run:
-    """Decisions in the paper's grid."""
+def _generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def _chain(actions: int) -> MarkovPrior:
+    return MarkovPrior(actions, 2).fit(torch.randint(actions, (1000, 16), generator=_generator()))
+
+
+def _decide(starts: int) -> Run:
     world = gridworld(20, 20, "torus")
     state = world.reset(starts, _generator())
     return partial(SamplingPlanner(UniformPrior(4), 4, 4).plan, world, state, _generator())
 
 
-def by_plans(number: int) -> Run:
-    """Plans of a chain."""
+def _sample(number: int) -> Run:
     return partial(_chain(4).sample, number, 8, generator=_generator())
 
 
-def by_length(length: int) -> Run:
-    """A chain fitted to one long plan."""
+def _sample_long(length: int) -> Run:
+    return partial(_chain(4).sample, 100, length, generator=_generator())
+
+
+def _fit_long(length: int) -> Run:
     plan = torch.randint(4, (1, length), dtype=torch.uint8, generator=_generator())
     return lambda: MarkovPrior(4, 2).fit(plan)
 
 
-def by_sampled_length(length: int) -> Run:
-    """Long plans of a chain."""
-    return partial(_chain(4).sample, 100, length, generator=_generator())
-
-
-def by_actions(actions: int) -> Run:
-    """A chain over many actions, fitted and sampled."""
+def _fit_and_sample(actions: int) -> Run:
     plans = torch.randint(actions, (10_000, 8), generator=_generator())
     return lambda: MarkovPrior(actions, 1).fit(plans).sample(10_000, 8, generator=_generator())
 
 
-def by_states(states: int) -> Run:
-    """Rollouts in a large grid."""
+def _rollouts(height: int, width: int, worlds: int) -> Run:
+    world = gridworld(height, width, "torus", num_worlds=worlds)
+    state = world.reset(10_000, _generator())
+    plans = UniformPrior(4).sample(640_000, 8, generator=_generator()).view(10_000, 64, 8)
+    return partial(world.rollout, state, plans)
+
+
+def _one_grid(states: int) -> Run:
     side = round(states**0.5)
     return _rollouts(side, math.ceil(states / side), 1)
 
 
-def by_worlds(worlds: int) -> Run:
-    """Rollouts in many small grids."""
-    return _rollouts(10, 10, worlds)
-
-
 SWEEPS = {
-    "starts": Sweep("decide: 4 uniform plans of 4 steps from each start, 20 x 20 grid", decades(2, 7), by_starts),
-    "plans": Sweep("sample plans of length 8, Markov-2", decades(2, 7), by_plans),
-    "length": Sweep("fit Markov-2 on one plan", decades(2, 7), by_length),
-    "length sampled": Sweep("sample 100 plans, Markov-2", decades(2, 4), by_sampled_length),
-    "actions": Sweep("fit Markov-1 on 10,000 plans of length 8, and sample as many", decades(1, 4), by_actions),
-    "states": Sweep("roll out 64 plans of 8 steps from 10,000 starts, one grid", decades(2, 7), by_states),
-    "worlds": Sweep("the same in 10 x 10 grids", decades(2, 6), by_worlds),
+    "starts": Sweep("decide: 4 uniform plans of 4 steps from each start, 20 x 20 grid", decades(2, 7), _decide),
+    "plans": Sweep("sample plans of length 8, Markov-2", decades(2, 7), _sample),
+    "length": Sweep("fit Markov-2 on one plan", decades(2, 7), _fit_long),
+    "length sampled": Sweep("sample 100 plans, Markov-2", decades(2, 4), _sample_long),
+    "actions": Sweep("fit Markov-1 on 10,000 plans of length 8, and sample as many", decades(1, 4), _fit_and_sample),
+    "states": Sweep("roll out 64 plans of 8 steps from 10,000 starts, one grid", decades(2, 7), _one_grid),
+    "worlds": Sweep("the same in 10 x 10 grids", decades(2, 6), partial(_rollouts, 10, 10)),
 }
-"""By the size that grows."""
+"""By the size that increases."""
 
 
 def measured(name: str, sweep: Sweep, most: float) -> Iterator[dict[str, Any]]:
@@ -123,27 +123,12 @@ def measured(name: str, sweep: Sweep, most: float) -> Iterator[dict[str, Any]]:
         }
 
 
-def slope(rows: list[dict[str, Any]]) -> float | None:
-    """By what power of the size the time grows, over the largest sizes; None for fewer than two of them."""
+def slope(rows: Rows) -> float | None:
+    """By what power of the size the time increases, over the largest sizes; None for fewer than two of them."""
     last = [row for row in rows if row["size"] >= rows[-1]["size"] / 10**LAST]
     if len(last) < 2:
         return None
     return math.log(last[-1]["seconds"] / last[0]["seconds"]) / math.log(last[-1]["size"] / last[0]["size"])
-
-
-def _rollouts(height: int, width: int, worlds: int) -> Run:
-    world = gridworld(height, width, "torus", num_worlds=worlds)
-    state = world.reset(10_000, _generator())
-    plans = UniformPrior(4).sample(640_000, 8, generator=_generator()).view(10_000, 64, 8)
-    return partial(world.rollout, state, plans)
-
-
-def _chain(actions: int) -> MarkovPrior:
-    return MarkovPrior(actions, 2).fit(torch.randint(actions, (1000, 16), generator=_generator()))
-
-
-def _generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
 
 
 def _bytes(result: Any) -> int:
@@ -156,18 +141,24 @@ def _bytes(result: Any) -> int:
 
 
 def _release() -> None:
-    """Give the system back what is free, so that work that takes it again is seen to."""
+    """Give the system back what is free, so that work that takes it again is counted."""
     gc.collect()
     with suppress(OSError, AttributeError):  # where there is no such library
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def _memory(what: str, set_back: bool = False) -> int | None:
-    """A line of this process's status, in bytes; None where the system does not tell."""
+    """A line of Linux's status of this process, in bytes; None on other systems.
+
+    Args:
+        what: VmRSS: what it has; VmHWM: the most that it had.
+        set_back: set the most back to what it has.
+    """
     try:
         if set_back:
-            RESET.write_text("5")
-        line = next(line for line in HIGH_WATER.read_text().splitlines() if line.startswith(what))
+            Path("/proc/self/clear_refs").write_text("5")
+        status = Path("/proc/self/status").read_text()
+        line = next(line for line in status.splitlines() if line.startswith(what))
     except (OSError, StopIteration):
         return None
     return int(line.split()[1]) * 1024

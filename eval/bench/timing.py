@@ -3,26 +3,42 @@
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from statistics import median
+from typing import Any
 
-from eval.bench.packages import Run
+Run = Callable[[], Any]
+Rows = list[dict[str, Any]]
 
 
 def seconds(run: Run) -> float:
-    """How long it takes."""
+    """How long it takes once."""
     begin = time.perf_counter()
     run()
     return time.perf_counter() - begin
 
 
-def seconds_again(run: Run, repetitions: int) -> float:
-    """How long it takes, the median; what is first is slow, and does not count."""
+def median_seconds(run: Run, repetitions: int) -> float:
+    """How long it takes, the median; the first run, which is slow, does not count."""
     run()
     return median(seconds(run) for _ in range(repetitions))
 
 
-def import_seconds(package: str) -> float:
-    """How long it takes to import a package, in a process of its own."""
-    code = f"import time; begin = time.perf_counter(); import {package}; print(time.perf_counter() - begin)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return float(done.stdout)
+def compared(ours: list[float], theirs: list[float]) -> dict[str, float]:
+    """How many times as long the second of each pair of times is: median, least and most."""
+    ratios = [second / first for first, second in zip(ours, theirs, strict=True)]
+    return {"ratio": median(ratios), "low": min(ratios), "high": max(ratios)}
+
+
+def import_times(repetitions: int) -> Rows:
+    """The row of the time to import the library, each time in a process of its own, as a ratio to that of torch."""
+
+    def import_seconds(package: str) -> float:
+        code = f"import time; begin = time.perf_counter(); import {package}; print(time.perf_counter() - begin)"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        return float(done.stdout)
+
+    times = [[import_seconds(package) for package in ("torch", "neuroprior")] for _ in range(repetitions + 1)]
+    torchs, ours = map(list, zip(*times[1:], strict=True))  # the first ones read files from the disk
+    row = {"seconds": median(ours), "torch_seconds": median(torchs), **compared(torchs, ours)}
+    return [row | {"goal": 1.1}]

@@ -12,9 +12,9 @@ from rich.console import Console
 from eval.compare.rows import growth_rows
 from neuroprior._files import versions, write_csv, write_json
 from neuroprior.analysis.statistics import paired_difference
+from neuroprior.report.document import printed
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels, short
 from neuroprior.report.page import FigureBox, Page, Section, Table, write_page
-from neuroprior.report.document import printed
 
 Rows = Sequence[Mapping[str, Any]]
 

@@ -13,9 +13,9 @@ from eval.compare.rows import Array, Cells, Rows, corrected, estimated
 from eval.compare.sections import plus_minus
 from neuroprior._files import versions, write_csv, write_json
 from neuroprior.analysis.statistics import paired_difference
+from neuroprior.report.document import printed
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
 from neuroprior.report.page import FigureBox, Page, Section, Table, write_page
-from neuroprior.report.document import printed
 
 PLAIN = "sampling"
 """The planner that the others are compared with."""

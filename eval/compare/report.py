@@ -14,8 +14,8 @@ from eval.compare.pairs import paired, words
 from eval.compare.rows import Cells, Rows, bits_rows, growth_rows, rows
 from eval.compare.summary import reasons, reasons_in_words, reasons_section
 from neuroprior._files import versions, write_csv, write_json
-from neuroprior.report.page import Page, Section, write_page
 from neuroprior.report.document import printed
+from neuroprior.report.page import Page, Section, write_page
 
 Settings = Mapping[str, Any]
 

@@ -1,9 +1,9 @@
-"""The mice's maze drawn as it is, and figures of what priors bring a planner there, as PNG."""
+"""The mice's maze drawn as it is, and figures of what priors bring a planner there."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from eval.paper.figures import save
 from neuroprior import Plans, Prior, TabularWorld, labyrinth, oracle
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds.labyrinth import DEPTH, WATER
@@ -21,7 +20,9 @@ from neuroprior.worlds.labyrinth import DEPTH, WATER
 COLORS = {"uniform": "#7f7f7f", "markov": "#2171b5", "gru": "#e6550d", "transformer": "#88419d", "oracle": "black"}
 """The colour of each kind of prior."""
 
-STYLES = {"": "-", "node": "-", "moves": (0, (4, 2))}
+STYLES: dict[str, Any] = {"": "-", "node": "-", "moves": (0, (4, 2))}
+TITLES = {"mice": "from mice", "planner": "from exhaustive search", "reached": "from random search"}
+
 ENTRANCE = (-8.0, 0.0)
 """Where the corridor from the home cage begins."""
 
@@ -70,7 +71,7 @@ def left_turns(plans: Plans) -> tuple[Tensor, Tensor]:
     return left / (left + right), left + right
 
 
-def maze(path: Path, plans: Plans) -> None:
+def maze(plans: Plans) -> Figure:
     """The maze twice: how often mice walked through each corridor, and which way they turned at each junction."""
     place = coordinates(labyrinth())
     figure = Figure(figsize=(12.4, 6.2))
@@ -88,13 +89,13 @@ def maze(path: Path, plans: Plans) -> None:
     turns.scatter(*junction.T, s=size, c=share.numpy(), cmap="PuOr", norm=even, edgecolor="#444444", zorder=4)
     turns.set_title("which way mice turned on their way in\n(the larger, the more moves inward)")
     bar = figure.colorbar(ScalarMappable(even, "PuOr"), ax=turns, shrink=0.75, pad=0.02, ticks=[0, 0.25, 0.5, 0.75, 1])
-    bar.set_ticklabels(["always right", "25 % left", "as often", "75 % left", "always left"])
+    bar.set_ticklabels(["always right", "25 % left", "equally often", "75 % left", "always left"])
     for axes in (visits, turns):
         _signs(axes, place)
-    save(figure, path)
+    return figure
 
 
-def plans_in_maze(path: Path, priors: dict[str, Prior], world: TabularWorld, seed: int, number: int = 60) -> None:
+def plans_in_maze(priors: dict[str, Prior], world: TabularWorld, seed: int, number: int = 60) -> Figure:
     """Plans of 16 moves from a node far from the water, a panel for each of up to three priors."""
     place, start = coordinates(world), far_from_water(world)
     figure = Figure(figsize=(4.3 * len(priors), 4.9))
@@ -104,16 +105,18 @@ def plans_in_maze(path: Path, priors: dict[str, Prior], world: TabularWorld, see
         generator = torch.Generator().manual_seed(seed)
         _, rollout = sample_in_world(prior, world, start, number, 16, generator=generator, keep_states=True)
         assert rollout.states is not None
-        course = torch.cat([start.expand(number, 1), rollout.states[0]], 1)
+        trajectory = torch.cat([start.expand(number, 1), rollout.states[0]], 1)
         shift = 0.4 * (torch.rand(number, 1, 2, generator=generator) - 0.5)
-        lines = LineCollection(list((place[course] + shift).numpy()), colors=color, linewidths=1.1, alpha=0.4, zorder=3)
+        lines = LineCollection(
+            list((place[trajectory] + shift).numpy()), colors=color, linewidths=1.1, alpha=0.4, zorder=3
+        )
         axes.add_collection(lines)
         axes.plot(*place[start].T.numpy(), "o", label="start", **START)
         _signs(axes, place)
         reached = int((rollout.rewards.sum(-1) > 0).sum())
         axes.set_title(f"{name}\n{reached} of {number} plans reach the water", fontsize=10)
     figure.tight_layout()
-    save(figure, path)
+    return figure
 
 
 def far_from_water(world: TabularWorld) -> Tensor:
@@ -158,60 +161,45 @@ def _signs(axes: Axes, place: Tensor) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, -0.05), ncols=2, frameon=False, handletextpad=0.1)
 
 
-def reached_against_candidates(path: Path, rows: list[dict[str, Any]]) -> None:
+def reached_against_candidates(rows: pd.DataFrame) -> Figure:
     """The share of nodes from which the water was found against the number of candidates.
 
     A column of panels for each length of plans, a row for what the priors learned from, with 95 % bands.
     """
-    lengths = sorted({row["length"] for row in rows})
-    sources = [source for source in dict.fromkeys(row["learned_from"] for row in rows) if source]
+    lengths = sorted(rows.length.unique())
+    sources = [source for source in rows.learned_from.unique() if source]
     figure = Figure(figsize=(3.1 * len(lengths) + 1, 2.6 * len(sources) + 0.4))
     panels = figure.subplots(len(sources), len(lengths), sharex=True, sharey=True, squeeze=False)
     for line, source in zip(panels, sources, strict=True):
         for axes, length in zip(line, lengths, strict=True):
-            shown = [row for row in rows if row["length"] == length and row["learned_from"] in ("", source)]
-            _panel(axes, shown)
-        line[0].set_ylabel(f"{TITLES[source]}\nwater reached, % of nodes")
+            _panel(axes, rows[(rows.length == length) & rows.learned_from.isin(["", source])])
+        line[0].set_ylabel(f"learned {TITLES[source]}\nwater reached, % of nodes")
     for axes, length in zip(panels[0], lengths, strict=True):
         axes.set_title(f"plans of {length} moves", fontsize=10)
     for axes in panels[-1]:
         axes.set_xlabel("candidate plans")
-    _legend(figure, panels[0, -1])
+    lines: dict[str, tuple[str, Any]] = {"random legal moves": (COLORS["uniform"], "-")}
+    lines |= {kind: (COLORS[kind], "-") for kind in ("markov", "gru", "transformer")}
+    lines |= {"context: the node": ("black", "-"), "no context": ("black", STYLES["moves"]), "oracle": ("black", ":")}
+    handles = [Line2D([], [], color=color, linestyle=style, linewidth=1.8) for color, style in lines.values()]
+    panels[0, -1].legend(handles, list(lines), frameon=False, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     figure.tight_layout()
-    save(figure, path)
+    return figure
 
 
-TITLES = {"mice": "learned from mice", "planner": "from a short look-ahead", "reached": "from lucky random plans"}
-
-
-def _panel(axes: Axes, rows: list[dict[str, Any]]) -> None:
-    best = next(row for row in rows if row["prior"] == "oracle")
-    axes.axhline(100 * best["reached"], color=COLORS["oracle"], linestyle=":", linewidth=1.4)
-    for kind, sees in dict.fromkeys((row["prior"], row["sees"]) for row in rows if row["prior"] != "oracle"):
-        some = [row for row in rows if (row["prior"], row["sees"]) == (kind, sees)]
-        some.sort(key=lambda row: row["num_plans"])
-        number = [row["num_plans"] for row in some]
-        axes.plot(
-            number, [100 * row["reached"] for row in some], color=COLORS[kind], linestyle=STYLES[sees], linewidth=1.8
-        )
-        low, high = ([100 * row[end] for row in some] for end in ("low", "high"))
-        axes.fill_between(number, low, high, color=COLORS[kind], alpha=0.18, linewidth=0)
+def _panel(axes: Axes, rows: pd.DataFrame) -> None:
+    best = rows[rows.prior == "oracle"].reached.iloc[0]
+    axes.axhline(100 * best, color=COLORS["oracle"], linestyle=":", linewidth=1.4)
+    tried = rows[rows.prior != "oracle"].astype({"num_plans": int}).sort_values("num_plans", kind="stable")
+    for _, some in tried.groupby(["prior", "sees"], sort=False):
+        color, style = COLORS[some.prior.iloc[0]], STYLES[some.sees.iloc[0]]
+        axes.plot(some.num_plans, 100 * some.reached, color=color, linestyle=style, linewidth=1.8)
+        axes.fill_between(some.num_plans, 100 * some.low, 100 * some.high, color=color, alpha=0.18, linewidth=0)
     axes.set_xscale("log", base=2)
-    axes.set_xticks(number, [f"{n:,}" for n in number])
+    numbers = tried.num_plans.unique()
+    axes.set_xticks(numbers, [f"{number:,}" for number in numbers])
     axes.minorticks_off()
     axes.set_ylim(0, 104)
     axes.grid(color="#e6e6e6", linewidth=0.7)
     axes.set_axisbelow(True)
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    """What colours and lines mean, beside the panels."""
-    lines: dict[str, tuple[str, Any]] = {"random legal moves": (COLORS["uniform"], "-")}
-    lines |= {kind: (COLORS[kind], "-") for kind in ("markov", "gru", "transformer")}
-    lines |= {
-        "sees the node": ("black", "-"),
-        "sees its own moves": ("black", STYLES["moves"]),
-        "oracle": ("black", ":"),
-    }
-    handles = [Line2D([], [], color=color, linestyle=style, linewidth=1.8) for color, style in lines.values()]
-    axes.legend(handles, list(lines), frameon=False, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    axes.spines[["top", "right"]].set_visible(False)

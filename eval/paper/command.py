@@ -1,41 +1,46 @@
 """`python -m eval paper`: the simulations of the paper, its figures beside ours."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, fields
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import pandas as pd
+from jsonargparse.typing import NonNegativeFloat, NonNegativeInt, PositiveInt
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from eval.paper import figures, first_simulation, second_simulation, tables, value_quality
-from eval.paper.first_simulation import PAPER_MATRIX, PROTOCOLS, Protocol, Report, Size
-from eval.paper.second_simulation import Task
-from neuroprior._files import versions, write_csv, write_json
+from eval.paper import figures, first_simulation, second_simulation, value_quality
+from eval.paper.first_simulation import PAPER_BEST, PAPER_MATRIX, PAPER_STRUCTURE
+from eval.paper.planners import ANY_PREFIX, PaperSettings
+from eval.paper.second_simulation import PAPER_REACHED
+from neuroprior._files import versions, write_json
+from neuroprior._jobs import Progress
+from neuroprior.report.document import Column, printed, records, table, write_figures, write_frames
+from neuroprior.report.page import Table
 
-SCALES = (1e-4, 0.01, 0.1, 1.0)
-"""Scales of Q-learning's initial values that `--protocols all` compares."""
+SHORT = {"deterministic": "det.", "random": "rand.", "markov-1": "m-1", "markov-2": "m-2", "markov-3": "m-3"}
+SHORT |= {"transformer": "trans."}
+"""Names of planners in headings."""
 
 
 def paper(
-    worlds: int = 100,
-    starts: int = 1000,
-    training_plans: int = 20_000,
-    size: int = 20,
+    worlds: PositiveInt = 100,
+    starts: PositiveInt = 1000,
+    training_plans: PositiveInt = 20_000,
+    size: PositiveInt = 20,
     edges: Literal["torus", "wall"] = "torus",
     ties: Literal["uniform", "first"] = "uniform",
     learn_from: Literal["all", "shortest"] = "all",
     protocols: Literal["one", "all"] = "one",
     reward_power: float = 1.0,
-    value_functions: int = 10,
-    q_steps: int = 10_000,
-    initial_scale: float = 0.01,
-    max_plans: int = 10,
-    depth: int = 4,
-    length: int = 8,
-    num_plans: int = 256,
-    seed: int = 0,
+    value_functions: PositiveInt = 10,
+    q_steps: NonNegativeInt = 10_000,
+    initial_scale: NonNegativeFloat = 0.01,
+    max_plans: PositiveInt = 10,
+    depth: PositiveInt = 4,
+    length: PositiveInt = 8,
+    num_plans: PositiveInt = 256,
+    seed: NonNegativeInt = 0,
     out: str = "runs/paper",
 ) -> None:
     """The paper's two simulations: who finds the best plan on a grid, and who reaches the goal on poor values?
@@ -70,124 +75,160 @@ def paper(
         out: folder to write to.
     """
     settings = dict(locals())
-    least = {"worlds": 1, "starts": 2, "training_plans": 2, "value_functions": 2, "max_plans": 1, "size": 2}
-    least |= {"depth": 1, "length": 1, "num_plans": 1, "q_steps": 0, "initial_scale": 0}
-    for name, value in least.items():
-        if not value <= settings[name] < float("inf"):
-            raise ValueError(f"{name}: at least {value} is expected, not {settings[name]}")
-    if not 0 <= seed < 2**62:
-        raise ValueError(f"seed: an integer from 0 to 2**62 - 1 is expected, not {seed}")
-    amount, task = (kind(**{field.name: settings[field.name] for field in fields(kind)}) for kind in (Size, Task))
-    folder = Path(out)
+    for name in ("size", "value_functions"):
+        if settings[name] < 2:
+            raise ValueError(f"{name}: an integer of at least 2 is expected, not {settings[name]}")
+    own = PaperSettings(**{name: value for name, value in settings.items() if name not in ("protocols", "out")})
+    folder, console = Path(out), Console()
     folder.mkdir(parents=True, exist_ok=True)
-    console = Console()
     results = {"settings": settings, "versions": versions(), "seed": seed}
-    if protocols == "all":
-        results |= _all_protocols(amount, console, folder) | _all_scales(task, console, folder)
-        write_json(folder / "results.json", results)
-    else:
-        # Written after each simulation, so that the second cannot take the first along.
-        results |= _first(Protocol(edges, ties, learn_from), amount, console, folder)
-        write_json(folder / "results.json", results)
-        results |= _second(task, console, folder)
-        write_json(folder / "results.json", results)
+    for part in (_all_protocols, _all_scales) if protocols == "all" else (_first, _second):
+        results |= part(own, console, folder)
+        write_json(folder / "results.json", results)  # an error in the second part does not lose the first
     console.print(f"written to {folder}")
 
 
-def _first(protocol: Protocol, amount: Size, console: Console, folder: Path) -> dict[str, Any]:
-    with _progress(console, steps=11) as report:
-        outcome = first_simulation.simulate(protocol, amount, neural=True, report=report)
-    rows = first_simulation.rows_of(outcome)
-    console.print(tables.table_1(f"Table 1 ({protocol}; {tables.amount_of(amount)})", rows))
-    for line in tables.findings(outcome):
-        console.print(line)
-    matrix = outcome.transition_matrix
-    console.print(tables.matrix_table(matrix))
-    write_csv(folder / "table_1.csv", rows)
-    write_csv(folder / "transition_matrix.csv", tables.matrix_rows(outcome))
-    figures.best_bars(folder / "table_1.png", rows)
-    figures.matrices(folder / "transition_matrix.png", {"learned": matrix, "paper": PAPER_MATRIX})
-    figures.plans_in_world(folder / "world.png", outcome)
-    return {"simulation_1": {"protocol": asdict(protocol), "rows": rows, "transition_matrix": matrix.tolist()}}
+def _first(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
+    with Progress("first simulation", 11, 11) as progress:
+        result = first_simulation.simulate(settings, neural=True, finished=progress.advance)
+    rows, paired, matrix = result.table(), result.paired(), result.matrix()
+    columns: dict[str, Column] = {
+        "planner": "planner",
+        "best,\n%": _percent("best"),
+        "95 %\ninterval": _interval(),
+        "paper,\n%": _percent("paper"),
+        "mean\nreward": "mean_reward:.4f",
+        "normalised\nscore": "oracle_share:.4f",
+        "optimal,\n%": _percent("at_oracle"),
+        "steps": "model_steps:,",
+    }
+    caption = (
+        "best: at least as good as each of the paper's four planners; ties count for each. normalised score: reward /"
+        " that of the oracle, which tries all plans. optimal: starts with a plan as good as the oracle's."
+    )
+    title = f"Table 1 ({settings.protocol}; {_amount(settings)})"
+    console.print(printed(title, table(rows, columns, caption)))
+    if len(paired):
+        console.print(printed("Table 1, paired over worlds: optimal, points", _paired_table(paired)))
+    moves = list(dict.fromkeys(matrix["next"]))
+    both = matrix.assign(shown=[f"{a:.3f} ({b:.2f})" for a, b in zip(matrix.learned, matrix.paper, strict=True)])
+    both = both.pivot(index="after", columns="next", values="shown").loc[moves].reset_index()
+    title = "Transition matrix, markov-1 (in brackets: the paper's, about)"
+    console.print(printed(title, table(both, {"after": "after"} | {move: move for move in moves})))
+    write_frames(folder, {"table_1": rows, "paired_1": paired, "transition_matrix": matrix})
+    learned = result.transition_matrix
+    pictures = {
+        "table_1": figures.best_bars(rows),
+        "transition_matrix": figures.matrices({"learned": learned, "paper": PAPER_MATRIX}),
+        "world": figures.plans_in_world(result),
+    }
+    write_figures(folder, pictures)
+    protocol = {"edges": settings.edges, "ties": settings.ties, "learn_from": settings.learn_from}
+    found = {"protocol": protocol, "rows": records(rows), "paired": records(paired)}
+    return {"simulation_1": found | {"transition_matrix": learned.tolist()}}
 
 
-def _second(task: Task, console: Console, folder: Path) -> dict[str, Any]:
-    with _progress(console, steps=4 + 14 + 5) as report:
-        outcome, priors = second_simulation.simulate(task, full=True, report=report)
-        quality = value_quality.measure(task, priors, report)
-    rows = second_simulation.rows_of(outcome)
-    ceilings = second_simulation.ceilings_of(outcome)
-    paired = second_simulation.findings(outcome)
-    console.print(tables.table_2(task, rows, ceilings))
-    console.print(tables.paired_table(paired))
-    console.print(tables.quality_table(quality))
-    write_csv(folder / "table_2.csv", rows)
-    write_csv(folder / "value_quality.csv", quality)
-    figures.values_and_stuck(folder / "figure_1.png", outcome, task)
-    figures.success_against_quality(folder / "value_quality.png", quality)
-    found = {"task": asdict(task), "rows": rows, **ceilings, "paired": paired, "value_quality": quality}
-    return {"simulation_2": found}
+def _second(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
+    with Progress("second simulation", 23, 23) as progress:
+        result, priors = second_simulation.simulate(settings, full=True, finished=progress.advance)
+        quality = value_quality.measure(settings, priors, progress.advance)
+    rows, ceilings, paired = result.table(), result.ceilings(), result.paired()
+    shown = [{"planner": "ceiling" + ANY_PREFIX * ("any" in name), "reached": best} for name, best in ceilings.items()]
+    columns: dict[str, Column] = {
+        "planner": "planner",
+        "reached, %": _percent("reached"),
+        "95 % interval": _interval(),
+        "paper, %": _percent("paper"),
+        "steps": "model_steps:,.0f",
+    }
+    caption = (
+        "reached: starts from which the goal was reached. steps: simulator steps for each plan. any prefix: plans may"
+        " end after any move. ceiling: starts from which some plans of these lengths end on the goal at all."
+    )
+    size = f"{settings.value_functions} value functions x {settings.starts:,} starts"
+    title = f"Table 2 ({settings.edges}; {size}, up to {settings.max_plans} plans)"
+    console.print(printed(title, table(pd.concat([rows, pd.DataFrame(shown)]), columns, caption)))
+    title = "Table 2, paired over value functions: goal reached, points"
+    console.print(printed(title, _paired_table(paired)))
+    names = [str(name) for name in quality if f"{name} low" in quality]
+    columns = {"values": "kind", "level": "level", "qual.": "quality:.2f"}
+    columns |= {SHORT.get(name, name): _percent(name) for name in names} | {"ceil.": _percent("ceiling")}
+    caption = (
+        "values: of Q-learning after so many steps; of value iteration cut short after so many sweeps; true ones"
+        " averaged over tiles of that side; of a network trained for so many steps; for a goal so many cells away."
+        " qual.: rank correlation with the true ones."
+    )
+    title = "How wrong the values are, and the goal reached, % of starts"
+    once = quality.assign(kind=quality.kind.where(~quality.kind.duplicated(), ""))
+    console.print(printed(title, table(once, columns, caption)))
+    write_frames(folder, {"table_2": rows, "value_quality": quality})
+    pictures = {"figure_1": figures.values_and_stuck(result, settings)}
+    write_figures(folder, pictures | {"value_quality": figures.success_against_quality(quality)})
+    found = {"task": asdict(settings), "rows": records(rows), **ceilings, "paired": records(paired)}
+    return {"simulation_2": found | {"value_quality": records(quality)}}
 
 
-def _all_protocols(amount: Size, console: Console, folder: Path) -> dict[str, Any]:
-    found = []
-    with _progress(console, steps=7 * len(PROTOCOLS)) as report:
-        for protocol in PROTOCOLS:
-            outcome = first_simulation.simulate(protocol, amount, neural=False, report=_prefixed(report, protocol))
-            found.append((protocol, first_simulation.rows_of(outcome), outcome.transition_matrix))
-    flat = [tables.protocol_row(*item) for item in found]
-    console.print(tables.protocols_table(flat, tables.amount_of(amount)))
+def _all_protocols(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
+    with Progress("protocols", 8, 8) as progress:
+        rows = first_simulation.all_protocols(settings, progress.advance)
+    repeat, turn, reverse, _ = PAPER_STRUCTURE
+    own = {"edges": "paper", **PAPER_BEST, "repeat": repeat, "turn": turn, "reverse": reverse}
+    columns: dict[str, Column] = {
+        "edges, ties,\nlearn from": lambda row: " ".join(row[["edges", "ties", "learn_from"]].dropna()),
+        **{SHORT[name]: _percent(name) for name in PAPER_BEST},
+        "re-\npeat": "repeat:.2f",
+        "turn": "turn:.2f",
+        "back": "reverse:.2f",
+        "off": _percent("table_distance"),
+        "off\nm.": "matrix_distance:.3f",
+    }
+    caption = "off: root mean square difference from the paper's table, points; off m.: from its matrix."
+    shown = table(pd.concat([rows, pd.DataFrame([own])]), columns, caption)
+    console.print(printed(f"Table 1 under every protocol, % of starts ({_amount(settings)})", shown))
     nearest = {}
     for what in ("table", "matrix"):
-        best = min(flat, key=lambda row: row[f"{what}_distance"])
-        nearest[what] = {name: best[name] for name in ("edges", "ties", "learn_from")}
-        console.print(f"nearest to the paper's {what}: [bold]{Protocol(**nearest[what])}[/bold]")
-    write_csv(folder / "protocols.csv", flat)
-    return {"protocols": flat, "nearest": nearest}
+        best = records(rows.nsmallest(1, f"{what}_distance")[["edges", "ties", "learn_from"]])[0]
+        nearest[what] = best
+        console.print(f"nearest to the paper's {what}: [bold]{replace(settings, **best).protocol}[/bold]")
+    write_frames(folder, {"protocols": rows})
+    return {"protocols": records(rows), "nearest": nearest}
 
 
-def _all_scales(task: Task, console: Console, folder: Path) -> dict[str, Any]:
-    flat = []
-    settings = [(edges, scale) for edges in ("torus", "wall") for scale in SCALES]
-    with _progress(console, steps=7 * len(settings)) as report:
-        for edges, scale in settings:
-            changed = Task(**(asdict(task) | {"edges": edges, "initial_scale": scale}))
-            outcome, _ = second_simulation.simulate(changed, full=False, report=_prefixed(report, (edges, scale)))
-            rows = second_simulation.rows_of(outcome)
-            row: dict[str, Any] = {"edges": edges, "initial_scale": scale}
-            row |= {r["planner"]: r["reached"] for r in rows} | second_simulation.ceilings_of(outcome)
-            distance, low, high = second_simulation.distance_interval(outcome)
-            flat.append(row | {"table_distance": distance, "low": low, "high": high})
-    console.print(tables.scales_table(flat))
-    best = min(flat, key=lambda row: row["table_distance"])
-    alike = [row for row in flat if row["low"] <= best["high"]]
+def _all_scales(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
+    with Progress("initial values", 8, 8) as progress:
+        rows = second_simulation.all_scales(settings, progress.advance)
+    columns: dict[str, Column] = {"edges": "edges", "initial\nvalues": "initial_scale:g"}
+    columns |= {SHORT[name]: _percent(name) for name in PAPER_REACHED}
+    columns |= {"ceiling": _percent("ceiling"), "off": _percent("table_distance"), "95 %": _interval()}
+    caption = "off: root mean square difference from the paper's table, points (interval over value functions)."
+    shown = table(pd.concat([rows, pd.DataFrame([{"edges": "paper", **PAPER_REACHED}])]), columns, caption)
+    console.print(printed("Table 2 under every setting: goal reached, % of starts", shown))
+    best = records(rows.nsmallest(1, "table_distance")[["edges", "initial_scale"]])[0]
     console.print(
-        f"nearest to the paper's Table 2: [bold]{_setting(best)}[/bold]; not told apart from it (intervals overlap): "
-        + "; ".join(_setting(row) for row in alike if row is not best)
+        f"nearest to the paper's Table 2: [bold]{best['edges']}, values up to {best['initial_scale']:g}[/bold]"
     )
-    write_csv(folder / "scales.csv", flat)
-    return {"scales": flat, "nearest_scale": {name: best[name] for name in ("edges", "initial_scale")}}
+    write_frames(folder, {"scales": rows})
+    return {"scales": records(rows), "nearest_scale": best}
 
 
-def _setting(row: dict[str, Any]) -> str:
-    return f"{row['edges']}, values up to {row['initial_scale']:g}"
+def _amount(settings: PaperSettings) -> str:
+    worlds = "1 world" if settings.worlds == 1 else f"{settings.worlds} worlds"
+    return f"{worlds} x {settings.starts:,} starts, {settings.num_plans} plans of {settings.length} moves"
 
 
-def _prefixed(report: Report, what: object) -> Report:
-    return lambda text: report(f"{what}: {text}")
+def _paired_table(paired: pd.DataFrame) -> Table:
+    short = {end: paired[end].str.replace(ANY_PREFIX, ", any", regex=False) for end in ("first", "second")}
+    columns: dict[str, Column] = {"planner": "first", "minus": "second", "gain": _percent("mean", "+.1f")}
+    columns |= {"95 % interval": _interval("+.1f", " to "), "p": "p_value:.1g"}
+    return table(paired.assign(**short), columns, align="llrrr")
 
 
-@contextmanager
-def _progress(console: Console, steps: int) -> Iterator[Callable[[str], None]]:
-    """A progress bar; the function that it gives is told what begins."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("", total=steps)
-        begun = False
+def _percent(name: str, form: str = ".1f") -> Callable[[Any], str]:
+    """A column of shares, in percent; what is missing is left blank."""
+    return lambda row: "" if pd.isna(row[name]) else f"{100 * row[name]:{form}}"
 
-        def report(what: str) -> None:
-            nonlocal begun
-            progress.update(task, description=what, advance=1 if begun else 0)
-            begun = True
 
-        yield report
+def _interval(form: str = ".1f", between: str = "-") -> Callable[[Any], str]:
+    """The interval of shares, in percent."""
+    low, high = _percent("low", form), _percent("high", form)
+    return lambda row: low(row) and f"{low(row)}{between}{high(row)}"

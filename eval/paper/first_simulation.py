@@ -1,27 +1,16 @@
 """The paper's first simulation: planners on a grid of random rewards, with and without behavioural priors."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import replace
+from itertools import product
+from typing import Any, NamedTuple
 
+import pandas as pd
 import torch
 from torch import Tensor
 
-from neuroprior import (
-    ExhaustivePlanner,
-    GridWorld,
-    GRUPrior,
-    MarkovPrior,
-    Planner,
-    Plans,
-    Prior,
-    SamplingPlanner,
-    TransformerPrior,
-    UniformPrior,
-    gridworld,
-    oracle,
-)
-from neuroprior.analysis.statistics import Interval, best_of, mean_interval, share_interval
+from eval.paper.planners import Finished, PaperSettings, fit_priors, groups, make_planners, over_groups
+from neuroprior import Decision, ExhaustivePlanner, GridWorld, MarkovPrior, Plans, gridworld, oracle
+from neuroprior.analysis.statistics import best_of, paired_difference
 from neuroprior.plans import all_plans
 
 PAPER_BEST = {"deterministic": 0.321, "random": 0.537, "markov-1": 0.841, "markov-2": 0.844}
@@ -32,216 +21,145 @@ PAPER_STRUCTURE = (0.60, 0.20, 0.0, 0.20)
 
 PAPER_MATRIX = torch.tensor([[PAPER_STRUCTURE[(b - a) % 4] for b in range(4)] for a in range(4)])
 
-Report = Callable[[str], None]
 
-
-@dataclass(frozen=True)
-class Protocol:
-    """What the paper leaves open."""
-
-    edges: Literal["wall", "torus"]
-    ties: Literal["uniform", "first"]
-    learn_from: Literal["all", "shortest"]
-
-    def __str__(self) -> str:
-        return f"{self.edges}, {self.ties} ties, learn from {self.learn_from}"
-
-
-PROTOCOLS = [
-    Protocol(edges, ties, learn_from)
-    for edges in ("torus", "wall")
-    for ties in ("uniform", "first")
-    for learn_from in ("all", "shortest")
-]
-
-
-@dataclass(frozen=True)
-class Size:
-    """How much is simulated."""
-
-    worlds: int
-    starts: int
-    training_plans: int
-    size: int
-    reward_power: float
-    depth: int
-    length: int
-    num_plans: int
-    seed: int
-
-
-class Outcome(NamedTuple):
-    """What came of one protocol: K planners, W worlds, n starts a world.
+class FirstResult(NamedTuple):
+    """The first simulation under one protocol, in W worlds with n starts in each.
 
     Attributes:
-        names: of the planners.
-        scores: `[K, W, n]`.
-        oracle: `[W, n]`: the best of any plan.
-        plans: `[K, W, n, L]`, padded with -1 where a planner's plans are shorter.
-        states: `[W, n]`: the starts.
         world: in which the planners were compared.
-        model_steps: single simulator steps for each start, by planner.
+        states: `[W, n]`: the starts.
+        decisions: of each planner, for the starts flattened.
+        oracle: `[W, n]`: the best of any plan.
         transition_matrix: `[A, A]` of the Markov prior of order 1.
     """
 
-    names: list[str]
-    scores: Tensor
-    oracle: Tensor
-    plans: Tensor
-    states: Tensor
     world: GridWorld
-    model_steps: list[int]
+    states: Tensor
+    decisions: dict[str, Decision]
+    oracle: Tensor
     transition_matrix: Tensor
 
+    def table(self) -> pd.DataFrame:
+        """Table 1: in what share of the starts each planner was best of the paper's four, and its rewards."""
+        scores = {name: decision.score.view(self.states.shape) for name, decision in self.decisions.items()}
+        scores["oracle"] = self.oracle
+        best = best_of(torch.stack(list(scores.values())), [list(scores).index(name) for name in PAPER_BEST])
+        rows = []
+        for (name, own), hits in zip(scores.items(), best, strict=True):
+            share = over_groups(hits)
+            row = {"planner": name, "best": share.mean, "low": share.low, "high": share.high}
+            row |= {
+                "paper": PAPER_BEST.get(name),
+                "mean_reward": float(own.double().mean()),
+                "oracle_share": float(own.double().sum() / self.oracle.double().sum()),
+                "at_oracle": float((own >= self.oracle).double().mean()),
+                "model_steps": None if name == "oracle" else self.decisions[name].model_steps,
+            }
+            rows.append(row)
+        return pd.DataFrame(rows, dtype=object)
 
-def simulate(protocol: Protocol, size: Size, neural: bool, report: Report) -> Outcome:
+    def paired(self) -> pd.DataFrame:
+        """Neural priors minus the best Markov prior: in how many more starts they found the best plan of all.
+
+        Paired over worlds; empty for a single world.
+        """
+        if len(self.oracle) < 2:
+            return pd.DataFrame()
+        optimal = {
+            name: (decision.score.view(self.states.shape) >= self.oracle).double().mean(1)
+            for name, decision in self.decisions.items()
+        }
+        markov = max((name for name in optimal if "markov" in name), key=lambda name: float(optimal[name].mean()))
+        pairs = [(name, markov) for name in ("gru", "transformer")]
+        return pd.DataFrame(
+            {"first": a, "second": b, **paired_difference(optimal[a], optimal[b])._asdict()} for a, b in pairs
+        )
+
+    def matrix(self) -> pd.DataFrame:
+        """The transition matrix of the Markov prior of order 1, a row for each pair of moves."""
+        names = self.world.action_names or ()
+        return pd.DataFrame(
+            {"after": a, "next": b, "learned": float(self.transition_matrix[i, j]), "paper": float(PAPER_MATRIX[i, j])}
+            for i, a in enumerate(names)
+            for j, b in enumerate(names)
+        )
+
+    def summary(self) -> dict[str, float]:
+        """The paper's four shares, the matrix as repeat, turn and reverse, and how far both are from the paper's.
+
+        Distances are root mean squares.
+        """
+        table, matrix = self.table().set_index("planner"), self.transition_matrix
+        shares = {name: float(table.best[name]) for name in PAPER_BEST}
+        gaps = torch.tensor([shares[name] - PAPER_BEST[name] for name in PAPER_BEST])
+        shifted = [float(torch.stack([matrix[a, (a + d) % 4] for a in range(4)]).mean()) for d in range(4)]
+        structure = {"repeat": shifted[0], "turn": (shifted[1] + shifted[3]) / 2, "reverse": shifted[2]}
+        return {
+            **shares,
+            **structure,
+            "table_distance": float(gaps.square().mean().sqrt()),
+            "matrix_distance": float((matrix - PAPER_MATRIX).square().mean().sqrt()),
+        }
+
+
+def simulate(settings: PaperSettings, neural: bool, finished: Finished) -> FirstResult:
     """Collect plans, fit the priors, and let all planners plan from the same starts.
 
     With one world the priors learn in the world where they are used; with more, in as many other ones.
 
     Args:
-        protocol: what the paper leaves open.
-        size: how much.
+        settings: see `paper`.
         neural: also fit a GRU and a transformer.
-        report: is told what begins.
+        finished: is called 11 times, without neural priors 7 times.
     """
-    generator = torch.Generator().manual_seed(size.seed)
-    more = size.worlds if size.worlds > 1 else 0
-    everywhere = gridworld(
-        size.size,
-        size.size,
-        protocol.edges,
-        reward_power=size.reward_power,
-        num_worlds=size.worlds + more,
-        seed=size.seed,
-    )
-    cells = everywhere.num_states
-    learn_in = more * cells + torch.randint(size.worlds * cells, (size.training_plans,), generator=generator)
-    report("collecting plans")
-    plans = training_plans(everywhere, learn_in, size.depth, protocol, generator)
-    priors = learn_priors(plans, size.seed, neural, generator, report)
-    planners = make_planners(priors, size.depth, size.length, size.num_plans)
-    start = torch.randint(cells, (size.worlds, size.starts), generator=generator)
-    states = start + torch.arange(size.worlds)[:, None] * cells
-    scores, chosen, steps = [], [], []
+    worlds, starts = settings.worlds, settings.starts
+    generator = torch.Generator().manual_seed(settings.seed)
+    more = worlds if worlds > 1 else 0
+    side, power = settings.size, settings.reward_power
+    world = gridworld(side, side, settings.edges, reward_power=power, num_worlds=worlds + more, seed=settings.seed)
+    cells = world.num_states
+    learn_in = more * cells + torch.randint(worlds * cells, (settings.training_plans,), generator=generator)
+    plans = training_plans(world, learn_in, settings, generator)
+    finished("collecting plans")
+    planners = make_planners(fit_priors(plans, settings.seed, neural, generator, finished), settings)
+    start = torch.randint(cells, (worlds, starts), generator=generator)
+    states = start + torch.arange(worlds)[:, None] * cells
+    decisions = {}
     for name, planner in planners.items():
-        report(f"planning: {name}")
-        decision = planner.plan(everywhere, states.flatten(), generator)
-        chosen.append(decision.plan.long())
-        scores.append(decision.score)
-        steps.append(decision.model_steps)
-    width = max(plan.shape[1] for plan in chosen)
-    chosen = [torch.nn.functional.pad(plan, (0, width - plan.shape[1]), value=-1) for plan in chosen]
-    shape = (len(planners), size.worlds, size.starts)
-    report("planning: oracle")
-    return Outcome(
-        list(planners),
-        torch.stack(scores).view(shape),
-        oracle(everywhere, states.flatten(), size.length).view(shape[1:]),
-        torch.stack(chosen).view(*shape, width),
-        states,
-        everywhere,
-        steps,
-        MarkovPrior(4, 1).fit(plans).transition_matrix(),
-    )
+        decisions[name] = planner.plan(world, states.flatten(), generator)
+        finished(f"planning: {name}")
+    best = oracle(world, states.flatten(), settings.length).view(states.shape)
+    finished("planning: oracle")
+    return FirstResult(world, states, decisions, best, MarkovPrior(4, 1).fit(plans).transition_matrix())
 
 
-def training_plans(
-    world: GridWorld, states: Tensor, depth: int, protocol: Protocol, generator: torch.Generator
-) -> Plans:
+def all_protocols(settings: PaperSettings, finished: Finished) -> pd.DataFrame:
+    """Table 1 under every protocol, with the Markov priors alone; `finished` is called 8 times."""
+    rows: list[dict[str, Any]] = []
+    for choice in product(("torus", "wall"), ("uniform", "first"), ("all", "shortest")):
+        protocol: dict[str, Any] = dict(zip(("edges", "ties", "learn_from"), choice, strict=True))
+        changed = replace(settings, **protocol)
+        rows.append(protocol | simulate(changed, neural=False, finished=lambda _: None).summary())
+        finished(changed.protocol)
+    return pd.DataFrame(rows)
+
+
+def training_plans(world: GridWorld, states: Tensor, settings: PaperSettings, generator: torch.Generator) -> Plans:
     """The executed plans of the deterministic planner that the priors learn from."""
+    depth = settings.depth
     decision = ExhaustivePlanner(depth).plan(world, states, generator)
     actions = decision.plan.long()
-    if protocol.ties == "first":
+    if settings.ties == "first":
         actions = _first_of_equals(world, states, decision.score, depth)
     kept = torch.ones(len(states), dtype=torch.bool)
-    if protocol.learn_from == "shortest":
-        kept = _distance(world, states, decision.final_state) == depth
+    if settings.learn_from == "shortest":
+        gap = (world.coordinates(states) - world.coordinates(decision.final_state)).abs()
+        if world.edges == "torus":
+            gap = torch.minimum(gap, torch.tensor([world.height, world.width]) - gap)
+        kept = gap.sum(-1) == depth
     if int(kept.sum()) < 2:
         raise ValueError("training_plans: too few plans to learn from; give more, or a larger grid")
     return Plans(actions[kept], 4, action_names=world.action_names, group=groups(world, states[kept]))
-
-
-def groups(world: GridWorld, states: Tensor) -> Tensor | None:
-    """The reward map of each state as its plan's group; None for one map: a single group cannot be split in two."""
-    maps = world.reward_map(states)
-    return maps if len(maps.unique()) > 1 else None
-
-
-def learn_priors(plans: Plans, seed: int, neural: bool, generator: torch.Generator, report: Report) -> dict[str, Prior]:
-    """The priors of the tables by name, with neural ones or without.
-
-    Order 3, which the paper does not have, is the highest that plans of four moves can teach: the neural priors' rival.
-    """
-    priors: dict[str, Prior] = {"random": UniformPrior(4)}
-    for order in (1, 2, 3):
-        priors[f"markov-{order}"] = MarkovPrior(4, order).fit(plans)
-    if neural:
-        for name, make in (("gru", GRUPrior), ("transformer", TransformerPrior)):
-            report(f"training: {name}")
-            priors[name] = make(4, seed=seed).fit(plans, generator=generator, progress=False)
-    return priors
-
-
-def make_planners(
-    priors: dict[str, Prior],
-    depth: int,
-    length: int,
-    num_plans: int,
-    value: Callable[[Tensor], Tensor] | None = None,
-    any_prefix: bool = False,
-) -> dict[str, Planner]:
-    """The planners of the tables by name: the deterministic one, and one for each prior."""
-    planners: dict[str, Planner] = {"deterministic": ExhaustivePlanner(depth, value=value, any_prefix=any_prefix)}
-    for name, prior in priors.items():
-        planners[name] = SamplingPlanner(prior, length, num_plans, value=value, any_prefix=any_prefix)
-    return planners
-
-
-def rows_of(outcome: Outcome) -> list[dict[str, Any]]:
-    """A row a planner: the share of starts where it was best of the paper's four, its rewards, and the oracle's."""
-    rivals = [outcome.names.index(name) for name in PAPER_BEST]
-    scores = torch.cat([outcome.scores, outcome.oracle[None]])
-    best = best_of(scores, rivals)
-    rows: list[dict[str, Any]] = []
-    for k, name in enumerate([*outcome.names, "oracle"]):
-        share = over_groups(best[k])
-        rows.append(
-            {
-                "planner": name,
-                "best": share.mean,
-                "low": share.low,
-                "high": share.high,
-                "paper": PAPER_BEST.get(name),
-                "mean_reward": float(scores[k].double().mean()),
-                "oracle_share": float(scores[k].double().sum() / outcome.oracle.double().sum()),
-                "at_oracle": float((scores[k] >= outcome.oracle).double().mean()),
-                "model_steps": None if name == "oracle" else outcome.model_steps[k],
-            }
-        )
-    return rows
-
-
-def table_distance(rows: list[dict[str, Any]], column: str) -> float:
-    """The root mean square difference between a column and the paper's figures, over its four planners."""
-    gaps = [row[column] - row["paper"] for row in rows if row["paper"] is not None]
-    return float(torch.tensor(gaps).square().mean().sqrt())
-
-
-def matrix_distance(matrix: Tensor) -> float:
-    """The root mean square difference between a transition matrix and the paper's."""
-    return float((matrix - PAPER_MATRIX).square().mean().sqrt())
-
-
-def over_groups(hits: Tensor) -> Interval:
-    """The share of True in `hits [G, n]` with an interval over the G worlds or value functions.
-
-    Where there is one alone, the interval is over its starts.
-    """
-    if len(hits) == 1:
-        return share_interval(int(hits.sum()), hits.numel())
-    share, low, high = mean_interval(hits.double().mean(1))
-    return Interval(share, max(low, 0.0), min(high, 1.0))
 
 
 def _first_of_equals(world: GridWorld, states: Tensor, score: Tensor, depth: int) -> Tensor:
@@ -252,11 +170,3 @@ def _first_of_equals(world: GridWorld, states: Tensor, score: Tensor, depth: int
         rewards = world.rollout(some, every.expand(len(some), *every.shape)).rewards[..., -1]
         chosen.append(every[(rewards == best[:, None]).int().argmax(1)])
     return torch.cat(chosen)
-
-
-def _distance(world: GridWorld, first: Tensor, second: Tensor) -> Tensor:
-    """The number of moves between states of an empty grid."""
-    gap = (world.coordinates(first) - world.coordinates(second)).abs()
-    if world.edges == "torus":
-        gap = torch.minimum(gap, torch.tensor([world.height, world.width]) - gap)
-    return gap.sum(-1)

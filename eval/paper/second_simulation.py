@@ -1,13 +1,14 @@
 """The paper's second simulation: planning on values that are only approximately right."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
+import pandas as pd
 import torch
 from torch import Tensor
 
-from eval.paper.first_simulation import Report, groups, learn_priors, make_planners, over_groups
+from eval.paper.planners import ANY_PREFIX, Finished, PaperSettings, fit_priors, groups, make_planners, over_groups
 from neuroprior import ExhaustivePlanner, GridWorld, Planner, Plans, Prior
 from neuroprior.analysis.statistics import Interval, paired_difference
 from neuroprior.values import can_reach, q_learning, value_iteration
@@ -15,31 +16,8 @@ from neuroprior.values import can_reach, q_learning, value_iteration
 PAPER_REACHED = {"deterministic": 0.2422, "random": 0.3952, "markov-1": 0.4961, "markov-2": 0.4733}
 """Hyvärinen, Table 2: the share of 10,000 starts from which the goal was reached."""
 
-ANY_PREFIX = " (any prefix)"
-"""What is added to the name of a planner that may end a plan after any of its actions."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """What is planned, and how much of it."""
-
-    edges: Literal["wall", "torus"]
-    value_functions: int
-    starts: int
-    size: int
-    q_steps: int
-    initial_scale: float
-    max_plans: int
-    training_plans: int
-    depth: int
-    length: int
-    num_plans: int
-    seed: int
-
-    @property
-    def goal(self) -> int:
-        """The goal's cell, in the middle."""
-        return self.size // 2 * self.size + self.size // 2
+SCALES = (1e-4, 0.01, 0.1, 1.0)
+"""Scales of Q-learning's initial values that are compared."""
 
 
 class Pursuit(NamedTuple):
@@ -62,39 +40,75 @@ class Pursuit(NamedTuple):
     model_steps: int
 
 
-class Outcome(NamedTuple):
-    """What came of a task: K planners, V value functions, n starts.
+class SecondResult(NamedTuple):
+    """The second simulation: V value functions with n starts for each.
 
     Attributes:
-        names: of the planners.
-        reached: `[K, V, n]` bool.
-        final_state: `[K, V, n]`.
+        world: with a map of rewards, all 0, for each value function.
+        states: `[V, n]`: the starts.
+        pursuits: of each planner, from the starts flattened.
         ceiling: `[V, n]` bool: starts that can end on the goal at all.
         prefix_ceiling: the same for planners that may end a plan after any action.
         values: `[V, S]`: the value functions, without the goal's infinity.
         exact: `[S]`: the true values.
-        world: with a map of rewards, all 0, for each value function.
-        model_steps: single simulator steps for each plan, by planner.
     """
 
-    names: list[str]
-    reached: Tensor
-    final_state: Tensor
+    world: GridWorld
+    states: Tensor
+    pursuits: dict[str, Pursuit]
     ceiling: Tensor
     prefix_ceiling: Tensor
     values: Tensor
     exact: Tensor
-    world: GridWorld
-    model_steps: list[int]
+
+    def reached(self) -> dict[str, Tensor]:
+        """From which starts each planner reached the goal: `[V, n]` bool."""
+        return {name: done.reached.view(self.states.shape) for name, done in self.pursuits.items()}
+
+    def table(self) -> pd.DataFrame:
+        """Table 2: the share of starts from which each planner reached the goal, and its simulator steps a plan."""
+        rows = []
+        for name, reached in self.reached().items():
+            share = over_groups(reached)
+            row = {"planner": name, "reached": share.mean, "low": share.low, "high": share.high}
+            rows.append(row | {"paper": PAPER_REACHED.get(name), "model_steps": self.pursuits[name].model_steps})
+        return pd.DataFrame(rows)
+
+    def ceilings(self) -> dict[str, float]:
+        """The shares of starts that can reach the goal at all, with whole plans and with any prefix of them."""
+        shares = {"ceiling": self.ceiling, "ceiling_any_prefix": self.prefix_ceiling}
+        return {name: float(able.double().mean()) for name, able in shares.items()}
+
+    def distance(self, resamples: int = 2000) -> Interval:
+        """The root mean square difference from the paper's Table 2.
+
+        The interval is a bootstrap's, over value functions: the distance is no mean of independent values.
+        """
+        reached = self.reached()
+        shares = torch.stack([reached[name].double().mean(1) for name in PAPER_REACHED])
+        paper = torch.tensor(list(PAPER_REACHED.values()), dtype=torch.double)[:, None]
+        functions = shares.shape[1]
+        again = torch.randint(functions, (resamples, functions), generator=torch.Generator().manual_seed(0))
+        distances = (shares[:, again].mean(2) - paper).square().mean(0).sqrt()
+        low, high = distances.quantile(torch.tensor([0.025, 0.975], dtype=torch.double)).tolist()
+        return Interval(float((shares.mean(1, keepdim=True) - paper).square().mean().sqrt()), low, high)
+
+    def paired(self) -> pd.DataFrame:
+        """Priors compared with none, and neural ones with the best Markov prior, paired over value functions."""
+        share = {name: reached.double().mean(1) for name, reached in self.reached().items()}
+        rows = []
+        for suffix in ("", ANY_PREFIX):
+            best = max((f"markov-{k}" for k in (1, 2, 3)), key=lambda name: float(share[name + suffix].mean()))
+            pairs = [("random", "deterministic"), ("markov-1", "random"), ("markov-2", "random")]
+            for pair in [*pairs, ("gru", best), ("transformer", best)]:
+                first, second = (name + suffix for name in pair)
+                gap = paired_difference(share[first], share[second])
+                rows.append({"first": first, "second": second, **gap._asdict()})
+        return pd.DataFrame(rows)
 
 
 def pursue(
-    planner: Planner,
-    world: GridWorld,
-    state: Tensor,
-    goal: int,
-    max_plans: int,
-    generator: torch.Generator,
+    planner: Planner, world: GridWorld, state: Tensor, goal: int, max_plans: int, generator: torch.Generator
 ) -> Pursuit:
     """Plan, go where the plan ends, and plan again from there, up to `max_plans` times or until on the goal."""
     state = state.clone()
@@ -120,9 +134,9 @@ def pursue(
     )
 
 
-def empty_world(task: Task, num_maps: int) -> GridWorld:
+def empty_world(settings: PaperSettings, num_maps: int) -> GridWorld:
     """The grid, without rewards, once for each value function."""
-    return GridWorld(task.size, task.size, task.edges, torch.zeros(num_maps, task.size**2))
+    return GridWorld(settings.size, settings.size, settings.edges, torch.zeros(num_maps, settings.size**2))
 
 
 def objective(values: Tensor, goal: int) -> Callable[[Tensor], Tensor]:
@@ -133,139 +147,97 @@ def objective(values: Tensor, goal: int) -> Callable[[Tensor], Tensor]:
     return lambda state: flat[state]
 
 
-def random_starts(task: Task, num_maps: int, number: int, generator: torch.Generator) -> Tensor:
+def random_starts(settings: PaperSettings, num_maps: int, number: int, generator: torch.Generator) -> Tensor:
     """`number` states for each of `num_maps` value functions, uniform over all cells but the goal: `[V, n]`."""
-    cell = torch.randint(task.size**2 - 1, (num_maps, number), generator=generator)
-    cell = cell + (cell >= task.goal)
-    return cell + torch.arange(num_maps)[:, None] * task.size**2
+    cell = torch.randint(settings.size**2 - 1, (num_maps, number), generator=generator)
+    cell = cell + (cell >= settings.goal)
+    return cell + torch.arange(num_maps)[:, None] * settings.size**2
 
 
-def planners_for(
-    priors: dict[str, Prior], task: Task, value: Callable[[Tensor], Tensor], any_prefix: bool = False
-) -> dict[str, Planner]:
-    """The planners of the table by name."""
-    planners = make_planners(priors, task.depth, task.length, task.num_plans, value, any_prefix)
-    return {name + (ANY_PREFIX if any_prefix else ""): planner for name, planner in planners.items()}
-
-
-def learn(task: Task, values: Tensor, neural: bool, generator: torch.Generator, report: Report) -> dict[str, Prior]:
+def learn(
+    settings: PaperSettings, values: Tensor, neural: bool, generator: torch.Generator, finished: Finished
+) -> dict[str, Prior]:
     """The priors that learn from the whole plans that the deterministic planner executes under `values [V, S]`."""
-    world = empty_world(task, len(values))
-    number = -(-task.training_plans // len(values))
-    states = random_starts(task, len(values), number, generator).flatten()
-    planner = ExhaustivePlanner(task.depth, value=objective(values, task.goal))
-    report("second simulation: collecting plans")
-    done = pursue(planner, world, states, task.goal, task.max_plans, generator)
+    world = empty_world(settings, len(values))
+    number = -(-settings.training_plans // len(values))
+    states = random_starts(settings, len(values), number, generator).flatten()
+    planner = ExhaustivePlanner(settings.depth, value=objective(values, settings.goal))
+    done = pursue(planner, world, states, settings.goal, settings.max_plans, generator)
     if len(done.plans) < 2:
         raise ValueError("training_plans: too few plans that lead anywhere; give more")
-    kept = torch.randperm(len(done.plans), generator=generator)[: task.training_plans]
+    kept = torch.randperm(len(done.plans), generator=generator)[: settings.training_plans]
     group = groups(world, states[done.start[kept]])
+    finished("collecting plans")
     plans = Plans(done.plans[kept], 4, action_names=world.action_names, group=group)
-    return learn_priors(plans, task.seed, neural, generator, lambda what: report(f"second simulation: {what}"))
+    return fit_priors(plans, settings.seed, neural, generator, finished)
 
 
-def simulate(task: Task, full: bool, report: Report) -> tuple[Outcome, dict[str, Prior]]:
+def simulate(settings: PaperSettings, full: bool, finished: Finished) -> tuple[SecondResult, dict[str, Prior]]:
     """Learn value functions, collect plans under some of them, and pursue the goal under the others.
 
     Args:
-        task: what, and how much of it.
+        settings: what, and how much of it.
         full: with neural priors too, and with planners that may end a plan after any action.
-        report: is told what begins.
+        finished: is called 18 times; 7 times where not `full`.
 
     Returns:
-        The outcome, and the priors.
+        The result, and the priors.
     """
-    generator = torch.Generator().manual_seed(task.seed)
-    number = task.value_functions
-    report("second simulation: Q-learning")
+    generator = torch.Generator().manual_seed(settings.seed)
+    number = settings.value_functions
     learned = q_learning(
-        empty_world(task, 1),
-        task.goal,
+        empty_world(settings, 1),
+        settings.goal,
         num_agents=2 * number,
-        steps=task.q_steps,
-        initial_scale=task.initial_scale,
+        steps=settings.q_steps,
+        initial_scale=settings.initial_scale,
         generator=generator,
     ).amax(-1)
+    finished("Q-learning")
     values, others = learned[:number], learned[number:]
-    priors = learn(task, others, full, generator, report)
-    world = empty_world(task, number)
-    states = random_starts(task, number, task.starts, generator)
-    value = objective(values, task.goal)
-    planners = planners_for(priors, task, value)
+    priors = learn(settings, others, full, generator, finished)
+    world = empty_world(settings, number)
+    states = random_starts(settings, number, settings.starts, generator)
+    value = objective(values, settings.goal)
+    planners = make_planners(priors, settings, value)
     if full:
-        planners |= planners_for(priors, task, value, any_prefix=True)
-    reached, final_state, model_steps = [], [], []
+        planners |= make_planners(priors, settings, value, any_prefix=True)
+    pursuits = {}
     for name, planner in planners.items():
-        report(f"second simulation: {name}")
-        done = pursue(planner, world, states.flatten(), task.goal, task.max_plans, generator)
-        reached.append(done.reached.view(states.shape))
-        final_state.append(done.final_state.view(states.shape))
-        model_steps.append(done.model_steps)
-    exact = value_iteration(world, goal=task.goal)[0]
-    return Outcome(
-        list(planners),
-        torch.stack(reached),
-        torch.stack(final_state),
-        ceiling(world, states, task),
-        ceiling(world, states, task, any_prefix=True),
-        values,
-        exact,
-        world,
-        model_steps,
-    ), priors
+        pursuits[name] = pursue(planner, world, states.flatten(), settings.goal, settings.max_plans, generator)
+        finished(f"planning: {name}")
+    ceilings = ceiling(world, states, settings), ceiling(world, states, settings, any_prefix=True)
+    exact = value_iteration(world, goal=settings.goal)[0]
+    return SecondResult(world, states, pursuits, *ceilings, values, exact), priors
 
 
-def ceiling(world: GridWorld, states: Tensor, task: Task, any_prefix: bool = False) -> Tensor:
+def all_scales(settings: PaperSettings, finished: Finished) -> pd.DataFrame:
+    """Table 2 with both edges and all `SCALES`, with the Markov priors alone; `finished` is called 8 times."""
+    rows: list[dict[str, Any]] = []
+    edges: Literal["torus", "wall"]
+    for edges in ("torus", "wall"):
+        for scale in SCALES:
+            changed = replace(settings, edges=edges, initial_scale=scale)
+            result, _ = simulate(changed, full=False, finished=lambda _: None)
+            table = result.table()
+            distance, low, high = result.distance()
+            row = {"edges": edges, "initial_scale": scale, **dict(zip(table.planner, table.reached, strict=True))}
+            rows.append(row | result.ceilings() | {"table_distance": distance, "low": low, "high": high})
+            finished(f"{edges}, values up to {scale:g}")
+    return pd.DataFrame(rows)
+
+
+def ceiling(world: GridWorld, states: Tensor, settings: PaperSettings, any_prefix: bool = False) -> Tensor:
     """Which starts can end on the goal at all, with plans of either length: bool, in the shape of `states`.
 
     With whole plans, that is after some number of them; with any prefix of plans, after at most all their moves.
     """
     flat = states.flatten()
-    lengths = {task.depth, task.length}
+    lengths = {settings.depth, settings.length}
     if any_prefix:
-        most = task.max_plans * max(lengths)
-        return can_reach(world, flat, task.goal, most, within=True).view(states.shape)
-    whole = [can_reach(world, flat, task.goal, n * moves) for n in range(1, task.max_plans + 1) for moves in lengths]
+        most = settings.max_plans * max(lengths)
+        return can_reach(world, flat, settings.goal, most, within=True).view(states.shape)
+    whole = [
+        can_reach(world, flat, settings.goal, n * moves) for n in range(1, settings.max_plans + 1) for moves in lengths
+    ]
     return torch.stack(whole).any(0).view(states.shape)
-
-
-def rows_of(outcome: Outcome) -> list[dict[str, Any]]:
-    """A row a planner: the share of starts from which it reached the goal, and its simulator steps a plan."""
-    rows: list[dict[str, Any]] = []
-    for name, reached, steps in zip(outcome.names, outcome.reached, outcome.model_steps, strict=True):
-        share = over_groups(reached)
-        row = {"planner": name, "reached": share.mean, "low": share.low, "high": share.high}
-        rows.append(row | {"paper": PAPER_REACHED.get(name), "model_steps": steps})
-    return rows
-
-
-def ceilings_of(outcome: Outcome) -> dict[str, float]:
-    """The shares of starts that can reach the goal at all, with whole plans and with any prefix of them."""
-    return {
-        "ceiling": float(outcome.ceiling.double().mean()),
-        "ceiling_any_prefix": float(outcome.prefix_ceiling.double().mean()),
-    }
-
-
-def distance_interval(outcome: Outcome, resamples: int = 2000) -> Interval:
-    """The root mean square difference from the paper's Table 2, with a bootstrap interval over value functions."""
-    shares = torch.stack([outcome.reached[outcome.names.index(name)].double().mean(1) for name in PAPER_REACHED])
-    paper = torch.tensor(list(PAPER_REACHED.values()), dtype=torch.double)[:, None]
-    functions = shares.shape[1]
-    again = torch.randint(functions, (resamples, functions), generator=torch.Generator().manual_seed(0))
-    distances = (shares[:, again].mean(2) - paper).square().mean(0).sqrt()
-    low, high = distances.quantile(torch.tensor([0.025, 0.975], dtype=torch.double)).tolist()
-    return Interval(float((shares.mean(1, keepdim=True) - paper).square().mean().sqrt()), low, high)
-
-
-def findings(outcome: Outcome) -> list[dict[str, Any]]:
-    """Paired comparisons over value functions: priors with none, neural ones with the best Markov prior."""
-    share = dict(zip(outcome.names, outcome.reached.double().mean(2), strict=True))
-    found = []
-    for suffix in ("", ANY_PREFIX):
-        markov = max((f"markov-{k}{suffix}" for k in (1, 2, 3)), key=lambda name: float(share[name].mean()))
-        pairs = [("random", "deterministic"), ("markov-1", "random"), ("markov-2", "random")]
-        named = [(first + suffix, second + suffix) for first, second in pairs]
-        for first, second in [*named, ("gru" + suffix, markov), ("transformer" + suffix, markov)]:
-            found.append({"first": first, "second": second, **paired_difference(share[first], share[second])._asdict()})
-    return found

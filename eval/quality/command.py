@@ -4,15 +4,19 @@ import time
 from dataclasses import dataclass
 from math import log
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 import torch
+from jsonargparse.typing import NonNegativeInt, PositiveInt
 from rich.console import Console
 from torch import Tensor
 
-from eval.paper.tables import columns, titled
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior
-from neuroprior._files import versions, write_csv, write_json
+from neuroprior._files import versions, write_json
+from neuroprior._jobs import Progress
 from neuroprior._random import draw_seed
+from neuroprior.report.document import Column, printed, records, table, write_frames
 
 LENGTH = 32
 CONTEXTS = 8
@@ -55,8 +59,8 @@ class Source:
             taken[:, t] = probs.gather(1, action)[:, 0].log()
             actions[:, t] = action[:, 0]
             history = (history * self.num_actions + action[:, 0]) % self.num_actions**self.order
-        seen = None if self.context is None else context if self.context == "step" else context[:, 0]
-        return Plans(actions, self.num_actions, context=seen), taken
+        given = None if self.context is None else context if self.context == "step" else context[:, 0]
+        return Plans(actions, self.num_actions, context=given), taken
 
     def _probs(self, actions: Tensor, context: Tensor, history: Tensor, t: int) -> Tensor:
         even = torch.full((len(actions), self.num_actions), 1 / self.num_actions, dtype=torch.double)
@@ -69,7 +73,7 @@ class Source:
 
     @property
     def contexts(self) -> int | None:
-        """The number of contexts that a prior for this source sees."""
+        """The number of contexts that a prior for this source is given."""
         return None if self.context is None else len(self.table)
 
     def context_at(self, plans: Plans, t: int) -> Tensor | int:
@@ -104,12 +108,14 @@ def sources(generator: torch.Generator) -> list[Source]:
     ]
 
 
-def quality(num_plans: int = 100_000, held_out: int = 5_000, seed: int = 0, out: str = "runs/quality") -> None:
+def quality(
+    num_plans: PositiveInt = 100_000, held_out: PositiveInt = 5_000, seed: NonNegativeInt = 0, out: str = "runs/quality"
+) -> None:
     """Fit priors to sources whose entropy is known; print how many bits more than the source they take.
 
     Args:
-        num_plans: plans of 32 actions to learn from.
-        held_out: plans to score.
+        num_plans: plans of 32 actions to learn from, at least 100.
+        held_out: plans to score, at least 100.
         seed: draws sources and plans.
         out: folder for `quality.csv` and `results.json`.
     """
@@ -117,21 +123,22 @@ def quality(num_plans: int = 100_000, held_out: int = 5_000, seed: int = 0, out:
         raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
     folder, console = Path(out), Console()
     folder.mkdir(parents=True, exist_ok=True)
-    generator = torch.Generator().manual_seed(seed)
-    rows = []
-    for source in sources(generator):
-        training, _ = source.draw(num_plans, generator)
-        test, true = source.draw(held_out, generator)
-        for kind in (MarkovPrior, GRUPrior, TransformerPrior):
-            with console.status(f"{source.name}: {kind.__name__}"):
+    generator, kinds = torch.Generator().manual_seed(seed), (MarkovPrior, GRUPrior, TransformerPrior)
+    every, rows = sources(generator), []
+    with Progress("quality", len(every) * len(kinds), len(every) * len(kinds)) as progress:
+        for source in every:
+            training, _ = source.draw(num_plans, generator)
+            test, true = source.draw(held_out, generator)
+            for kind in kinds:
                 rows.append(_fit(source, kind, training, test, true, seed))
-            _print(console, rows[-1])
-    console.print(_table(rows, num_plans, held_out))
-    write_csv(folder / "quality.csv", rows)
-    write_json(folder / "results.json", {"rows": rows, "versions": versions()})
+                progress.advance(f"{source.name}: {rows[-1]['model']} {rows[-1]['excess_percent']:+.2f} %")
+    frame = pd.DataFrame(rows)
+    _print(console, frame, f"{num_plans:,} plans of {LENGTH} actions, {held_out:,} held out")
+    write_frames(folder, {"quality": frame})
+    write_json(folder / "results.json", {"rows": records(frame), "versions": versions()})
 
 
-def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, object]:
+def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
     prior, began = source.make(kind), time.perf_counter()
     how = {} if kind is MarkovPrior else {"generator": torch.Generator().manual_seed(seed), "progress": False}
     prior.fit(training, **how)
@@ -157,27 +164,22 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
     }
 
 
-def _print(console: Console, row: dict[str, object]) -> None:
-    console.print(f"{row['source']}: {row['model']} {row['excess_percent']:+.2f} %, {row['seconds']:.0f} s")
-
-
-def _table(rows: list[dict[str, object]], num_plans: int, held_out: int):
-    table = titled(
-        f"Bits more than the source, % ({num_plans:,} plans of {LENGTH} actions, {held_out:,} held out)", gap=1
-    )
-    columns(table, ("source", "entropy", "markov", "expected", "gru", "transformer"), 1)
-    for name in dict.fromkeys(row["source"] for row in rows):
-        markov, *neural = (row for row in rows if row["source"] == name)
-        expected = markov["expected_percent"]
-        table.add_row(
-            str(name),
-            f"{markov['entropy_rate']:.4f}",
-            f"{markov['excess_percent']:+.3f}",
-            "" if expected is None else f"{expected:+.3f}",
-            *(f"{row['excess_percent']:+.2f} ({row['seconds']:.0f} s)" for row in neural),
-        )
-    table.caption = (
+def _print(console: Console, rows: pd.DataFrame, size: str) -> None:
+    """A row a source: the excess of each prior, and of the neural ones the seconds of training."""
+    trained = rows.assign(text=[f"{row.excess_percent:+.2f} ({row.seconds:.0f})" for row in rows.itertuples()])
+    neural = trained.pivot(index="source", columns="model", values="text")[["gru", "transformer"]]
+    columns: dict[str, Column] = {
+        "source": "source",
+        "entropy": "entropy_rate:.4f",
+        "markov": "excess_percent:+.3f",
+        "ex-\npected": "expected_percent:+.3f",
+        "gru (s)": "gru",
+        "transformer (s)": "transformer",
+    }
+    caption = (
         "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
         " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. (s): seconds of training."
     )
-    return table
+    title = f"Bits more than the source, % ({size})"
+    shown = table(rows[rows.model == "markov"].join(neural, on="source"), columns, caption)
+    console.print(printed(title, shown))

@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 import rich.table
+from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -99,6 +100,13 @@ def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
             continue
         with written_whole(path) as file:
             frame.to_csv(file, index=False, lineterminator="\n")
+
+
+def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
+    """Write each figure as `NAME.png`."""
+    for name, figure in figures.items():
+        with written_whole(folder / f"{name}.png", "wb") as file:
+            figure.savefig(file, format="png", dpi=150, bbox_inches="tight", facecolor="white")
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:

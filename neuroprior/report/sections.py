@@ -14,11 +14,11 @@ from neuroprior.analysis import (
     by_group,
     by_plan,
     by_position,
-    two_sample_tests,
     motifs,
     mutual_information,
     order_selection,
     transitions,
+    two_sample_tests,
 )
 from neuroprior.analysis.comparison import unit_name
 from neuroprior.plans import Plans, is_per_step
@@ -110,7 +110,9 @@ def lag_section(found: Evaluation) -> Part | None:
     skip = found.settings["skip"]
     lags = found.gains
     if int(found.plans.mask()[:, max(skip, 1) :].sum()) >= 2:
-        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles())).rename(columns={"critical_value": "chance"})
+        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles())).rename(
+            columns={"critical_value": "chance"}
+        )
         information = information.assign(what="mutual information", model="counts", sees=ACTIONS, units=None)
         lags = pd.concat([information, lags], ignore_index=True) if len(lags) else information
         lags = lags[["what", "model", "sees", "lag", "bits", "low", "high", "chance", "units"]]
@@ -357,7 +359,9 @@ def likeness_section(found: Evaluation) -> Part | None:
     order = frame[["model", "sees"]].drop_duplicates()
     wide = cells.pivot(index=["model", "sees"], columns="statistic", values="cell").reset_index()
     wide = order.merge(wide, on=["model", "sees"])
-    wide.loc[len(wide)] = {"model": "same source", "sees": ""} | {one.statistic: f"{one.null_distance:.3f}" for one in results}
+    wide.loc[len(wide)] = {"model": "same source", "sees": ""} | {
+        one.statistic: f"{one.null_distance:.3f}" for one in results
+    }
     test = (
         "*: p < 0.05, permutation test over plans, corrected."
         if tested

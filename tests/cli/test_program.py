@@ -79,7 +79,21 @@ def ran(capsys: pytest.CaptureFixture, *words: str) -> tuple[int, str, str]:
 
 def test_options_are_the_parameters_of_a_function(capsys):
     assert ran(capsys, "make", "x") == (0, "x ['grid'] None 3 None False\n", "")
-    words = "make x --worlds maze grid --sizes 1 2 --number=0 --rate .5 --done true".split()
+    words = [
+        "make",
+        "x",
+        "--worlds",
+        "maze",
+        "grid",
+        "--sizes",
+        "1",
+        "2",
+        "--number=0",
+        "--rate",
+        ".5",
+        "--done",
+        "true",
+    ]
     assert ran(capsys, *words) == (0, "x ['maze', 'grid'] [1, 2] 0 0.5 True\n", "")
     assert ran(capsys, "say", "a", "--b-c") == (0, "['a', '--b_c']\n", "")
 

@@ -54,7 +54,9 @@ def layers() -> list[str]:
 def layer(path: Path, order: list[str]) -> int:
     """The number of the layer that a file belongs to: the longest path that it begins with."""
     own = str(path.relative_to(ROOT))
-    fitting = [entry for entry in order if own == entry or own == entry + ".py" or own.startswith(entry.rstrip("/") + "/")]
+    fitting = [
+        entry for entry in order if own == entry or own == entry + ".py" or own.startswith(entry.rstrip("/") + "/")
+    ]
     assert fitting, f"{own}: in no layer of CONTRIBUTING.md"
     return order.index(max(fitting, key=len))
 

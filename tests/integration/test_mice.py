@@ -11,14 +11,14 @@ from scipy import stats
 
 from eval.__main__ import main
 from eval.mice.command import DATA
+from eval.mice.experiment import MiceSettings, collected, shares_reached
 from eval.mice.figures import ENTRANCE, coordinates, far_from_water, left_turns, passages
-from eval.mice.study import Study, collected, shares_reached
 from neuroprior import Plans, SamplingPlanner, UniformPrior, labyrinth, oracle, read_plans
 from neuroprior.worlds.labyrinth import WATER
 from tests.support.sources import FALSE_ALARM, every_plan, in_world_distribution, seeded
 
 INNER = range(63)
-TINY = Study(2, 6, (2, 8), (4, 8), 200, 5, 0)
+TINY = MiceSettings(2, 6, (2, 8), (4, 8), 200, 5, 0)
 DRY = torch.tensor([node for node in range(127) if node != WATER])
 
 
@@ -99,10 +99,10 @@ def test_the_far_node_is_as_far_as_can_be():
     assert needed == [0, 1]
 
 
-def chance(length: int) -> torch.Tensor:
+def reaching(length: int) -> torch.Tensor:
     """`[127]`: the probability that so many uniform legal moves pass the water, by dynamic programming."""
     world = labyrinth(absorbing=True)
-    legal = world.legal_table.double()
+    legal = world.legal_actions(torch.arange(127)).double()
     reached = (torch.arange(127) == WATER).double()
     for _ in range(length):
         reached = (legal * reached[world.next_state]).sum(1) / legal.sum(1)
@@ -110,11 +110,11 @@ def chance(length: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("node", [57, 115, 28])
-def test_the_chance_is_that_of_all_plans(node):
+def test_the_probability_is_that_of_all_plans(node):
     world = labyrinth(absorbing=True)
     probs = in_world_distribution(UniformPrior(4), world, node, 4)
     found = world.rollout(torch.tensor([node]), every_plan(4, 4)[None]).rewards[0].sum(-1) > 0
-    assert float(probs[found].sum()) == pytest.approx(float(chance(4)[node]), abs=1e-6)
+    assert float(probs[found].sum()) == pytest.approx(float(reaching(4)[node]), abs=1e-6)
 
 
 @pytest.mark.parametrize("node", [57, 115, 13, 0])
@@ -125,7 +125,7 @@ def test_uniform_candidates_reach_what_they_must(node):
     shares = shares_reached(UniformPrior(4), world, start, lengths, numbers, seeded(node))
     for t, length in enumerate(lengths):
         for p, number in enumerate(numbers):
-            expected = 1 - (1 - float(chance(length)[node])) ** number
+            expected = 1 - (1 - float(reaching(length)[node])) ** number
             trials = times * (16 // number)
             hits = round(float(shares[t, p]) * trials)
             assert stats.binomtest(hits, trials, expected).pvalue > FALSE_ALARM
@@ -173,9 +173,11 @@ def test_results(tiny_run):
     results = json.loads((tiny_run / "results.json").read_text())
     rows = results["rows"]
     names = {(row["prior"], row["learned_from"], row["sees"]) for row in rows}
-    sights = ("moves", "node")
-    learned = [(prior, "mice", sees) for prior in ("markov", "gru", "transformer") for sees in sights]
-    learned += [(prior, own, sees) for prior in ("markov", "gru") for own in ("planner", "reached") for sees in sights]
+    contexts = ("moves", "node")
+    learned = [(prior, "mice", sees) for prior in ("markov", "gru", "transformer") for sees in contexts]
+    learned += [
+        (prior, own, sees) for prior in ("markov", "gru") for own in ("planner", "reached") for sees in contexts
+    ]
     assert names == {*learned, ("uniform", "", ""), ("oracle", "", "")}
     assert len(rows) == 2 * (2 * (len(names) - 1) + 1)
     best = {row["length"]: row["reached"] for row in rows if row["prior"] == "oracle"}
@@ -213,12 +215,12 @@ def test_figures_are_written(tiny_run):
     ("options", "says"),
     [
         (["--seeds", "1"], "seeds: at least 2"),
-        (["--starts", "127"], "starts: from 1 to 126"),
-        (["--num-plans", "4", "0"], "num_plans: at least 1"),
+        (["--starts", "127"], "starts: integers from 1 to 126"),
+        (["--num-plans", "4", "0"], "num_plans: an integer of at least 1"),
         (["--num-plans", "4", "4"], "num_plans: each may be given once"),
-        (["--lengths", "501"], "lengths: from 1 to 500"),
+        (["--lengths", "501"], "lengths: integers from 1 to 500"),
         (["--lengths", "long"], "lengths"),
-        (["--steps", "0"], "steps: at least 1"),
+        (["--steps", "0"], "steps: an integer of at least 1"),
         (["--training-plans", "2", "--seeds", "2"], "training_plans"),
     ],
 )

@@ -23,7 +23,10 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert len(list((folder / "dist").glob("*.tar.gz"))) == 1
     (wheel,) = (folder / "dist").glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    assert {name.split("/")[0] for name in names} == {"neuroprior", next(n for n in names if "dist-info" in n).split("/")[0]}
+    assert {name.split("/")[0] for name in names} == {
+        "neuroprior",
+        next(n for n in names if "dist-info" in n).split("/")[0],
+    }
     for needed in ("cli/example.csv", "cli/recipes/gru.yaml", "report/page.html.j2", "py.typed"):
         assert f"neuroprior/{needed}" in names
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)

@@ -7,16 +7,19 @@ import pytest
 import torch
 
 from eval.__main__ import main
-from eval.bench import command as bench
-from eval.bench import gpu as bench_gpu
-from eval.bench import limits as bench_limits
-from eval.bench import packages as bench_packages
-from eval.bench import peers as bench_peers
-from eval.bench import sizes as bench_sizes
-from eval.bench import training as bench_training
-from eval.bench.jobs import JOBS, ON_DEVICES, chain_plans, source
-from eval.bench.training import TrainingRace
-from eval.paper.first_simulation import Protocol, Size, simulate
+from eval.bench import limits, peers, sizes
+from eval.bench.command import tables
+from eval.bench.jobs import (
+    JOBS,
+    ON_DEVICES,
+    against_peers,
+    chain_plans,
+    excess,
+    on_device,
+    our_table_1,
+    quickest,
+    source,
+)
 from neuroprior import MarkovPrior, UniformPrior, gridworld
 from neuroprior.plans import all_plans
 from tests.support.sources import FALSE_ALARM, p_value, seeded
@@ -36,10 +39,10 @@ def test_peers_that_evaluate(package):
     world, state, plans = evaluated()
     given = world.next_state, world.reward, state, plans
     if package is None:
-        final, rewards = bench_peers.torch_rollout(*given)
+        final, rewards = peers.torch_rollout(*given)
     else:
         pytest.importorskip(package)
-        final, rewards = map(torch.from_numpy, bench_packages.numba_rollout(*given)())
+        final, rewards = map(torch.from_numpy, peers.numba_rollout(*given)())
     want = world.rollout(state, plans)
     assert torch.equal(final, world.cell(want.final_state))
     assert torch.equal(rewards, want.rewards)
@@ -51,12 +54,12 @@ def test_peers_that_count():
     for plan in plans.tolist():
         for a, b, c in zip(plan, plan[1:], plan[2:], strict=False):
             counts[a, b, c] += 1
-    for count in (bench_peers.numpy_counts, bench_peers.numpy_add_at):
+    for count in (peers.numpy_counts, peers.numpy_add_at):
         assert torch.equal(torch.from_numpy(count(plans.numpy(), 4, 2)), counts.view(16, 4))
     pytest.importorskip("pomegranate")
-    fitted = bench_packages.pomegranate_fit(plans, 2)().distributions[-1].probs[0]
-    seen = counts.sum(-1) > 0
-    assert torch.allclose(fitted[seen], (counts / counts.sum(-1, keepdim=True)).float()[seen], atol=1e-6)
+    fitted = peers.pomegranate_fit(plans, 2)().distributions[-1].probs[0]
+    some = counts.sum(-1) > 0
+    assert torch.allclose(fitted[some], (counts / counts.sum(-1, keepdim=True)).float()[some], atol=1e-6)
 
 
 def test_peers_that_sample_a_chain():
@@ -65,67 +68,65 @@ def test_peers_that_sample_a_chain():
     every = all_plans(2, 4)
     want = prior.log_prob(every).double().exp()
     tables = prior.log_probs.exp().double().numpy(), prior.next_node.numpy(), int(prior.start_node)
-    drawn = bench_peers.numpy_sample(*tables, 20_000, 4)
+    drawn = peers.numpy_sample(*tables, 20_000, 4)
     assert p_value(torch.from_numpy(drawn @ np.array([8, 4, 2, 1])), want) > FALSE_ALARM
     pytest.importorskip("pomegranate")
-    plans = bench_packages.pomegranate_sample(torch.from_numpy(drawn), 2, 30, 6)()
+    plans = peers.pomegranate_sample(torch.from_numpy(drawn), 2, 30, 6)()
     assert plans.shape == (30, 6)
 
 
 def test_the_numpy_script_finds_what_the_library_finds():
     """From the same starts: the deterministic planner the same, others in the mean, within six errors of it."""
-    size = Size(1, 600, 600, 20, 8.0, 4, 8, 64, 0)
-    ours = simulate(Protocol("torus", "uniform", "all"), size, False, lambda what: None)
-    reward, start = ours.world.reward[0].numpy(), ours.states[0].numpy()
-    theirs = bench_peers.numpy_table_1(reward, start, 64, 8, 4, (1, 2, 3))
-    scores = dict(zip(ours.names, ours.scores[:, 0].double().numpy(), strict=True))
-    assert list(theirs) == list(scores)
-    assert np.allclose(theirs["deterministic"], scores["deterministic"])
-    for name in list(scores)[1:]:
-        gap = theirs[name] - scores[name]
+    world = gridworld(20, 20, "torus", reward_power=8.0)
+    start, size = world.reset(600, seeded(0)), (64, 8, 4, (1, 2, 3))
+    ours = {name: scores.double().numpy() for name, scores in our_table_1(world, start, *size).items()}
+    theirs = peers.numpy_table_1(world.reward[0].numpy(), start.numpy(), *size)
+    assert list(theirs) == list(ours)
+    assert np.allclose(theirs["deterministic"], ours["deterministic"])
+    for name in list(ours)[1:]:
+        gap = theirs[name] - ours[name]
         assert abs(gap.mean()) < 6 * gap.std() / 600**0.5
     assert theirs["markov-3"].mean() > theirs["random"].mean() + 0.05
 
 
 def test_the_plain_gru():
     torch.manual_seed(0)
-    model = bench_peers.PlainGRU(3, 8).eval()
+    model = peers.PlainGRU(3, 8).eval()
     every = all_plans(3, 3)
     want = model(every).log_softmax(-1).gather(-1, every[..., None].long())[..., 0].sum(1).double().exp()
     drawn = model.sample(20_000, 3).long() @ torch.tensor([9, 3, 1])
     assert p_value(drawn, want.detach()) > FALSE_ALARM
 
 
-def test_the_quickest_training_that_is_close_enough_is_timed(monkeypatch):
-    race = TrainingRace(source(), chain_plans(200, 8))
-    assert race.excess(race.source) == pytest.approx(1.0, abs=1e-6)
-    clock = [0.0]
-    monkeypatch.setattr(bench_training, "perf_counter", lambda: clock[0])
+def test_the_quickest_training_that_is_close_enough_is_timed():
+    chain, uniform, clock = source(), UniformPrior(4), [0.0]
+    assert excess(chain, chain, chain_plans(200, 8)) == pytest.approx(1.0, abs=1e-6)
 
     def train(batch_size, learning_rate, steps):
         """Batches of 64 never come close, those of 256 after 200 steps, those of 1024 after 25, which is quickest."""
         clock[0] += steps * batch_size
-        return race.source if steps >= {64: 900, 256: 200, 1024: 25}[batch_size] else UniformPrior(4)
+        return chain if steps >= {64: 900, 256: 200, 1024: 25}[batch_size] else uniform
 
-    assert race._quickest(train).args == (1024, 1e-3, 25)
+    found = quickest(train, lambda model: model is chain, clock=lambda: clock[0])
+    assert found.args == (1024, 1e-3, 25)
     with pytest.raises(ValueError, match="no training of 800 steps came within 1%"):
-        race._quickest(lambda *how: UniformPrior(4))
+        quickest(train, lambda model: False)
 
 
 def test_transformers_draws_plans():
     pytest.importorskip("transformers")
-    plans = bench_packages.transformers_generate(3, 5, 200)()
+    plans = peers.transformers_generate(3, 5, 200)()
     assert plans.shape == (200, 5)
     assert plans.unique().tolist() == [0, 1, 2]
 
 
 def test_vlmc_finds_the_tree():
     pytest.importorskip("vlmc")
-    found = bench_packages.vlmc_fit([0, 1] * 50, 2, 3)()
+    found = peers.vlmc_fit([0, 1] * 50, 2, 3)()
     assert sorted(map(list, found.get_contexts())) == [[0], [1]]
 
 
-@pytest.mark.parametrize("make", [bench_packages.deep_copies, bench_packages.vector_env])
+@pytest.mark.parametrize("make", [peers.deep_copies, peers.vector_env])
 def test_gymnasium_takes_the_plans(make):
     """To the goal of an empty room of three by three squares, and nowhere."""
     pytest.importorskip("minigrid")
@@ -142,7 +143,7 @@ def test_mctx_finds_the_action_that_pays(gumbel):
     pytest.importorskip("mctx")
     next_state, reward = torch.tensor([[0, 0, 1, 0], [1, 1, 1, 1]]), torch.tensor([[0.0, 1.0]])
     state = torch.zeros(20, dtype=torch.long)
-    action = bench_packages.mctx_search(next_state, reward, state, 64, 4, gumbel)()
+    action = peers.mctx_search(next_state, reward, state, 64, 4, gumbel)()
     assert np.asarray(action).tolist().count(2) >= 15
 
 
@@ -154,7 +155,7 @@ def test_the_program(tmp_path, capsys):
     for row in [*results["rows"], *results["imports"]]:
         assert 0 < row["low"] <= row["ratio"] <= row["high"]
         assert row["goal"] > 0
-    assert {row["growing"] for row in results["sizes"]} == set(bench_sizes.SWEEPS) - {"length sampled"}
+    assert {row["growing"] for row in results["sizes"]} == set(sizes.SWEEPS) - {"length sampled"}
     assert [row["work"] for row in results["limits"]][:2] == ["copy", "product"]
     assert len(results["limits"]) == 6
     for part in ("peers", "sizes", "limits", "imports"):
@@ -168,31 +169,30 @@ def test_the_program(tmp_path, capsys):
     assert "import neuroprior:" in shown
 
 
-def test_jobs_of_an_accelerator(tmp_path, capsys, monkeypatch):
+def test_jobs_of_an_accelerator(tmp_path, capsys):
     """On a CPU in place of one."""
-    rows = list(bench_gpu.measured(torch.device("cpu"), SMALL, 1))
+    rows = [row for name in ON_DEVICES for row in on_device(name, torch.device("cpu"), SMALL, 1)]
     assert [(row["job"], row["about"]) for row in rows] == [(name, JOBS[name](SMALL).about) for name in ON_DEVICES]
     assert all(row["seconds"] > 0 for row in rows)
+    (shown,) = tables({"gpu": rows}, {})
+    assert [row[0] for row in shown.rows] == [row["about"] for row in rows]
     options = ["--parts", "gpu", "--scale", str(SMALL), "--repetitions", "1", "--out", str(tmp_path)]
-    if not torch.cuda.is_available():
-        assert main(["bench", *options]) == 0
-        assert "there is no CUDA device" in capsys.readouterr().out
-        monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-        monkeypatch.setattr(bench_gpu, "measured", lambda *how: iter(rows))
     assert main(["bench", *options]) == 0
-    assert rows[0]["about"] in " ".join(capsys.readouterr().out.split())
-    results = json.loads((tmp_path / "results.json").read_text())
-    assert len(results["gpu"]) == len(rows)
-    assert "rows" not in results
+    if torch.cuda.is_available():
+        results = json.loads((tmp_path / "results.json").read_text())
+        assert len(results["gpu"]) == len(rows)
+        assert "rows" not in results
+    else:
+        assert "there is no CUDA device" in capsys.readouterr().out
 
 
-def test_sizes_grow_and_memory_is_seen():
+def test_sizes_increase_and_memory_is_measured():
     """A sweep whose result takes eight bytes for each of its size, and four times as many on the way."""
 
     def make(size):
         return lambda: torch.ones(4 * size, dtype=torch.float64)[:size].clone()
 
-    rows = list(bench_sizes.measured("x", bench_sizes.Sweep("", (10**3, 10**7, 10**8), make), 10**7))
+    rows = list(sizes.measured("x", sizes.Sweep("", (10**3, 10**7, 10**8), make), 10**7))
     assert [(row["size"], row["result_bytes"]) for row in rows] == [(10**3, 8 * 10**3), (10**7, 8 * 10**7)]
     if rows[-1]["peak_bytes"] is not None:
         assert 4.5 * 8 * 10**7 < rows[-1]["peak_bytes"] < 6 * 8 * 10**7
@@ -200,33 +200,30 @@ def test_sizes_grow_and_memory_is_seen():
 
 def test_the_slope_is_that_of_the_last_decades():
     rows = [{"size": 10**k, "seconds": 1.0 if k < 3 else 10.0 ** (1.5 * (k - 3))} for k in range(6)]
-    assert bench_sizes.slope(rows) == pytest.approx(1.5)
-    assert bench_sizes.slope(rows[:1]) is None
+    assert sizes.slope(rows) == pytest.approx(1.5)
+    assert sizes.slope(rows[:1]) is None
 
 
-def test_the_share_of_the_limit(monkeypatch):
-    """On a machine that copies in a second, and multiplies in two, work of half the bytes in four seconds."""
-    work = bench_limits.Work("half", lambda: None, bench_limits.COPIED, bench_limits.SIDE**3)
-    seconds = iter([1.0, 2.0, 4.0])
-    monkeypatch.setattr(bench_limits, "works", lambda scale: [work])
-    monkeypatch.setattr(bench_limits, "seconds_again", lambda run, repetitions: next(seconds))
-    *_, row = bench_limits.measured(1.0, 1)
-    assert row["bound"] == "arithmetic"
-    assert row["share"] == pytest.approx(0.25)
-    rates = {"memory": 1.0, "arithmetic": 1e30}
-    assert bench_limits._row(work, 2.0 * bench_limits.COPIED, rates)["share"] == pytest.approx(0.5)
+@pytest.mark.parametrize(
+    ("seconds", "operations", "bound", "share"),
+    [((1.0, 2.0, 4.0), limits.SIDE**3, "arithmetic", 0.25), ((1.0, 1e-9, 2.0), limits.SIDE**3, "memory", 0.25)],
+)
+def test_the_share_of_the_limit(seconds, operations, bound, share):
+    """Work of half the bytes of a copy, and half the operations of a product."""
+    work = limits.Work("half", lambda: None, limits.COPIED, operations)
+    taken = iter(seconds)
+    *_, row = limits.measured([work], 1, timed=lambda run, repetitions: next(taken))
+    assert row["bound"] == bound
+    assert row["share"] == pytest.approx(share)
 
 
-def test_what_is_not_installed_is_left_out(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(bench, "missing", lambda package: package is not None)
-    options = ["--jobs", "evaluate", "shoot", "--parts", "peers", "--repetitions", "1", "--scale", str(SMALL)]
-    assert main(["bench", *options, "--out", str(tmp_path)]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "numba, parallel left out, numba is not installed" in said
+def test_what_is_not_installed_is_left_out():
+    said = []
+    rows = list(against_peers("evaluate", SMALL, 1, said.append, missing=lambda package: package is not None))
+    assert [row["peer"] for row in rows] == ["plain torch indexing"]
+    assert not list(against_peers("shoot", SMALL, 1, said.append, missing=lambda package: package is not None))
+    assert "evaluate: numba, parallel left out, numba is not installed" in said
     assert "shoot: left out, minigrid is not installed" in said
-    assert [row["peer"] for row in json.loads((tmp_path / "results.json").read_text())["rows"]] == [
-        "plain torch indexing"
-    ]
 
 
 @pytest.mark.parametrize(

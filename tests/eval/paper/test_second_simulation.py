@@ -5,17 +5,22 @@ import itertools
 import pytest
 import torch
 
-from eval.paper.second_simulation import Task, ceiling, empty_world, objective, pursue, random_starts
-from eval.paper.value_quality import families
+from eval.paper.planners import PaperSettings
+from eval.paper.second_simulation import ceiling, empty_world, objective, pursue, random_starts
+from eval.paper.value_quality import families, quality
 from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, oracle
 from neuroprior.testing import FALSE_ALARM
 from neuroprior.testing.chi_square import chi_square
 from neuroprior.values import can_reach, value_iteration
 
 
-def task(**changes: object) -> Task:
+def settings(**changes: object) -> PaperSettings:
     small: dict[str, object] = {
+        "worlds": 1,
         "edges": "torus",
+        "ties": "uniform",
+        "learn_from": "all",
+        "reward_power": 1.0,
         "value_functions": 3,
         "starts": 40,
         "size": 6,
@@ -28,7 +33,7 @@ def task(**changes: object) -> Task:
         "num_plans": 32,
         "seed": 0,
     }
-    return Task(**(small | changes))
+    return PaperSettings(**(small | changes))
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -37,7 +42,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 @pytest.mark.parametrize(("edges", "any_prefix"), [("torus", False), ("torus", True), ("wall", True)])
 def test_exact_values_lead_every_start_that_can_to_the_goal(edges: str, any_prefix: bool) -> None:
-    t = task(edges=edges, max_plans=6, depth=4)
+    t = settings(edges=edges, max_plans=6, depth=4)
     world = empty_world(t, 1)
     states = random_starts(t, 1, 200, generator())[0]
     values = value_iteration(world, goal=t.goal)
@@ -52,7 +57,7 @@ def test_exact_values_lead_every_start_that_can_to_the_goal(edges: str, any_pref
 
 
 def test_pursuit_goes_on_from_where_the_last_plan_ended() -> None:
-    t = task()
+    t = settings()
     world = empty_world(t, 3)
     values = torch.rand(3, 36, generator=generator(2))
     states = random_starts(t, 3, 60, generator()).flatten()
@@ -72,14 +77,14 @@ def test_pursuit_goes_on_from_where_the_last_plan_ended() -> None:
 
 
 def test_pursuit_without_anything_to_do() -> None:
-    t = task()
+    t = settings()
     done = pursue(ExhaustivePlanner(2), empty_world(t, 1), torch.tensor([t.goal]), t.goal, 3, generator())
     assert done.reached.tolist() == [True]
     assert len(done.plans) == 0
 
 
 def test_starts_are_uniform_over_all_cells_but_the_goal() -> None:
-    t = task()
+    t = settings()
     states = random_starts(t, 2, 20_000, generator())
     cells = (states % 36).flatten().bincount(minlength=36)
     assert int(cells[t.goal]) == 0
@@ -91,7 +96,7 @@ def test_starts_are_uniform_over_all_cells_but_the_goal() -> None:
 @pytest.mark.parametrize("edges", ["torus", "wall"])
 @pytest.mark.parametrize("depth", [1, 2])
 def test_ceiling_by_brute_force(edges: str, depth: int) -> None:
-    t = task(edges=edges, size=4, depth=depth, length=2, max_plans=3)
+    t = settings(edges=edges, size=4, depth=depth, length=2, max_plans=3)
     world = empty_world(t, 1)
     states = torch.arange(16)
     reached = torch.zeros(16, dtype=torch.bool)
@@ -150,21 +155,16 @@ def test_collect_keeps_the_lengths() -> None:
 
 
 def test_worse_values_are_of_lower_quality() -> None:
-    from eval.paper.value_quality import _rank_correlation
-
-    t = task(size=12)
+    t = settings(size=12)
     exact = value_iteration(empty_world(t, 1), goal=t.goal)[0]
-    other = torch.arange(144) != t.goal
     for kind, levels in families(t, generator()).items():
-        quality = [
-            sum(_rank_correlation(v[other], exact[other]) for v in values) / len(values) for values in levels.values()
-        ]
-        assert quality[-1] > quality[0], kind
-        assert max(quality) <= 1 + 1e-9
+        found = [quality(values, exact, t.goal) for values in levels.values()]
+        assert found[-1] > found[0], kind
+        assert max(found) <= 1 + 1e-9
 
 
 def test_ceiling_bounds_every_start() -> None:
-    t = task(size=8, max_plans=2, length=3)
+    t = settings(size=8, max_plans=2, length=3)
     world = empty_world(t, 2)
     values = torch.rand(2, 64, generator=generator(4))
     states = random_starts(t, 2, 300, generator())

@@ -1,0 +1,276 @@
+"""The experiment of `python -m eval mice`: what priors learn in the maze, and how often they find the water."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import pandas as pd
+import torch
+from torch import Tensor
+
+from neuroprior import (
+    ExhaustivePlanner,
+    GRUPrior,
+    MarkovPrior,
+    Planner,
+    Plans,
+    Prior,
+    SamplingPlanner,
+    TabularWorld,
+    TransformerPrior,
+    UniformPrior,
+    collect,
+    oracle,
+)
+from neuroprior._random import draw_seed
+from neuroprior.analysis.comparison import score
+from neuroprior.analysis.statistics import mean_interval, paired_difference
+from neuroprior.sampling import sample_in_world
+from neuroprior.worlds.labyrinth import WATER
+
+ORDERS = range(9)
+DEPTH, SHOTS, SHOT_LENGTH = 6, 256, 16
+ROWS = 2048
+"""Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
+
+SOURCES = {
+    "mice": "the mice's moves, cut into plans as long as the longest that is tried",
+    "planner": f"a planner that tries all plans of {DEPTH} moves; most reach no water, and any of them is taken",
+    "reached": f"the best of {SHOTS} random plans of {SHOT_LENGTH} moves, only where it reached the water",
+}
+"""What the priors learn from."""
+
+CONTEXTS = {"moves": None, "node": 127}
+"""What a prior predicts from, and its number of contexts: its own "moves" alone, or the "node" before each move too."""
+
+
+class PriorName(NamedTuple):
+    """A prior of the comparison: its kind, what it learned from (`SOURCES`) and what it predicts from (`CONTEXTS`)."""
+
+    prior: str
+    learned_from: str
+    sees: str
+
+    def __str__(self) -> str:
+        return ", ".join(filter(None, self))
+
+
+UNIFORM, ORACLE = PriorName("uniform", "", ""), PriorName("oracle", "", "")
+
+NEURAL = [
+    PriorName(kind, source, sees)
+    for source in SOURCES
+    for kind in ("gru", "transformer")
+    for sees in CONTEXTS
+    if kind == "gru" or source == "mice"
+]
+"""Neural priors, in the order of training: from the mice both kinds, from planners the GRU."""
+
+PRIORS = [UNIFORM] + [
+    name
+    for source in SOURCES
+    for sees in CONTEXTS
+    for name in (PriorName(kind, source, sees) for kind in ("markov", "gru", "transformer"))
+    if name.prior == "markov" or name in NEURAL
+]
+"""All priors, in the order of the tables."""
+
+
+@dataclass(frozen=True)
+class MiceSettings:
+    """How much is done; see `mice`."""
+
+    seeds: int
+    starts: int
+    num_plans: tuple[int, ...]
+    lengths: tuple[int, ...]
+    training_plans: int
+    steps: int
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class MiceResult:
+    """What was reached.
+
+    Attributes:
+        settings: how much was done.
+        reached: of each prior `[R, T, P]`: the share of starts at which the water was reached, in R repeats, with plans
+            of T lengths and P numbers of candidates.
+        oracle: `[R, T]`: the share of starts from which plans of these lengths can reach it.
+        priors: those of the last repeat.
+        learned: a row for each source: its size, and the orders that were chosen for the Markov priors.
+    """
+
+    settings: MiceSettings
+    reached: dict[PriorName, Tensor]
+    oracle: Tensor
+    priors: dict[PriorName, Prior]
+    learned: pd.DataFrame
+
+    def table(self) -> pd.DataFrame:
+        """A row a prior, length and number of candidates, and one a length for the oracle; intervals over repeats."""
+        rows = []
+        for t, length in enumerate(self.settings.lengths):
+            best = mean_interval(self.oracle[:, t]).mean
+            cells = [
+                (name, number, shares[:, t, p])
+                for name, shares in self.reached.items()
+                for p, number in enumerate(self.settings.num_plans)
+            ]
+            for name, number, shares in [*cells, (ORACLE, None, self.oracle[:, t])]:
+                mean, low, high = mean_interval(shares)
+                normalised = 1.0 if name == ORACLE else mean / best if best else None
+                steps = None if number is None else length * number
+                row = name._asdict() | {"length": length, "num_plans": number, "model_steps": steps}
+                row |= {"reached": mean, "low": max(low, 0.0), "high": min(high, 1.0), "oracle_share": normalised}
+                rows.append(row)
+        return pd.DataFrame(rows).astype({"num_plans": "Int64", "model_steps": "Int64"})
+
+    def paired(self) -> pd.DataFrame:
+        """Paired differences over repeats, a row a pair of priors, length and number of candidates."""
+        rows = []
+        for what, first, second in _pairs():
+            for t, length in enumerate(self.settings.lengths):
+                for p, number in enumerate(self.settings.num_plans):
+                    # Rounded, so that equal differences have no spread.
+                    gaps = (self.reached[first] - self.reached[second])[:, t, p].round(decimals=9)
+                    gap = paired_difference(gaps, torch.zeros_like(gaps))
+                    ends = zip(PriorName._fields, first, second, strict=True)
+                    row: dict[str, Any] = {name: " - ".join(dict.fromkeys(pair)) for name, *pair in ends}
+                    row |= {"what": what, "length": length, "num_plans": number, "difference": gap.mean}
+                    rows.append(row | {"low": gap.low, "high": gap.high, "p_value": gap.p_value})
+        return pd.DataFrame(rows)
+
+
+def _pairs() -> Iterator[tuple[str, PriorName, PriorName]]:
+    """Neural minus Markov, mice's minus planners', and with the node as context minus without; all else equal."""
+    for name in PRIORS:
+        if name in NEURAL:
+            yield "neural minus Markov", name, name._replace(prior="markov")
+    for name in PRIORS:
+        others = (name._replace(learned_from=source) for source in ("planner", "reached"))
+        for other in others if name.learned_from == "mice" else ():
+            if other in PRIORS:
+                yield "mice's minus a planner's", name, other
+    for name in PRIORS:
+        if name.sees == "node":
+            yield "node as context minus none", name, name._replace(sees="moves")
+
+
+def simulate(
+    settings: MiceSettings, world: TabularWorld, mice_plans: Plans, finished: Callable[[str], None]
+) -> MiceResult:
+    """Learn all priors and let a planner draw from each, `settings.seeds` times.
+
+    Args:
+        settings: how much.
+        world: the maze; it ends at the water.
+        mice_plans: what the mice did, with the node before each move as context.
+        finished: is called twice, and in each repeat once for each neural prior trained and each prior planned with.
+    """
+    generator = torch.Generator().manual_seed(settings.seed)
+    dry = torch.tensor([node for node in range(world.num_states) if node != WATER])
+    sources = collected(settings, world, mice_plans, dry, generator)
+    finished("collecting plans")
+    priors, learned = _count_based(sources, generator)
+    finished("counting")
+    reached: dict[PriorName, list[Tensor]] = {name: [] for name in PRIORS}
+    best = []
+    for repeat in range(1, settings.seeds + 1):
+        drawn = torch.Generator().manual_seed(draw_seed(generator))
+        start = dry[torch.randperm(len(dry), generator=drawn)[: settings.starts]].sort().values
+        best.append(torch.stack([oracle(world, start, n, objective="return").mean() for n in settings.lengths]))
+        for name in NEURAL:
+            make = GRUPrior if name.prior == "gru" else TransformerPrior
+            prior = make(4, num_contexts=CONTEXTS[name.sees], seed=draw_seed(drawn))
+            plans = sources[name.learned_from]
+            priors[name] = prior.fit(plans, generator=drawn, progress=False, max_steps=settings.steps)
+            finished(f"training {name}, repeat {repeat}")
+        for name in PRIORS:
+            shares = shares_reached(priors[name], world, start, settings.lengths, settings.num_plans, drawn)
+            reached[name].append(shares)
+            finished(f"planning with {name}, repeat {repeat}")
+    stacked = {name: torch.stack(found) for name, found in reached.items()}
+    return MiceResult(settings, stacked, torch.stack(best), priors, learned)
+
+
+def shares_reached(
+    prior: Prior,
+    world: TabularWorld,
+    start: Tensor,
+    lengths: tuple[int, ...],
+    num_plans: tuple[int, ...],
+    generator: torch.Generator,
+) -> Tensor:
+    """The share of starts at which a sampling planner reaches the water.
+
+    Candidates are drawn once, as many and as long as the most asked for. Fewer are blocks of them, each block a
+    planner's decision; shorter ones are their beginnings.
+
+    Returns:
+        `[T, P]`, float64, for T `lengths` and P `num_plans`.
+    """
+    most = max(num_plans)
+    found = torch.empty(len(start), most, len(lengths), dtype=torch.bool)
+    ends = torch.tensor(lengths) - 1
+    size = max(ROWS // most, 1)
+    for at in range(0, len(start), size):
+        some = start[at : at + size]
+        _, rollout = sample_in_world(prior, world, some, most, max(lengths), generator=generator)
+        found[at : at + size] = (rollout.rewards.cumsum(-1) > 0)[..., ends]
+    shares = []
+    for number in num_plans:
+        blocks = most // number
+        block = found[:, : blocks * number].view(len(start), blocks, number, len(lengths))
+        shares.append(block.any(2).double().mean((0, 1)))
+    return torch.stack(shares, 1)
+
+
+def collected(
+    settings: MiceSettings, world: TabularWorld, mice_plans: Plans, dry: Tensor, generator: torch.Generator
+) -> dict[str, Plans]:
+    """What the priors learn from, by the names in `SOURCES`; planners start at random nodes of `dry`.
+
+    The mice's sequences are cut, because a planner's candidates begin without a past: a neural prior that was trained
+    on pieces as long as the plans reaches more, and trains in a fifth of the time.
+    """
+
+    def chosen(planner: Planner, min_score: float | None) -> Plans:
+        state = dry[torch.randint(len(dry), (settings.training_plans,), generator=generator)]
+        return collect(planner, world, state=state, context="step", min_score=min_score, generator=generator)
+
+    searched = chosen(ExhaustivePlanner(DEPTH, objective="return"), None)
+    shot = chosen(SamplingPlanner(UniformPrior(4), SHOT_LENGTH, SHOTS, objective="return"), 0.0)
+    if len(shot) < 20:
+        raise ValueError(f"training_plans: {len(shot)} plans reached the water; at least 20 are needed")
+    return {"mice": _cut(mice_plans, max(settings.lengths)), "planner": searched, "reached": shot}
+
+
+def _cut(plans: Plans, length: int) -> Plans:
+    """Plans in pieces of `length` moves; what is left over at the end is dropped. A plan's pieces are a group."""
+    assert plans.context is not None
+    pieces = plans.max_length // length
+
+    def cut(values: Tensor) -> Tensor:
+        return values[:, : pieces * length].reshape(-1, length)
+
+    group = torch.arange(len(plans)).repeat_interleave(pieces)
+    return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group)
+
+
+def _count_based(sources: dict[str, Plans], generator: torch.Generator) -> tuple[dict[PriorName, Prior], pd.DataFrame]:
+    """The uniform prior, and for each source the Markov priors of the orders that predict held-out plans best."""
+    priors: dict[PriorName, Prior] = {UNIFORM: UniformPrior(4)}
+    learned = []
+    for source, plans in sources.items():
+        row: dict[str, Any] = {"source": source, "plans": len(plans), "moves": int(plans.mask().sum())}
+        training, validation = plans.split(0.1, generator)
+        for sees, contexts in CONTEXTS.items():
+            tried = {order: MarkovPrior(4, order, num_contexts=contexts).fit(training) for order in ORDERS}
+            bits = {order: score("", prior, validation).bits_per_action().mean for order, prior in tried.items()}
+            best = min(bits, key=lambda order: bits[order])
+            priors[PriorName("markov", source, sees)] = MarkovPrior(4, best, num_contexts=contexts).fit(plans)
+            row |= {f"markov_order_{sees}": best, f"bits_{sees}": bits[best]}
+        learned.append(row)
+    return priors, pd.DataFrame(learned)
