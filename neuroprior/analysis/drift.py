@@ -11,7 +11,7 @@ from math import nan
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special, stats
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
@@ -317,11 +317,11 @@ def _rank_correlation(values: NDArray[np.float64]) -> Difference:
         p_value = float((np.abs(every) >= abs(correlation) - 1e-9).mean())
     else:
         t = correlation * np.sqrt((num - 2) / max(1 - correlation**2, 1e-12))
-        p_value = float(2 * stats.t.sf(abs(t), num - 2))
+        p_value = float(2 * special.stdtr(num - 2, -abs(t)))
     if num <= FEWEST_RANKED or abs(correlation) == 1:
         return Difference(correlation, -1.0, 1.0, p_value)
     # 1.06: the variance for ranks (Fieller, Hartley and Pearson 1957).
-    centre, half = np.arctanh(correlation), stats.norm.ppf(0.975) * np.sqrt(1.06 / (num - 3))
+    centre, half = np.arctanh(correlation), special.ndtri(0.975) * np.sqrt(1.06 / (num - 3))
     return Difference(correlation, float(np.tanh(centre - half)), float(np.tanh(centre + half)), p_value)
 
 

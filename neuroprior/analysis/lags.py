@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from math import log
 
 import torch
-from scipy import stats
+from scipy import special
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
@@ -107,13 +107,13 @@ def _information(plans: Plans, lag: int, later: Tensor, generator: torch.Generat
     unit = ((unit.bincount() > 0).cumsum(0) - 1)[unit]  # a group without pairs must not leave a block empty
     _, _, error, blocks = _jackknife(past, then, actions, unit % MOST_BLOCKS)
     freedom = (len(past.unique()) - 1) * (len(then.unique()) - 1)
-    critical = max(bias, 0) * (float(stats.chi2.ppf(0.95, freedom)) / freedom - 1) if freedom else 0.0
+    critical = max(bias, 0) * (float(special.chdtri(freedom, 0.05)) / freedom - 1) if freedom else 0.0
     if pairs < ENOUGH_PAIRS * freedom:
         order = [torch.randperm(pairs, generator=generator, device=past.device) for _ in range(SHUFFLES)]
         shuffled = [_jackknife(past, then[index], actions, fine)[:2] for index in order]
         left = torch.tensor([whole - part for whole, part in shuffled], dtype=torch.double)
-        critical = max(critical, float(left.mean() + stats.norm.ppf(0.95) * left.std()))
-    half = max(float(stats.t.ppf(0.975, blocks - 1)) * error, critical)
+        critical = max(critical, float(left.mean() + special.ndtri(0.95) * left.std()))
+    half = max(float(special.stdtrit(blocks - 1, 0.975)) * error, critical)
     bits, half, critical = (nats - bias) / log(2), half / log(2), critical / log(2)
     return LagInformation(lag, bits, bits - half, bits + half, critical, pairs)
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import stats
-from scipy.special import xlogy
+from scipy.special import stdtrit, xlogy
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
@@ -25,6 +24,9 @@ POISSON_ZERO = -log(0.025)
 
 LEVEL = 0.05
 """Sequences with a corrected p-value up to this come first."""
+
+COUNTS_AT_ONCE = 2**20
+"""Counts of windows by unit that are in memory at a time."""
 
 TERMS = 64
 """Terms of a hypergeometric tail that are summed together."""
@@ -250,22 +252,28 @@ def _half_width(windows: _Windows, sequences: _Sequences, unit: Tensor) -> Tenso
     """
     every = torch.arange(len(sequences.counts), device=unit.device)
     squares, num_units = torch.zeros_like(sequences.total, dtype=torch.double), torch.zeros_like(sequences.total)
-    for part in unit.argsort(stable=True).split(unit.bincount().tolist()):
-        middle, whole = _times(windows.middle, part, sequences.middle), _times(sequences.of_window, part, every)
-        shift = middle / sequences.total.double() + whole / sequences.counts.clamp(min=1).double()
-        shift -= _times(windows.head, part, sequences.head) / sequences.heads.double()
-        shift -= _times(windows.tail, part, sequences.tail) / sequences.tails.double()
-        squares += shift**2
-        num_units += middle > 0
-    student = torch.tensor([inf, inf, *stats.t.ppf(0.975, range(1, BLOCKS))], dtype=torch.double, device=unit.device)
+    sizes = unit.bincount().tolist()
+    together = max(COUNTS_AT_ONCE // max(len(unit), len(every), 1), 1)
+    parts = unit.argsort(stable=True).split([sum(sizes[k : k + together]) for k in range(0, len(sizes), together)])
+    for k, part in enumerate(parts):
+        row = unit[part] - k * together
+
+        def times(rank: Tensor, wanted: Tensor, part: Tensor = part, row: Tensor = row) -> Tensor:
+            """`[U, K]`: how often each of `wanted [K]` is among the ranks of the windows of each of some units."""
+            width = max(int(rank.max()), int(wanted.max())) + 1
+            counts = (row * width + rank[part]).bincount(minlength=(int(row.max()) + 1) * width)
+            return counts.view(-1, width)[:, wanted]
+
+        if len(every):
+            middle, whole = times(windows.middle, sequences.middle), times(sequences.of_window, every)
+            shift = middle / sequences.total.double() + whole / sequences.counts.clamp(min=1).double()
+            shift -= times(windows.head, sequences.head) / sequences.heads.double()
+            shift -= times(windows.tail, sequences.tail) / sequences.tails.double()
+            squares += shift.square().sum(0)
+            num_units += (middle > 0).sum(0)
+    student = torch.tensor([inf, inf, *stdtrit(range(1, BLOCKS), 0.975)], dtype=torch.double, device=unit.device)
     error = (squares * num_units / (num_units - 1).clamp(min=1)).sqrt()
     return torch.where(num_units < FEWEST_UNITS, inf, student[num_units] * error)
-
-
-def _times(ranks: Tensor, part: Tensor, wanted: Tensor) -> Tensor:
-    """How often each of `wanted [K]` is among `ranks[part]`."""
-    highest = int(wanted.max()) + 1 if len(wanted) else 0
-    return ranks[part].bincount(minlength=highest)[wanted]
 
 
 def _units(plans: Plans, place: Tensor) -> Tensor:

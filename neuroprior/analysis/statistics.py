@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special, stats
 from torch import Tensor
 
 
@@ -67,7 +67,7 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
     """
     values = _vector("values", values)
     mean, error = float(values.mean()), float(stats.sem(values))
-    half = float(stats.t.ppf((1 + level) / 2, len(values) - 1)) * error
+    half = float(special.stdtrit(len(values) - 1, (1 + level) / 2)) * error
     return Interval(mean, mean - half, mean + half)
 
 
@@ -87,7 +87,7 @@ def mean_intervals(frame: Any, by: str | Sequence[str], value: str, level: float
     by = [by] if isinstance(by, str) else list(by)
     groups = frame.groupby(by, sort=False, dropna=False)[value]
     found = groups.agg(mean="mean", error="sem", n="count")
-    half = stats.t.ppf((1 + level) / 2, found["n"] - 1) * found["error"]
+    half = special.stdtrit(found["n"] - 1, (1 + level) / 2) * found["error"]
     found = found.assign(low=found["mean"] - half, high=found["mean"] + half)
     return found[["mean", "low", "high", "n"]].reset_index()
 
@@ -184,11 +184,11 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
         raise ValueError("sizes: numbers of at least 0 with a positive sum are expected")
     units, ratio = len(above), float(above.sum() / below.sum())
     error = float(np.sqrt(units / (units - 1) * ((above - ratio * below) ** 2).sum()) / below.sum())
-    half = float(stats.t.ppf((1 + level) / 2, units - 1)) * error
+    half = float(special.stdtrit(units - 1, (1 + level) / 2)) * error
     if error == 0:
         # Without spread Student's test would be certain: a sign test, as few units may agree at random.
         return Difference(ratio, ratio, ratio, 1.0 if ratio == 0 else 2.0 ** (1 - units))
-    return Difference(ratio, ratio - half, ratio + half, float(2 * stats.t.sf(abs(ratio) / error, units - 1)))
+    return Difference(ratio, ratio - half, ratio + half, float(2 * special.stdtr(units - 1, -abs(ratio) / error)))
 
 
 def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -96,7 +96,7 @@ def test_a_calibrated_forecaster_has_little_error():
 
 @pytest.mark.parametrize("p", [0.55, 0.6, 0.75])
 def test_a_forecaster_that_is_too_sure(p):
-    """At temperature 0.5 p becomes p**2 / (p**2 + (1 - p)**2): the error is the gap, of p and of its opposite alike."""
+    """At temperature 0.5 p becomes p**2 / (p**2 + (1 - p)**2): the error is the gap, the same for p and for 1 - p."""
     log_probs = torch.tensor([[p, 1 - p]], dtype=torch.double).log().expand(1000, 2)
     actions = (torch.arange(1000) >= round(1000 * p)).long()
     sure = reliability((2 * log_probs).log_softmax(-1), actions, torch.arange(1000))
@@ -132,7 +132,7 @@ def test_many_places_of_many_actions():
         ({"bins": 0}, ["bins"]),
     ],
 )
-def test_what_cannot_be(change, words):
+def test_bad_input(change, words):
     given = {"log_probs": HAND.log(), "actions": torch.zeros(5).long(), "unit": torch.arange(5)} | change
     with refuses(*words):
         reliability(**given)

@@ -80,7 +80,7 @@ def test_a_ratio_refuses(totals, sizes, word):
 
 
 def test_intervals_of_ratios_cover_at_their_level():
-    """2,000 samples of 40 units of 1 to 9 actions with different costs: hits of 95 % intervals.
+    """2,000 samples of 40 units of 1 to 9 actions with different tried_bits: hits of 95 % intervals.
 
     The interval is approximate, so its true level may be between 0.925 and 0.965; of such binomials the bounds are
     passed with a probability of `FALSE_ALARM`.
@@ -97,7 +97,7 @@ def test_intervals_of_ratios_cover_at_their_level():
 
 
 def test_scores_cover_at_their_level():
-    """400 samples of plans of 1 to 8 independent actions, whose cost is a cross entropy: as above."""
+    """400 samples of plans of 1 to 8 independent actions, whose bits are a cross entropy: as above."""
     prior = MarkovPrior(2, 0, backoff="dirichlet").fit(torch.tensor([[0, 0, 0, 1]]))
     p = prior(torch.zeros(1, 1).long()).softmax(-1)[0, 0].double()
     truth = float(-(0.6 * p[0].log2() + 0.4 * p[1].log2()))
@@ -197,26 +197,26 @@ def test_no_plans_are_refused():
 def test_score_of_bits_with_a_mask(group):
     """Only what counts is summed, by unit; a unit of which nothing counts is none."""
     plans = held_out(group=group)
-    cost = torch.rand(12, 7, generator=seeded(4))
+    surprisal = torch.rand(12, 7, generator=seeded(4))
     mask = plans.mask()
     mask[:, :2] = False
-    found = score_bits("it", "actions", cost, plans, mask)
+    found = score_bits("it", "actions", surprisal, plans, mask)
     unit = torch.arange(12) if group is None else group
     of = [unit == number for number in unit.unique()]
-    want = [(float(cost[rows][mask[rows]].double().sum()), int(mask[rows].sum())) for rows in of]
+    want = [(float(surprisal[rows][mask[rows]].double().sum()), int(mask[rows].sum())) for rows in of]
     want = [(total, number) for total, number in want if number]
     assert found.bits.tolist() == pytest.approx([total for total, _ in want])
     assert found.actions.tolist() == [number for _, number in want]
-    whole = score_bits("it", "actions", cost, plans)
+    whole = score_bits("it", "actions", surprisal, plans)
     assert float(whole.actions.sum()) == 40
-    assert float(whole.bits.sum()) == pytest.approx(float(cost[plans.mask()].sum()))
+    assert float(whole.bits.sum()) == pytest.approx(float(surprisal[plans.mask()].sum()))
     prior = MarkovPrior(3, 1).fit(plans)
     again = score_bits("it", "actions", action_bits(prior, plans), plans)
     torch.testing.assert_close(again.bits, score("it", prior, plans).bits)
     mask[:, :] = False
     mask[0, 3] = True
     with refuses("two held-out actions", "not 1"):
-        score_bits("it", "actions", cost, plans, mask)
+        score_bits("it", "actions", surprisal, plans, mask)
 
 
 def test_minus_is_paired():
@@ -263,10 +263,10 @@ def test_each_baseline_is_the_best_of_what_was_tried(num_contexts):
             for backoff, smoothing in BACKOFFS_TRIED:
                 prior = MarkovPrior(3, order, smoothing, num_contexts=contexts, backoff=backoff).fit(training)
                 tried[contexts, backoff, smoothing] = prior
-        costs = {key: bits(prior, validation) for key, prior in tried.items()}
-        assert baseline.validation_bits == pytest.approx(min(costs.values()), abs=1e-6)
+        tried_bits = {key: bits(prior, validation) for key, prior in tried.items()}
+        assert baseline.validation_bits == pytest.approx(min(tried_bits.values()), abs=1e-6)
         chosen = baseline.prior.num_contexts, baseline.prior.backoff, baseline.prior.smoothing
-        assert costs[chosen] == pytest.approx(min(costs.values()), abs=1e-6)
+        assert tried_bits[chosen] == pytest.approx(min(tried_bits.values()), abs=1e-6)
         assert baseline.how == f"{chosen[1]} {chosen[2]:g}"
         assert baseline.prior.order == order
         # Counted once for all, and yet what `fit` alone makes.
@@ -296,7 +296,7 @@ def test_context_is_taken_where_it_helps(matters):
 
 
 def test_contexts_that_only_held_out_plans_have():
-    """A context never met in training costs what some probabilities cost, and stops nothing."""
+    """A context that training plans do not have still has probabilities."""
     training = sources(True)
     for validation in (replace(sources(True, 50, 3), context=torch.full((50,), 4)), sources(True, 50, 3)):
         for baseline in baselines(training, validation, 5):

@@ -136,7 +136,7 @@ def test_groups_are_the_units():
 
 
 def numbered(**more) -> Plans:
-    """Plans whose actions tell plan and place: 10 times the plan and the step."""
+    """Plans whose actions are 10 times the plan plus the step."""
     lengths = torch.tensor([5, 2, 7, 0, 3])
     return Plans(10 * torch.arange(5)[:, None] + torch.arange(7), 50, lengths, **more)
 
@@ -185,13 +185,13 @@ def test_pieces_may_end():
     assert (found.actions[:, -1] == 2).sum() == 20
 
 
-def test_pieces_are_drawn_alike_and_without_replacement():
-    """9 of 17 starts, 3,000 times: each is drawn as often, pieces differ, and a seed tells them."""
+def test_pieces_are_drawn_uniformly_and_without_replacement():
+    """9 of 17 starts, 3,000 times: each is drawn as often, pieces differ, and a seed determines them."""
     plans = numbered()
     generator, times = seeded(2), torch.zeros(50)
     for _ in range(3000):
         found = pieces(plans, 1, 9, generator).actions[:, 0].long()
-        assert len(found.unique()) == 9
+        assert len(set(found.tolist())) == 9
         times[found] += 1
     taken = times[plans.actions[plans.mask()].long()]
     assert taken.sum() == 27000
@@ -203,7 +203,7 @@ def test_pieces_are_drawn_alike_and_without_replacement():
     assert again[0].equal(again[1])
 
 
-def test_pieces_that_cannot_be():
+def test_pieces_bad_input():
     with refuses("length: no plan has 8 actions", "7"):
         pieces(numbered(), 8, 10)
     with refuses("length"):

@@ -47,10 +47,10 @@ def test_tails_of_large_tables(table):
 
 def brute_force(plans: Plans, n: int) -> dict[tuple[int, ...], tuple[int, int, int, int]]:
     """Of each possible sequence: its count, and how often its middle, its first and its last n - 1 actions occurred."""
-    seen = []
+    found = []
     for row, length in zip(plans.actions.tolist(), plans.mask().sum(1).tolist(), strict=True):
-        seen += [tuple(row[t : t + n]) for t in range(length - n + 1)]
-    whole, heads, tails, middles = (Counter(w[a:b] for w in seen) for a, b in ((0, n), (0, n - 1), (1, n), (1, n - 1)))
+        found += [tuple(row[t : t + n]) for t in range(length - n + 1)]
+    whole, heads, tails, middles = (Counter(w[a:b] for w in found) for a, b in ((0, n), (0, n - 1), (1, n), (1, n - 1)))
     return {
         (*head, last): (whole[(*head, last)], middles[head[1:]], heads[head], tails[(*head[1:], last)])
         for head in heads
@@ -150,7 +150,7 @@ def test_a_single_plan_is_cut_in_parts():
 
 
 def test_intervals_without_spread_or_without_counts():
-    """`0 1 0` and `2 1 2` alone occur: the others never do; all plans of either kind are alike."""
+    """`0 1 0` and `2 1 2` alone occur: the others never do; all plans of a kind are equal."""
     actions = torch.tensor([[0, 1, 0], [2, 1, 2]]).repeat(20, 1)
     found = {m.actions: m for m in motifs(Plans(actions, 3, group=torch.arange(40) // 2), (3,))}
     assert found[0, 1, 0].low == pytest.approx(2)
@@ -189,7 +189,7 @@ def test_false_positives(num_actions, order, num, length, lengths):
     assert min(single) < 0.2
 
 
-def test_rare_sequences_are_not_found_where_there_is_nothing():
+def test_no_rare_sequences_are_found_among_independent_actions():
     """Many actions, few counts: a correction for the sequences that occurred alone finds motifs in all of these."""
     for seed in range(20):
         plans = Plans(torch.randint(30, (20, 100), generator=seeded(seed)), 30)
@@ -197,7 +197,7 @@ def test_rare_sequences_are_not_found_where_there_is_nothing():
 
 
 def test_intervals_cover_at_their_level():
-    """300 null data sets of 30 plans, with a ratio of 1; the level, which is approximate, is let be 0.92 to 0.97."""
+    """300 null data sets of 30 plans, with a ratio of 1; the level, which is approximate, may be 0.92 to 0.97."""
     hits = []
     for plans in null_sets(2, 1, 300, 30, 40, spread=0.5):
         found = next(m for m in motifs(plans, (3,)) if m.actions == (0, 0, 1))
@@ -245,7 +245,7 @@ def test_codes_do_not_overflow():
 
 
 def test_repeats_are_merged():
-    """Within plans, never across; runs of one action are then not the first that is seen."""
+    """Within plans, never across; runs of one action then do not come first."""
     plans = Plans(torch.tensor([[0, 0, 1, 1, 1, 0], [0, 2, 2, 2, 0, 0], [1, 1, 0, 0, 0, 0]]).repeat(8, 1), 3)
     merged = Plans(torch.tensor([[0, 1, 0], [0, 2, 0], [1, 0, 0]]).repeat(8, 1), 3, torch.tensor([3, 3, 2] * 8))
     for lengths in ((3,), (3, 4)):

@@ -19,8 +19,8 @@ def brute_force(plans: Plans, order: int, max_order: int, contexts=None) -> tupl
     for n, row in enumerate(plans.actions.tolist()):
         length = plans.max_length if plans.lengths is None else int(plans.lengths[n])
         for t in range(max_order, length):
-            seen = None if contexts is None else int(contexts[n, t] if contexts.dim() == 2 else contexts[n])
-            history = (seen, *row[t - order : t])
+            index = None if contexts is None else int(contexts[n, t] if contexts.dim() == 2 else contexts[n])
+            history = (index, *row[t - order : t])
             pairs[history, row[t]] += 1
             histories[history] += 1
     likelihood = sum(c * math.log(c / histories[history]) for (history, _), c in pairs.items())
@@ -47,8 +47,8 @@ def test_fits_are_those_of_brute_force(per):
 
 def test_context_is_left_aside_where_it_is_not_asked_for():
     plans = markov_plans(markov_probs(3, 1, 0), 5, 20, 1)
-    seen = Plans(plans.actions, 3, context=torch.arange(5))
-    assert order_selection(seen, 2) == order_selection(plans, 2)
+    other = Plans(plans.actions, 3, context=torch.arange(5))
+    assert order_selection(other, 2) == order_selection(plans, 2)
 
 
 def test_a_cycle_is_certain_after_one_action():
@@ -89,11 +89,11 @@ def test_twice_the_likelihood_ratio_is_chi_square():
 
 
 def test_context_stands_in_for_memory():
-    """Where the context of a step tells the last action, order 0 with context is order 1 without."""
+    """If the context of a step is the last action, order 0 with context is order 1 without."""
     plans = markov_plans(markov_probs(3, 1, 0), 20, 50, 1)
     last = torch.cat([torch.zeros(20, 1).long(), plans.actions[:, :-1].long()], 1)
-    seen = Plans(plans.actions, 3, context=last)
-    with_context, without = order_selection(seen, 3, num_contexts=3), order_selection(plans, 3)
+    given = Plans(plans.actions, 3, context=last)
+    with_context, without = order_selection(given, 3, num_contexts=3), order_selection(plans, 3)
     for order in range(3):
         assert with_context[order].log_likelihood == pytest.approx(without[max(order, 1)].log_likelihood)
     assert min(with_context, key=lambda fit: fit.bic).order == 0

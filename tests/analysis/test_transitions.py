@@ -81,7 +81,7 @@ def statistics(plans: Plans) -> tuple[float, float]:
 
 def test_permutations_come_near_to_all_divisions():
     """Three of seven plans in one group: all 35 divisions against 4,000 drawn ones (5 standard errors)."""
-    actions = markov_plans(markov_probs(2, 1, 0), 7, 9, 3).actions
+    actions = markov_plans(markov_probs(2, 1, 0), 7, 9, 5).actions
     divisions = []
     for chosen in itertools.combinations(range(7), 3):
         group = torch.zeros(7).long().index_fill(0, torch.tensor(chosen), 1)
@@ -98,7 +98,7 @@ def test_permutations_come_near_to_all_divisions():
 
 
 def test_ties_count():
-    """Plans that are all alike: every shuffle has the same statistic, and every p-value is 1."""
+    """Plans that are all equal: every permutation has the same statistic, and every p-value is 1."""
     plans = Plans(torch.tensor([0, 0, 1, 1, 0]).expand(12, 5), 2, group=torch.arange(12) % 2)
     found = transitions(plans, 50, seeded(0))
     assert found.p_value == 1
@@ -156,7 +156,7 @@ def test_cells_without_anything_to_compare_are_nan():
 
 
 def null_plans(seed: int, groups: int, num: int, length: int) -> Plans:
-    """A source whose plans are unlike each other: each has its own of two chains."""
+    """A source of dissimilar plans: each follows one of two chains."""
     both = [markov_plans(markov_probs(3, 1, 2 * seed + i), num, length, 7 * seed + i) for i in (0, 1)]
     which = torch.rand(num, 1, generator=seeded(seed)) < 0.5
     actions = torch.where(which, both[0].actions, both[1].actions)
@@ -187,7 +187,7 @@ def test_false_positives_of_chi_square():
 
 
 def test_a_group_of_its_own_is_found():
-    """Group 2 goes from 0 to 1 more often; the rows of other actions are alike."""
+    """Group 2 goes from 0 to 1 more often; the rows of other actions do not differ."""
     probs = markov_probs(4, 1, 0)
     other = probs.clone()
     other[0] = torch.tensor([0.1, 0.7, 0.1, 0.1])

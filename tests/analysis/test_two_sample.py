@@ -159,7 +159,7 @@ def test_what_does_not_occur_is_left_out():
     assert [found.statistic for found in two_sample_tests(one, two, 99)] == ["1-grams", "run lengths"]
 
 
-def test_what_cannot_be():
+def test_bad_input():
     plans = chain(20, 5, 0.5, 0)
     with refuses("2 actions", "3"):
         two_sample_tests(plans, Plans(plans.actions, 3))

@@ -163,7 +163,7 @@ def test_the_end_symbol_closes_every_plan_and_comes_off_again():
     )
 
 
-def test_where_lengths_are_not_given_the_first_end_symbol_tells_them():
+def test_without_lengths_plans_end_at_the_first_end_symbol():
     sampled = torch.tensor([[0, 2, 2], [2, 2, 2], [0, 1, 0]])
     assert Plans(sampled, 3, end=2).lengths.tolist() == [2, 1, 3]
     assert Plans(sampled, 3, end=2).without_end().lengths.tolist() == [1, 0, 3]

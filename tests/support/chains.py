@@ -19,10 +19,12 @@ def markov_plans(probs: Tensor, num_plans: int, length: int, seed: int, **more: 
     histories, num_actions = probs.shape
     generator, order = seeded(seed), round(torch.tensor(histories).log().div(torch.tensor(num_actions).log()).item())
     actions = torch.randint(num_actions, (num_plans, length), generator=generator)
+    draws = torch.rand(length, num_plans, 1, generator=generator, dtype=torch.double)
+    edges = (probs / probs.sum(1, keepdim=True)).double().cumsum(1)[:, :-1]
     base = num_actions ** torch.arange(order - 1, -1, -1)
     for t in range(order, length):
         history = (actions[:, t - order : t] * base).sum(1)
-        actions[:, t] = torch.multinomial(probs[history], 1, generator=generator)[:, 0]
+        actions[:, t] = (edges[history] < draws[t]).sum(1)
     return Plans(actions, num_actions, **more)
 
 

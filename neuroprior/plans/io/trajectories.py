@@ -36,10 +36,10 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     observed: list[NDArray[Any] | None] = []
     for number, trajectory in enumerate(trajectories):
         place = f"trajectory {number}"
-        taken, seen = _parts(trajectory, place)
+        taken, made = _parts(trajectory, place)
         actions.append(_actions(taken, num_actions, place))
         if observations is not None:
-            observed.append(None if seen is None else _observations(seen, len(actions[-1]), place))
+            observed.append(None if made is None else _observations(made, len(actions[-1]), place))
     if not actions:
         raise ValueError("trajectories: none are given")
     lengths = np.array([len(part) for part in actions])
