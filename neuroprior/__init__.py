@@ -1,32 +1,25 @@
-"""neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner."""
+"""neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner.
+
+Here are the names that most programs need; everything else is in its room: `neuroprior.worlds`, `neuroprior.sampling`,
+`neuroprior.priors`, `neuroprior.planners`, `neuroprior.agents`, `neuroprior.analysis`, `neuroprior.report` and
+`neuroprior.testing`.
+"""
 
 from neuroprior._version import __version__
-from neuroprior.agents.agent import Agent
-from neuroprior.agents.checkpoints import restore_agent, save_agent
 from neuroprior.planners import (
-    CrossEntropyPlanner,
-    Decision,
-    DistinctPlanner,
-    Execution,
     ExhaustivePlanner,
-    ForagingOracle,
     FrontierPlanner,
-    HorizonPlanner,
-    HorizonRound,
     MCTSPlanner,
     Planner,
     SamplingPlanner,
     collect,
     execute,
-    expected_score,
-    extend_horizon,
     oracle,
 )
 from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.priors import (
     ContextTreePrior,
     GRUPrior,
-    Macro,
     MacroPrior,
     MarkovPrior,
     MixturePrior,
@@ -34,89 +27,41 @@ from neuroprior.priors import (
     StackedPrior,
     TransformerPrior,
     UniformPrior,
-    learn_macros,
+    fit,
     load,
     save,
 )
-from neuroprior.sampling.ancestral import sample, sample_in_world
-from neuroprior.sampling.distinct import Distinct, most_probable, sample_distinct, sample_distinct_in_world
-from neuroprior.worlds import (
-    EpisodicWorld,
-    ForagingWorld,
-    GridWorld,
-    PocketCube,
-    Rollout,
-    SteppedWorld,
-    TabularWorld,
-    World,
-    cube,
-    egocentric,
-    four_rooms,
-    from_gymnasium,
-    gridworld,
-    labyrinth,
-    maze,
-    patches,
-)
+from neuroprior.sampling import sample
+from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
 
 __all__ = [
-    "__version__",
-    "Agent",
     "ContextTreePrior",
-    "CrossEntropyPlanner",
-    "Decision",
-    "Distinct",
-    "DistinctPlanner",
-    "EpisodicWorld",
-    "Execution",
     "ExhaustivePlanner",
-    "ForagingOracle",
-    "ForagingWorld",
     "FrontierPlanner",
     "GRUPrior",
-    "GridWorld",
-    "HorizonRound",
-    "HorizonPlanner",
     "MCTSPlanner",
-    "Macro",
     "MacroPrior",
     "MarkovPrior",
     "MixturePrior",
     "Planner",
     "Plans",
-    "PocketCube",
     "Prior",
-    "Rollout",
     "SamplingPlanner",
     "StackedPrior",
-    "SteppedWorld",
     "TabularWorld",
     "TransformerPrior",
     "UniformPrior",
     "World",
+    "__version__",
     "collect",
-    "cube",
-    "egocentric",
     "execute",
-    "expected_score",
-    "four_rooms",
+    "fit",
     "from_gymnasium",
     "gridworld",
-    "extend_horizon",
-    "labyrinth",
-    "learn_macros",
     "load",
-    "maze",
-    "most_probable",
     "oracle",
-    "patches",
     "read_plans",
-    "restore_agent",
     "sample",
-    "sample_distinct",
-    "sample_distinct_in_world",
-    "sample_in_world",
     "save",
-    "save_agent",
     "write_plans",
 ]

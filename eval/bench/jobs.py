@@ -17,7 +17,6 @@ from eval.bench.timing import Run, compared, median_seconds, seconds
 from neuroprior import (
     ContextTreePrior,
     ExhaustivePlanner,
-    GridWorld,
     GRUPrior,
     MarkovPrior,
     Planner,
@@ -28,6 +27,7 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
+from neuroprior.worlds import GridWorld
 
 FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from eval.worlds.suite import Task, best_score
-from neuroprior import Prior, SamplingPlanner, TabularWorld, World, expected_score
+from neuroprior import Prior, SamplingPlanner, TabularWorld, World
+from neuroprior.planners import expected_score
 
 ROLLOUTS = 16
 """Of each candidate, where chance decides."""

@@ -17,7 +17,8 @@ from eval.compare.planners import ORDERS, entry_of, planned
 from eval.compare.run import Contest
 from eval.compare.settings import Settings
 from eval.worlds.suite import TASKS, Task
-from neuroprior import HorizonPlanner, Planner, Prior, SamplingPlanner
+from neuroprior import Planner, Prior, SamplingPlanner
+from neuroprior.planners import HorizonPlanner
 
 WORLDS = ("grid", "four_rooms", "egocentric", "goal_maze", "taxi", "frozen_lake")
 

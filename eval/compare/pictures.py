@@ -5,7 +5,9 @@ from typing import Any
 import torch
 
 from eval.compare.curves import Starts
-from neuroprior import GridWorld, Prior, World, sample_in_world
+from neuroprior import Prior, World
+from neuroprior.sampling import sample_in_world
+from neuroprior.worlds import GridWorld
 
 SAMPLED, DRAWN = 2000, 12
 """Plans that transitions are counted in, and plans that are drawn."""

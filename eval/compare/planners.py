@@ -13,17 +13,8 @@ from eval.compare.curves import ROLLOUTS, TEMPERATURES, Starts, worth
 from eval.compare.run import Contest, Contestant
 from eval.compare.settings import Settings
 from eval.worlds.suite import TASKS, Task
-from neuroprior import (
-    CrossEntropyPlanner,
-    DistinctPlanner,
-    FrontierPlanner,
-    MCTSPlanner,
-    Planner,
-    Prior,
-    SamplingPlanner,
-    World,
-    execute,
-)
+from neuroprior import FrontierPlanner, MCTSPlanner, Planner, Prior, SamplingPlanner, World, execute
+from neuroprior.planners import CrossEntropyPlanner, DistinctPlanner
 
 ORDERS = (3,)
 """Of the Markov priors that planners are compared with."""

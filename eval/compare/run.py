@@ -25,17 +25,10 @@ from eval.compare.settings import SEES, Settings
 from eval.worlds.foraging import Home
 from eval.worlds.splits import LAYOUTS, MAPS, SCRAMBLE
 from eval.worlds.suite import Task
-from neuroprior import (
-    ExhaustivePlanner,
-    Plans,
-    Prior,
-    UniformPrior,
-    World,
-    collect,
-    extend_horizon,
-)
+from neuroprior import ExhaustivePlanner, Plans, Prior, UniformPrior, World, collect
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
+from neuroprior.planners import extend_horizon
 
 GROWN_WITH = 64
 """Candidate plans in the rounds of growth."""

@@ -9,19 +9,11 @@ import torch
 from eval.compare.recipes import RECIPE, UnlimitedGRU
 from eval.compare.settings import LiveSettings
 from eval.worlds.foraging import Home
-from neuroprior import (
-    Agent,
-    ForagingOracle,
-    ForagingWorld,
-    MarkovPrior,
-    Planner,
-    Prior,
-    SamplingPlanner,
-    TabularWorld,
-    UniformPrior,
-    patches,
-)
+from neuroprior import MarkovPrior, Planner, Prior, SamplingPlanner, TabularWorld, UniformPrior
 from neuroprior._random import draw_seed
+from neuroprior.agents import Agent
+from neuroprior.planners import ForagingOracle
+from neuroprior.worlds import ForagingWorld, patches
 
 ORDERS = {"nothing": 3, "each step": 2}
 """Of chains, by what they see."""

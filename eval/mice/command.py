@@ -10,11 +10,12 @@ from rich.console import Console
 
 from eval.mice import figures
 from eval.mice.experiment import NEURAL, PRIORS, SOURCES, UNIFORM, MiceSettings, PriorName, simulate
-from neuroprior import labyrinth, read_plans
+from neuroprior import read_plans
 from neuroprior._files import versions, write_json
 from neuroprior._jobs import Progress
 from neuroprior.report.document import Column, printed, records, table, write_figures, write_frames
 from neuroprior.report.page import Table
+from neuroprior.worlds import labyrinth
 
 DATA = Path(__file__).parents[1] / "data" / "labyrinth" / "plans.jsonl"
 NODES, LONGEST = 126, 500

@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from neuroprior import Plans, Prior, TabularWorld, labyrinth, oracle
+from neuroprior import Plans, Prior, TabularWorld, oracle
 from neuroprior.sampling import sample_in_world
+from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import DEPTH, WATER
 
 COLORS = {"uniform": "#7f7f7f", "markov": "#2171b5", "gru": "#e6550d", "transformer": "#88419d", "oracle": "black"}

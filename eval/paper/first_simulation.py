@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from eval.paper.planners import Finished, PaperSettings, fit_priors, groups, make_planners, over_groups
-from neuroprior import Decision, ExhaustivePlanner, GridWorld, MarkovPrior, Plans, gridworld, oracle
+from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, gridworld, oracle
 from neuroprior.analysis.statistics import best_of, paired_difference
+from neuroprior.planners import Decision
 from neuroprior.plans import all_plans
+from neuroprior.worlds import GridWorld
 
 PAPER_BEST = {"deterministic": 0.321, "random": 0.537, "markov-1": 0.841, "markov-2": 0.844}
 """Hyvärinen, Table 1: in what share of the starts each planner was best, of these four."""

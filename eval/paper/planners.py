@@ -9,7 +9,6 @@ from torch import Tensor
 
 from neuroprior import (
     ExhaustivePlanner,
-    GridWorld,
     GRUPrior,
     MarkovPrior,
     Planner,
@@ -20,6 +19,7 @@ from neuroprior import (
     UniformPrior,
 )
 from neuroprior.analysis.statistics import Interval, mean_interval, share_interval
+from neuroprior.worlds import GridWorld
 
 ANY_PREFIX = " (any prefix)"
 """Added to the name of a planner that may end a plan after any of its actions."""

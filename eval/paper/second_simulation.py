@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from eval.paper.planners import ANY_PREFIX, Finished, PaperSettings, fit_priors, groups, make_planners, over_groups
-from neuroprior import ExhaustivePlanner, GridWorld, Planner, Plans, Prior
+from neuroprior import ExhaustivePlanner, Planner, Plans, Prior
 from neuroprior.analysis.statistics import Interval, paired_difference
 from neuroprior.values import can_reach, q_learning, value_iteration
+from neuroprior.worlds import GridWorld
 
 PAPER_REACHED = {"deterministic": 0.2422, "random": 0.3952, "markov-1": 0.4961, "markov-2": 0.4733}
 """Hyvärinen, Table 2: the share of 10,000 starts from which the goal was reached."""

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from neuroprior import TabularWorld, egocentric, gridworld, labyrinth, maze
+from neuroprior import TabularWorld, gridworld
+from neuroprior.worlds import egocentric, labyrinth, maze
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from eval.worlds import minigrid as minigrid_worlds
 from eval.worlds.mid_plan import UnderWay
-from neuroprior import ExhaustivePlanner, PocketCube, TabularWorld, World, from_gymnasium, maze
-from neuroprior.worlds import EpisodicWorld, goal_direction
+from neuroprior import ExhaustivePlanner, TabularWorld, World, from_gymnasium
+from neuroprior.worlds import EpisodicWorld, PocketCube, goal_direction, maze
 
 MAPS = 100
 """Reward maps or layouts in each of the three worlds of a seed, where they cost nothing to make."""

@@ -24,7 +24,8 @@ from eval.worlds.splits import (
     under_way,
     unlike,
 )
-from neuroprior import PocketCube, TabularWorld, World, four_rooms, gridworld, maze, oracle
+from neuroprior import TabularWorld, World, gridworld, oracle
+from neuroprior.worlds import PocketCube, four_rooms, maze
 from neuroprior.worlds.cube import FACES
 from neuroprior.worlds.grid import MOVES, TURNS
 

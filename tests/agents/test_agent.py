@@ -6,23 +6,9 @@ import re
 import pytest
 import torch
 
-from neuroprior import (
-    Agent,
-    ForagingWorld,
-    GRUPrior,
-    MarkovPrior,
-    Plans,
-    SamplingPlanner,
-    UniformPrior,
-    execute,
-    gridworld,
-    load,
-    patches,
-    restore_agent,
-    save,
-    save_agent,
-)
-from neuroprior.agents import checkpoints
+from neuroprior import GRUPrior, MarkovPrior, Plans, SamplingPlanner, UniformPrior, execute, gridworld, load, save
+from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
+from neuroprior.worlds import ForagingWorld, patches
 from tests.support.sources import corridor, every_plan, refuses, seeded
 
 TRAINING = {"max_steps": 4, "progress": False}

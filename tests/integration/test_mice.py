@@ -13,7 +13,8 @@ from eval.__main__ import main
 from eval.mice.command import DATA
 from eval.mice.experiment import MiceSettings, collected, shares_reached
 from eval.mice.figures import ENTRANCE, coordinates, far_from_water, left_turns, passages
-from neuroprior import Plans, SamplingPlanner, UniformPrior, labyrinth, oracle, read_plans
+from neuroprior import Plans, SamplingPlanner, UniformPrior, oracle, read_plans
+from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import WATER
 from tests.support.sources import FALSE_ALARM, every_plan, in_world_distribution, seeded
 

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
-from neuroprior import CrossEntropyPlanner, GRUPrior, MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, cube
+from neuroprior import GRUPrior, MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior
+from neuroprior.planners import CrossEntropyPlanner
 from neuroprior.planners.cross_entropy import RefittedPrior, _places
+from neuroprior.worlds import cube
 from tests.support.sources import every_plan, fits, random_world, refuses, seeded, stochastic_world
 
 WALK = every_plan(3, 4)

@@ -15,13 +15,11 @@ from neuroprior import (
     TabularWorld,
     UniformPrior,
     collect,
-    cube,
-    egocentric,
     gridworld,
-    maze,
     oracle,
 )
 from neuroprior.planners import frontier
+from neuroprior.worlds import cube, egocentric, maze
 from tests.support.sources import random_world, refuses, seeded, stochastic_world
 
 HOW = (

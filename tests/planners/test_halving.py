@@ -7,7 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuroprior import SamplingPlanner, TabularWorld, UniformPrior, expected_score
+from neuroprior import SamplingPlanner, TabularWorld, UniformPrior
+from neuroprior.planners import expected_score
 from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
 from tests.support.sources import every_plan, seeded, stochastic_world
 

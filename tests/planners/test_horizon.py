@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from eval.__main__ import main
-from neuroprior import HorizonPlanner, MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld, labyrinth
+from neuroprior import MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld
+from neuroprior.planners import HorizonPlanner
 from neuroprior.planners.horizon import _Found
 from neuroprior.testing import check_planner
+from neuroprior.worlds import labyrinth
 from tests.support.reports import FROM_ELSEWHERE
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded, stochastic_world
 

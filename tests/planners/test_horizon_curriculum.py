@@ -12,8 +12,8 @@ from neuroprior import (
     TabularWorld,
     UniformPrior,
     collect,
-    extend_horizon,
 )
+from neuroprior.planners import extend_horizon
 from neuroprior.testing import check_world
 from neuroprior.worlds import EpisodicWorld, cube, four_rooms, gridworld, labyrinth, maze
 from neuroprior.worlds.labyrinth import WATER

@@ -12,10 +12,10 @@ from neuroprior import (
     SamplingPlanner,
     TabularWorld,
     UniformPrior,
-    cube,
     gridworld,
     oracle,
 )
+from neuroprior.worlds import cube
 from tests.support.sources import random_world, refuses, seeded, stochastic_world
 
 

@@ -3,16 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import (
-    CrossEntropyPlanner,
-    DistinctPlanner,
-    FrontierPlanner,
-    HorizonPlanner,
-    MarkovPrior,
-    MCTSPlanner,
-    SamplingPlanner,
-    UniformPrior,
-)
+from neuroprior import FrontierPlanner, MarkovPrior, MCTSPlanner, SamplingPlanner, UniformPrior
+from neuroprior.planners import CrossEntropyPlanner, DistinctPlanner, HorizonPlanner
 from neuroprior.sampling import (
     Steppable,
     most_probable,

@@ -11,11 +11,11 @@ from neuroprior import (
     UniformPrior,
     World,
     collect,
-    expected_score,
     oracle,
-    sample_in_world,
 )
+from neuroprior.planners import expected_score
 from neuroprior.planners.rollouts import mean_scores
+from neuroprior.sampling import sample_in_world
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,

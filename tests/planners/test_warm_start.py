@@ -3,17 +3,10 @@
 import pytest
 import torch
 
-from neuroprior import (
-    Decision,
-    MarkovPrior,
-    SamplingPlanner,
-    TabularWorld,
-    UniformPrior,
-    expected_score,
-    gridworld,
-    labyrinth,
-)
+from neuroprior import MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld
+from neuroprior.planners import Decision, expected_score
 from neuroprior.planners.warm_start import continue_plans, with_rest
+from neuroprior.worlds import labyrinth
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,

@@ -5,7 +5,8 @@ from functools import partial
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, sample, sample_in_world
+from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, sample
+from neuroprior.sampling import sample_in_world
 from tests.support.sources import distribution, every_plan, random_world, refuses, seeded
 
 A, L, C = 3, 7, 4

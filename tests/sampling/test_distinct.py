@@ -7,16 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuroprior import (
-    GRUPrior,
-    MarkovPrior,
-    Plans,
-    TransformerPrior,
-    UniformPrior,
-    most_probable,
-    sample_distinct,
-    sample_distinct_in_world,
-)
+from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior
+from neuroprior.sampling import most_probable, sample_distinct, sample_distinct_in_world
 from tests.support.sources import (
     FALSE_ALARM,
     TablePrior,

@@ -5,17 +5,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuroprior import (
-    GRUPrior,
-    MarkovPrior,
-    Plans,
-    TabularWorld,
-    TransformerPrior,
-    UniformPrior,
-    World,
-    sample,
-    sample_in_world,
-)
+from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, TransformerPrior, UniformPrior, World, sample
+from neuroprior.sampling import sample_in_world
 from neuroprior.sampling.draws import Draw
 from tests.support.sources import (
     FALSE_ALARM,

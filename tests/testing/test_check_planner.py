@@ -3,18 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import (
-    CrossEntropyPlanner,
-    Decision,
-    DistinctPlanner,
-    ExhaustivePlanner,
-    FrontierPlanner,
-    HorizonPlanner,
-    MCTSPlanner,
-    Planner,
-    SamplingPlanner,
-    TabularWorld,
-)
+from neuroprior import ExhaustivePlanner, FrontierPlanner, MCTSPlanner, Planner, SamplingPlanner, TabularWorld
+from neuroprior.planners import CrossEntropyPlanner, Decision, DistinctPlanner, HorizonPlanner
 from neuroprior.testing import check_planner
 from tests.support.sources import TablePrior, refuses, seeded
 

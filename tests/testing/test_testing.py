@@ -17,16 +17,12 @@ from neuroprior import (
     TransformerPrior,
     UniformPrior,
     World,
-    cube,
-    egocentric,
-    four_rooms,
     from_gymnasium,
     gridworld,
-    maze,
 )
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
-from neuroprior.worlds import Rollout
+from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze
 from tests.support.sources import stochastic_world
 
 

@@ -5,7 +5,8 @@ import itertools
 import pytest
 import torch
 
-from neuroprior import SamplingPlanner, UniformPrior, cube
+from neuroprior import SamplingPlanner, UniformPrior
+from neuroprior.worlds import cube
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 HALF_TURNS = [1, 9, 54, 321, 1847, 9992, 50136, 227536, 870072, 1887748, 623800, 2644]

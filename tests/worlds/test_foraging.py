@@ -3,23 +3,11 @@
 import pytest
 import torch
 
-from neuroprior import (
-    ExhaustivePlanner,
-    ForagingOracle,
-    ForagingWorld,
-    FrontierPlanner,
-    HorizonPlanner,
-    MarkovPrior,
-    SamplingPlanner,
-    UniformPrior,
-    egocentric,
-    gridworld,
-    labyrinth,
-    maze,
-    patches,
-    sample_in_world,
-)
+from neuroprior import ExhaustivePlanner, FrontierPlanner, MarkovPrior, SamplingPlanner, UniformPrior, gridworld
+from neuroprior.planners import ForagingOracle, HorizonPlanner
+from neuroprior.sampling import sample_in_world
 from neuroprior.testing import check_world
+from neuroprior.worlds import ForagingWorld, egocentric, labyrinth, maze, patches
 from tests.support.sources import (
     FALSE_ALARM,
     corridor,

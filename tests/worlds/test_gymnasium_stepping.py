@@ -4,8 +4,9 @@ import gymnasium
 import pytest
 import torch
 
-from neuroprior import SamplingPlanner, SteppedWorld, UniformPrior, from_gymnasium
+from neuroprior import SamplingPlanner, UniformPrior, from_gymnasium
 from neuroprior.testing import check_world
+from neuroprior.worlds import SteppedWorld
 from tests.support import environments
 from tests.support.sources import every_plan, refuses, seeded
 

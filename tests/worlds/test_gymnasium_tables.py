@@ -7,8 +7,9 @@ import gymnasium
 import pytest
 import torch
 
-from neuroprior import EpisodicWorld, from_gymnasium, oracle
+from neuroprior import from_gymnasium, oracle
 from neuroprior.testing import check_world
+from neuroprior.worlds import EpisodicWorld
 from tests.support.environments import Corridor
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 

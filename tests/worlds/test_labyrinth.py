@@ -5,8 +5,9 @@ from pathlib import Path
 
 import torch
 
-from neuroprior import labyrinth, oracle, read_plans
+from neuroprior import oracle, read_plans
 from neuroprior.testing import check_world
+from neuroprior.worlds import labyrinth
 
 DATA = Path(__file__).parents[2] / "eval" / "data" / "labyrinth"
 

@@ -3,19 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import (
-    ExhaustivePlanner,
-    GridWorld,
-    GRUPrior,
-    SamplingPlanner,
-    collect,
-    egocentric,
-    four_rooms,
-    gridworld,
-    maze,
-    oracle,
-)
-from neuroprior.worlds import goal_direction, local_view
+from neuroprior import ExhaustivePlanner, GRUPrior, SamplingPlanner, collect, gridworld, oracle
+from neuroprior.worlds import GridWorld, egocentric, four_rooms, goal_direction, local_view, maze
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 OFFSETS = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuroprior import Rollout, TabularWorld, World, gridworld
-from neuroprior.worlds import tabular
+from neuroprior import TabularWorld, World, gridworld
+from neuroprior.worlds import Rollout, tabular
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
 
 UP, RIGHT, DOWN, LEFT = range(4)

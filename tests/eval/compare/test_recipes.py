@@ -9,8 +9,8 @@ from eval.compare import recipes as compare_priors
 from eval.compare.context_markov import ContextMarkov, Sights
 from eval.compare.recipes import chain, network, sizes_of
 from eval.worlds.suite import TASKS
-from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, Prior, collect, gridworld, maze
-from neuroprior.worlds import local_view
+from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, Prior, collect, gridworld
+from neuroprior.worlds import local_view, maze
 from tests.support.sources import seeded
 
 

@@ -19,18 +19,8 @@ from eval.compare.settings import Settings
 from eval.worlds.mid_plan import UnderWay
 from eval.worlds.splits import Worlds, unlike
 from eval.worlds.suite import TASKS, Task, best_score
-from neuroprior import (
-    ExhaustivePlanner,
-    MarkovPrior,
-    TabularWorld,
-    UniformPrior,
-    collect,
-    cube,
-    four_rooms,
-    maze,
-    save,
-)
-from neuroprior.worlds import goal_direction, local_view
+from neuroprior import ExhaustivePlanner, MarkovPrior, TabularWorld, UniformPrior, collect, save
+from neuroprior.worlds import cube, four_rooms, goal_direction, local_view, maze
 from tests.support.sources import refuses, seeded
 
 SMALL = Settings((4, 16), ("markov", "gru"), ("nothing", "each step"), 1, 3, 4, 30, 0)

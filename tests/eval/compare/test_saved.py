@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from eval.compare.saved import Renumbered, load_for
-from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, gridworld, sample_in_world, save
+from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, gridworld, save
+from neuroprior.sampling import sample_in_world
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import FALSE_ALARM, every_plan, p_value, plan_number, refuses, seeded
 

@@ -4,9 +4,9 @@ import torch
 
 from eval.worlds.mid_plan import UnderWay
 from eval.worlds.suite import TASKS, best_score
-from neuroprior import ExhaustivePlanner, SamplingPlanner, UniformPrior, collect, maze
+from neuroprior import ExhaustivePlanner, SamplingPlanner, UniformPrior, collect
 from neuroprior.testing import check_world
-from neuroprior.worlds import labyrinth
+from neuroprior.worlds import labyrinth, maze
 from neuroprior.worlds.labyrinth import WATER
 from tests.support.sources import seeded
 

@@ -17,10 +17,10 @@ from neuroprior import (
     SamplingPlanner,
     TransformerPrior,
     UniformPrior,
-    learn_macros,
     load,
     save,
 )
+from neuroprior.priors import learn_macros
 from neuroprior.priors.macros import CRITERIA
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, random_world, refuses, seeded
