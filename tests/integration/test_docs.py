@@ -1,6 +1,8 @@
 """The README and the pages of docs: examples run, commands have the options they are given, links lead somewhere."""
 
 import csv
+import importlib
+import io
 import json
 import os
 import pkgutil
@@ -9,6 +11,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout, suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -142,10 +145,10 @@ def given() -> Iterator[tuple[str, str, str, list[str]]]:
 @lru_cache
 def known(program: str, command: str) -> set[str]:
     """The options of a command, by what it says itself."""
-    code = f"import sys; from {PROGRAMS[program]} import main; sys.exit(main(['{command}', '--help']))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return {option.replace("-", "_") for option in re.findall(r"(?<!\w)--([\w.\-]+)", done.stdout)}
+    printed = io.StringIO()
+    with redirect_stdout(printed), suppress(SystemExit):
+        importlib.import_module(PROGRAMS[program]).main([command, "--help"])
+    return {option.replace("-", "_") for option in re.findall(r"(?<!\w)--([\w.\-]+)", printed.getvalue())}
 
 
 def test_commands_have_these_options() -> None:
