@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from neuroprior.cli.program import Command, run_commands
 
 COMMANDS = {
-    "fit": Command("neuroprior.cli.fit:fit", "train a prior on executed plans and save it", raw=True),
+    "fit": Command("neuroprior.cli.fit:run", "train a prior on executed plans and save it", raw=True),
     "report": Command("neuroprior.report.command:plans", "report on a file of plans: structure, models, figures"),
     "score": Command("neuroprior.cli.score:score", "log-likelihood and bits per action of plans under a saved prior"),
     "sample": Command("neuroprior.cli.sample:sample", "new plans from a saved prior"),

@@ -30,7 +30,7 @@ class Command(NamedTuple):
     Attributes:
         target: `module:function`, imported only when the command is given.
         about: one line for the list of commands.
-        raw: the function parses its arguments itself: it is called with the list of them.
+        raw: the function parses its arguments itself: it is called with the list of them, the command first.
     """
 
     target: str
@@ -71,7 +71,7 @@ def run_commands(
             raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
         command = commands[name]
         if command.raw:
-            command.load()(options)
+            command.load()([name, *options])
         else:
             call(command.load(), f"{program} {name}", options)
 

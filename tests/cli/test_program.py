@@ -95,7 +95,7 @@ def test_options_are_the_parameters_of_a_function(capsys):
         "true",
     ]
     assert ran(capsys, *words) == (0, "x ['maze', 'grid'] [1, 2] 0 0.5 True\n", "")
-    assert ran(capsys, "say", "a", "--b-c") == (0, "['a', '--b_c']\n", "")
+    assert ran(capsys, "say", "a", "--b-c") == (0, "['say', 'a', '--b_c']\n", "")
 
 
 @pytest.mark.parametrize(
