@@ -41,7 +41,7 @@ def test_scores_are_means_over_all_rollouts_of_the_plans_that_are_left(prefix):
 
 
 def test_it_finds_better_plans_with_as_many_steps():
-    """64 plans of one action, of values from .2 to .8 and large variance: rollouts of the best ones distinguish them."""
+    """64 plans of one action, of values from .2 to .8 and large variance: rollouts of the best ones rank them."""
     worth = torch.linspace(0.2, 0.8, 64, dtype=torch.double)
     table = torch.ones(3, 64, 2, dtype=torch.long)
     table[..., 1] = 2

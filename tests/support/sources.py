@@ -114,7 +114,7 @@ def stochastic_world(
 def trajectories(
     world: TabularWorld, state: int, plan: list[int]
 ) -> list[tuple[float, tuple[int, ...], tuple[float, ...]]]:
-    """All possible trajectories of `plan` from `state`: (probability, states after each step, rewards), by recursion."""
+    """All trajectories of `plan` from `state`: (probability, states after each step, rewards), by recursion."""
     if not plan:
         return [(1.0, (), ())]
     cell, number = state % world.num_states, state // world.num_states
