@@ -11,7 +11,7 @@ def row_hashes(rows: Tensor) -> Tensor:
     """
     if rows.dim() == 1 and not rows.is_floating_point():
         return rows.long()
-    # Numbers are told apart by their bits; a sum with random odd weights tells rows apart.
+    # Numbers are compared by their bits; rows are hashed by a sum with random odd weights.
     flat = rows[:, None] if rows.dim() == 1 else rows.flatten(1)
     bits = flat.double().view(torch.int64) if flat.is_floating_point() else flat.long()
     weight = torch.Generator().manual_seed(0)

@@ -8,7 +8,7 @@ from tests.support.sources import seeded
 
 
 @pytest.mark.parametrize("states", [torch.int64, torch.uint8, torch.float32, torch.float64])
-def test_states_are_told_apart(states):
+def test_states_have_different_hashes(states):
     state = torch.randint(3, (500, 2, 6), generator=seeded(0)).to(states)
     if states != torch.uint8:
         state -= 1
@@ -19,7 +19,7 @@ def test_states_are_told_apart(states):
     assert torch.equal(row_hashes(row), row)
 
 
-def test_numbers_and_their_complements_are_told_apart():
+def test_numbers_and_their_complements_have_different_hashes():
     """All rows of three whole numbers from -4 to 4, of which x and -x - 1 have the same bits, inverted."""
     rows = torch.cartesian_prod(*[torch.arange(-4, 5)] * 3)
     for some in (rows, rows.double(), rows[:, None].expand(-1, 2, -1)):

@@ -86,7 +86,7 @@ def test_illegal_actions_are_not_taken():
     torch.testing.assert_close(value_iteration(corridor(reward, legal)), torch.full((1, 4), 10.0).double())
 
 
-def test_discount_zero_sees_one_reward():
+def test_discount_zero_counts_one_reward():
     assert value_iteration(corridor([5.0, 0.0, 1.0, 2.0]), discount=0).tolist() == [[5.0, 5.0, 2.0, 2.0]]
 
 
@@ -133,7 +133,7 @@ def test_even_plans_on_a_torus_keep_the_parity():
     assert can_reach(gridworld(20, 20, "wall"), states, 210, 40).all()
 
 
-def test_can_reach_sees_legal_actions_and_the_cell_of_a_state():
+def test_can_reach_depends_on_legal_actions_and_the_cell_of_a_state():
     legal = torch.tensor([[True, True], [True, False], [True, True], [True, True]])
     world = corridor(torch.zeros(2, 4), legal)
     states = torch.tensor([7, 6, 1, 0, 2])

@@ -69,8 +69,8 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
     require(whole.shape == shape, f"forward: logits {list(whole.shape)}, not {list(shape)}")
     require(not whole.isnan().any(), "forward: NaN in the logits")
     whole = whole.log_softmax(-1)
-    seen = _at(context, 0)
-    logits, state = prior.start(num, seen)
+    given = _at(context, 0)
+    logits, state = prior.start(num, given)
     order = torch.arange(num - 1, -1, -1, device=plans.device)
     for t in range(length):
         kind = "no context" if context is None else f"context {list(context.shape)}"
@@ -80,9 +80,9 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
         gap = float((logits.log_softmax(-1) - whole[:, t]).abs().nan_to_num(0).max())
         require(gap < 1e-4, f"stepping differs from forward by {gap:.2g} nats ({where})")
         if t + 1 < length:
-            seen = _at(context, t + 1) if is_per_step(context) else None
-            backwards, _ = prior.step(plans[order, t], state[order], None if seen is None else seen[order])
-            logits, state = prior.step(plans[:, t], state, seen)
+            given = _at(context, t + 1) if is_per_step(context) else None
+            backwards, _ = prior.step(plans[order, t], state[order], None if given is None else given[order])
+            logits, state = prior.step(plans[:, t], state, given)
             gap = float((backwards[order] - logits).abs().nan_to_num(0).max())
             require(gap < 1e-4, f"reordering the state changes the logits by {gap:.2g} ({where})")
 
@@ -95,9 +95,9 @@ def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> Non
             logits, state = prior.start(num, _at(context, 0))
             _, other = prior.start(num, _at(context, 0))
             for t in range(length - 1):
-                seen = _at(context, t + 1) if is_per_step(context) else None
-                logits, state = prior.step(plans[:, t], state, seen)
-                again, other = prior.advance(plans[:, t], other, seen, room)
+                given = _at(context, t + 1) if is_per_step(context) else None
+                logits, state = prior.step(plans[:, t], state, given)
+                again, other = prior.advance(plans[:, t], other, given, room)
                 gap = float((again - logits).abs().nan_to_num(0).max())
                 require(gap < 1e-4, f"advance differs from step by {gap:.2g} (action {t}, room {room})")
                 if t % 2:  # states that were picked out go on by themselves

@@ -128,12 +128,12 @@ def _check_distribution(world: World, state: Tensor, plans: Tensor, seed: int, t
     for t in range(plans.shape[1]):
         now, reward = world.step(now, plans[:, t], generator)
         rewards.append(reward)
-    seen = torch.cat([rollout.final_state.reshape(len(now), -1).double(), rollout.rewards[:, 0].double()], 1)
+    observed = torch.cat([rollout.final_state.reshape(len(now), -1).double(), rollout.rewards[:, 0].double()], 1)
     due = torch.cat([now.reshape(len(now), -1).double(), torch.stack(rewards, 1).double()], 1)
-    for column in range(seen.shape[1]):
-        p = alike(seen[:, column].cpu(), due[:, column].cpu(), group)
-        what = "rewards" if column >= seen.shape[1] - plans.shape[1] else "final states"
-        require(p > FALSE_ALARM / seen.shape[1], f"{what} of rollout do not fit those of steps: p = {p:.2g}")
+    for column in range(observed.shape[1]):
+        p = alike(observed[:, column].cpu(), due[:, column].cpu(), group)
+        what = "rewards" if column >= observed.shape[1] - plans.shape[1] else "final states"
+        require(p > FALSE_ALARM / observed.shape[1], f"{what} of rollout do not fit those of steps: p = {p:.2g}")
     if isinstance(world, TabularWorld):
         twice = world.rollout(state, plans[::times, None].expand(-1, 2, -1), generator)
         require(

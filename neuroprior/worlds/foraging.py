@@ -77,9 +77,9 @@ class ForagingWorld(World):
         up_to = self.growth.double().cumsum(1)
         height = torch.rand(items.shape, generator=generator, device=state.device, dtype=torch.float64)
         # Places of probability 0 are never drawn: `right` finds the next place of a probability above 0.
-        grown = torch.searchsorted(up_to[season], height * up_to[season, -1:], right=True)
+        place = torch.searchsorted(up_to[season], height * up_to[season, -1:], right=True)
         new = (items == self.num_places) | (time % self.period == 0)[:, None]
-        return torch.cat([state[:, :2], torch.where(new, grown.clamp(max=self.num_places - 1), items)], 1)
+        return torch.cat([state[:, :2], torch.where(new, place.clamp(max=self.num_places - 1), items)], 1)
 
     def season(self, state: Tensor) -> Tensor:
         """The season, from 0, in each of `state [N, 2 + K]`: `[N]`."""

@@ -67,7 +67,7 @@ def test_it_comes_nearer_step_by_step():
     assert found.model_steps == sampled.model_steps == 3200
 
 
-def test_in_worlds_with_chance_and_where_not_all_is_legal():
+def test_in_stochastic_worlds_and_where_not_all_is_legal():
     world, state = stochastic_world(0), torch.zeros(7, dtype=torch.long)
     planner = CrossEntropyPlanner(UniformPrior(world.num_actions), 3, 12, num_rollouts=5)
     assert planner.plan(world, state, seeded(0)).model_steps == 12 * 3 * 5
@@ -85,7 +85,7 @@ def test_counts_of_many_starts_are_kept_a_few_at_a_time():
     assert CrossEntropyPlanner(UniformPrior(3), 4, 2).rounds == 2
 
 
-def test_priors_that_see():
+def test_priors_with_context():
     world = cube(scramble=2)
     state = world.reset(5, seeded(0))
     prior = GRUPrior(world.num_actions, hidden_size=8, context_size=world.observe(state).shape[-1])

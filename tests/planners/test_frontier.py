@@ -84,7 +84,7 @@ def test_it_finds_what_the_oracle_does_when_it_may_try_all(seed, how, kind, lega
 
 @pytest.mark.parametrize("temperature", [1.0, 0.1, 0.01, 1e-4])
 @pytest.mark.parametrize("noise", [False, True])
-def test_nor_does_a_prior_that_is_sure_of_the_wrong_way_stop_it(temperature, noise):
+def test_nor_does_an_overconfident_wrong_prior_stop_it(temperature, noise):
     """A line of 9 cells with a reward at its end, and a prior that goes the other way."""
     cell = torch.arange(9)
     world = TabularWorld(torch.stack([(cell - 1).clamp(min=0), (cell + 1).clamp(max=8)], 1), (cell == 8).float())
@@ -132,7 +132,7 @@ def test_plans_that_meet_add_up_and_the_best_goes_on():
     assert torch.allclose(gained, torch.tensor([[0.5, 0.5, 0.0], [0.0, 0.0, 0.5]], dtype=torch.double))
 
 
-def test_a_seeing_prior_sees_where_each_plan_is():
+def test_the_context_is_the_observation_of_each_plans_state():
     """It knows the way: in each cell of a table one action is right, and one plan alone is tried."""
     table, right = torch.randint(30, (30, 4), generator=seeded(1)), torch.randint(4, (30,), generator=seeded(2))
     world = TabularWorld(table, torch.nn.functional.one_hot(right, 4).double())

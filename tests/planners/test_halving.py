@@ -42,7 +42,7 @@ def test_scores_are_means_over_all_rollouts_of_the_plans_that_are_left(prefix):
 
 
 def test_it_finds_better_plans_with_as_many_steps():
-    """64 plans of one action, worth from 0 to 1 with much chance: rollouts spent on the best tell them apart."""
+    """64 plans of one action, of values from .2 to .8 and large variance: rollouts of the best ones rank them."""
     worth = torch.linspace(0.2, 0.8, 64, dtype=torch.double)
     table = torch.ones(3, 64, 2, dtype=torch.long)
     table[..., 1] = 2
@@ -58,7 +58,7 @@ def test_it_finds_better_plans_with_as_many_steps():
     assert found[True] > found[False] + 0.01
 
 
-def test_steps_are_counted_and_without_chance_there_is_nothing_to_halve():
+def test_steps_are_counted_and_in_a_deterministic_world_there_is_nothing_to_halve():
     world = stochastic_world(5, "WSAK")
     planner = SamplingPlanner(UniformPrior(3), 3, 20, num_rollouts=7, halving=True)
     taken, rollout = [], world.rollout

@@ -97,7 +97,7 @@ def test_ties_over_rounds():
     assert p_value(number, torch.ones(8)) > FALSE_ALARM
 
 
-def test_with_chance_and_where_not_all_is_legal():
+def test_in_stochastic_worlds_and_where_not_all_is_legal():
     world = stochastic_world(0)
     planner = HorizonPlanner(UniformPrior(3), 4, 10, objective="return", num_rollouts=5)
     decision = planner.plan(world, world.reset(20, seeded(0)), seeded(1))

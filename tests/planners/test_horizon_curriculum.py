@@ -41,7 +41,7 @@ class FromTheMiddle(TabularWorld):
 
 
 def test_what_short_plans_teach_reaches_far():
-    """The best three moves are three the same. Who repeats goes straight on for 20 moves, which chance never does."""
+    """The best three moves are equal. Repeating goes straight on for 20 moves, which random plans never do."""
     world, generator = FromTheMiddle(), seeded(0)
     plans = collect(ExhaustivePlanner(3), world, 200, generator=generator)
     prior = MarkovPrior(2, 1)
@@ -152,7 +152,7 @@ def test_plans_end_where_it_is_over():
 
 
 def slippery() -> TabularWorld:
-    """A line of six cells that ends at 5; each step goes on or stays, by chance."""
+    """A line of six cells that ends at 5; each step goes on or stays, at random."""
     cell = torch.arange(6)
     after = torch.stack([cell, (cell + 1).clamp(max=5)], 1)[:, None]
     reward = torch.zeros(6, 1, 2)
@@ -160,7 +160,7 @@ def slippery() -> TabularWorld:
     return TabularWorld(after, reward, probability=torch.full((6, 1, 2), 0.5))
 
 
-def test_with_chance_a_plan_is_executed_once():
+def test_in_a_stochastic_world_a_plan_is_executed_once():
     """What is recorded as seen before its last executed action is not the end."""
     world, planner = slippery(), SamplingPlanner(UniformPrior(1), 12, 2, objective="return")
     plans = collect(planner, world, state=torch.zeros(400, dtype=torch.long), context="step", generator=seeded(0))
@@ -172,8 +172,8 @@ def test_with_chance_a_plan_is_executed_once():
     assert bool((beyond[shorter] == 5).all())
 
 
-def test_growth_with_chance_scores_by_several_rollouts():
-    """Two actions gain 1: one with chance 0.5, one always. A single rollout often takes the former for as good."""
+def test_in_a_stochastic_world_plans_are_scored_by_several_rollouts():
+    """Two actions gain 1: one with probability 0.5, one always. A single rollout often takes the former for as good."""
     next_state = torch.zeros(1, 2, 2, dtype=torch.long)
     outcomes, chances = torch.tensor([[[0.0, 1.0], [1.0, 1.0]]]), torch.full((1, 2, 2), 0.5)
     world = TabularWorld(next_state, outcomes[None], probability=chances)

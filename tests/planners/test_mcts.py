@@ -50,7 +50,7 @@ def test_each_simulation_adds_a_node_and_takes_steps_from_there_on():
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.1])
-def test_nor_does_a_prior_that_is_sure_of_the_wrong_way_stop_it(temperature):
+def test_nor_does_an_overconfident_wrong_prior_stop_it(temperature):
     """A line of five cells with a reward at its end, and a prior that goes the other way."""
     cell = torch.arange(5)
     world = TabularWorld(torch.stack([(cell - 1).clamp(min=0), (cell + 1).clamp(max=4)], 1), (cell == 4).float())
@@ -59,7 +59,7 @@ def test_nor_does_a_prior_that_is_sure_of_the_wrong_way_stop_it(temperature):
     assert planner.plan(world, torch.zeros(3, dtype=torch.long), seeded(0)).score.tolist() == [1.0] * 3
 
 
-def test_scores_steer_it_better_than_chance():
+def test_scores_guide_it_better_than_random_search():
     """Rewards on the way tell where more are: with as many steps it finds more than samples do."""
     world = gridworld(15, 15, "torus", num_worlds=5, reward_power=4)
     state = world.reset(300, seeded(0))

@@ -1,4 +1,4 @@
-"""Planners where chance decides: exact means against enumerated courses, means over rollouts, ties, what is refused."""
+"""Planners in stochastic worlds: exact means against enumerated trajectories, means over rollouts, ties, refusals."""
 
 import pytest
 import torch
@@ -46,7 +46,7 @@ PLANS = every_plan(3, 3)
 
 
 def brute_force(world, state, plan, goal):
-    """The exact mean score of one plan, course by course."""
+    """The exact mean score of one plan, trajectory by trajectory."""
     total = 0.0
     discount = goal.get("discount", 1.0)
     for p, states, rewards in trajectories(world, state, plan):
@@ -61,7 +61,7 @@ def brute_force(world, state, plan, goal):
 
 @pytest.mark.parametrize("goal", OBJECTIVES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_expected_scores_are_those_of_all_courses(kind, goal):
+def test_expected_scores_are_those_of_all_trajectories(kind, goal):
     world = stochastic_world(1, kind)
     states = torch.arange(world.num_maps * 5)
     plans = torch.randint(3, (len(states), 4, 3), generator=seeded(2))
@@ -82,7 +82,7 @@ def test_expected_scores_are_those_of_all_courses(kind, goal):
 
 @pytest.mark.parametrize("goal", OBJECTIVES)
 @pytest.mark.parametrize("kind", ["S", "SA", "WS", "WSA"])
-def test_without_chance_the_expected_score_is_the_score(kind, goal):
+def test_in_a_deterministic_world_the_expected_score_is_the_score(kind, goal):
     world = random_world(3, kind, states=5)
     states = world.reset(20, seeded(0))
     plans = torch.randint(3, (20, 6, 4), generator=seeded(1))
@@ -116,7 +116,7 @@ def test_means_over_rollouts_come_to_the_expected_score(kind):
 
 @pytest.mark.parametrize("prefix", [False, True])
 @pytest.mark.parametrize("rollouts", [1, 6])
-def test_all_plans_meet_the_same_chance_whatever_is_tried_together(prefix, rollouts, monkeypatch):
+def test_all_plans_have_common_random_numbers_in_whatever_chunks(prefix, rollouts, monkeypatch):
     world = stochastic_world(5, "WSAK")
     states, planner = torch.arange(10), ExhaustivePlanner(3, any_prefix=prefix)
     plans = torch.cat([PLANS, PLANS]).expand(10, -1, -1)
@@ -166,7 +166,7 @@ def test_a_decision_is_what_the_first_rollout_says(make, prefix, monkeypatch):
 
 
 def test_prefixes_win_ties_as_often_as_each_other():
-    """All is equally good: each of the 3 + 9 + 27 distinct prefixes is a uniform draw, as without chance."""
+    """All is equally good: each of the 3 + 9 + 27 distinct prefixes is a uniform draw, as in a deterministic world."""
     table = torch.randint(3, (3, 3, 2), generator=seeded(0))
     world = TabularWorld(table, torch.ones(3), probability=torch.full((3, 3, 2), 0.5))
     for rollouts in (1, 3):
@@ -179,8 +179,8 @@ def test_prefixes_win_ties_as_often_as_each_other():
         assert p_value(code, weight.flatten()) > FALSE_ALARM
 
 
-def test_plans_that_a_prior_drew_seeing_the_world_are_scored_anew():
-    """A coin leads to cell 1 or 2; the prior sees which and answers right, but a plan cannot see: it wins half."""
+def test_plans_drawn_along_with_the_world_are_scored_by_new_rollouts():
+    """A coin leads to cell 1 or 2; a prior with context is always right, but a plan cannot be: it wins half."""
     table = torch.tensor([[[1, 2]] * 2, [[3, 3], [4, 4]], [[4, 4], [3, 3]], [[3, 3]] * 2, [[4, 4]] * 2])
     world = TabularWorld(table, torch.tensor([0.0, 0, 0, 1, 0]), probability=torch.full((5, 2, 2), 0.5))
     prior = TablePrior([torch.zeros(1, 1, 2), torch.zeros(1, 2, 2)])
@@ -236,7 +236,7 @@ def test_oracle_is_the_best_policy_and_no_plan_is_better(kind, prefix, goal):
         lambda **rest: SamplingPlanner(MarkovPrior(3, num_contexts=6), 3, 9, any_prefix=True, **rest),
     ],
 )
-def test_without_chance_one_rollout_is_taken(make):
+def test_in_a_deterministic_world_one_rollout_is_taken(make):
     world, states = random_world(1), torch.arange(12)
     one, five = (make(num_rollouts=n).plan(world, states, seeded(0)) for n in (1, 5))
     for first, second in zip(one, five, strict=True):
@@ -261,7 +261,7 @@ def test_same_seed_same_decisions_and_no_global_state(rollouts):
 
 
 class Gusty(World):
-    """A world of one's own, with chance and states of two numbers: a gust may add a half to the right move."""
+    """A world of one's own, stochastic, with states of two numbers: a gust may add a half to the right move."""
 
     num_actions = 2
     stochastic = True

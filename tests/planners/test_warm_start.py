@@ -81,7 +81,7 @@ def test_of_equals_a_random_one():
     assert p_value(chosen.plan[:, 0].long(), torch.tensor([0.5, 0.5])) > FALSE_ALARM
 
 
-def test_with_chance_both_are_tried_alike():
+def test_in_a_stochastic_world_both_have_the_same_rollouts():
     """The score of a winner among many flatters it; where both are tried anew, the better one wins in the mean."""
     world, prior = stochastic_world(0), UniformPrior(3)
     state = world.reset(400, seeded(0))
@@ -98,7 +98,7 @@ def test_with_chance_both_are_tried_alike():
     assert not torch.equal(chosen.plan, decision.plan)
 
 
-def test_seeing_priors_see_where_the_rest_leads():
+def test_the_context_is_the_observation_where_the_rest_leads():
     world = gridworld(4, 4)
     state = world.reset(50, seeded(0))
     prior = MarkovPrior(4, 1, num_contexts=16)
@@ -108,7 +108,7 @@ def test_seeing_priors_see_where_the_rest_leads():
     assert (plans[:, 0, :2] == 0).all()
 
 
-def test_with_chance_nothing_beyond_the_end_of_a_plan_wins():
+def test_in_a_stochastic_world_nothing_beyond_the_end_of_a_plan_wins():
     """Every step of one action is rewarded: what comes after the end of what was decided would score more."""
     table = torch.zeros(1, 2, 1, dtype=torch.long)
     world = TabularWorld(table, torch.tensor([[[1.0], [0.0]]]), probability=torch.ones(1, 2, 1, dtype=torch.float64))

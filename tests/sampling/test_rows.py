@@ -37,7 +37,7 @@ def test_gradients_pass():
     assert values.grad[:, 0].tolist() == [0, 2, 0, 1]
 
 
-def test_states_grow_where_there_is_room_and_nowhere_else():
+def test_states_are_extended_where_there_is_room_and_nowhere_else():
     state = states_with_room(torch.zeros(5, 1), 3, 2)
     state[:] = torch.arange(15).view(5, 3)
     after = grown(state, 5)

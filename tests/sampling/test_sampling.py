@@ -123,7 +123,7 @@ def test_each_plan_has_the_distribution_of_its_context(method, num):
 @pytest.mark.parametrize("kind", ["markov", "gru"])
 @pytest.mark.parametrize("per", ["plan", "step"])
 @pytest.mark.parametrize("features", [False, True])
-def test_contexts_seen_beforehand(kind, per, features):
+def test_contexts_known_beforehand(kind, per, features):
     if features and kind == "markov":
         kind = "transformer"
     generator = seeded(0)
@@ -271,18 +271,18 @@ class CountingSteps(TabularWorld):
         return super().step(state, action, generator)
 
 
-@pytest.mark.parametrize("chance", [False, True])
+@pytest.mark.parametrize("stochastic", [False, True])
 @pytest.mark.parametrize(("num_plans", "steps"), [(20_000, 2 * (3 + 9 + 27)), (17, 2 * (3 + 17 + 17))])
-def test_in_world_plans_that_begin_alike_are_tried_once(chance, num_plans, steps):
-    """With few plans only the first step is shared; where chance decides, none is."""
+def test_in_world_plans_that_share_a_prefix_are_stepped_once(stochastic, num_plans, steps):
+    """With few plans only the first step is shared; in a stochastic world, none is."""
     known = random_world(3)
     world = CountingSteps(known.next_state, known.reward)
-    world.stochastic = chance
+    world.stochastic = stochastic
     states = torch.tensor([4, 9])
     plans, rollout = sample_in_world(
         UniformPrior(A), world, states, num_plans, 3, generator=seeded(0), keep_states=True
     )
-    assert world.taken == (2 * num_plans * 3 if chance else steps)
+    assert world.taken == (2 * num_plans * 3 if stochastic else steps)
     want = known.rollout(states, plans, keep_states=True)
     for found, wanted in zip(rollout, want, strict=True):
         assert torch.equal(found, wanted)

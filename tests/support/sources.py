@@ -13,9 +13,8 @@ from torch import Tensor
 
 from neuroprior import Prior, TabularWorld
 
-torch.set_num_threads(
-    1
-)  # on tensors this small several threads only wait for each other, for seconds on a busy machine
+# On tensors this small several threads only wait for each other, for seconds on a busy machine.
+torch.set_num_threads(1)
 
 FALSE_ALARM = 1e-6
 """The probability with which one chi-square test of right code fails; seeds are fixed, so it does always or never."""
@@ -98,7 +97,7 @@ def random_world(
 def stochastic_world(
     seed: int, rewards: str = "WSAK", states: int = 5, actions: int = 3, outcomes: int = 4, maps: int = 2
 ) -> TabularWorld:
-    """A random table with chance; the outcomes of an action are different cells, about a third of which cannot occur.
+    """A random stochastic table; the outcomes of an action are different cells, about a third of which cannot occur.
 
     `rewards`: "S", "SA", "SAK", or one of these after a "W".
     """
@@ -115,7 +114,7 @@ def stochastic_world(
 def trajectories(
     world: TabularWorld, state: int, plan: list[int]
 ) -> list[tuple[float, tuple[int, ...], tuple[float, ...]]]:
-    """All that may come of `plan` from `state`: (probability, states after each step, rewards), by recursion."""
+    """All trajectories of `plan` from `state`: (probability, states after each step, rewards), by recursion."""
     if not plan:
         return [(1.0, (), ())]
     cell, number = state % world.num_states, state // world.num_states

@@ -221,7 +221,7 @@ class Line(World):
 
 
 class Noisy(Line):
-    """With chance, which is allowed."""
+    """Stochastic, which is allowed."""
 
     stochastic = True
 
@@ -265,7 +265,7 @@ class Unannounced(Noisy):
 
 
 class Calm(Noisy):
-    """Chance in its rollouts is less than in its steps."""
+    """Its rollouts have a smaller variance than its steps."""
 
     def rollout(
         self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
@@ -275,7 +275,7 @@ class Calm(Noisy):
 
 
 class Lucky(TabularWorld):
-    """Each plan meets its own chance."""
+    """Each plan has random numbers of its own."""
 
     def __init__(self) -> None:
         world = stochastic_world(0)

@@ -53,7 +53,7 @@ def test_an_agent_that_turns_eats_in_its_square():
     assert after[0, 2] == world.num_places
 
 
-def test_food_grows_where_the_season_lets_it():
+def test_food_regrows_at_the_places_of_the_season():
     """Chi-square test of 20,000 items."""
     growth = torch.tensor([[0.0, 1.0, 3.0, 0.0], [2.0, 0.0, 0.0, 1.0]])
     world = ForagingWorld(corridor(), growth, 10, 2)

@@ -53,7 +53,7 @@ def test_a_corridor_and_its_counter():
     check_world(world)
 
 
-def test_states_that_look_alike_are_told_apart():
+def test_states_with_equal_observations_are_distinguished():
     world = from_gymnasium(environments.Keys())
     assert world.num_states == 4
     assert world.next_state[0].tolist() == [1, 0, 0]
@@ -112,7 +112,7 @@ WAYS_TO_KEEP = {
 
 
 @pytest.mark.parametrize("way", WAYS_TO_KEEP)
-def test_states_are_told_apart_however_they_are_kept(way):
+def test_states_are_distinguished_however_they_are_stored(way):
     world = from_gymnasium(environments.Hidden(*WAYS_TO_KEEP[way]))
     assert world.next_state.tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
 
@@ -229,7 +229,7 @@ def test_what_cannot_be_enumerated_is_refused(env, words):
     ],
     ids=["generator", "random state", "random", "torch"],
 )
-def test_chance_deep_inside_is_noticed(make, draw):
+def test_randomness_deep_inside_is_noticed(make, draw):
     # Each of eight transitions is repeated, and differs with probability 0.48; the seeds are fixed.
     with refuses("led to two different states"):
         from_gymnasium(environments.Deep(make, draw))

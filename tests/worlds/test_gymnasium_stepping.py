@@ -13,8 +13,8 @@ from tests.support.sources import every_plan, refuses, seeded
 NAMES = ("CartPole-v1", "MountainCar-v0")
 
 
-def real_course(env, seed, actions, first=0):
-    """Observations and rewards of a course, and how many of the actions were taken."""
+def real_trajectory(env, seed, actions, first=0):
+    """Observations and rewards of a trajectory, and how many of the actions were taken."""
     seen, _ = env.reset(seed=seed)
     observations, rewards = [seen], []
     for action in actions:
@@ -38,7 +38,7 @@ def test_rollouts_are_the_environments(name):
     env = gymnasium.make(name).unwrapped
     for b, seed in enumerate(world.seeds):
         for p in range(6):
-            observations, rewards = real_course(env, seed, plans[b, p].tolist())
+            observations, rewards = real_trajectory(env, seed, plans[b, p].tolist())
             taken = len(rewards)
             assert rollout.rewards[b, p].tolist() == pytest.approx(rewards + [0.0] * (25 - taken))
             assert rollout.states[b, p, :, 1].tolist() == [min(t + 1, taken) for t in range(25)]
@@ -94,7 +94,7 @@ def test_replayed_and_copied_environments_go_the_same_way(env):
     rollout = world.rollout(world.reset(1), plans, keep_states=True)
     real = env()
     for p in range(20):
-        observations, rewards = real_course(real, 2, plans[0, p].tolist(), first=5)
+        observations, rewards = real_trajectory(real, 2, plans[0, p].tolist(), first=5)
         shown = world.observe(rollout.states[0, p]).argmax(1).tolist()
         assert shown[: len(rewards)] == observations[1:]
         assert rollout.rewards[0, p, : len(rewards)].tolist() == pytest.approx(rewards)

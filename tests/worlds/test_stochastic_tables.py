@@ -63,7 +63,7 @@ def test_step_has_the_given_probabilities_and_rewards(kind):
 
 
 @pytest.mark.parametrize("kind", ["WS", "WSA", "WSAK"])
-def test_rollout_has_the_distribution_of_its_courses(kind):
+def test_rollout_has_the_distribution_of_its_trajectories(kind):
     world = stochastic_world(2, kind)
     start, plan = 7, [2, 0, 1]
     all_courses = trajectories(world, start, plan)
@@ -76,7 +76,7 @@ def test_rollout_has_the_distribution_of_its_courses(kind):
     assert torch.equal(rollout.final_state, rollout.states[:, :, -1])
 
 
-def test_plans_of_a_start_meet_the_same_chance_and_starts_do_not():
+def test_plans_of_a_start_have_common_random_numbers_and_starts_do_not():
     world = stochastic_world(3)
     state = torch.full((4000,), 3)
     plans = torch.randint(3, (1, 5, 4), generator=seeded(1)).repeat(4000, 1, 1)
@@ -92,7 +92,7 @@ def test_plans_of_a_start_meet_the_same_chance_and_starts_do_not():
     assert p_value(first[::2] * 10 + first[1::2], (share[:, None] * share).flatten()) > FALSE_ALARM
 
 
-def test_chance_is_a_quantile_that_every_plan_shares():
+def test_random_numbers_are_quantiles_that_all_plans_share():
     """Two actions with the same outcomes, of which the second is 0.2 likelier to succeed: it never does worse."""
     probability = torch.tensor([[[0.5, 0.5], [0.3, 0.7]]]).repeat(2, 1, 1)
     world = TabularWorld(torch.tensor([[[0, 1]] * 2] * 2), torch.tensor([0.0, 1.0]), probability=probability)
@@ -114,7 +114,7 @@ def test_as_many_numbers_are_drawn_however_many_plans(num_plans):
 
 
 @pytest.mark.parametrize("kind", ["S", "SA", "WS", "WSA"])
-def test_a_sure_outcome_is_no_chance(kind):
+def test_a_certain_outcome_is_deterministic(kind):
     plain = random_world(6, kind)
     table = torch.stack([plain.next_state * 0, plain.next_state, plain.next_state, plain.next_state * 0 + 5], -1)
     probability = torch.tensor([0.0, 0.25, 0.75, 0.0]).expand(6, 3, 4)
@@ -220,7 +220,7 @@ def test_a_cube_of_rewards_is_ambiguous():
     assert TabularWorld(table, reward[:1], probability=probability).num_maps == 1
 
 
-def test_nobody_is_sure_to_reach_a_goal_by_chance():
+def test_reaching_a_goal_needs_a_deterministic_world():
     with refuses("deterministic"):
         can_reach(stochastic_world(0), torch.tensor([0]), 1, 3)
 

@@ -66,10 +66,10 @@ def first_difference(first: list[Transition], second: list[Transition]) -> str |
 def nondeterminism(episode: Episode, seed: int) -> str | None:
     """What differs between two trajectories of the same actions from the same seed; None: nothing."""
     for actions in walks(episode.num_actions):
-        seen = episode.reset(seed)
+        observation = episode.reset(seed)
         first = follow(episode, actions)
         again = episode.reset(seed)
-        if not np.array_equal(seen, again, equal_nan=True):
+        if not np.array_equal(observation, again, equal_nan=True):
             return "the first observation"
         difference = first_difference(first, follow(episode, actions))
         if difference is not None:
@@ -265,7 +265,7 @@ class _Writer:
         elif id(value) in self._seen:
             self.parts.append(f"@{self._seen[id(value)]}")
         else:
-            if not isinstance(value, tuple):  # equal tuples are not told apart
+            if not isinstance(value, tuple):  # equal tuples cannot be distinguished
                 self._seen[id(value)] = len(self._seen)
                 self._kept.append(value)
             self._compound(value)
@@ -295,7 +295,7 @@ class _Writer:
             reduced = value.__reduce_ex__(4)
         except Exception as error:
             raise ValueError(
-                f'env: it holds a {type(value).__name__}, by which its states cannot be told apart; use method="step"'
+                f'env: it holds a {type(value).__name__}, by which its states cannot be compared; use method="step"'
             ) from error
         for part in reduced:
             self.value(list(part) if isinstance(part, Iterator) else part)
