@@ -113,21 +113,20 @@ def files() -> dict[str, tuple[Plans, str]]:
 
 @pytest.mark.parametrize("name", files())
 def test_each_kind_of_file(name, tmp_path):
-    plans, sees = files()[name]
+    plans, takes = files()[name]
     write_plans(plans, tmp_path / name)
-    arguments = ["--data.file", str(tmp_path / name), "--out", str(tmp_path / "run"), *QUICK, *SMALL["gru"]]
-    assert main([*recipe("gru"), *arguments]) == 0
+    kind = "gru" if name == "features.npz" else "markov"  # features cannot be counted
+    assert main([*small(kind, tmp_path / "run"), "--data.file", str(tmp_path / name)]) == 0
     report = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert report["unit"] == ("plans" if plans.group is None else "groups")
-    assert ("context" in report["rows"][-1]["sees"]) == (sees == "context")
+    assert ("context" in report["rows"][-1]["sees"]) == (takes == "context")
     assert read_plans(tmp_path / "run" / "plans.npz").actions.shape == plans.actions.shape
 
 
 def test_a_minari_dataset(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     write_minari(some_plans(60, context=torch.randint(4, (60, 6), generator=seeded(4))), "mice/train-v0")
-    arguments = ["--data.file", "minari:mice/train-v0", "--out", str(tmp_path / "run"), *QUICK, *SMALL["gru"]]
-    assert main([*recipe("gru"), *arguments]) == 0
+    assert main([*small("markov", tmp_path / "run"), "--data.file", "minari:mice/train-v0"]) == 0
     assert load(tmp_path / "run").num_contexts == 4
 
 
@@ -214,13 +213,12 @@ def test_a_recipe_by_name(plans_file, tmp_path, capsys, monkeypatch):
         assert "gru, markov, transformer" in said
 
 
-LONG = ["--data.check_every", "5", "--trainer.max_steps", "200", "--trainer.patience", "200"]
+LONG = ["--data.check_every", "5", "--trainer.max_steps", "100", "--trainer.patience", "100"]
 LONG += ["--model.prior.dropout", "0.1"]
 
 
 def test_killed_and_resumed_gives_the_same_prior_bit_for_bit(tmp_path):
-    whole = [*small("gru", tmp_path / "whole"), *LONG]
-    assert run(whole).returncode == 0
+    assert main([*small("gru", tmp_path / "whole"), *LONG]) == 0
     process = subprocess.Popen(
         [sys.executable, "-m", "train", *small("gru", tmp_path / "cut"), *LONG],
         cwd=ROOT,
@@ -239,7 +237,7 @@ def test_killed_and_resumed_gives_the_same_prior_bit_for_bit(tmp_path):
     for name in ("model.safetensors",):
         assert (moved / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     first, second = (json.loads((f / "metrics.json").read_text()) for f in (tmp_path / "whole", moved))
-    assert len(first["curve"]) == 40
+    assert len(first["curve"]) == 20
     assert first["curve"] == second["curve"]
     assert first["rows"] == second["rows"]
 
@@ -316,17 +314,6 @@ def test_no_pickle_is_executed(tmp_path, capsys):
     (out / "plans.npz").write_bytes(pickle.dumps(Poison(tmp_path / "poisoned")))
     assert main(["fit", "--resume", str(out)]) == 2
     assert not (tmp_path / "poisoned").exists()
-
-
-def test_a_full_disk_is_one_line(tmp_path):
-    limit = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)); "
-    program = limit + "from train.__main__ import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run(
-        [sys.executable, "-c", program, *small("gru", tmp_path / "run")], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "error" in done.stderr
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -1,4 +1,4 @@
-"""`python -m train` when things go wrong: bad options and files, too few plans, contexts never met in training."""
+"""`python -m train` when things go wrong: bad options and files, too few plans, contexts that are new."""
 
 import json
 from pathlib import Path
@@ -118,7 +118,7 @@ def test_half_precision(tmp_path):
 
 
 def test_two_processes_learn_from_long_plans_what_one_does(tmp_path):
-    """In windows, with memory carried over, and as many pieces as two processes cannot share evenly."""
+    """In windows, with the hidden state carried over, and as many pieces as two processes cannot share evenly."""
     actions = (torch.arange(9 * 300).view(9, 300) // 3 + torch.arange(9)[:, None]) % 4
     noise = torch.rand(9, 300, generator=seeded(0)) < 0.2
     actions = torch.where(noise, torch.randint(4, (9, 300), generator=seeded(1)), actions)

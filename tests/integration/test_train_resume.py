@@ -43,6 +43,7 @@ MOMENTS = {
     "saved": lambda: setattr(neuroprior.cli.fit_report, "score", die),
     "compared": lambda: after(neuroprior.cli.fit_report, "write_json", "metrics.json"),
     "full": lambda: disk(7000),
+    "fuller": lambda: disk(2000),
 }
 for moment, change in MOMENTS.items():
     if not (child := os.fork()):
@@ -120,6 +121,13 @@ def test_a_disk_full_of_checkpoints_is_one_line(cut):
     assert not [name for name in left(cut / "full") if "ckpt" in name]
     assert main(["fit", "--resume", str(cut / "full")]) == 0
     assert (cut / "full" / "model.safetensors").read_bytes() == (cut / "whole" / "model.safetensors").read_bytes()
+
+
+def test_a_disk_too_full_for_the_plans_is_one_line(cut):
+    assert "fuller 2" in (cut / "codes").read_text().splitlines()
+    said = (cut / "fuller.err").read_text()
+    assert said.count("\n") == 1, said
+    assert said.startswith("error: ")
 
 
 @pytest.mark.parametrize("kept", [0, 0.5, 0.999])

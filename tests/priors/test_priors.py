@@ -16,22 +16,25 @@ SMALL = {
     "markov": partial(MarkovPrior, A, order=2),
     "uniform": partial(UniformPrior, A),
 }
-SEES = {
-    "nothing": ({}, None),
+CONTEXTS = {
+    "no context": ({}, None),
     "index a plan": ({"num_contexts": C}, "plan"),
     "index a step": ({"num_contexts": C}, "step"),
     "features a plan": ({"context_size": 2}, "plan"),
     "features a step": ({"context_size": 2}, "step"),
 }
 NEURAL = [
-    (kind, sees, window) for kind in ("gru", "transformer") for sees in SEES for window in (None, 0, 1, 3, L - 1, L)
+    (kind, takes, window)
+    for kind in ("gru", "transformer")
+    for takes in CONTEXTS
+    for window in (None, 0, 1, 3, L - 1, L)
 ]
-MARKOV = [("markov", sees, None) for sees in ("nothing", "index a plan", "index a step")]
-ALL = [*NEURAL, *MARKOV, ("uniform", "nothing", None)]
+MARKOV = [("markov", takes, None) for takes in ("no context", "index a plan", "index a step")]
+ALL = [*NEURAL, *MARKOV, ("uniform", "no context", None)]
 
 
-def draw_context(sees, num, length, seed=0):
-    arguments, per = SEES[sees]
+def draw_context(takes, num, length, seed=0):
+    arguments, per = CONTEXTS[takes]
     if per is None:
         return None
     shape = (num,) if per == "plan" else (num, length)
@@ -40,18 +43,18 @@ def draw_context(sees, num, length, seed=0):
     return torch.randn(*shape, 2, generator=seeded(seed))
 
 
-def make(kind, sees, window=None, seed=0):
-    """A prior whose predictions depend on all that it may look at: random weights, or counts of random plans."""
+def make(kind, takes, window=None, seed=0):
+    """A prior whose predictions depend on all of its input: random weights, or counts of random plans."""
     extra = {} if window is None else {"window": window}
     if kind in ("gru", "transformer"):
-        prior = SMALL[kind](**SEES[sees][0], **extra, seed=seed)
+        prior = SMALL[kind](**CONTEXTS[takes][0], **extra, seed=seed)
         with torch.no_grad():
             for weight in prior.parameters():
                 weight.mul_(2)  # away from the near-uniform predictions of fresh weights
         return prior.eval()
-    prior = SMALL[kind](**SEES[sees][0])
+    prior = SMALL[kind](**CONTEXTS[takes][0])
     plans = torch.randint(A, (60, 5), generator=seeded(seed))
-    return prior.fit(Plans(plans, A, context=draw_context(sees, 60, 5)))
+    return prior.fit(Plans(plans, A, context=draw_context(takes, 60, 5)))
 
 
 def steps(prior, plans, context, per, explicit=False):
@@ -60,18 +63,18 @@ def steps(prior, plans, context, per, explicit=False):
     logits, state = prior.start(len(plans), context[:, 0] if per_step else context)
     out, states = [logits], [state]
     for t in range(plans.shape[1] - 1):
-        seen = context[:, t + 1] if per_step else context if explicit else None
-        logits, state = prior.step(plans[:, t], state, seen)
+        current = context[:, t + 1] if per_step else context if explicit else None
+        logits, state = prior.step(plans[:, t], state, current)
         out.append(logits)
         states.append(state)
     return torch.stack(out, 1), states
 
 
-@pytest.mark.parametrize(("kind", "sees", "window"), ALL)
+@pytest.mark.parametrize(("kind", "takes", "window"), ALL)
 @torch.no_grad()
-def test_stepping_is_forward(kind, sees, window):
-    prior = make(kind, sees, window)
-    plans, context, per = torch.randint(A, (9, L), generator=seeded(1)), draw_context(sees, 9, L), SEES[sees][1]
+def test_stepping_is_forward(kind, takes, window):
+    prior = make(kind, takes, window)
+    plans, context, per = torch.randint(A, (9, L), generator=seeded(1)), draw_context(takes, 9, L), CONTEXTS[takes][1]
     forward = prior(plans, context)
     assert forward.shape == (9, L, A)
     assert forward.dtype == torch.float32
@@ -88,9 +91,9 @@ def test_stepping_is_forward(kind, sees, window):
     torch.testing.assert_close(prior.log_prob(Plans(plans, A, lengths, context=context)), shorter)
 
 
-@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None])
-def test_log_prob_in_parts(kind, sees, monkeypatch):
-    prior, context = make(kind, sees), draw_context(sees, 9, L)
+@pytest.mark.parametrize(("kind", "takes"), [(k, s) for k, s, w in ALL if w is None])
+def test_log_prob_in_parts(kind, takes, monkeypatch):
+    prior, context = make(kind, takes), draw_context(takes, 9, L)
     plans, lengths = torch.randint(A, (9, L), generator=seeded(1)), torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
     whole = prior.log_prob(Plans(plans, A, lengths, context=context))
     monkeypatch.setattr(type(prior), "actions_at_once", 2 * L)
@@ -98,17 +101,17 @@ def test_log_prob_in_parts(kind, sees, monkeypatch):
 
 
 @pytest.mark.parametrize("end", [False, True])
-@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None])
+@pytest.mark.parametrize(("kind", "takes"), [(k, s) for k, s, w in ALL if w is None])
 @torch.no_grad()
-def test_forecasts(kind, sees, end, monkeypatch):
+def test_forecasts(kind, takes, end, monkeypatch):
     """What is forecast of every action, some plans at a time, is what `log_prob` takes of the one that came."""
-    prior = make(kind, sees)
+    prior = make(kind, takes)
     lengths = torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 7])
     actions = torch.randint(A, (9, L), generator=seeded(1))
     if end:  # action 2 closes plans, and the prior has learned so
         actions = torch.where(torch.arange(L) == lengths[:, None] - 1, 2, actions.clamp(max=1))
         prior.end = 2
-    plans = Plans(actions, A, lengths, context=draw_context(sees, 9, L), end=2 if end else None)
+    plans = Plans(actions, A, lengths, context=draw_context(takes, 9, L), end=2 if end else None)
     (whole,) = list(prior.forecasts(plans))
     assert whole[0].actions.equal(plans.actions)
     assert whole[1].shape == (9, L, A)
@@ -142,29 +145,29 @@ def test_forecasts_of_other_plans_are_refused():
     assert list(prior.forecasts(Plans(torch.zeros(0, 2).long(), A, context=torch.zeros(0).long()))) == []
 
 
-@pytest.mark.parametrize(("kind", "sees", "window"), [case for case in ALL if case[2] in (None, 1, 3)])
+@pytest.mark.parametrize(("kind", "takes", "window"), [case for case in ALL if case[2] in (None, 1, 3)])
 @torch.no_grad()
-def test_states_are_reordered_by_indexing(kind, sees, window):
-    prior = make(kind, sees, window)
-    plans, context, per = torch.randint(A, (5, L), generator=seeded(2)), draw_context(sees, 5, L), SEES[sees][1]
+def test_states_are_reordered_by_indexing(kind, takes, window):
+    prior = make(kind, takes, window)
+    plans, context, per = torch.randint(A, (5, L), generator=seeded(2)), draw_context(takes, 5, L), CONTEXTS[takes][1]
     index = torch.tensor([3, 0, 0, 4, 1, 3])
     _, states = steps(prior, plans, context, per)
     for t in range(L - 1):
-        seen = context[:, t + 1] if per == "step" else None
-        logits, state = prior.step(plans[:, t], states[t], seen)
-        moved = None if seen is None else seen[index]
+        current = context[:, t + 1] if per == "step" else None
+        logits, state = prior.step(plans[:, t], states[t], current)
+        moved = None if current is None else current[index]
         got, after = prior.step(plans[index, t], states[t][index], moved)
         torch.testing.assert_close(got, logits[index], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(after, state[index], rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(("kind", "sees"), [("gru", s) for s in SEES] + [("transformer", s) for s in SEES])
+@pytest.mark.parametrize(("kind", "takes"), [("gru", s) for s in CONTEXTS] + [("transformer", s) for s in CONTEXTS])
 @pytest.mark.parametrize("window", [0, 1, 3])
 @torch.no_grad()
-def test_window(kind, sees, window):
+def test_window(kind, takes, window):
     """Past the window a prediction is that after the last `window` actions had opened a plan, and uses all of them."""
-    prior = make(kind, sees, window)
-    plans, context, per = torch.randint(A, (20, L), generator=seeded(3)), draw_context(sees, 20, L), SEES[sees][1]
+    prior = make(kind, takes, window)
+    plans, context, per = torch.randint(A, (20, L), generator=seeded(3)), draw_context(takes, 20, L), CONTEXTS[takes][1]
     forward = prior(plans, context)
     for t in range(window, L):
         last = slice(t - window, t + 1)
@@ -177,11 +180,11 @@ def test_window(kind, sees, window):
         assert differs == (age <= window)
 
 
-@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None and s != "nothing"])
+@pytest.mark.parametrize(("kind", "takes"), [(k, s) for k, s, w in ALL if w is None and s != "no context"])
 @torch.no_grad()
-def test_the_context_counts_from_when_it_is_seen(kind, sees):
-    prior, per = make(kind, sees), SEES[sees][1]
-    plans, context = torch.randint(A, (30, L), generator=seeded(4)), draw_context(sees, 30, L)
+def test_the_context_counts_from_its_step_on(kind, takes):
+    prior, per = make(kind, takes), CONTEXTS[takes][1]
+    plans, context = torch.randint(A, (30, L), generator=seeded(4)), draw_context(takes, 30, L)
     forward = prior(plans, context)
     for t in [4] if per == "step" else [0]:
         changed = context.clone()
@@ -194,20 +197,20 @@ def test_the_context_counts_from_when_it_is_seen(kind, sees):
             assert (other - forward).abs().amax((0, 2)).min() > 1e-3
 
 
-@pytest.mark.parametrize(("kind", "sees", "window"), [case for case in ALL if case[2] in (None, 0, 3)])
-def test_probabilities_of_all_plans_sum_to_one(kind, sees, window):
-    prior = make(kind, sees, window)
+@pytest.mark.parametrize(("kind", "takes", "window"), [case for case in ALL if case[2] in (None, 0, 3)])
+def test_probabilities_of_all_plans_sum_to_one(kind, takes, window):
+    prior = make(kind, takes, window)
     for length in (0, 1, 5):
-        context = draw_context(sees, 1, length)
+        context = draw_context(takes, 1, length)
         probs = distribution(prior, length, None if context is None else context[0])
         assert float(probs.sum()) == pytest.approx(1, abs=1e-4)
 
 
-@pytest.mark.parametrize(("kind", "sees", "window"), [case for case in ALL if case[2] in (None, 3)])
+@pytest.mark.parametrize(("kind", "takes", "window"), [case for case in ALL if case[2] in (None, 3)])
 @pytest.mark.parametrize("size", [(0, 3), (0, 6), (4, 0), (0, 0), (1, 0)])
 @torch.no_grad()
-def test_empty_batches(kind, sees, window, size):
-    prior, context = make(kind, sees, window), draw_context(sees, *size)
+def test_empty_batches(kind, takes, window, size):
+    prior, context = make(kind, takes, window), draw_context(takes, *size)
     plans = torch.zeros(size, dtype=torch.long)
     assert prior(plans, context).shape == (*size, A)
     assert prior.log_prob(Plans(plans, A, context=context)).tolist() == [0.0] * size[0]
@@ -215,8 +218,8 @@ def test_empty_batches(kind, sees, window, size):
 
 
 BAD_CONTEXTS = [
-    ("nothing", torch.zeros(4).long(), "context"),
-    ("nothing", torch.zeros(4, 2), "context"),
+    ("no context", torch.zeros(4).long(), "context"),
+    ("no context", torch.zeros(4, 2), "context"),
     ("index a plan", None, "context"),
     ("index a plan", torch.tensor([0, 1, C, 0]), str(C)),
     ("index a plan", torch.tensor([0, 1, -1, 0]), "-1"),
@@ -240,23 +243,23 @@ CALLS = {
 
 @pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize(
-    ("kind", "sees", "context", "word"),
+    ("kind", "takes", "context", "word"),
     [(kind, *bad) for kind in SMALL for bad in BAD_CONTEXTS if (kind, bad[0], None) in ALL],
 )
-def test_refuses_a_context(call, kind, sees, context, word):
-    if call == "fit" and sees == "nothing":  # which leaves the context of the plans aside
-        assert make(kind, sees).training_plans(Plans(torch.zeros(4, 2).long(), A, context=context)).context is None
+def test_refuses_a_context(call, kind, takes, context, word):
+    if call == "fit" and takes == "no context":  # which ignores the context of the plans
+        assert make(kind, takes).training_plans(Plans(torch.zeros(4, 2).long(), A, context=context)).context is None
         return
     with refuses(word):
-        CALLS[call](make(kind, sees), torch.zeros(4, 2, dtype=torch.long), context)
+        CALLS[call](make(kind, takes), torch.zeros(4, 2, dtype=torch.long), context)
 
 
-@pytest.mark.parametrize(("kind", "sees"), [(k, s) for k, s, w in ALL if w is None and s != "nothing"])
-def test_refuses_a_world_that_shows_something_else(kind, sees):
+@pytest.mark.parametrize(("kind", "takes"), [(k, s) for k, s, w in ALL if w is None and s != "no context"])
+def test_refuses_a_world_that_shows_something_else(kind, takes):
     """The world's six cells are neither below `num_contexts` = 4 nor features."""
     world = random_world(0)
     with refuses("context"):
-        sample_in_world(make(kind, sees), world, torch.arange(6), 50, 4, generator=seeded(0))
+        sample_in_world(make(kind, takes), world, torch.arange(6), 50, 4, generator=seeded(0))
 
 
 @pytest.mark.parametrize("kind", SMALL)
@@ -270,7 +273,7 @@ def test_refuses_a_world_that_shows_something_else(kind, sees):
     ],
 )
 def test_refuses_plans(kind, plans, words):
-    prior = make(kind, "nothing")
+    prior = make(kind, "no context")
     for call in (prior.log_prob, prior.fit):
         with refuses(*words):
             call(plans)
@@ -279,7 +282,7 @@ def test_refuses_plans(kind, plans, words):
 @pytest.mark.parametrize("kind", SMALL)
 def test_refuses_plans_of_other_actions(kind):
     with refuses(str(A), str(A + 1)):
-        make(kind, "nothing").fit(Plans(torch.zeros(4, 2).long(), A + 1))
+        make(kind, "no context").fit(Plans(torch.zeros(4, 2).long(), A + 1))
 
 
 def test_many_actions():

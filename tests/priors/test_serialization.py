@@ -18,8 +18,8 @@ PRIORS = [
     (UniformPrior, {}),
     *((MarkovPrior, {"order": k, "initial": i, "smoothing": 0.3}) for k in (0, 1, 3) for i in ("joint", "lower")),
     (MarkovPrior, {"order": 2} | INDEX),
-    *((GRUPrior, {"hidden_size": 8, "num_layers": 2} | seen) for seen in ({}, {"window": 2}, INDEX, FEATURES)),
-    *((TransformerPrior, {"width": 8, "num_heads": 2} | seen) for seen in ({}, {"window": 2}, INDEX, FEATURES)),
+    *((GRUPrior, {"hidden_size": 8, "num_layers": 2} | current) for current in ({}, {"window": 2}, INDEX, FEATURES)),
+    *((TransformerPrior, {"width": 8, "num_heads": 2} | current) for current in ({}, {"window": 2}, INDEX, FEATURES)),
 ]
 
 

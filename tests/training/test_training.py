@@ -19,7 +19,7 @@ def test_frequent_plans_keep_their_probability(length: int) -> None:
     # Half of all plans are one and the same; the others are one of 4**length, below and above MOST_DISTINCT.
     same = torch.zeros(4000, length, dtype=torch.long)
     plans = torch.cat([same, torch.randint(4, (4000, length), generator=generator())])
-    prior = GRUPrior(4, 32).fit(plans, generator=generator(), progress=False, max_steps=400)
+    prior = GRUPrior(4, 32).fit(plans, generator=generator(), progress=False, max_steps=150)
     assert float(prior.log_prob(same[:1]).detach().exp()) == pytest.approx(0.5 * (1 + 4.0**-length), abs=0.03)
 
 

@@ -1,4 +1,4 @@
-"""Training in windows: what each batch holds, memory carried over, and priors that read on as they were trained."""
+"""Training in windows: what each batch holds, the hidden state carried over, and priors that read as trained."""
 
 import math
 
@@ -23,7 +23,7 @@ def long_plans(num_plans: int = 5, length: int = 37) -> Plans:
 def test_a_pass_reads_every_action_once_and_in_order(window, batch_size):
     plans = long_plans()
     windows = PlansModule(plans, plans, Settings(batch_size=batch_size, window=window), seed=3).training
-    seen = []
+    current = []
     for index in Walk(windows, windows.steps, 3, (0, 1)):
         batch = windows[index]
         for row in range(len(batch.actions)):
@@ -31,11 +31,11 @@ def test_a_pass_reads_every_action_once_and_in_order(window, batch_size):
             place = batch.context[row][taken]
             if len(place):
                 before = int(batch.previous[row]) if batch.previous is not None else 3
-                seen.append((batch.actions[row][taken].tolist(), place.tolist(), before))
-    total = sorted(len(actions) for actions, _, _ in seen)
+                current.append((batch.actions[row][taken].tolist(), place.tolist(), before))
+    total = sorted(len(actions) for actions, _, _ in current)
     assert sum(total) == int(plans.lengths.sum())
     steps = torch.zeros(5, 37, dtype=torch.long)
-    for actions, place, before in seen:
+    for actions, place, before in current:
         assert place == list(range(place[0], place[0] + len(place)))
         found = [
             n
@@ -73,19 +73,19 @@ def test_an_epoch_depends_on_its_number_and_the_seed_alone():
 
     assert epoch(3) == epoch(3) != epoch(4)
     assert epoch(3) != epoch(3, seed=1)
-    assert not epoch(3)[0][2], "an epoch begins without memory, so that it can be begun anywhere"
+    assert not epoch(3)[0][2], "an epoch begins without a hidden state, so that it can be begun anywhere"
 
 
 @pytest.mark.parametrize("prior", SMALL)
-def test_windows_with_memory_cost_what_the_whole_costs(prior):
+def test_windows_with_the_hidden_state_cost_what_the_whole_costs(prior):
     prior.set_training_window(40)
     plans = long_plans()
     lengths = torch.tensor([37, 33, 29, 36, 30])
     windows = Windows(Plans(plans.actions, 3, lengths=lengths), 5, 100, least_windows=8)
-    assert windows.windows == 8, "pieces as long as the longest plan, so that memory goes all the way"
-    total, memory = 0.0, None
+    assert windows.windows == 8, "pieces as long as the longest plan, so that the hidden state goes all the way"
+    total, hidden = 0.0, None
     for index in Walk(windows, None, None, (0, 1)):
-        cost, _, memory = bits(prior, windows[index], memory)
+        cost, _, hidden = bits(prior, windows[index], hidden)
         total += float(cost.detach())
     whole = -float(prior.log_prob(Plans(plans.actions, 3, lengths)).sum().detach()) / math.log(2)
     assert total == pytest.approx(whole, rel=1e-5)
@@ -104,12 +104,12 @@ def test_stepping_equals_forward_far_past_the_window(prior):
     if isinstance(prior, TransformerPrior):
         far = plans.clone()
         far[:, :10] = (far[:, :10] + 1) % 3
-        # two layers of span 5 and three lags see no further than 13 inputs back
+        # two layers of span 5 and three lags reach no further than 13 inputs back
         assert torch.allclose(prior(far)[:, 25:], prior(plans)[:, 25:], atol=1e-6)
 
 
-def test_memory_is_learned_to_be_used():
-    """A plan's bit comes again every fourth action; at the beginning of a window memory alone can tell it."""
+def test_the_hidden_state_is_learned_to_be_used():
+    """A plan's bit comes again every fourth action; at the beginning of a window only the hidden state holds it."""
     bit = torch.randint(2, (400, 1), generator=seeded(0))
     actions = torch.where(torch.arange(24) % 4 == 0, bit, 2)
     prior = GRUPrior(3, 16, lags=1).fit(
@@ -125,18 +125,18 @@ def test_a_window_of_its_own_does_not_go_with_long_plans():
         GRUPrior(3, 8, window=4).fit(torch.randint(3, (9, 30), generator=seeded(0)), window=10, progress=False)
 
 
-def test_validation_looks_at_no_more_than_it_must():
+def test_validation_reads_no_more_than_it_must():
     actions = torch.randint(2, (3, MOST_VALIDATION), generator=seeded(0))
     data = PlansModule(Plans(actions[:, :9], 2), Plans(actions, 2), Settings(), 0)
     assert len(data.validation.plans) == 1
-    # one long plan does not crowd out the short ones, and those without actions are left aside
+    # one long plan does not crowd out the short ones, and those without actions are ignored
     lengths = torch.cat([torch.tensor([30_000]), torch.full((2000,), 10), torch.zeros(50, dtype=torch.long)])
     many = Plans(torch.randint(2, (2051, 30_000), generator=seeded(1), dtype=torch.uint8), 2, lengths=lengths)
     assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 2001
 
 
 @pytest.mark.parametrize(("num_plans", "length"), [(1, 10_000), (20, 1000), (100, 1000), (1, 100_000)])
-def test_memory_is_carried_by_default(num_plans, length):
+def test_the_hidden_state_is_carried_by_default(num_plans, length):
     plans = Plans(torch.randint(3, (num_plans, length), generator=seeded(0)), 3)
     data = PlansModule(plans, plans, Settings(), 0)
     for windows in (data.training, data.validation):
@@ -146,7 +146,7 @@ def test_memory_is_carried_by_default(num_plans, length):
         assert share >= 0.8
 
 
-def test_few_plans_are_looked_at_often():
+def test_few_plans_are_validated_often():
     plans = Plans(torch.randint(3, (200, 20), generator=seeded(0)), 3)
     data = PlansModule(plans, plans, Settings(), 0)
     assert (data.steps, data.epochs) == (10, 100)

@@ -49,7 +49,7 @@ def test_blends_by_hand():
 
 
 @pytest.mark.parametrize("rule", BACKOFFS)
-def test_nothing_seen_leaves_the_shorter_history(rule):
+def test_without_counts_the_shorter_history_remains(rule):
     lower = doubles(0.1, 0.9)
     torch.testing.assert_close(blend(torch.zeros(2).double(), lower, rule, 1.0, doubles(0.5, 1, 1.5)), lower)
 
@@ -73,8 +73,8 @@ def test_kneser_ney_by_hand():
 @pytest.mark.parametrize("contexts", [None, 2])
 def test_probabilities_of_all_plans_sum_to_one(rule, contexts):
     actions = (torch.rand(200, 5, generator=seeded(0)) ** 3 * 3).long()
-    seen = None if contexts is None else torch.arange(200) % 2
-    prior = MarkovPrior(3, 3, num_contexts=contexts, backoff=rule).fit(Plans(actions, 3, context=seen))
+    current = None if contexts is None else torch.arange(200) % 2
+    prior = MarkovPrior(3, 3, num_contexts=contexts, backoff=rule).fit(Plans(actions, 3, context=current))
     for length in (1, 3, 5):
         probs = distribution(prior, length, None if contexts is None else torch.tensor(1))
         assert float(probs.sum()) == pytest.approx(1, abs=1e-5)

@@ -31,7 +31,7 @@ def trees(num_actions, depth, beta):
 
 
 def forests(num_actions, depth, beta, contexts):
-    """The same with the context that is seen as the nearest symbol of all."""
+    """The same with the present context as the most recent symbol."""
     below = trees(num_actions, depth, beta)
     if contexts is None:
         return below
@@ -42,9 +42,9 @@ def forests(num_actions, depth, beta, contexts):
     return out
 
 
-def past_of(actions, t, seen):
+def past_of(actions, t, current):
     past = (*reversed(actions[:t]), BEGINNING)
-    return past if seen is None else (f"context {seen}", *past)
+    return past if current is None else (f"context {current}", *past)
 
 
 def leaf_of(leaves, past):
@@ -84,16 +84,16 @@ class EveryTree:
     def log_evidence(self):
         return float(self.joint.logsumexp(0))
 
-    def next(self, actions, seen):
+    def next(self, actions, current):
         pseudo = torch.tensor(self.pseudo, dtype=torch.double)
         out = torch.zeros_like(pseudo)
         for (leaves, _), counts, weight in zip(self.trees, self.counts, self.joint.softmax(0), strict=True):
-            n = torch.tensor(counts[leaf_of(leaves, past_of(actions, len(actions), seen))], dtype=torch.double)
+            n = torch.tensor(counts[leaf_of(leaves, past_of(actions, len(actions), current))], dtype=torch.double)
             out += weight * (n + pseudo) / (n.sum() + pseudo.sum())
         return out
 
     def best(self):
-        """The leaves that were met, of each tree that is as probable as the best, and their counts."""
+        """The leaves that occurred, of each tree that is as probable as the best, and their counts."""
         top = float(self.joint.max())
         return [
             {leaf: n for leaf, n in counts.items() if sum(n)}
@@ -142,14 +142,14 @@ def problems(draw):
 
 
 def rows_of(plans, per):
-    seen = torch.zeros_like(plans.actions) if per is None else plans.context
-    seen = seen[:, None].expand_as(plans.actions) if per == "plan" else seen
+    current = torch.zeros_like(plans.actions) if per is None else plans.context
+    current = current[:, None].expand_as(plans.actions) if per == "plan" else current
     lengths = plans.mask().sum(1).tolist()
-    rows = [(plans.actions[i, :n].tolist(), seen[i, :n].tolist()) for i, n in enumerate(lengths)]
+    rows = [(plans.actions[i, :n].tolist(), current[i, :n].tolist()) for i, n in enumerate(lengths)]
     return rows if per else [(actions, [None] * len(actions)) for actions, _ in rows]
 
 
-@settings(max_examples=120, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(problems())
 def test_every_tree(problem):
     plans, contexts, per, arguments, generator = problem
@@ -168,8 +168,8 @@ def test_every_tree(problem):
     got = prior(test, context).double().exp()
     for i in range(num):
         for t in range(length):
-            seen = None if context is None else int(context[i] if per == "plan" else context[i, t])
-            torch.testing.assert_close(got[i, t], truth.next(test[i, :t].tolist(), seen), rtol=1e-6, atol=1e-7)
+            current = None if context is None else int(context[i] if per == "plan" else context[i, t])
+            torch.testing.assert_close(got[i, t], truth.next(test[i, :t].tolist(), current), rtol=1e-6, atol=1e-7)
     best = truth.best()
     assert met(prior) in best
     assert len(met(prior)) == min(map(len, best))
@@ -242,7 +242,7 @@ def test_alpha_is_the_most_probable_one():
         assert float(ContextTreePrior(3, 2, base="uniform").fit(plans).pseudo_counts.sum()) == size
 
 
-def test_nothing_seen_is_uniform():
+def test_without_counts_it_is_uniform():
     for prior in (ContextTreePrior(3), ContextTreePrior(3).fit(torch.zeros(0, 4).long())):
         torch.testing.assert_close(prior(torch.zeros(2, 4).long()).exp(), torch.full((2, 4, 3), 1 / 3))
         assert prior.map_tree() == []

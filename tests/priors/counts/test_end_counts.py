@@ -79,16 +79,16 @@ def test_a_planner_says_that_it_cannot_end_plans(name):
 
 
 def test_the_uniform_prior_takes_one_of_three_until_the_end():
-    """An action, or the end, has probability 1 / 3 until the end; past it nothing is left to tell."""
+    """An action, or the end, has probability 1 / 3 until the end; past it everything is certain."""
     prior = fitted("uniform")
     plans = every_plan(3, 4)
     ended = (plans == 2).int().cummax(1).values
-    told = 4 - ended[:, :-1].sum(1)
-    want = (-told * math.log(3)).masked_fill(goes_on(plans), -math.inf)
+    predicted = 4 - ended[:, :-1].sum(1)
+    want = (-predicted * math.log(3)).masked_fill(goes_on(plans), -math.inf)
     torch.testing.assert_close(prior.log_prob(plans), want)
 
 
-def test_a_context_tree_tells_how_long_plans_are():
+def test_a_context_tree_learns_how_long_plans_are():
     """Plans are 0 to 4 actions long, each as likely: after t actions one of 5 - t has ended, and 4 are never passed.
 
     The counts lean on few pseudo-counts: 0.01. What is left is the error of estimating a share from about 400 plans or
@@ -127,8 +127,8 @@ def test_the_end_with_contexts():
     drawn = prior.sample(2000, 4, torch.arange(2000) % 2, generator=seeded(6))
     lengths = Plans(drawn, 3, end=2).without_end().lengths
     # each of 1,000 plans ends where it should with a probability of over 0.98; 940 is over 9 standard errors below
-    for seen, length in ((0, 1), (1, 3)):
-        assert int((lengths[seen::2] == length).sum()) > 940
+    for current, length in ((0, 1), (1, 3)):
+        assert int((lengths[current::2] == length).sum()) > 940
     ends = prior(torch.tensor([[0, 1, 0, 1]] * 2), torch.arange(2)).softmax(-1)[..., 2]
     assert float(ends[0, 1]) > 0.98
     assert float(ends[1, 3]) > 0.98

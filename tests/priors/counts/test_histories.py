@@ -32,13 +32,13 @@ def dictionary(plans, contexts, depth):
         length = plans.max_length if plans.lengths is None else int(plans.lengths[i])
         actions = plans.actions[i, :length].tolist()
         for t, action in enumerate(actions):
-            seen = 0
+            current = 0
             if contexts:
-                seen = int(plans.context[i] if plans.context.dim() == 1 else plans.context[i, t])
+                current = int(plans.context[i] if plans.context.dim() == 1 else plans.context[i, t])
             for k in range(min(t, depth) + 1):
-                out[False, tuple(actions[t - k : t]), seen, action] += 1
+                out[False, tuple(actions[t - k : t]), current, action] += 1
             if t < depth:
-                out[True, tuple(actions[:t]), seen, action] += 1
+                out[True, tuple(actions[:t]), current, action] += 1
     return out
 
 
@@ -68,8 +68,8 @@ def test_the_tree_and_its_counts(problem, at_once):
     assert len(name) == len(tree.parent) == len(tree.next_node)
     found = {}
     for row, action, count in zip(counts.row.tolist(), counts.action.tolist(), counts.count.tolist(), strict=True):
-        node, seen = divmod(int(counts.row_code[row]), contexts or 1)
-        found[(*name[node], seen, action)] = count
+        node, current = divmod(int(counts.row_code[row]), contexts or 1)
+        found[(*name[node], current, action)] = count
     assert found == dict(truth)
     for node, (opening, history) in name.items():
         if node:
@@ -85,11 +85,11 @@ def test_read_in_parts(make):
     generator = seeded(0)
     lengths = torch.randint(10, (300,), generator=generator)
     plans = Plans(torch.randint(3, (300, 9), generator=generator), 3, lengths, context=torch.arange(300) % 2)
-    test, seen = torch.randint(3, (50, 12), generator=generator), torch.randint(2, (50, 12), generator=generator)
-    want, prior = make().fit(plans)(test, seen), make()
+    test, current = torch.randint(3, (50, 12), generator=generator), torch.randint(2, (50, 12), generator=generator)
+    want, prior = make().fit(plans)(test, current), make()
     depth = getattr(prior, "depth", 4)
     prior.learn(*count_histories(plans, depth, 2, True, prior.device, at_once=50))
-    torch.testing.assert_close(prior(test, seen), want)
+    torch.testing.assert_close(prior(test, current), want)
 
 
 @pytest.mark.parametrize("prior", [MarkovPrior(300, 3), ContextTreePrior(300, 3)])

@@ -37,11 +37,11 @@ def equals_stepping(prior: Prior, length: int, kind: str, seed: int = 0, num: in
     plans = torch.randint(prior.num_actions, (num, length), generator=seeded(seed))
     # One as those learned from, in which the histories go on and on.
     plans[0] = torch.randint(max(prior.num_actions - 1, 1), (length,), generator=seeded(seed + 1))
-    seen = contexts(kind, prior.num_contexts or 1, num, length, seed + 2)
-    got = prior(plans, seen)
+    current = contexts(kind, prior.num_contexts or 1, num, length, seed + 2)
+    got = prior(plans, current)
     assert got.shape == (num, length, prior.num_actions)
     assert got.dtype == torch.float32
-    return torch.equal(got, Prior.forward(prior, plans, seen))
+    return torch.equal(got, Prior.forward(prior, plans, current))
 
 
 @pytest.mark.parametrize("kind", ["none", "plan", "step"])
@@ -52,10 +52,10 @@ def test_forward_is_stepping(name, kind):
     prior, longest = fitted(make, depth, more, kind), 1500 if depth in (0, 3, 6) else 600
     plans = torch.randint(3, (3, longest), generator=seeded(depth))
     plans[0] = torch.randint(2, (longest,), generator=seeded(depth + 1))  # as those learned from
-    seen = contexts(kind, 3, 3, longest, seed=depth + 2)
-    want, edge = Prior.forward(prior, plans, seen), CHUNK + depth
+    current = contexts(kind, 3, 3, longest, seed=depth + 2)
+    want, edge = Prior.forward(prior, plans, current), CHUNK + depth
     for length in (0, 1, CHUNK, edge - 1, edge, edge + 1, 2 * edge - 1, 2 * edge, 2 * edge + 1, longest - 1, longest):
-        got = prior(plans[:, :length], seen[:, :length] if kind == "step" else seen)
+        got = prior(plans[:, :length], current[:, :length] if kind == "step" else current)
         assert got.shape == (3, length, 3)
         assert torch.equal(got, want[:, :length]), length
 
@@ -101,8 +101,8 @@ def test_small_integers_are_read_as_large_ones(name, dtype):
     make, depth, more = PRIORS[name]
     prior = fitted(make, depth, more, "step")
     plans = torch.randint(3, (2, 700), generator=seeded(5))
-    seen = torch.randint(3, (2, 700), generator=seeded(6))
-    assert torch.equal(prior(plans.to(dtype), seen.to(dtype)), prior(plans, seen))
+    current = torch.randint(3, (2, 700), generator=seeded(6))
+    assert torch.equal(prior(plans.to(dtype), current.to(dtype)), prior(plans, current))
 
 
 @pytest.mark.parametrize("name", ["markov-0 joint", "markov-4 joint", "markov-4 lower", "tree-10"])

@@ -30,12 +30,12 @@ class Counting:
         self.initial, self.backoff, self.contexts = initial, backoff, contexts
         # How often each action followed: of (at a plan's beginning, history, context).
         self.raw = {}
-        for actions, seen in plans:
+        for actions, current in plans:
             for t, action in enumerate(actions):
                 for k in range(min(t, order) + 1):
-                    keys = [(False, tuple(actions[t - k : t]), seen[t])]
+                    keys = [(False, tuple(actions[t - k : t]), current[t])]
                     if k == t < order:
-                        keys.append((True, tuple(actions[:t]), seen[t]))
+                        keys.append((True, tuple(actions[:t]), current[t]))
                     for key in keys:
                         self.raw.setdefault(key, [0] * num_actions)[action] += 1
         self.none = [0] * num_actions
@@ -43,11 +43,11 @@ class Counting:
     def followed(self, key):
         return self.raw.get(key, self.none)
 
-    def counts(self, opening, history, seen):
+    def counts(self, opening, history, current):
         if self.backoff != "kneser-ney" or opening or len(history) == self.order:
-            return self.followed((opening, history, seen))
-        longer = [self.followed((False, (older, *history), seen)) for older in range(self.num_actions)]
-        longer.append(self.followed((True, history, seen)))
+            return self.followed((opening, history, current))
+        longer = [self.followed((False, (older, *history), current)) for older in range(self.num_actions)]
+        longer.append(self.followed((True, history, current)))
         return [sum(counts[a] > 0 for counts in longer) for a in range(self.num_actions)]
 
     def in_all_contexts(self):
@@ -80,22 +80,22 @@ class Counting:
         s = self.smoothing * (sum(n > 0 for n in counts) if self.backoff == "witten-bell" else 1)
         return [(n + s * p) / (total + s) for n, p in zip(counts, lower, strict=True)]
 
-    def chain(self, history, seen):
+    def chain(self, history, current):
         if history:
-            lower = self.chain(history[1:], seen)
+            lower = self.chain(history[1:], current)
         else:
             lower = [1 / self.num_actions] * self.num_actions
             if self.contexts:
                 pooled = self.in_all_contexts()
                 lower = self.blend(pooled, lower, pooled)
-        return self.blend(self.counts(False, history, seen), lower, self.level(False, len(history)))
+        return self.blend(self.counts(False, history, current), lower, self.level(False, len(history)))
 
-    def next(self, past, seen):
+    def next(self, past, current):
         """The probabilities of the action after all of `past`."""
         past = tuple(past)
-        probs = self.chain(past[max(len(past) - self.order, 0) :], seen)
+        probs = self.chain(past[max(len(past) - self.order, 0) :], current)
         if self.initial == "joint" and len(past) < self.order:
-            probs = self.blend(self.counts(True, past, seen), probs, self.level(True, len(past)))
+            probs = self.blend(self.counts(True, past, current), probs, self.level(True, len(past)))
         return probs
 
 
@@ -105,7 +105,7 @@ def problems(draw):
     per = draw(st.sampled_from(["plan", "step"])) if contexts else None
     num, seed = draw(st.sampled_from([0, 1, 3, 12, 60])), draw(st.integers(0, 2**31))
     generator = seeded(seed)
-    # Few contexts and actions are used in training, so that some are met in the test alone.
+    # Few contexts and actions are used in training, so that some occur in the test alone.
     used = draw(st.integers(1, num_actions))
     actions = torch.randint(used, (num, length), generator=generator)
     lengths = torch.randint(length + 1, (num,), generator=generator) if draw(st.booleans()) else None
@@ -123,7 +123,7 @@ def problems(draw):
     return Plans(actions, num_actions, lengths, context=context), contexts, per, arguments, seed
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(problems())
 def test_counts(problem):
     plans, contexts, per, arguments, seed = problem
@@ -132,10 +132,10 @@ def test_counts(problem):
     rows = []
     for i in range(len(plans)):
         length = plans.max_length if plans.lengths is None else int(plans.lengths[i])
-        seen = [None] * length
+        current = [None] * length
         if contexts:
-            seen = [int(plans.context[i])] * length if per == "plan" else plans.context[i, :length].tolist()
-        rows.append((plans.actions[i, :length].tolist(), seen))
+            current = [int(plans.context[i])] * length if per == "plan" else plans.context[i, :length].tolist()
+        rows.append((plans.actions[i, :length].tolist(), current))
     truth = Counting(rows, contexts=contexts, **arguments)
     generator = seeded(seed + 1)
     num, length = 6, plans.max_length + 2
@@ -146,8 +146,8 @@ def test_counts(problem):
     got = prior(test, context).softmax(-1)
     for i in range(num):
         for t in range(length):
-            seen = None if context is None else int(context[i] if per == "plan" else context[i, t])
-            want = torch.tensor(truth.next(test[i, :t].tolist(), seen))
+            current = None if context is None else int(context[i] if per == "plan" else context[i, t])
+            want = torch.tensor(truth.next(test[i, :t].tolist(), current))
             torch.testing.assert_close(got[i, t], want, rtol=1e-4, atol=1e-6)
     assert (got > 0).all()
     taken = got.gather(-1, test[..., None])[..., 0].log()
@@ -160,8 +160,8 @@ def test_counts(problem):
 @pytest.mark.parametrize("contexts", [None, 2])
 def test_probabilities_of_all_plans_sum_to_one(order, initial, contexts):
     actions = torch.randint(3, (40, 4), generator=seeded(order))
-    seen = None if contexts is None else torch.arange(40) % 2
-    prior = MarkovPrior(3, order, initial=initial, num_contexts=contexts).fit(Plans(actions, 3, context=seen))
+    current = None if contexts is None else torch.arange(40) % 2
+    prior = MarkovPrior(3, order, initial=initial, num_contexts=contexts).fit(Plans(actions, 3, context=current))
     for length in (0, 1, 3, 6):
         probs = distribution(prior, length, None if contexts is None else torch.tensor(1))
         assert float(probs.sum()) == pytest.approx(1, abs=1e-5)
@@ -170,7 +170,7 @@ def test_probabilities_of_all_plans_sum_to_one(order, initial, contexts):
 
 @pytest.mark.parametrize("order", [0, 1, 3])
 @pytest.mark.parametrize("fitted", [None, torch.zeros(0, 5).long(), torch.zeros(7, 0).long()])
-def test_nothing_seen_is_uniform(order, fitted):
+def test_without_counts_it_is_uniform(order, fitted):
     prior = MarkovPrior(3, order)
     if fitted is not None:
         prior.fit(fitted)

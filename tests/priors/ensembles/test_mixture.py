@@ -61,19 +61,19 @@ def test_weights_follow_the_recursion_of_fixed_share(share):
     forecasts = [e(plan).softmax(-1)[0] for e in mixture.experts]
     now, total = list(weights), 0.0
     for t, action in enumerate(plan[0].tolist()):
-        told = [w * float(f[t, action]) for w, f in zip(now, forecasts, strict=True)]
-        total += math.log(sum(told))
-        now = [(1 - share) * w / sum(told) + share * first for w, first in zip(told, weights, strict=True)]
+        predicted = [w * float(f[t, action]) for w, f in zip(now, forecasts, strict=True)]
+        total += math.log(sum(predicted))
+        now = [(1 - share) * w / sum(predicted) + share * first for w, first in zip(predicted, weights, strict=True)]
     assert float(mixture.log_prob(plan)) == pytest.approx(total, abs=1e-5)
 
 
 @cache
 def conformance() -> list[MixturePrior]:
-    plans, seen = some_plans(), some_plans(contexts=4)
+    plans, current = some_plans(), some_plans(contexts=4)
     small = {"max_steps": 5, "progress": False}
     made = [weighted(MixturePrior(A, experts()), [0.1, 0.4, 0.3, 0.2], 0.1)]
     some = [MarkovPrior(A, 1, num_contexts=4), ContextTreePrior(A, 2), GRUPrior(A, 8, num_contexts=4)]
-    made.append(MixturePrior(A, some).fit(seen, generator=seeded(0), **small))
+    made.append(MixturePrior(A, some).fit(current, generator=seeded(0), **small))
     made.append(MixturePrior(A, [TransformerPrior(A, 16, window=2), GRUPrior(A, 8, window=1)]))
     nested = MixturePrior(A, [StackedPrior(A, 8, orders=(1,), depth=2), UniformPrior(A)])
     return [*made, MixturePrior(A, [nested, MarkovPrior(A, 1)]).fit(plans, generator=seeded(0), **small)]

@@ -1,4 +1,4 @@
-"""The stacked prior: what its network sees, that experts forecast plans new to them, and what it gains."""
+"""The stacked prior: its network's inputs, that experts forecast plans new to them, and what it gains."""
 
 import math
 
@@ -21,15 +21,15 @@ def some_plans(num: int = 30, length: int = 12, per: str = "step", seed: int = 0
     return Plans(actions, A, lengths, context=torch.randint(C, shape, generator=seeded(seed + 2)))
 
 
-def fitted(plans: Plans, sees: bool, **settings) -> StackedPrior:
-    prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C if sees else None)
+def fitted(plans: Plans, takes: bool, **settings) -> StackedPrior:
+    prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C if takes else None)
     return prior.fit(plans, generator=seeded(0), **({"max_steps": 10, "progress": False} | settings))
 
 
-@pytest.mark.parametrize("sees", [False, True])
+@pytest.mark.parametrize("takes", [False, True])
 @pytest.mark.parametrize("per", ["plan", "step"])
-def test_it_is_a_prior(sees, per):
-    check_prior(fitted(some_plans(per=per), sees), 3, 2000)
+def test_it_is_a_prior(takes, per):
+    check_prior(fitted(some_plans(per=per), takes), 3, 2000)
 
 
 def test_fresh_it_forecasts_the_experts_geometric_mean():
@@ -44,8 +44,8 @@ def test_fresh_it_forecasts_the_experts_geometric_mean():
         assert prior(actions, context).log_softmax(-1).allclose(expected, atol=1e-5)
 
 
-def test_it_sees_how_long_ago_an_action_was_taken_here():
-    """Against a search backwards, and what stepping sees against what is seen of whole plans."""
+def test_its_input_is_how_long_ago_an_action_was_taken_here():
+    """Against a search backwards; and the inputs when stepping against those of whole plans."""
     prior = fitted(some_plans(), True)
     plans = some_plans(6, 20, seed=5)
     actions, context = plans.actions.long(), plans.context
@@ -68,14 +68,14 @@ def test_it_sees_how_long_ago_an_action_was_taken_here():
 
 @pytest.mark.parametrize("grouped", [False, True])
 def test_experts_forecast_plans_that_they_did_not_learn_from(grouped):
-    """Each plan (group) always does the same one thing that no other does: an expert that knew it would tell."""
+    """Each plan (group) always does one thing that no other does: an expert that learned from it would predict it."""
     group = torch.arange(12) // 3 if grouped else None
     own = torch.arange(12)[:, None] if group is None else group[:, None]
     plans = Plans(own.expand(12, 20).clone(), 12, group=group)
     prior = StackedPrior(12, 8, orders=(0, 1), depth=2)
     forecasts = prior._forecasts(plans, seeded(0))
-    told = forecasts.exp().gather(-1, plans.actions.long()[:, :, None, None].expand(-1, -1, len(prior.experts), 1))
-    assert float(told[:, 0].max()) < 1 / 12 + 1e-6
+    predicted = forecasts.exp().gather(-1, plans.actions.long()[:, :, None, None].expand(-1, -1, len(prior.experts), 1))
+    assert float(predicted[:, 0].max()) < 1 / 12 + 1e-6
     for expert in prior.experts:
         expert.fit(plans)
     assert float(prior.experts[1](plans.actions[:1])[0, 5].exp()[0]) > 0.5
@@ -118,7 +118,7 @@ def test_it_is_saved_and_loaded(tmp_path):
 
 
 def test_long_plans_and_a_single_one():
-    """Past the training window memory is carried on; a single plan is cut in parts."""
+    """Past the training window the hidden state is carried on; a single plan is cut in parts."""
     one = Plans(torch.randint(A, (1, 300), generator=seeded(3)), A)
     prior = fitted(one, False, window=16)
     assert prior.action_log_probs(one).shape == (1, 300)

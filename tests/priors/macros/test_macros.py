@@ -82,9 +82,9 @@ def test_macros_are_those_found_by_hand(plans, by):
         left = merits(symbols, len(meaning), by)
         assert not left or max(merit for merit, _, _ in left.values()) <= 1e-9
     for row, (plan, own) in enumerate(zip(plans, symbols, strict=True)):
-        told = recoded.actions[row, : recoded.lengths[row]].tolist()
-        assert told == own
-        assert [action for symbol in told for action in meaning[symbol]] == plan
+        predicted = recoded.actions[row, : recoded.lengths[row]].tolist()
+        assert predicted == own
+        assert [action for symbol in predicted for action in meaning[symbol]] == plan
 
 
 def test_what_plans_repeat_is_found():
@@ -149,8 +149,8 @@ def test_probabilities_are_sums_over_all_ways(inner):
             total = 0.0
             for way in all_ways(tuple(plans[row].tolist()), prior.macros, 3):
                 # Macros that were not found are never taken.
-                told = prior.inner(torch.tensor([way]))[..., :known].log_softmax(-1).double()
-                total += float(told.gather(2, torch.tensor([way])[..., None]).sum().exp())
+                predicted = prior.inner(torch.tensor([way]))[..., :known].log_softmax(-1).double()
+                total += float(predicted.gather(2, torch.tensor([way])[..., None]).sum().exp())
             assert float(found[row]) == pytest.approx(total, rel=1e-4)
     assert float(found.sum()) == pytest.approx(1, abs=1e-4)
 
@@ -162,16 +162,16 @@ def test_it_is_a_prior(inner):
 
 
 @pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
-def test_networks_inside_tell_plans_longer_than_their_window(kind):
+def test_networks_inside_predict_plans_longer_than_their_window(kind):
     """Recoded plans are short, and so is the window that is learned; past it a network's state has another shape."""
     words = torch.tensor([[0, 1, 2, 3], [3, 2, 2, 0], [1, 1, 0, 3]])
     plans = words[torch.randint(3, (200, 4), generator=seeded(0))].flatten(1)
     prior = MacroPrior(4, kind(12)).fit(plans, max_steps=3, progress=False)
     long = torch.randint(4, (3, 20), generator=seeded(1))
     with torch.no_grad():
-        told = prior.log_prob(long)
-        assert told.isfinite().all()
-        assert torch.allclose(prior.log_prob(long.to(torch.uint8)), told)
+        predicted = prior.log_prob(long)
+        assert predicted.isfinite().all()
+        assert torch.allclose(prior.log_prob(long.to(torch.uint8)), predicted)
     assert prior.sample(5, 18, generator=seeded(2)).shape == (5, 18)
 
 
@@ -198,7 +198,7 @@ def test_before_it_learned_it_has_no_macros():
 
 
 def test_macros_say_more_than_chains_of_the_same_order():
-    """Words of four actions: a chain of order 0 over words tells plans better than one over actions."""
+    """Words of four actions: a chain of order 0 over words predicts plans better than one over actions."""
     words = torch.tensor([[0, 1, 2, 3], [3, 2, 2, 0], [1, 1, 0, 3]])
     pick = torch.randint(3, (600, 4), generator=seeded(0))
     plans = words[pick].flatten(1)
