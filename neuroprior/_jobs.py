@@ -116,9 +116,7 @@ class JobRun(Generic[Job, Result]):
         return [self.read(job) for job in jobs]
 
     def _do(self, jobs: Sequence[Job], processes: int, dask: str | None, progress: "Progress") -> None:
-        call = partial(_attempt, self.run)
-        if dask is not None:
-            call = partial(call, code=self.code)
+        call = partial(_attempt, self.run, **({"parent": os.getpid()} if dask is None else {"code": self.code}))
         with progress:
             for index, result in _unordered(call, jobs, processes, dask):
                 where = self.name(jobs[index])
@@ -147,9 +145,12 @@ class Failure:
         return self.kind(f"{where}: {self.message}")
 
 
-def _attempt(run: Callable[[Job], Result], job: Job, index: int, code: str | None = None) -> tuple[int, Any]:
+def _attempt(
+    run: Callable[[Job], Result], job: Job, index: int, code: str | None = None, parent: int | None = None
+) -> tuple[int, Any]:
     """Do a job in one thread, since the number of threads changes the last digits."""
-    _end_with_parent()
+    if parent is not None and parent != os.getpid():
+        _end_with(parent)
     if code is not None and code_version(run) != code:
         return index, Failure(ValueError("the cluster's workers have another version of the code than this program"))
     try:
@@ -303,11 +304,8 @@ def _is_module(name: str) -> bool:
 
 
 @lru_cache
-def _end_with_parent() -> None:
-    """In a process that joblib started: end when the main process is gone, since nobody else would end it."""
-    if not any("loky" in word for word in sys.orig_argv):
-        return
-    parent = os.getppid()
+def _end_with(parent: int) -> None:
+    """In a process that joblib started: end when the main process is gone, also if it went before the first job."""
 
     def watch() -> None:
         while os.getppid() == parent:
