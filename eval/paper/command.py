@@ -40,6 +40,7 @@ def paper(
     depth: PositiveInt = 4,
     length: PositiveInt = 8,
     num_plans: PositiveInt = 256,
+    steps: PositiveInt = 1000,
     seed: NonNegativeInt = 0,
     out: str = "runs/paper",
 ) -> None:
@@ -71,6 +72,7 @@ def paper(
         depth: moves in a plan of the deterministic planner.
         length: moves in a plan of the others.
         num_plans: candidate plans of the others.
+        steps: of training of each neural prior, at most.
         seed: of everything random.
         out: folder to write to.
     """

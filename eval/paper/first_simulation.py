@@ -123,7 +123,7 @@ def simulate(settings: PaperSettings, neural: bool, finished: Finished) -> First
     learn_in = more * cells + torch.randint(worlds * cells, (settings.training_plans,), generator=generator)
     plans = training_plans(world, learn_in, settings, generator)
     finished("collecting plans")
-    planners = make_planners(fit_priors(plans, settings.seed, neural, generator, finished), settings)
+    planners = make_planners(fit_priors(plans, settings, neural, generator, finished), settings)
     start = torch.randint(cells, (worlds, starts), generator=generator)
     states = start + torch.arange(worlds)[:, None] * cells
     decisions = {}

@@ -47,6 +47,7 @@ class PaperSettings:
     depth: int
     length: int
     num_plans: int
+    steps: int
     seed: int
 
     @property
@@ -61,7 +62,7 @@ class PaperSettings:
 
 
 def fit_priors(
-    plans: Plans, seed: int, neural: bool, generator: torch.Generator, finished: Finished
+    plans: Plans, settings: PaperSettings, neural: bool, generator: torch.Generator, finished: Finished
 ) -> dict[str, Prior]:
     """The priors of the tables by name, with the neural ones or without.
 
@@ -73,7 +74,8 @@ def fit_priors(
         priors[f"markov-{order}"] = MarkovPrior(4, order).fit(plans)
     if neural:
         for name, make in (("gru", GRUPrior), ("transformer", TransformerPrior)):
-            priors[name] = make(4, seed=seed).fit(plans, generator=generator, progress=False)
+            prior = make(4, seed=settings.seed)
+            priors[name] = prior.fit(plans, generator=generator, progress=False, max_steps=settings.steps)
             finished(f"training: {name}")
     return priors
 

@@ -170,7 +170,7 @@ def learn(
     group = groups(world, states[done.start[kept]])
     finished("collecting plans")
     plans = Plans(done.plans[kept], 4, action_names=world.action_names, group=group)
-    return fit_priors(plans, settings.seed, neural, generator, finished)
+    return fit_priors(plans, settings, neural, generator, finished)
 
 
 def simulate(settings: PaperSettings, full: bool, finished: Finished) -> tuple[SecondResult, dict[str, Prior]]:

@@ -20,7 +20,7 @@ from neuroprior import Plans, gridworld
 from neuroprior._files import write_json
 
 SMALL = ["--worlds=3", "--starts=20", "--training-plans=200", "--size=8", "--num-plans=16"]
-SMALL += ["--value-functions=2", "--q-steps=300", "--max-plans=2"]
+SMALL += ["--value-functions=2", "--q-steps=300", "--max-plans=2", "--steps=30"]
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_protocols_choose_the_plans_they_say(edges: str) -> None:
     generator = torch.Generator().manual_seed(1)
 
     def chosen(ties: str, learn_from: str) -> Plans:
-        settings = PaperSettings(2, 300, 300, 9, edges, ties, learn_from, 1.0, 2, 0, 0.01, 1, 3, 3, 16, 0)
+        settings = PaperSettings(2, 300, 300, 9, edges, ties, learn_from, 1.0, 2, 0, 0.01, 1, 3, 3, 16, 10, 0)
         return training_plans(world, states, settings, generator)
 
     first, uniform = chosen("first", "all"), chosen("uniform", "all")

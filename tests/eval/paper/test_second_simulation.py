@@ -31,6 +31,7 @@ def settings(**changes: object) -> PaperSettings:
         "depth": 3,
         "length": 4,
         "num_plans": 32,
+        "steps": 10,
         "seed": 0,
     }
     return PaperSettings(**(small | changes))
