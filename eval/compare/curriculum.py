@@ -142,7 +142,9 @@ def first_and_last(frame: pd.DataFrame) -> pd.DataFrame:
     longest = frame[frame["length"] == frame.groupby("world")["length"].transform("max")]
     by = [*PRIOR, "seed"]
     ends = longest.sort_values("round", kind="stable").groupby(by, sort=False)
-    found = ends.agg(first=("share", "last"), second=("share", "first"), length=("length", "max"), rounds=("round", "max"))
+    found = ends.agg(
+        first=("share", "last"), second=("share", "first"), length=("length", "max"), rounds=("round", "max")
+    )
     return found.reset_index()
 
 
@@ -196,7 +198,7 @@ def curriculum_figure(rows: pd.DataFrame) -> Figure:
         panel.set_xlabel(ACROSS[by])
         panel.set_title(fixed)
         panel.grid(axis="y")
-    axes[0].set_ylabel("normalised score, % of the optimum")
+    axes[0].set_ylabel("normalised score,\n% of the optimum")
     axes[0].yaxis.set_major_formatter(PercentFormatter(1, symbol=""))
     legend(figure, axes[0].get_legend_handles_labels()[0])
     return figure

@@ -32,7 +32,9 @@ def planner_document(
         baseline: the planner that the others are compared with.
         title: of the page.
     """
-    frame = pd.DataFrame([{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["entries"]])
+    frame = pd.DataFrame(
+        [{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["entries"]]
+    )
     rows, pairs = planner_rows(frame), planner_pairs(frame, baseline)
     gaps = paired_differences(pairs, PLACE)
     # Worlds offer unlike contexts: of each, the last counts.
@@ -127,7 +129,7 @@ def planner_figure(rows: pd.DataFrame) -> Figure:
         panel.set_title(prior if context == "none" else f"{prior}, context: {context}")
         panel.set_xlabel("model steps per start")
         panel.grid(axis="y")
-    axes[0].set_ylabel("normalised score, % of the optimum")
+    axes[0].set_ylabel("normalised score,\n% of the optimum")
     axes[0].yaxis.set_major_formatter(PercentFormatter(1, symbol=""))
     legend(figure, axes[0].get_legend_handles_labels()[0])
     return figure

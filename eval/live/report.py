@@ -63,7 +63,9 @@ def live_frame(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     `reward` in the whole run, `after` and `late`: in the first and the last quarter of all seasons but the first; NaN
     where there is but one season.
     """
-    frame = pd.DataFrame([{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["entries"]])
+    frame = pd.DataFrame(
+        [{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["entries"]]
+    )
     rewards = 100 * np.array(frame["rewards"].tolist()).reshape(len(frame), -1, PARTS)
     quarters = {"reward": rewards, "after": rewards[:, 1:, : PARTS // 4], "late": rewards[:, 1:, -PARTS // 4 :]}
     means = {name: some.mean((1, 2)) if some.size else np.nan for name, some in quarters.items()}

@@ -41,7 +41,9 @@ _tasks = (
         lambda seed: egocentric(_maze(seed)),
         8,
     ),
-    ForagingTask("forage_labyrinth", "the labyrinth of the mice, 127 nodes of a binary tree", lambda seed: labyrinth(), 3),
+    ForagingTask(
+        "forage_labyrinth", "the labyrinth of the mice, 127 nodes of a binary tree", lambda seed: labyrinth(), 3
+    ),
 )
 FORAGING_WORLDS = {task.name: task for task in _tasks}
 """By name. A patch covers from a thirtieth (grid) to a twelfth (labyrinth) of each."""
