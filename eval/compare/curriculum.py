@@ -23,6 +23,7 @@ from eval.worlds.runs import (
     check_distinct,
     command_line,
     difference_table,
+    frame_of,
     paired_differences,
     plus_minus,
     runs_of,
@@ -104,10 +105,11 @@ def grow(
 
 def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
     """The tables and figures of the results of `curriculum_run`."""
-    frame = pd.DataFrame([{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["growth"]])
+    frame = frame_of(results, "growth")
     rows, pairs = curriculum_rows(frame), first_and_last(frame)
     gaps, across = paired_differences(pairs, PRIOR), across_worlds(pairs, PRIOR[1:])
-    tables, boxes = [], []
+    tables: list[Table] = []
+    boxes = []
     for world, own in rows.groupby("world", sort=False):
         tables += curriculum_tables(own)
         if len(here := gaps[gaps["world"] == world]):
@@ -130,8 +132,8 @@ def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
 
 
 def curriculum_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """The normalised score with its interval over seeds, a row a world, prior, round, and length and number of plans."""
-    found = mean_intervals(frame, [*PRIOR, "round", "length", "num_plans"], "share")
+    """The normalised score with its interval over seeds, a row a world, prior, round and length of plans."""
+    found: pd.DataFrame = mean_intervals(frame, [*PRIOR, "round", "length", "num_plans"], "share")
     return found.rename(columns={"mean": "oracle_share", "n": "seeds"})
 
 
@@ -140,18 +142,16 @@ def first_and_last(frame: pd.DataFrame) -> pd.DataFrame:
     first round, `second`.
     """
     longest = frame[frame["length"] == frame.groupby("world")["length"].transform("max")]
-    by = [*PRIOR, "seed"]
-    ends = longest.sort_values("round", kind="stable").groupby(by, sort=False)
-    found = ends.agg(
-        first=("share", "last"), second=("share", "first"), length=("length", "max"), rounds=("round", "max")
-    )
-    return found.reset_index()
+    ends = longest.sort_values("round", kind="stable").groupby([*PRIOR, "seed"], sort=False)
+    last = ends.last().rename(columns={"share": "first", "round": "rounds"})
+    return last.assign(second=ends["share"].first()).reset_index()
 
 
 def gain_rows(pairs: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
     """The mean gain of `first_and_last` with its interval over seeds, a row a world and prior."""
     gains = pairs.assign(gain=pairs["first"] - pairs["second"])
-    found = mean_intervals(gains, [*PRIOR, "length", "rounds"], "gain").rename(columns={"mean": "gain", "n": "seeds"})
+    found: pd.DataFrame = mean_intervals(gains, [*PRIOR, "length", "rounds"], "gain")
+    found = found.rename(columns={"mean": "gain", "n": "seeds"})
     return found.merge(gaps[[*PRIOR, "p_value", "p_holm"]], "left", PRIOR)
 
 

@@ -89,7 +89,8 @@ def depth_run(run: Run, settings: DepthSettings) -> dict[str, Any]:
     """
     task = replace(TASKS[run.world], any_prefix=True)
     contest = Contest(task, run.seed, replace(settings, context=task.contexts[-1:]), ORDERS)
-    longest, how = settings.length, {"objective": task.objective, "discount": task.discount}
+    how: dict[str, Any] = {"objective": task.objective, "discount": task.discount}
+    longest = settings.length
     starts = starts_of(task, contest.worlds.held_out, settings.starts, longest, contest.generator)
     horizons = [2**k for k in range(1, longest.bit_length())]
     entries: list[dict[str, Any]] = []

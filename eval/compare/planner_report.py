@@ -7,7 +7,15 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from eval.worlds.runs import across_table, across_worlds, difference_table, paired_differences, plus_minus, significance
+from eval.worlds.runs import (
+    across_table,
+    across_worlds,
+    difference_table,
+    frame_of,
+    paired_differences,
+    plus_minus,
+    significance,
+)
 from neuroprior.analysis.statistics import mean_intervals
 from neuroprior.report.document import Document, table
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
@@ -32,9 +40,7 @@ def planner_document(
         baseline: the planner that the others are compared with.
         title: of the page.
     """
-    frame = pd.DataFrame(
-        [{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["entries"]]
-    )
+    frame = frame_of(results)
     rows, pairs = planner_rows(frame), planner_pairs(frame, baseline)
     gaps = paired_differences(pairs, PLACE)
     # Worlds offer unlike contexts: of each, the last counts.
@@ -66,7 +72,7 @@ def planner_document(
 
 def planner_rows(frame: pd.DataFrame) -> pd.DataFrame:
     """The normalised score with its interval over seeds, a row a world, planner, prior and number of plans."""
-    found = mean_intervals(frame, PLACE, "share")
+    found: pd.DataFrame = mean_intervals(frame, PLACE, "share")
     means = frame.groupby(PLACE, sort=False)[["model_steps", "seconds"]].mean().reset_index(drop=True)
     return found[PLACE].assign(
         model_steps=means["model_steps"],
@@ -120,13 +126,13 @@ def planner_figure(rows: pd.DataFrame) -> Figure:
     priors = list(rows.groupby(["prior", "sees"], sort=False))
     figure, axes = panels(1, len(priors), (WIDTH, 3.2), sharey=True)
     for panel, ((prior, context), own) in zip(axes, priors, strict=True):
-        for planner, some in own.groupby("planner", sort=False):
+        for planner, (color, style) in styles.items():
+            some = own[own["planner"] == planner]
             points = some[["model_steps", "oracle_share", "low", "high"]].sort_values("model_steps")
-            color, style = styles[planner]
             band(panel, list(points.itertuples(index=False, name=None)), color, planner, style)
         panel.set_xscale("log", base=2)
         panel.set_xticks(places, [f"{place:,}" for place in places])
-        panel.set_title(prior if context == "none" else f"{prior}, context: {context}")
+        panel.set_title(str(prior) if context == "none" else f"{prior}, context: {context}")
         panel.set_xlabel("model steps per start")
         panel.grid(axis="y")
     axes[0].set_ylabel("normalised score,\n% of the optimum")

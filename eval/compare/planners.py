@@ -6,7 +6,7 @@ from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import torch
 
@@ -42,7 +42,7 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
 }
 """By their names in tables; "replanning" is halving in a closed loop, planning anew after each action."""
 
-PlannerName = Literal[tuple(PLANNERS)]  # type: ignore[valid-type]
+PlannerName: TypeAlias = Literal[tuple(PLANNERS)]  # type: ignore[valid-type]
 
 STOCHASTIC, ONLY_STOCHASTIC = {"sampling", "cross-entropy", "halving", "replanning"}, {"halving", "replanning"}
 """Planners for stochastic worlds, and those that plan like another one in deterministic worlds."""

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from jsonargparse.typing import PositiveInt, restricted_number_type
 
@@ -17,8 +17,8 @@ from neuroprior._files import written_whole
 from neuroprior._jobs import JobRun
 from neuroprior.report.document import publish
 
-Kind = Literal[tuple(LEARN_EVERY)]  # type: ignore[valid-type]
-Items = restricted_number_type("Items", int, [(">=", 1), ("<=", 8)], docstring="More food would take the oracle long.")
+Kind: TypeAlias = Literal[tuple(LEARN_EVERY)]  # type: ignore[valid-type]
+Items: TypeAlias = restricted_number_type("Items", int, [(">=", 1), ("<=", 8)], docstring="More takes the oracle long.")  # type: ignore[valid-type]
 
 
 def live(

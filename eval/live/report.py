@@ -8,9 +8,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from eval.live.run import FORESIGHT, ORACLE, PARTS, RANDOM
-from eval.worlds.runs import across_table, across_worlds, difference_table, paired_differences, plus_minus, significance
+from eval.worlds.runs import (
+    across_table,
+    across_worlds,
+    difference_table,
+    frame_of,
+    paired_differences,
+    plus_minus,
+    significance,
+)
 from neuroprior.analysis.statistics import mean_intervals
-from neuroprior.report.document import Document, table
+from neuroprior.report.document import Column, Document, table
 from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
 from neuroprior.report.page import FigureBox, Section, Table
 
@@ -38,8 +46,8 @@ def live_document(
     for world, one in about.items():
         places = np.mean([result["places"] for result in results if result["world"] == world])
         caption = (
-            f"{world}: {one['about']}; food grows in a patch of about {places:.0f} places, which moves with every season."
-            " Bands: Student's 95 % intervals over seeds."
+            f"{world}: {one['about']}; food grows in a patch of about {places:.0f} places, which moves with every"
+            " season. Bands: Student's 95 % intervals over seeds."
         )
         alt = f"Food eaten in 100 steps in {world} against time, a line a prior; the numbers are in the tables."
         boxes.append(FigureBox(pictures[world], caption, alt))
@@ -63,9 +71,7 @@ def live_frame(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     `reward` in the whole run, `after` and `late`: in the first and the last quarter of all seasons but the first; NaN
     where there is but one season.
     """
-    frame = pd.DataFrame(
-        [{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["entries"]]
-    )
+    frame = frame_of(results)
     rewards = 100 * np.array(frame["rewards"].tolist()).reshape(len(frame), -1, PARTS)
     quarters = {"reward": rewards, "after": rewards[:, 1:, : PARTS // 4], "late": rewards[:, 1:, -PARTS // 4 :]}
     means = {name: some.mean((1, 2)) if some.size else np.nan for name, some in quarters.items()}
@@ -78,7 +84,7 @@ def live_rows(frame: pd.DataFrame) -> pd.DataFrame:
     `oracle_share`: the reward as a share of the oracle's.
     """
     by = ["world", *CONDITION]
-    found = mean_intervals(frame, by, "reward")
+    found: pd.DataFrame = mean_intervals(frame, by, "reward")
     means = frame.groupby(by, sort=False)[["after", "late", "model_steps", "seconds"]].mean().reset_index(drop=True)
     best = found[found["prior"] == "oracle"].set_index("world")["mean"].clip(lower=1e-12)
     rows = found.rename(columns={"mean": "reward", "n": "seeds"}).join(means)
@@ -111,7 +117,8 @@ def live_table(rows: pd.DataFrame, gaps: pd.DataFrame, world: str) -> Table:
     """Rewards in one world, a row a condition."""
     against_random = gaps[gaps["against"] == "random"].assign(warm_start=True)
     own = rows[rows["world"] == world].merge(against_random[["world", *CONDITION, "p_holm"]], "left")
-    columns = NAMES | {
+    columns: dict[str, Column] = {
+        **NAMES,
         "learns": lambda row: row["learns"] + ("" if row["warm_start"] else ", cold"),
         "eaten": lambda row: plus_minus(row, "reward") + "*" * bool(row["p_holm"] < 0.05),
         "%": lambda row: f"{100 * row['oracle_share']:,.0f}",

@@ -131,7 +131,7 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
 
 def _prior(condition: Condition, table: TabularWorld, seed: int) -> Prior:
     """A prior that has learned nothing yet."""
-    context = {"num_contexts": table.num_states} if condition.sees == "per-step" else {}
+    context: dict[str, Any] = {"num_contexts": table.num_states} if condition.sees == "per-step" else {}
     if condition.prior == "markov":
         return MarkovPrior(table.num_actions, ORDERS[condition.sees], **context)
     if condition.prior == "gru":

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
-from neuroprior.worlds import TabularWorld, egocentric, gridworld, labyrinth, maze
+from neuroprior.worlds import GridWorld, TabularWorld, egocentric, gridworld, labyrinth, maze
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ def _grid(seed: int) -> TabularWorld:
     return gridworld(20, 20, edges="torus", seed=seed)
 
 
-def _maze(seed: int) -> TabularWorld:
+def _maze(seed: int) -> GridWorld:
     return maze(15, 15, seed=seed)
 
 
@@ -48,4 +48,4 @@ _tasks = (
 FORAGING_WORLDS = {task.name: task for task in _tasks}
 """By name. A patch covers from a thirtieth (grid) to a twelfth (labyrinth) of each."""
 
-ForagingWorldName = Literal[tuple(FORAGING_WORLDS)]  # type: ignore[valid-type]
+ForagingWorldName: TypeAlias = Literal[tuple(FORAGING_WORLDS)]  # type: ignore[valid-type]

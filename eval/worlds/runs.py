@@ -62,6 +62,11 @@ def command_line(name: str) -> str:
     return "python -m eval " + shlex.join(given)
 
 
+def frame_of(results: Sequence[Mapping[str, Any]], key: str = "entries") -> pd.DataFrame:
+    """The rows that the results of runs hold under `key`, each with the world and the seed of its run."""
+    return pd.DataFrame([{"world": one["world"], "seed": one["seed"], **row} for one in results for row in one[key]])
+
+
 def paired_differences(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     """How much higher `first` is than `second`, paired by seed, for each group of rows; see `paired_difference`.
 

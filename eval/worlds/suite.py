@@ -7,7 +7,7 @@ To add a world, add a `Task` to `_tasks` below. Its `worlds` makes three worlds 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import torch
 from torch import Tensor
@@ -86,7 +86,7 @@ class Task:
 
 _ENDS = "the reward where a plan ends; new walls and rewards held out"
 _SQUARES = "which of the 24 squares around it are free"
-# Of the squares around, five rows of five without the middle: the eight nearest, and those that actions lead or turn to.
+# Of the squares around, five rows of five without the middle, the eight nearest.
 _EIGHT = (6, 7, 8, 11, 12, 15, 16, 17)
 
 _moving: dict[str, Any] = {
@@ -231,7 +231,7 @@ _tasks = (
 TASKS = {task.name: task for task in _tasks}
 """By name."""
 
-WorldName = Literal[tuple(TASKS)]  # type: ignore[valid-type]
+WorldName: TypeAlias = Literal[tuple(TASKS)]  # type: ignore[valid-type]
 """A name of `TASKS`, as the type of an option."""
 
 

@@ -6,7 +6,7 @@ from eval.worlds.minigrid import KINDS, MOVES, NEAR, SIDE, layouts
 
 
 def test_what_is_observed_is_what_can_be_done():
-    """An agent that can go forward observes a free square; that can open a door, a closed one; that can take a key, it."""
+    """An agent that can go forward observes a free square, one that can open a door a closed one, and so on."""
     world = layouts("MiniGrid-DoorKey-5x5-v0", range(2))
     assert world.num_layouts == 2
     assert world.features.shape == (world.num_states, SIDE * SIDE * KINDS)
