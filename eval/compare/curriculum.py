@@ -1,9 +1,6 @@
 """`python -m eval grow`: what priors gain from the horizon curriculum, in which they learn from ever longer plans."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
-from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,23 +11,8 @@ from matplotlib.ticker import PercentFormatter
 
 from eval.compare.command import KINDS, Kind, TrainingStarts
 from eval.compare.run import Settings, curriculum_run
-from eval.worlds.runs import (
-    MAKERS,
-    PowerOfTwo,
-    Seed,
-    across_table,
-    across_worlds,
-    check_distinct,
-    command_line,
-    difference_table,
-    frame_of,
-    paired_differences,
-    plus_minus,
-    runs_of,
-    significance,
-)
+from eval.worlds import runs
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
-from neuroprior._jobs import JobRun
 from neuroprior.analysis.statistics import mean_intervals
 from neuroprior.report.document import Document, publish, records, table, write_frames
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
@@ -48,13 +30,13 @@ def grow(
     worlds: Sequence[WorldName] = tuple(TASKS),
     lengths: Sequence[PositiveInt] | None = None,
     seeds: PositiveInt = 5,
-    num_plans: PowerOfTwo = 256,
+    num_plans: runs.PowerOfTwo = 256,
     kinds: Sequence[Kind] = KINDS,
     context: Sequence[Context] = ("none",),
     steps: PositiveInt = 600,
     starts: PositiveInt = 32,
     training_starts: TrainingStarts = 1000,
-    seed: Seed = 0,
+    seed: runs.Seed = 0,
     processes: PositiveInt | None = None,
     dask: str | None = None,
     out: str = "runs/grow",
@@ -81,7 +63,7 @@ def grow(
         dask: address of a Dask scheduler, tcp://host:port, whose workers do the runs.
         out: folder for the report and for finished runs.
     """
-    check_distinct(worlds=worlds, kinds=kinds, context=context)
+    runs.check_distinct(worlds=worlds, kinds=kinds, context=context)
     check_contexts(worlds, context)
     longer = tuple(lengths or ())
     if list(longer) != sorted(set(longer)):
@@ -93,35 +75,31 @@ def grow(
     rounds = len(longer) or ROUNDS
     how = (tuple(kinds), tuple(context), rounds, steps, starts, training_starts, seed)
     settings = Settings((num_plans,), *how, lengths=longer)
-    folder, asked = Path(out), {"command": "grow", **settings.asked}
-    work = partial(curriculum_run, settings=settings)
-    jobs = JobRun(work, folder / "runs", asked, name=attrgetter("name"), packages=MAKERS)
-    results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title="grow")
-    told = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-    document = curriculum_document(results, told, command_line("grow"))
-    publish(document, folder)
-    write_frames(folder, {"grow": pd.DataFrame(document.results["rows"])})
+    found = runs.finished("grow", curriculum_run, settings, worlds, seeds, out, processes, dask)
+    document = curriculum_document(*found, runs.command_line("grow"))
+    publish(document, Path(out))
+    write_frames(Path(out), {"grow": pd.DataFrame(document.results["rows"])})
 
 
 def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
     """The tables and figures of the results of `curriculum_run`."""
-    frame = frame_of(results, "growth")
+    frame = runs.frame_of(results, "growth")
     rows, pairs = curriculum_rows(frame), first_and_last(frame)
-    gaps, across = paired_differences(pairs, PRIOR), across_worlds(pairs, PRIOR[1:])
+    gaps, across = runs.paired_differences(pairs, PRIOR), runs.across_worlds(pairs, PRIOR[1:])
     tables: list[Table] = []
     boxes = []
     for world, own in rows.groupby("world", sort=False):
         tables += curriculum_tables(own)
         if len(here := gaps[gaps["world"] == world]):
             above = f"{world}: after the last round minus before the first, plans of {own['length'].max()} actions"
-            tables.append(difference_table(here, above, NAMES, "normalised score, % of the optimum", 100))
+            tables.append(runs.difference_table(here, above, NAMES, "normalised score, % of the optimum", 100))
         caption = f"{world}: {own['num_plans'].iloc[0]:,} candidates for each start; bands: 95 % intervals over seeds."
         alt = f"Normalised score in {world} against rounds and actions in a plan; the numbers are in the tables."
         boxes.append(FigureBox(curriculum_figure(own), caption, alt))
     if len(across):
         unit = "the normalised score of the longest plans, % of the optimum"
-        tables.append(across_table(across, NAMES, "after", "before", unit, 100))
-    lead = significance(gaps, "Normalised scores after the last round of the curriculum against before the first")
+        tables.append(runs.across_table(across, NAMES, "after", "before", unit, 100))
+    lead = runs.significance(gaps, "Normalised scores after the last round of the curriculum against before the first")
     sections = [
         Section("Normalised score against rounds and length of plans", [], figures=boxes),
         Section("Tables", [], tables),
@@ -171,7 +149,7 @@ def curriculum_tables(rows: pd.DataFrame) -> Iterator[Table]:
     world, number, seeds = (rows[name].iloc[0] for name in ("world", "num_plans", "seeds"))
     over = f"; ±: half of Student's 95 % interval over {seeds} seeds." if seeds > 1 else "; a single seed."
     for by, fixed, own in views(rows):
-        own = own.assign(score=[plus_minus(row, "oracle_share", 100) for _, row in own.iterrows()])
+        own = own.assign(score=[runs.plus_minus(row, "oracle_share", 100) for _, row in own.iterrows()])
         cells = own.pivot_table("score", ["prior", "sees"], by, aggfunc="first", sort=False).sort_index(axis=1)
         cells = cells.rename(columns=str)
         caption = f"Normalised score, % of the optimum, by {ACROSS[by]}; {number:,} candidates{over}"

@@ -1,9 +1,7 @@
 """`python -m eval depth`: how deep to plan, and who should choose it: every fixed horizon against a chosen one."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from operator import attrgetter
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,8 @@ from eval.compare.curves import starts_of
 from eval.compare.planner_report import planner_document
 from eval.compare.planners import ORDERS, planned
 from eval.compare.run import Contest, Settings
-from eval.worlds.runs import MAKERS, PowerOfTwo, Run, Seed, check_distinct, command_line, runs_of
+from eval.worlds import runs
 from eval.worlds.suite import TASKS, WorldName
-from neuroprior._jobs import JobRun
 from neuroprior.planners import HorizonPlanner, Planner, SamplingPlanner
 from neuroprior.report.document import publish
 
@@ -27,23 +24,19 @@ CHOSEN = "chosen"
 
 @dataclass(frozen=True)
 class DepthSettings(Settings):
-    """All that decides the results of a run, beside its world and seed.
-
-    Attributes:
-        length: the longest horizon.
-    """
+    """As `Settings`, with the longest horizon."""
 
     length: int = 64
 
 
 def depth(
     worlds: Sequence[WorldName] = WORLDS,
-    num_plans: Sequence[PowerOfTwo] = (4, 16, 64),
+    num_plans: Sequence[runs.PowerOfTwo] = (4, 16, 64),
     seeds: PositiveInt = 20,
-    length: PowerOfTwo = 64,
+    length: runs.PowerOfTwo = 64,
     starts: PositiveInt = 32,
     training_starts: PositiveInt = 1000,
-    seed: Seed = 0,
+    seed: runs.Seed = 0,
     processes: PositiveInt | None = None,
     dask: str | None = None,
     out: str = "runs/depth",
@@ -67,22 +60,18 @@ def depth(
         dask: address of a Dask scheduler, tcp://host:port, whose workers do the runs.
         out: folder for the report and for finished runs.
     """
-    check_distinct(worlds=worlds, num_plans=num_plans)
+    runs.check_distinct(worlds=worlds, num_plans=num_plans)
     if length < 2:
         raise ValueError(f"length: a power of two from 2 is expected, not {length}")
     for world in worlds:
         if TASKS[world].worlds(0).held_out.stochastic:
             raise ValueError(f"worlds: deterministic ones are expected, not {world}")
     settings = DepthSettings(tuple(num_plans), ("markov",), (), 9, 1, starts, training_starts, seed, length=length)
-    folder, asked = Path(out), {"command": "depth", **settings.asked}
-    work = partial(depth_run, settings=settings)
-    jobs = JobRun(work, folder / "runs", asked, name=attrgetter("name"), packages=MAKERS)
-    results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title="depth")
-    told = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-    publish(planner_document(results, told, command_line("depth"), CHOSEN, "How deep to plan"), folder)
+    found = runs.finished("depth", depth_run, settings, worlds, seeds, out, processes, dask)
+    publish(planner_document(*found, runs.command_line("depth"), CHOSEN, "How deep to plan"), Path(out))
 
 
-def depth_run(run: Run, settings: DepthSettings) -> dict[str, Any]:
+def depth_run(run: runs.Run, settings: DepthSettings) -> dict[str, Any]:
     """Collect plans, fit priors, extend their horizons, and plan with every horizon in one seed's worlds.
 
     Returns, raises: see `eval.compare.planners.planner_run`.

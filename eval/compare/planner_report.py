@@ -7,15 +7,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from eval.worlds.runs import (
-    across_table,
-    across_worlds,
-    difference_table,
-    frame_of,
-    paired_differences,
-    plus_minus,
-    significance,
-)
+from eval.worlds import runs
 from neuroprior.analysis.statistics import mean_intervals
 from neuroprior.report.document import Document, table
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
@@ -40,12 +32,12 @@ def planner_document(
         baseline: the planner that the others are compared with.
         title: of the page.
     """
-    frame = frame_of(results)
+    frame = runs.frame_of(results)
     rows, pairs = planner_rows(frame), planner_pairs(frame, baseline)
-    gaps = paired_differences(pairs, PLACE)
+    gaps = runs.paired_differences(pairs, PLACE)
     # Worlds offer unlike contexts: of each, the last counts.
     last = pairs.drop_duplicates(["world", "planner", "prior", "num_plans", "seed"], keep="last")
-    across = across_worlds(last, ["prior", "planner", "num_plans"])
+    across = runs.across_worlds(last, ["prior", "planner", "num_plans"])
     most = frame["num_plans"].max()
     score = "normalised score, % of the optimum"
     tables, boxes = [], []
@@ -54,14 +46,14 @@ def planner_document(
         tables.append(planner_table(here, gaps, baseline))
         if len(shown := learned[learned["num_plans"] == most]):
             above = f"{world}, {most:,} plans: differences to {baseline}"
-            tables.append(difference_table(shown, above, NAMES, score, 100))
+            tables.append(runs.difference_table(shown, above, NAMES, score, 100))
         alt = f"Normalised score in {world} against model steps, a line a planner; the numbers are in the tables."
         caption = f"{world}: {about}. Bands: Student's 95 % intervals over seeds."
         boxes.append(FigureBox(planner_figure(here), caption, alt))
     if len(shown := across[across["num_plans"] == most]):
         names = {"prior": "prior", "planner": "planner"}
-        tables.append(across_table(shown, names, "score", baseline, f"the {score}, {most:,} plans", 100))
-    lead = significance(gaps, f"Normalised scores against {baseline}")
+        tables.append(runs.across_table(shown, names, "score", baseline, f"the {score}, {most:,} plans", 100))
+    lead = runs.significance(gaps, f"Normalised scores against {baseline}")
     sections = [
         Section("Normalised score against model steps", [], figures=boxes),
         Section("Tables", [], tables),
@@ -95,7 +87,7 @@ def planner_pairs(frame: pd.DataFrame, baseline: str) -> pd.DataFrame:
 def planner_table(rows: pd.DataFrame, gaps: pd.DataFrame, baseline: str) -> Table:
     """Normalised scores in one world, a row a prior and planner; stars mark significant differences."""
     own = rows.merge(gaps[[*PLACE, "p_holm"]], "left", PLACE)
-    own["score"] = [plus_minus(r, "oracle_share", 100) + "*" * bool(r["p_holm"] < 0.05) for _, r in own.iterrows()]
+    own["score"] = [runs.plus_minus(r, "oracle_share", 100) + "*" * bool(r["p_holm"] < 0.05) for _, r in own.iterrows()]
     cells = own.pivot_table("score", ["prior", "sees", "planner"], "num_plans", aggfunc="first", sort=False)
     cells = cells.sort_index(axis=1).rename(columns=lambda number: f"{number:,} plans")
     slowest = own[own["num_plans"] == own["num_plans"].max()].set_index(["prior", "sees", "planner"])

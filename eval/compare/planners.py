@@ -1,9 +1,8 @@
 """`python -m eval compare --planners`: several planners with the same priors and as many model steps."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, TypeAlias
@@ -13,9 +12,8 @@ import torch
 from eval.compare.curves import ROLLOUTS, TEMPERATURES, Starts, worth
 from eval.compare.planner_report import planner_document
 from eval.compare.run import Contest, Contestant, Settings
-from eval.worlds.runs import MAKERS, Run, check_distinct, command_line, runs_of
+from eval.worlds import runs
 from eval.worlds.suite import TASKS
-from neuroprior._jobs import JobRun
 from neuroprior.planners import (
     CrossEntropyPlanner,
     DistinctPlanner,
@@ -53,11 +51,7 @@ TRAJECTORIES = 8
 
 @dataclass(frozen=True)
 class PlannerSettings(Settings):
-    """All that decides the results of a run, beside its world and seed; no `context`: the last of each world's.
-
-    Attributes:
-        planners: some of `PLANNERS`.
-    """
+    """As `Settings`, with some of `PLANNERS`; no `context`: the last of each world's."""
 
     planners: tuple[str, ...] = ()
 
@@ -75,7 +69,7 @@ def compare_planners(
     Raises:
         ValueError: a planner is given twice, or no planner suits one of the worlds.
     """
-    check_distinct(planners=settings.planners)
+    runs.check_distinct(planners=settings.planners)
     given = set(settings.planners)
     for world in worlds:
         if given & STOCHASTIC and given - ONLY_STOCHASTIC:
@@ -84,15 +78,11 @@ def compare_planners(
         if not any(suits(name, held_out) for name in settings.planners):
             names = " ".join(settings.planners)
             raise ValueError(f"planners: none of {names} is for {world}; leave it out, or add sampling")
-    folder, asked = Path(out), {"command": "planners", **settings.asked}
-    work = partial(planner_run, settings=settings)
-    jobs = JobRun(work, folder / "runs", asked, name=attrgetter("name"), packages=MAKERS)
-    results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title="compare")
-    told = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-    publish(planner_document(results, told, command_line("compare")), folder)
+    found = runs.finished("compare --planners", planner_run, settings, worlds, seeds, out, processes, dask)
+    publish(planner_document(*found, runs.command_line("compare")), Path(out))
 
 
-def planner_run(run: Run, settings: PlannerSettings) -> dict[str, Any]:
+def planner_run(run: runs.Run, settings: PlannerSettings) -> dict[str, Any]:
     """Collect plans, fit priors, extend their horizons, and plan with each planner and prior, in one seed's worlds.
 
     Returns:

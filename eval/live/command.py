@@ -1,9 +1,6 @@
 """`python -m eval live`: agents that plan, execute and learn while food is eaten and grows elsewhere."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -11,10 +8,9 @@ from jsonargparse.typing import PositiveInt, restricted_number_type
 
 from eval.live.report import live_document
 from eval.live.run import LEARN_EVERY, PARTS, REPLAN_EVERY, LiveSettings, run_live
+from eval.worlds import runs
 from eval.worlds.foraging import FORAGING_WORLDS, ForagingWorldName
-from eval.worlds.runs import Seed, check_distinct, command_line, runs_of
 from neuroprior._files import written_whole
-from neuroprior._jobs import JobRun
 from neuroprior.report.document import publish
 
 Kind: TypeAlias = Literal[tuple(LEARN_EVERY)]  # type: ignore[valid-type]
@@ -31,7 +27,7 @@ def live(
     items: Items = 4,
     num_plans: PositiveInt = 32,
     length: Literal[4, 8, 16] = 16,
-    seed: Seed = 0,
+    seed: runs.Seed = 0,
     processes: PositiveInt | None = None,
     dask: str | None = None,
     out: str = "runs/live",
@@ -59,17 +55,14 @@ def live(
         dask: address of a Dask scheduler, tcp://host:port, whose workers do the runs.
         out: folder for the report and for finished runs.
     """
-    check_distinct(worlds=worlds, kinds=kinds)
+    runs.check_distinct(worlds=worlds, kinds=kinds)
     whole = max(*LEARN_EVERY.values(), PARTS * REPLAN_EVERY)
     if period % whole:
         raise ValueError(f"period: a multiple of {whole} is expected, not {period}")
     settings = LiveSettings(tuple(kinds), period, seasons, agents, items, num_plans, length, seed)
-    folder = Path(out)
-    jobs = JobRun(partial(run_live, settings=settings), folder / "runs", asdict(settings), name=attrgetter("name"))
-    results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title="live")
-    asked = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-    document, pictures = live_document(results, asked, command_line("live"))
-    publish(document, folder)
+    found = runs.finished("live", run_live, settings, worlds, seeds, out, processes, dask)
+    document, pictures = live_document(*found, runs.command_line("live"))
+    publish(document, Path(out))
     for world, figure in pictures.items():
-        with written_whole(folder / f"{world}.png", "wb") as file:
+        with written_whole(Path(out) / f"{world}.png", "wb") as file:
             figure.savefig(file, format="png", dpi=150, bbox_inches="tight", facecolor="white")

@@ -8,15 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from eval.live.run import FORESIGHT, ORACLE, PARTS, RANDOM
-from eval.worlds.runs import (
-    across_table,
-    across_worlds,
-    difference_table,
-    frame_of,
-    paired_differences,
-    plus_minus,
-    significance,
-)
+from eval.worlds import runs
 from neuroprior.analysis.statistics import mean_intervals
 from neuroprior.report.document import Column, Document, table
 from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
@@ -35,11 +27,11 @@ def live_document(
     """The tables and figures of the results of `run_live`, and the figures by world."""
     frame = live_frame(results)
     rows, pairs = live_rows(frame), live_pairs(frame)
-    gaps = paired_differences(pairs, ["world", *CONDITION[:3], "against"])
+    gaps = runs.paired_differences(pairs, ["world", *CONDITION[:3], "against"])
     best = frame[frame["prior"] == "oracle"].set_index(["world", "seed"])["reward"].clip(lower=1e-12)
     pairs = pairs[pairs["against"] == "random"].set_index(["world", "seed"])
     shares = pairs.assign(**{side: pairs[side] / best.loc[pairs.index] for side in ("first", "second")}).reset_index()
-    across = across_worlds(shares, CONDITION[:3])
+    across = runs.across_worlds(shares, CONDITION[:3])
     about = {result["world"]: result for result in results}
     pictures = {world: live_figure(frame, world, one["period"]) for world, one in about.items()}
     boxes = []
@@ -51,15 +43,15 @@ def live_document(
         )
         alt = f"Food eaten in 100 steps in {world} against time, a line a prior; the numbers are in the tables."
         boxes.append(FigureBox(pictures[world], caption, alt))
-    lead = significance(gaps, "Food eaten in 100 steps")
+    lead = runs.significance(gaps, "Food eaten in 100 steps")
     tables = []
     for world in about:
         tables.append(live_table(rows, gaps, world))
         if len(own := gaps[gaps["world"] == world]):
             names = NAMES | {"against": "against"}
-            tables.append(difference_table(own, f"{world}: differences", names, "food eaten in 100 steps"))
+            tables.append(runs.difference_table(own, f"{world}: differences", names, "food eaten in 100 steps"))
     if len(across):
-        tables.append(across_table(across, NAMES, "agent", "random", "food eaten, % of the oracle's", 100))
+        tables.append(runs.across_table(across, NAMES, "agent", "random", "food eaten, % of the oracle's", 100))
     sections = [Section("Food eaten against time", [], figures=boxes), Section("Tables", [], tables)]
     frames = {"rows": rows, "paired": gaps, "across": across}
     return Document("Online learning", lead, sections, frames, settings, command, {"words": [lead]}), pictures
@@ -71,7 +63,7 @@ def live_frame(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     `reward` in the whole run, `after` and `late`: in the first and the last quarter of all seasons but the first; NaN
     where there is but one season.
     """
-    frame = frame_of(results)
+    frame = runs.frame_of(results)
     rewards = 100 * np.array(frame["rewards"].tolist()).reshape(len(frame), -1, PARTS)
     quarters = {"reward": rewards, "after": rewards[:, 1:, : PARTS // 4], "late": rewards[:, 1:, -PARTS // 4 :]}
     means = {name: some.mean((1, 2)) if some.size else np.nan for name, some in quarters.items()}
@@ -120,7 +112,7 @@ def live_table(rows: pd.DataFrame, gaps: pd.DataFrame, world: str) -> Table:
     columns: dict[str, Column] = {
         **NAMES,
         "learns": lambda row: row["learns"] + ("" if row["warm_start"] else ", cold"),
-        "eaten": lambda row: plus_minus(row, "reward") + "*" * bool(row["p_holm"] < 0.05),
+        "eaten": lambda row: runs.plus_minus(row, "reward") + "*" * bool(row["p_holm"] < 0.05),
         "%": lambda row: f"{100 * row['oracle_share']:,.0f}",
         "first": "after:,.1f",
         "last": "late:,.1f",

@@ -41,18 +41,7 @@ HALF_LIFE = 96
 
 @dataclass(frozen=True)
 class LiveSettings:
-    """All that decides the results of a run, beside its world and seed.
-
-    Attributes:
-        kinds: of priors that learn: "markov", "gru".
-        period: steps in a season.
-        seasons: their number.
-        agents: in each world; they share a prior.
-        items: of food.
-        num_plans: candidates of each decision.
-        length: actions in a plan.
-        seed: of everything random.
-    """
+    """All that decides the results of a run, beside its world and seed; see `eval.live.command.live`."""
 
     kinds: tuple[str, ...]
     period: int
@@ -111,16 +100,29 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
     world = ForagingWorld(table, growth, settings.period, settings.items)
     state, own = world.reset(settings.agents, generator), draw_seed(generator)
     steps = settings.period * settings.seasons
+
+    def agent(condition: Condition, prior: Prior, state: torch.Tensor, drawn: torch.Generator, learns: bool) -> Agent:
+        planner: Planner = ForagingOracle(FORESIGHT * settings.length, DISCOUNT)
+        if condition != ORACLE:
+            # The rest of the last plan is one more candidate: without it there is one more plan.
+            number = settings.num_plans + (not condition.warm)
+            planner = SamplingPlanner(prior, settings.length, number, objective="return", discount=DISCOUNT)
+        often = LEARN_EVERY.get(condition.prior)
+        how: dict[str, Any] = {"replan_every": REPLAN_EVERY, "change": world.regrow, "warm_start": condition.warm}
+        how |= {"learn_every": often if learns else None, "retention": 0.5 ** ((often or 1) / HALF_LIFE)}
+        how |= {"plan_length": settings.length, "min_score": 0.0, "training": TRAINING.get(condition.prior)}
+        return Agent(world, planner, prior, state, generator=drawn, **how)
+
     entries = []
     for condition in conditions(settings.kinds):
         drawn = torch.Generator().manual_seed(own)
-        prior = _prior(condition, table, own)
+        prior = untrained(condition, table, own)
         if condition.learns == "before":
             before = world.reset(settings.agents, drawn)
             before[:, 1] = steps
-            _agent(condition, world, prior, world.regrow(before, drawn), settings, drawn).run(settings.period)
+            agent(condition, prior, world.regrow(before, drawn), drawn, True).run(settings.period)
         begin = perf_counter()
-        done = _agent(condition, world, prior, state, settings, drawn, condition.learns == "online").run(steps)
+        done = agent(condition, prior, state, drawn, condition.learns == "online").run(steps)
         rewards = done.rewards.double().mean(0).view(-1, settings.period // PARTS).mean(1)
         entry: dict[str, Any] = condition._asdict() | {"rewards": rewards.tolist()}
         entry |= {"seconds": (perf_counter() - begin) / steps / settings.agents}
@@ -129,43 +131,11 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
     return found | {"places": float((growth > 0).sum(1).double().mean()), "entries": entries}
 
 
-def _prior(condition: Condition, table: TabularWorld, seed: int) -> Prior:
-    """A prior that has learned nothing yet."""
+def untrained(condition: Condition, table: TabularWorld, seed: int) -> Prior:
+    """The prior of a condition, which has learned nothing yet."""
     context: dict[str, Any] = {"num_contexts": table.num_states} if condition.sees == "per-step" else {}
     if condition.prior == "markov":
         return MarkovPrior(table.num_actions, ORDERS[condition.sees], **context)
     if condition.prior == "gru":
         return GRUPrior(table.num_actions, lags=1, dropout=0.2, seed=seed, **context)
     return UniformPrior(table.num_actions)
-
-
-def _agent(
-    condition: Condition,
-    world: ForagingWorld,
-    prior: Prior,
-    state: torch.Tensor,
-    settings: LiveSettings,
-    generator: torch.Generator,
-    learns: bool = True,
-) -> Agent:
-    planner: Planner = ForagingOracle(FORESIGHT * settings.length, DISCOUNT)
-    if condition != ORACLE:
-        # The rest of the last plan is one more candidate: without it there is one more plan.
-        number = settings.num_plans + (not condition.warm)
-        planner = SamplingPlanner(prior, settings.length, number, objective="return", discount=DISCOUNT)
-    often = LEARN_EVERY.get(condition.prior)
-    return Agent(
-        world,
-        planner,
-        prior,
-        state,
-        replan_every=REPLAN_EVERY,
-        change=world.regrow,
-        warm_start=condition.warm,
-        learn_every=often if learns else None,
-        plan_length=settings.length,
-        retention=0.5 ** ((often or 1) / HALF_LIFE),
-        min_score=0.0,
-        generator=generator,
-        training=TRAINING.get(condition.prior),
-    )

@@ -5,13 +5,18 @@ All intervals are Student's, over the seeds of a world: these are what is indepe
 
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from jsonargparse.typing import extend_base_type, restricted_number_type
 
+from neuroprior._jobs import JobRun
 from neuroprior.analysis.statistics import holm, interquartile_mean, paired_difference, probability_of_improvement
 from neuroprior.report.document import Column, table
 from neuroprior.report.page import Table
@@ -45,6 +50,36 @@ class Run(NamedTuple):
 def runs_of(worlds: Sequence[str], seeds: int) -> list[Run]:
     """A run for each of the worlds and each of `seeds` seeds."""
     return [Run(world, seed) for world in worlds for seed in range(seeds)]
+
+
+def finished(
+    command: str,
+    work: Callable[..., dict[str, Any]],
+    settings: Any,
+    worlds: Sequence[str],
+    seeds: int,
+    out: str,
+    processes: int | None = None,
+    dask: str | None = None,
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Do the runs of an experiment that are not finished yet; see `neuroprior._jobs.JobRun`.
+
+    Args:
+        command: the name of the experiment.
+        work: does a run, `work(run, settings=settings)`.
+        settings: a dataclass; its property `asked`, if it has one, says what tells finished runs apart.
+        worlds, seeds: see `runs_of`.
+        out: the folder of the experiment; finished runs are kept in `runs` below it.
+        processes, dask: see `JobRun.do`.
+
+    Returns:
+        The results in the order of `runs_of`; and what was asked, as a report shows it.
+    """
+    asked = {"command": command, **(settings.asked if hasattr(settings, "asked") else asdict(settings))}
+    run = partial(work, settings=settings)
+    jobs = JobRun(run, Path(out) / "runs", asked, name=attrgetter("name"), packages=MAKERS)
+    results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title=command)
+    return results, {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
 
 
 def check_distinct(**options: Sequence[Any]) -> None:
