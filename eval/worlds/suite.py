@@ -153,7 +153,7 @@ _tasks = (
     ),
     Task(
         "goal_maze",
-        about="the same mazes with a goal, whose direction is observed too; reaching it; new walls and goals held out",
+        about="the same mazes with a goal whose direction is observed; reaching it; new walls and goals held out",
         worlds=splits.goal_mazes,
         observation=f"{_SQUARES}, and how far ahead and aside the goal is",
         # With the side on which the goal is, and no more, Markov priors meet the same contexts again.
