@@ -1,37 +1,21 @@
-"""`python -m eval compare --planners`: a small comparison from end to end, and its tables from made-up cells."""
+"""`python -m eval compare --planners`: a small comparison from end to end, and its tables from made-up results."""
 
 import csv
 import json
 import re
 
+import pandas as pd
 import pytest
 
 from eval.__main__ import main
-from eval.compare import command as compare
-from eval.compare import planner_report
-from eval.compare import planners as compare_planners
-from neuroprior.analysis.statistics import paired_difference
+from eval.compare import planners
+from eval.compare.planner_report import planner_document
+from neuroprior.analysis.statistics import interquartile_mean, paired_difference
 from tests.support.reports import FROM_ELSEWHERE
 
-SMALL = [
-    *(
-        "compare",
-        "--planners",
-        "sampling",
-        "distinct",
-        "frontier",
-        "mcts",
-        "cross-entropy",
-        "halving",
-        "replanning",
-        "--kinds",
-        "markov",
-        "--rounds",
-        "1",
-    ),
-    *("--worlds", "grid", "slippery", "--seeds", "2", "--starts", "4", "--training-starts", "60"),
-    *("--num-plans", "4", "16", "--processes", "1"),
-]
+SMALL = ["compare", "--planners", *planners.PLANNERS, "--kinds", "markov", "--rounds", "1", "--processes", "1"]
+SMALL += ["--worlds", "grid", "slippery", "--seeds", "2", "--starts", "4", "--training-starts", "60"]
+SMALL += ["--num-plans", "4", "16"]
 
 
 def test_a_small_comparison(tmp_path, capsys, monkeypatch):
@@ -45,8 +29,8 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     assert names | {"seconds_per_decision"} <= set(rows[0])
     by_world = {world: {row["planner"] for row in rows if row["world"] == world} for world in ("grid", "slippery")}
     assert by_world == {
-        "grid": set(compare_planners.PLANNERS) - compare_planners.ONLY_CHANCE,
-        "slippery": compare_planners.CHANCE,
+        "grid": set(planners.PLANNERS) - planners.ONLY_STOCHASTIC,
+        "slippery": planners.STOCHASTIC,
     }
     assert {row["prior"] for row in rows} == {"uniform", "markov-3"}
     for row in rows:
@@ -62,11 +46,7 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     page = (out / "report.html").read_text()
     assert not re.search(FROM_ELSEWHERE, page)
     assert "cross-entropy" in page
-    monkeypatch.setattr(compare, "PLANNERS", {})  # none is known
-    assert main([*SMALL, "--out", str(out)]) == 2
-    assert "planners" in capsys.readouterr().err
-    monkeypatch.undo()
-    monkeypatch.setattr(compare_planners, "_entry", None)
+    monkeypatch.setattr(planners, "Contest", None)  # finished runs are not done again
     assert main([*SMALL, "--out", str(out)]) == 0
     assert json.loads((out / "results.json").read_text())["rows"] == rows
 
@@ -74,7 +54,7 @@ def test_a_small_comparison(tmp_path, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        (["best"], "planners: 'best' is not known"),
+        (["best"], "planners: one of sampling, distinct, frontier"),
         (["mcts", "mcts"], "planners: each may be given"),
         (["mcts", "--worlds", "grid", "slippery"], "planners: none of mcts is for slippery"),
         (["halving", "--worlds", "grid"], "planners: none of halving is for grid"),
@@ -88,25 +68,31 @@ def test_bad_planners_are_one_line(given, says, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def cells(gap, seeds=4):
+def results(gap, seeds=4, worlds=("maze",)):
     """Samples that reach .5 to .53, and trees that reach `gap` more."""
 
-    def entry(planner, shares):
-        return {"planner": planner, "prior": "gru", "sees": "start", "rounds": 1, "share": shares} | {
-            what: [8 * n for n in (4, 16)] for what in ("model_steps", "seconds")
-        }
+    def entry(planner, number, share):
+        label = {"planner": planner, "prior": "gru", "sees": "initial", "num_plans": number, "share": share}
+        return label | {"model_steps": 8 * number, "seconds": 0.01 * number}
 
-    for seed in range(seeds):
-        low = 0.5 + 0.01 * seed
-        entries = [entry("sampling", [low, low + 0.1]), entry("mcts", [low + gap * (1 + seed % 2), low + 0.1])]
-        yield {"world": "maze", "seed": seed, "about": "a maze", "num_plans": [4, 16], "entries": entries}
+    for world in worlds:
+        for seed in range(seeds):
+            low = 0.5 + 0.01 * seed
+            trees = low + gap * (1 + seed % 2)
+            entries = [entry("sampling", 4, low), entry("sampling", 16, low + 0.1)]
+            entries += [entry("mcts", 4, trees), entry("mcts", 16, low + 0.1)]
+            yield {"world": world, "seed": seed, "about": "a maze", "entries": entries}
+
+
+def shares(made, planner, number, world="maze"):
+    entries = [entry for one in made if one["world"] == world for entry in one["entries"]]
+    return [entry["share"] for entry in entries if (entry["planner"], entry["num_plans"]) == (planner, number)]
 
 
 def test_differences_are_paired_by_seed():
-    made = list(cells(0.2))
-    first, second = planner_report.paired_rows(made)
-    shares = [[cell["entries"][k]["share"][0] for cell in made] for k in (1, 0)]
-    gap = paired_difference(*shares)
+    made = list(results(0.2))
+    first, second = planner_document(made, {}, "").frames["paired"].to_dict("records")
+    gap = paired_difference(shares(made, "mcts", 4), shares(made, "sampling", 4))
     assert first["difference"] == pytest.approx(0.3)
     assert (first["low"], first["high"], first["p_value"]) == pytest.approx((gap.low, gap.high, gap.p_value))
     assert first["p_holm"] == pytest.approx(2 * gap.p_value)
@@ -114,20 +100,33 @@ def test_differences_are_paired_by_seed():
     assert second["p_holm"] == 1
 
 
-def test_what_is_told():
-    made = list(cells(0.2))
-    rows, gaps = planner_report.planner_rows(made), planner_report.paired_rows(made)
-    table = planner_report.table(rows, gaps, "maze")
-    assert [row[:2] for row in table.rows] == [["gru", "sampling"], ["gru", "mcts"]]
-    assert "Learned priors see start." in table.caption
-    assert table.rows[1][2].startswith("81.5 ±")
-    assert table.rows[1][2].endswith("*") == (gaps[0]["p_holm"] < 0.05)
-    said = planner_report.words(rows, gaps, "maze")
-    unclear = "maze, 16 plans: cannot be told apart from sampling in so many tests:"
-    assert said == f"{unclear} mcts with gru, sees start +0.0 (+0.0 to +0.0)."
-    alone = list(cells(0.2, seeds=1))
-    rows = planner_report.planner_rows(alone)
-    assert planner_report.paired_rows(alone) == []
-    assert rows[0]["low"] is None
-    assert "differences need several seeds" in planner_report.words(rows, [], "maze")
-    assert planner_report.table(rows, [], "maze").rows[0][2] == "50.0"
+def test_tables_of_a_world():
+    document = planner_document(list(results(0.2)), {}, "")
+    scores, differences = document.sections[1].tables
+    assert [row[:3] for row in scores.rows] == [["gru", "initial", "sampling"], ["gru", "initial", "mcts"]]
+    assert scores.rows[1][3].startswith("81.5 ±")
+    assert scores.rows[1][3].endswith("*") == bool(document.frames["paired"]["p_holm"][0] < 0.05)
+    assert differences.title == "maze, 16 plans: differences to sampling"
+    assert differences.rows == [["gru", "initial", "mcts", "+0.0", "+0.0 to +0.0", "1.000"]]
+    assert document.lead.startswith("Normalised scores against sampling: 1 of 2 differences are significant")
+    assert document.lead.endswith("1 positive, 0 negative.")
+
+
+def test_a_single_seed_has_no_interval():
+    document = planner_document(list(results(0.2, seeds=1)), {}, "")
+    assert document.frames["paired"].empty
+    assert pd.isna(document.frames["rows"]["low"][0])
+    assert "need at least two seeds" in document.lead
+    assert document.sections[1].tables[0].rows[0][3] == "50.0"
+
+
+def test_aggregates_over_worlds():
+    made = list(results(0.2, worlds=("maze", "grid", "cube")))
+    across = planner_document(made, {}, "").frames["across"]
+    assert across["num_plans"].tolist() == [4, 16]
+    assert across[["worlds", "seeds"]].to_numpy().tolist() == [[3, 4], [3, 4]]
+    for planner, side in (("mcts", "first"), ("sampling", "second")):
+        due = interquartile_mean([shares(made, planner, 4, world) for world in ("maze", "grid", "cube")])
+        assert across.loc[0, [side, f"{side}_low", f"{side}_high"]].tolist() == pytest.approx(list(due))
+    assert across["improvement"].tolist() == [1, 0.5]
+    assert planner_document(list(results(0.2)), {}, "").frames["across"].empty

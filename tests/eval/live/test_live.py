@@ -1,4 +1,4 @@
-"""`python -m eval live`: a small comparison from end to end, and its tables from made-up cells."""
+"""`python -m eval live`: a small comparison from end to end, and its tables from made-up results."""
 
 import json
 import re
@@ -7,65 +7,65 @@ import numpy as np
 import pytest
 
 from eval.__main__ import main
-from eval.live import report as live_report
-from eval.live.run import lives
+from eval.live.report import live_document
+from eval.live.run import PARTS, conditions
 from neuroprior.analysis.statistics import paired_difference
 from tests.support.reports import FROM_ELSEWHERE
 
 SMALL = ["live", "--worlds", "forage_grid", "--kinds", "markov", "--seeds", "2", "--seasons", "2", "--period", "64"]
-SMALL += ["--agents", "3", "--items", "2", "--num-plans", "4", "--processes", "1"]
+SMALL += ["--agents", "3", "--items", "2", "--num-plans", "4", "--length", "8", "--processes", "1"]
 
 
 def test_a_small_comparison(tmp_path, capsys):
     out = tmp_path / "out"
     assert main([*SMALL, "--out", str(out)]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "forage_grid: food eaten in 100 steps" in told
+    printed = capsys.readouterr().out
+    assert "Food eaten in 100 steps" in " ".join(printed.split())
     results = json.loads((out / "results.json").read_text())
     rows = results["rows"]
-    assert [(row["prior"], row["sees"], row["learns"], row["warm_start"]) for row in rows] == list(lives(("markov",)))
+    assert [(row["prior"], row["sees"], row["learns"], row["warm_start"]) for row in rows] == list(
+        conditions(("markov",))
+    )
     for row in rows:
         assert row["seeds"] == 2
         assert row["low"] <= row["reward"] <= row["high"]
-        assert row["prior"] == "oracle" or row["model_steps"] in (5 * 16 / 4, (4 * 16 * 32 + 16 * 31) / 32 / 4)
+        assert row["prior"] == "oracle" or row["model_steps"] in (5 * 8 / 4, (4 * 8 * 32 + 8 * 31) / 32 / 4)
     assert rows[-1]["oracle_share"] == 1
     page = (out / "report.html").read_text()
     assert not re.search(FROM_ELSEWHERE, page)
     assert page.count("<svg") == 1
+    assert (out / "forage_grid.png").stat().st_size > 0
+    kept = sorted((out / "runs").rglob("forage*.json"))
+    times = [path.stat().st_mtime_ns for path in kept]
+    assert main([*SMALL, "--out", str(out)]) == 0  # finished runs are not done again
+    assert [path.stat().st_mtime_ns for path in kept] == times
+    assert len(times) == 2
+    assert capsys.readouterr().out == printed
 
 
-def test_finished_cells_are_not_done_again(tmp_path, capsys):
-    out = tmp_path / "out"
-    assert main([*SMALL, "--seeds", "1", "--out", str(out)]) == 0
-    (cell,) = (out / "cells").rglob("forage*.json")
-    first = cell.stat().st_mtime_ns
-    table = capsys.readouterr().out
-    assert main([*SMALL, "--seeds", "1", "--out", str(out)]) == 0
-    assert cell.stat().st_mtime_ns == first
-    assert capsys.readouterr().out == table
-
-
-def made_up(seeds=6):
-    """Cells in which an agent that learns online is rewarded .2 more than random, from the second season on."""
+def made_up(seeds=6, seasons=2, worlds=("forage_grid",)):
+    """Results in which an agent that learns online is rewarded .2 more than random, from the second season on."""
     generator = np.random.default_rng(0)
     worth = {"oracle": 0.5, "uniform": 0.1, "markov": 0.1}
-    cells = []
-    for seed in range(seeds):
-        entries = []
-        for life in lives(("markov",)):
-            rewards = worth[life.prior] + 0.01 * generator.random((2, live_report.PARTS))
-            rewards[1] += 0.2 * (life.learns == "online")
-            entry = life._asdict() | {"rewards": rewards.flatten().tolist(), "seconds": 1e-4, "model_steps": 128}
-            entries.append(entry)
-        cells.append({"world": "forage_grid", "seed": seed, "about": "a grid", "period": 64, "places": 9.0})
-        cells[-1]["entries"] = entries
-    return cells
+    results = []
+    for world in worlds:
+        for seed in range(seeds):
+            entries = []
+            for condition in conditions(("markov",)):
+                rewards = worth[condition.prior] + 0.01 * generator.random((seasons, PARTS))
+                rewards[1:] += 0.2 * (condition.learns == "online")
+                entry = condition._asdict() | {"rewards": rewards.flatten().tolist()}
+                entries.append(entry | {"seconds": 1e-4, "model_steps": 128})
+            results.append({"world": world, "seed": seed, "about": "a grid", "period": 64, "places": 9.0})
+            results[-1]["entries"] = entries
+    return results
 
 
-def test_what_is_told():
-    cells = made_up()
-    rows, gaps = live_report.live_rows(cells), live_report.paired_rows(cells)
-    online = next(row for row in rows if row["learns"] == "online" and row["sees"] == "nothing")
+def test_what_is_reported():
+    results = made_up()
+    document, _ = live_document(results, {}, "")
+    rows, gaps = (document.frames[name].to_dict("records") for name in ("rows", "paired"))
+    online = next(row for row in rows if row["learns"] == "online" and row["sees"] == "none")
     assert online["reward"] == pytest.approx(100 * (0.1 + 0.1 + 0.005), abs=0.3)
     assert online["after"] == pytest.approx(30.5, abs=0.6)
     assert online["late"] == pytest.approx(30.5, abs=0.6)
@@ -79,31 +79,37 @@ def test_what_is_told():
     }
     gap = next(gap for gap in gaps if gap["against"] == "random" and gap["learns"] == "online")
     own, other = (
-        [100 * np.mean(entry["rewards"]) for cell in cells for entry in cell["entries"] if pick(entry)]
+        [100 * np.mean(entry["rewards"]) for one in results for entry in one["entries"] if pick(entry)]
         for pick in (
-            lambda entry: entry["learns"] == "online" and entry["sees"] == "nothing",
+            lambda entry: entry["learns"] == "online" and entry["sees"] == "none",
             lambda entry: entry["prior"] == "uniform" and entry["warm"],
         )
     )
     due = paired_difference(own, other)
     assert (gap["difference"], gap["low"], gap["p_value"]) == pytest.approx((due.mean, due.low, due.p_value))
-    said = live_report.words(gaps, "forage_grid")
-    assert re.search(r"markov, sees nothing, learns online against random \+(9\.9|10\.)", said)
-    assert "Not to be told apart in so many tests: random against no warm start" in said
-    table = live_report.table(rows, gaps, "forage_grid")
-    assert [row[3].endswith("*") for row in table.rows] == [False, False, False, True, False, True, False, False]
+    eaten, differences = document.sections[1].tables
+    assert [row[3].endswith("*") for row in eaten.rows] == [False, False, False, True, False, True, False, False]
+    found = {tuple(row[:4]): row[4:] for row in differences.rows}
+    assert re.match(r"\+(9\.9|10\.)", found["markov", "none", "online", "random"][0])
+    assert float(found["uniform", "none", "never", "no warm start"][-1]) > 0.05
+    significant, tests = sum(gap["p_holm"] < 0.05 for gap in gaps), len(gaps)
+    assert f"{significant} of {tests} differences are significant" in document.lead
 
 
 def test_a_single_seed_and_season():
-    cells = made_up(1)
-    for entry in cells[0]["entries"]:
-        entry["rewards"] = entry["rewards"][: live_report.PARTS]
-    rows, gaps = live_report.live_rows(cells), live_report.paired_rows(cells)
-    assert gaps == []
-    assert "several seeds" in live_report.words(gaps, "forage_grid")
-    assert rows[0]["after"] is None
-    assert live_report.table(rows, gaps, "forage_grid").rows[0][5] == ""
-    live_report.live_figure(cells, "forage_grid")
+    document, pictures = live_document(made_up(1, seasons=1), {}, "")
+    assert document.frames["paired"].empty
+    assert "need at least two seeds" in document.lead
+    assert document.sections[1].tables[0].rows[0][5] == ""
+    assert list(pictures) == ["forage_grid"]
+
+
+def test_aggregates_over_worlds_are_shares_of_the_oracle():
+    across = live_document(made_up(worlds=("forage_grid", "forage_maze")), {}, "")[0].frames["across"]
+    online = across[(across["learns"] == "online") & (across["sees"] == "none")].iloc[0]
+    assert (online["worlds"], online["seeds"], online["improvement"]) == (2, 6, 1)
+    assert online["first"] == pytest.approx(0.205 / 0.505, abs=0.02)
+    assert online["second"] == pytest.approx(0.105 / 0.505, abs=0.02)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
-"""Plans that start in the middle of others: what is left of these, and that it leads where they were going."""
+"""Plans that start in the middle of others: the actions left, and that they lead where the plan was going."""
 
 import torch
 
-from eval.worlds.mid_plan import UnderWay
+from eval.worlds.mid_plan import MidPlanWorld
 from eval.worlds.suite import TASKS, best_score
 from neuroprior import ExhaustivePlanner, SamplingPlanner, UniformPrior, collect
 from neuroprior.testing import check_world
@@ -11,8 +11,8 @@ from neuroprior.worlds.labyrinth import WATER
 from tests.support.sources import seeded
 
 
-def made() -> UnderWay:
-    return UnderWay(maze(7, 7, num_layouts=3, egocentric=True), ExhaustivePlanner(5), 2)
+def made() -> MidPlanWorld:
+    return MidPlanWorld(maze(7, 7, num_layouts=3, egocentric=True), ExhaustivePlanner(5), 2)
 
 
 def test_it_is_a_world():
@@ -27,13 +27,13 @@ def test_what_is_left_leads_where_the_plan_was_going():
     best = ExhaustivePlanner(5).plan(world.world, inner, seeded(1)).score
     ended = world.rollout(state, state[:, None, 1:]).rewards[:, 0, -1]
     assert torch.equal(ended, best)
-    seen = world.observe(state).view(200, 3, 3)
-    assert torch.equal(seen.argmax(-1), state[:, 1:])
-    assert bool((seen.sum(-1) == 1).all())
+    observed = world.observe(state).view(200, 3, 3)
+    assert torch.equal(observed.argmax(-1), state[:, 1:])
+    assert bool((observed.sum(-1) == 1).all())
 
 
 def test_the_oracle_is_that_of_the_inner_world():
-    task, world = TASKS["under_way"], made()
+    task, world = TASKS["mid_plan"], made()
     state = world.reset(50, seeded(0))
     found = ExhaustivePlanner(4).plan(world, state, seeded(1)).score
     assert torch.allclose(best_score(task, world, state, 4), found)
@@ -41,8 +41,8 @@ def test_the_oracle_is_that_of_the_inner_world():
     assert torch.equal(plans.context, world.observe(state)[:, None].expand(-1, 4, -1))
 
 
-def test_it_is_over_where_the_inner_world_is():
-    world = UnderWay(labyrinth(absorbing=True), ExhaustivePlanner(3), 1)
+def test_it_terminates_where_the_inner_world_does():
+    world = MidPlanWorld(labyrinth(absorbing=True), ExhaustivePlanner(3), 1)
     state = torch.tensor([[WATER, 0, 0], [5, 0, 0]])
     assert world.terminated(state).tolist() == [True, False]
     assert torch.equal(world.legal_actions(state), world.world.legal_actions(state[:, 0]))

@@ -1,12 +1,12 @@
-"""What is seen of MiniGrid in `eval compare`, against what its table of transitions says can be done there."""
+"""What is observed of MiniGrid in `eval compare`, against what its table of transitions says can be done there."""
 
 import torch
 
 from eval.worlds.minigrid import KINDS, MOVES, NEAR, SIDE, layouts
 
 
-def test_what_is_seen_is_what_can_be_done():
-    """Who can go forward sees a free square before it; who can open a door sees it shut; who can take a key sees it."""
+def test_what_is_observed_is_what_can_be_done():
+    """An agent that can go forward observes a free square, one that can open a door a closed one, and so on."""
     world = layouts("MiniGrid-DoorKey-5x5-v0", range(2))
     assert world.num_layouts == 2
     assert world.features.shape == (world.num_states, SIDE * SIDE * KINDS)
