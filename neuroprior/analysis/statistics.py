@@ -1,7 +1,22 @@
-"""Statistics of comparisons: shares of best, confidence intervals, paired differences. Needs scipy (`[programs]`)."""
+"""Statistics of comparisons: confidence intervals, paired differences, aggregates over worlds, corrected p-values.
+
+All intervals are made in one way: Student's t over independent units, the units being whatever was drawn independently
+(the seeds of a world, animals, folds of a cross-validation, plans), with one number for each. `mean_interval`,
+`paired_difference`, `ratio_difference` and the two aggregates over worlds are that interval of different numbers.
+
+It is exact for normal values. A unit's number is here mostly a mean over many starts, plans or actions, and bounded (a
+share, a normalised score), so that 10 to 20 units suffice: in simulations the nominal 95 % interval of such values
+covers the mean in 93 to 95 % of all cases with 10 or 20 units, and in 91 to 93 % where the values pile up at a bound
+(Beta(1, 9)). The bias-corrected and accelerated bootstrap, which assumes no distribution, covers less there (about 90 %
+with 10 units), as it takes the spread of few values for the true one. No method helps where rare outliers decide the
+mean: if one seed in ten fails, ten seeds contain no failure in a third of all cases, and the interval is too narrow.
+`tests/analysis/test_statistics.py` repeats the simulations.
+
+The one exception is `share_interval` (Wilson) for a share of independent yes-or-no trials.
+"""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -56,8 +71,71 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
     return Interval(mean, mean - half, mean + half)
 
 
+def mean_intervals(frame: Any, by: str | Sequence[str], value: str, level: float = 0.95) -> Any:
+    """The mean of a column of a table with Student's interval, for each group of rows; see `mean_interval`.
+
+    Args:
+        frame: a pandas frame with a row for each independent unit of each group.
+        by: the column or columns that define the groups.
+        value: the column of which the means are taken; missing values are left out.
+        level: of confidence.
+
+    Returns:
+        A pandas frame with a row for each group, in order of appearance: the columns `by`, then `mean`, `low`, `high`
+        and `n`, the number of units. `low` and `high` are NaN for fewer than two units.
+    """
+    by = [by] if isinstance(by, str) else list(by)
+    groups = frame.groupby(by, sort=False, dropna=False)[value]
+    found = groups.agg(mean="mean", error="sem", n="count")
+    half = stats.t.ppf((1 + level) / 2, found["n"] - 1) * found["error"]
+    found = found.assign(low=found["mean"] - half, high=found["mean"] + half)
+    return found[["mean", "low", "high", "n"]].reset_index()
+
+
+def interquartile_mean(values: ArrayLike, level: float = 0.95) -> Interval:
+    """The mean over the middle half of W worlds, with Student's interval over G seeds.
+
+    An aggregate over worlds that a single easy or hard world does not decide (Agarwal et al. 2021, Deep reinforcement
+    learning at the edge of the statistical precipice): for each seed the int(W / 4) highest and as many lowest worlds
+    are left out and the others averaged, which gives G independent numbers.
+
+    Args:
+        values: `[W, G]`, G >= 2: normalised scores. Seed g of one world is independent of seed g of another, and the
+            seeds of a world are exchangeable.
+        level: of confidence.
+
+    Raises:
+        ValueError: another shape, fewer than two seeds, or values that are not finite.
+    """
+    return mean_interval(stats.trim_mean(_matrix("values", values), 0.25, axis=0), level)
+
+
+def probability_of_improvement(first: ArrayLike, second: ArrayLike, level: float = 0.95) -> Interval:
+    """The share of worlds in which `first` is better than `second`, with Student's interval over seeds.
+
+    The probability that the first method has the higher score in a world drawn at random (Agarwal et al. 2021); a tie
+    counts one half. The interval is cut at 0 and 1.
+
+    Args:
+        first: `[W, G]`, G >= 2: scores in W worlds with G seeds, as for `interquartile_mean`.
+        second: `[W, G]`: of the other method, with the same worlds and seeds.
+        level: of confidence.
+
+    Raises:
+        ValueError: unequal shapes, fewer than two seeds, or values that are not finite.
+    """
+    a, b = _matrix("first", first), _matrix("second", second)
+    if a.shape != b.shape:
+        raise ValueError(f"second: shape {list(a.shape)}, that of first, is expected, not {list(b.shape)}")
+    mean, low, high = mean_interval(((a > b) + (a == b) / 2).mean(0), level)
+    return Interval(mean, max(low, 0.0), min(high, 1.0))
+
+
 def share_interval(successes: int, trials: int, level: float = 0.95) -> Interval:
     """A share of independent trials, with Wilson's interval.
+
+    Only for single trials that are each a success or not. Trials that share a world, a seed or a subject are not
+    independent: take the `mean_interval` of their shares.
 
     Raises:
         ValueError: no trials, or more successes than trials.
@@ -138,6 +216,20 @@ def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     corrected = np.empty_like(values)
     corrected[order] = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1)
     return corrected
+
+
+def _matrix(name: str, values: ArrayLike) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    if isinstance(values, torch.Tensor):
+        values = values.cpu().numpy()
+    matrix = np.asarray(values, dtype=np.float64)
+    if matrix.ndim != 2 or matrix.shape[0] < 1 or matrix.shape[1] < 2:
+        raise ValueError(
+            f"{name}: shape [W, G] is expected, with one world and two seeds at least, not {list(matrix.shape)}"
+        )
+    wrong = np.argwhere(~np.isfinite(matrix))
+    if len(wrong):
+        raise ValueError(f"{name}{wrong[0].tolist()}: {matrix[tuple(wrong[0])]} is not a finite number")
+    return matrix
 
 
 def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -1,10 +1,22 @@
 """Shares of best, intervals and paired differences, against hand-computed cases and simulated coverage."""
 
+from collections.abc import Callable
+
 import numpy as np
+import pandas as pd
 import pytest
 import torch
+from scipy import stats
 
-from neuroprior.analysis.statistics import best_of, mean_interval, paired_difference, share_interval
+from neuroprior.analysis.statistics import (
+    best_of,
+    interquartile_mean,
+    mean_interval,
+    mean_intervals,
+    paired_difference,
+    probability_of_improvement,
+    share_interval,
+)
 
 
 def test_ties_count_for_each() -> None:
@@ -51,3 +63,104 @@ def test_too_few_values(call) -> None:
 def test_impossible_shares(successes: int, trials: int) -> None:
     with pytest.raises(ValueError, match="share_interval"):
         share_interval(successes, trials)
+
+
+Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
+
+BOUNDED: list[tuple[str, Draw, float, float, float]] = [
+    # Values of a unit, their mean, and the least coverage of the nominal 95 % with 10 and with 20 units.
+    ("200 trials", lambda r, s: r.binomial(200, 0.9, s) / 200, 0.9, 0.94, 0.94),
+    ("200 trials, overdispersed", lambda r, s: r.binomial(200, r.beta(18, 2, s)) / 200, 0.9, 0.925, 0.93),
+    ("skewed", lambda r, s: r.beta(8, 2, s), 0.8, 0.93, 0.935),
+    ("at a bound", lambda r, s: r.beta(1, 9, s), 0.1, 0.905, 0.92),
+    ("two modes", lambda r, s: r.beta(0.5, 0.5, s), 0.5, 0.93, 0.94),
+    ("a third fails", lambda r, s: r.binomial(200, np.where(r.random(s) < 0.3, 0.7, 0.9)) / 200, 0.84, 0.92, 0.93),
+]
+
+
+def hits(draw: Draw, mean: float, units: int, repeats: int) -> int:
+    """How many of so many intervals hold the mean."""
+    frame = pd.DataFrame(draw(np.random.default_rng(units), (repeats, units))).melt(ignore_index=False)
+    found = mean_intervals(frame.reset_index(), "index", "value")
+    assert len(found) == repeats
+    assert (found.n == units).all()
+    return int(((found.low <= mean + 1e-12) & (mean <= found.high + 1e-12)).sum())
+
+
+@pytest.mark.parametrize("repeats", [4000, pytest.param(200_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("units", [10, 20])
+@pytest.mark.parametrize(("draw", "mean", "least_of_10", "least_of_20"), [row[1:] for row in BOUNDED])
+def test_coverage_for_bounded_values(
+    draw: Draw, mean: float, least_of_10: float, least_of_20: float, units: int, repeats: int
+) -> None:
+    # A correct interval misses the quantile with a probability of 1e-6: 12 cases raise a false alarm once in 80,000 runs.
+    least = least_of_10 if units == 10 else least_of_20
+    assert hits(draw, mean, units, repeats) >= stats.binom.ppf(1e-6, repeats, least)
+
+
+def test_mean_intervals_of_a_frame() -> None:
+    frame = pd.DataFrame(
+        {
+            "world": ["b", "b", "a", "a", "b", "c"],
+            "prior": ["x", "x", "x", "x", "x", None],
+            "score": [1.0, 2.0, 5.0, np.nan, 6.0, 3.0],
+        }
+    )
+    found = mean_intervals(frame, ["world", "prior"], "score")
+    assert found.columns.tolist() == ["world", "prior", "mean", "low", "high", "n"]
+    assert found.world.tolist() == ["b", "a", "c"]
+    assert found.n.tolist() == [3, 1, 1]
+    assert tuple(found.loc[0, ["mean", "low", "high"]]) == pytest.approx(mean_interval([1, 2, 6]))
+    assert found["mean"].tolist() == [3, 5, 3]
+    assert found.loc[1:, ["low", "high"]].isna().all(axis=None)
+    assert mean_intervals(frame, "world", "score", level=0.5).high[0] == pytest.approx(
+        mean_interval([1, 2, 6], 0.5).high
+    )
+
+
+def test_interquartile_mean() -> None:
+    # Of five worlds one is left out at each end, whichever these are for a seed.
+    values = np.array([[0.0, 9.0, 2.0], [1.0, 1.0, 1.0], [2.0, 0.0, 0.0], [3.0, 2.0, 3.0], [50.0, 3.0, -50.0]])
+    assert interquartile_mean(values) == pytest.approx(mean_interval([2, 2, 1]))
+    assert interquartile_mean(torch.tensor(values[:3]), 0.9) == pytest.approx(mean_interval([1, 10 / 3, 1], 0.9))
+
+
+def test_probability_of_improvement() -> None:
+    first = np.array([[1.0, 2.0], [3.0, 1.0], [5.0, 5.0], [0.0, 1.0]])
+    second = np.array([[0.0, 1.0], [3.0, 1.0], [4.0, 6.0], [1.0, 0.0]])
+    # Better in 2 of 4 with one tie: 2.5; and the same with the other seed.
+    assert probability_of_improvement(first, second) == pytest.approx((0.625, 0.625, 0.625))
+    assert probability_of_improvement(second, first).mean == pytest.approx(0.375)
+    # 3/4 and 1/4 with one degree of freedom: far wider than the possible.
+    assert probability_of_improvement([[2, 0], [2, 0], [1, 1], [2, 0]], np.ones((4, 2)), 0.95) == (0.5, 0.0, 1.0)
+    assert probability_of_improvement(first + 9, second) == (1, 1, 1)
+
+
+def test_aggregates_cover_at_their_level() -> None:
+    # 14 worlds of unequal means and spread; 600 intervals, of which 0.945 hold the truth but for 1e-6.
+    draw, repeats, seeds = np.random.default_rng(0), 600, 10
+    level, spread = np.linspace(0, 1, 14)[:, None], np.linspace(0.02, 0.2, 14)[:, None]
+    # The truth, of 10**5 seeds: its error is a hundredth of that of an interval.
+    truth = float(stats.trim_mean(level + spread * draw.standard_normal((14, 10**5)), 0.25, axis=0).mean())
+    better = float(stats.norm.cdf(0.05 / (spread * 2**0.5)).mean())
+    held = np.zeros(2)
+    for _ in range(repeats):
+        first, second = level + spread * draw.standard_normal((2, 14, seeds))
+        low, high = interquartile_mean(first)[1:]
+        held[0] += low <= truth <= high
+        low, high = probability_of_improvement(first + 0.05, second)[1:]
+        held[1] += low <= better <= high
+    assert (held >= stats.binom.ppf(1e-6, repeats, 0.945)).all()
+
+
+@pytest.mark.parametrize("values", [[1.0, 2.0], [[1.0], [2.0]], np.zeros((0, 3)), [[1.0, float("nan")]]])
+def test_aggregates_refuse_other_values(values: list[float]) -> None:
+    with pytest.raises(ValueError, match="values"):
+        interquartile_mean(values)
+    with pytest.raises(ValueError, match="first"):
+        probability_of_improvement(values, values)
+
+
+def test_improvement_needs_equal_shapes() -> None:
+    with pytest.raises(ValueError, match="second: shape"):
+        probability_of_improvement(np.zeros((3, 2)), np.zeros((2, 2)))
