@@ -1,4 +1,4 @@
-"""What a prior's candidate plans reach against their number: the curves behind `python -m eval compare`."""
+"""Normalised scores against the number of candidate plans: what a planner reaches that samples from a prior."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,33 +13,33 @@ from neuroprior import Prior, SamplingPlanner, TabularWorld, World, expected_sco
 from neuroprior.planners.chance import mean_scores
 
 ROLLOUTS = 16
-"""Of each candidate, where chance decides."""
+"""Simulations of each candidate in a stochastic world."""
 
 ROWS = 2**15
 """Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
 
 TEMPERATURES = (1.0, 1.5, 2.0)
-"""At which priors may be sampled: one that is too sure of itself tries the same plans again and again."""
+"""At which priors may be sampled: an overconfident prior tries the same plans again and again."""
 
 DRAWN, AGAIN = 20, 9
-"""For each start that is wanted so many are drawn, and, where too few of them are of use, so many times again."""
+"""For each start that is wanted so many are drawn, and, if too few of them are of use, so many times again."""
 
 CLOSE = 1e-6
-"""A score this near to the oracle's is as good."""
+"""A score this near to the optimum is optimal."""
 
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """Where priors are compared, or temperatures chosen: B starts of a world, with the best that can be had from each.
+    """B starts of a world, with the best score that can be reached from each.
 
     Attributes:
         task: what is optimised.
         world: the held-out world, or the validation world.
         state: `[B, ...]`.
         length: number of actions in a plan.
-        best: `[B]`: the oracle's scores.
-        reference: the score that counts as nothing: 0 where rewards are never negative, else what a single plan of
-            random moves scores in the mean.
+        best: `[B]`: the optimal scores.
+        reference: the score that counts as 0: 0 if rewards are never negative, else the mean score of a single plan of
+            random moves.
     """
 
     task: Task
@@ -49,8 +49,8 @@ class Starts:
     best: Tensor
     reference: float
 
-    def share(self, score: Tensor) -> float:
-        """The share of the oracle that scores `[B]` are, between the reference and the oracle."""
+    def normalised(self, score: Tensor) -> float:
+        """The normalised score of scores `[B]`: 0 for the reference, 1 for the optimum."""
         gained, most = (values.double() - self.reference for values in (score, self.best))
         return float(gained.mean() / most.mean())
 
@@ -60,9 +60,9 @@ class Curve:
     """What was reached with each number of candidates: means over starts.
 
     Attributes:
-        share: of the oracle.
-        at_oracle: share of starts at which the best plan was found.
-        score: what was scored.
+        share: normalised score.
+        at_oracle: share of starts at which an optimal plan was found.
+        score: score.
     """
 
     share: list[float]
@@ -71,7 +71,7 @@ class Curve:
 
 
 def starts_of(task: Task, world: World, number: int, length: int, generator: torch.Generator) -> Starts:
-    """Random starts, where something can be had: with rewards that are never negative the oracle scores above 0.
+    """Random starts; if rewards are never negative, only those with an optimum above 0.
 
     Raises:
         ValueError: there are hardly any.
@@ -98,31 +98,31 @@ def starts_of(task: Task, world: World, number: int, length: int, generator: tor
 
 
 def planner_of(starts: Starts, prior: Prior, num_plans: int, temperature: float) -> SamplingPlanner:
-    """A planner that draws its candidates from a prior."""
+    """A planner that samples its candidates from a prior."""
     how = starts.task.scoring | {"num_rollouts": ROLLOUTS, "temperature": temperature}
     return SamplingPlanner(prior, starts.length, num_plans, **how)
 
 
 def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """What a planner takes its candidates to be worth, and what they are worth; these differ where chance decides.
+    """The scores of a planner's P candidates: as the planner estimates them, and exactly.
 
     Returns:
-        Twice `[B, P]`, of the planner's P candidates.
+        Twice `[B, P]`; the two differ in stochastic worlds.
     """
-    told, true = [], []
+    estimated, exact = [], []
     for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
         if starts.world.stochastic:
             plans = planner.proposals(starts.world, state, generator)
-            told.append(mean_scores(planner, starts.world, state, plans, ROLLOUTS, generator)[0])
-            true.append(worth(starts.task, starts.world, state, plans))
+            estimated.append(mean_scores(planner, starts.world, state, plans, ROLLOUTS, generator)[0])
+            exact.append(worth(starts.task, starts.world, state, plans))
             continue
         _, rollout = planner.candidates(starts.world, state, generator)
         score = planner.scored(rollout)[0]
         if planner.any_prefix:
             score = score.amax(-1)
-        told.append(score)
-        true.append(score)
-    return torch.cat(told), torch.cat(true)
+        estimated.append(score)
+        exact.append(score)
+    return torch.cat(estimated), torch.cat(exact)
 
 
 def best_temperature(starts: Starts, prior: Prior, budget: int, generator: torch.Generator) -> float:
@@ -136,16 +136,16 @@ def curve(
 ) -> Curve:
     """What a sampling planner reaches with each number of candidates.
 
-    The most are drawn once from each start. Fewer are blocks of them, each block a planner's decision.
+    The largest number is drawn once from each start. Smaller numbers are blocks of it, each block a decision.
     """
-    told, true = candidate_scores(starts, planner_of(starts, prior, max(budgets), temperature), generator)
+    estimated, exact = candidate_scores(starts, planner_of(starts, prior, max(budgets), temperature), generator)
     found = Curve([], [], [])
     for budget in budgets:
-        blocks = told.shape[1] // budget
-        shape = (len(told), blocks, budget)
-        chosen = told[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
-        score = true[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0].double()
-        found.share.append(starts.share(score.mean(1)))
+        blocks = estimated.shape[1] // budget
+        shape = (len(estimated), blocks, budget)
+        chosen = estimated[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
+        score = exact[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0].double()
+        found.share.append(starts.normalised(score.mean(1)))
         found.at_oracle.append(float((score >= starts.best[:, None] - CLOSE).double().mean()))
         found.score.append(float(score.mean()))
     return found

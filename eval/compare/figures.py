@@ -4,18 +4,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from eval.compare.rows import Key
 from neuroprior.report.drawing import (
     FEWER,
     MORE,
     Array,
-    Number,
     band,
     dot,
     drawn,
@@ -42,13 +41,9 @@ WALL, REWARD = (0.49, 0.51, 0.55), (0.18, 0.62, 0.36)
 JITTER = 0.17
 """How far the paths of a drawing are moved apart, squares."""
 
-Estimate = tuple[Number, Number, Number]
+POINTS = "difference in normalised score, percentage points"
+
 Style = tuple[str, str]
-
-
-def key_of(row: Mapping[str, Any]) -> Key:
-    """The planner and prior that a row is about."""
-    return Key(row.get("planner", "sampling"), row["prior"], row["sees"], row.get("rounds", 0))
 
 
 def styles(priors: Iterable[str]) -> dict[str, Style]:
@@ -58,12 +53,12 @@ def styles(priors: Iterable[str]) -> dict[str, Style]:
 
 
 @drawn
-def share_figure(rows: Sequence[Mapping[str, Any]], strong: Sequence[str], style: Mapping[str, Style]) -> Figure:
-    """The share of the oracle of one world's priors against the number of candidate plans.
+def score_figure(rows: pd.DataFrame, strong: Sequence[str], style: Mapping[str, Style]) -> Figure:
+    """The normalised score of one world's priors against the number of candidate plans.
 
     Args:
-        rows: of `compare_rows.rows`, of one world, with all numbers of plans; one without a number of plans is drawn
-            as a line across.
+        rows: of `score_rows`, of one world, with all numbers of plans; a row without a number of plans is drawn as a
+            line across.
         strong: priors drawn with a band; other ones are thin lines.
         style: of the priors by name.
 
@@ -72,68 +67,63 @@ def share_figure(rows: Sequence[Mapping[str, Any]], strong: Sequence[str], style
     """
     expect_some("rows", rows)
     figure, (axes,) = panels(1, 1, SMALL)
-    for prior in dict.fromkeys(row["prior"] for row in rows if row["num_plans"] is not None):
-        own = [row for row in rows if row["prior"] == prior and row["num_plans"] is not None]
-        points = [(row["num_plans"], row["oracle_share"], row["low"], row["high"]) for row in own]
-        _curve(axes, points, prior, style[prior], prior in strong)
-    for row in rows:
-        if row["num_plans"] is None:
-            axes.axhline(100 * row["oracle_share"], color=INK, lw=1, ls=(0, (1, 2)), label=row["planner"])
-    most = max((row["num_plans"] or 1 for row in rows), default=1)
+    counted = rows[rows["num_plans"].notna()]
+    _curves(axes, counted, "num_plans", strong, style)
+    for _, row in rows[rows["num_plans"].isna()].iterrows():
+        axes.axhline(100 * row["oracle_share"], color=INK, lw=1, ls=(0, (1, 2)), label=row["planner"])
+    most = int(counted["num_plans"].max()) if len(counted) else 1
     axes.set_xscale("log", base=2)
     base = 16 if most > 256 else 4
     axes.set_xticks([base**k for k in range(8) if base**k <= most])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     axes.minorticks_off()
-    _finish(axes, "candidate plans", "share of the oracle, %", rows[0]["world"])
+    _finish(axes, "candidate plans", rows["world"].iloc[0])
     return figure
 
 
 @drawn
-def growth_figure(rows: Sequence[Mapping[str, Any]], strong: Sequence[str], style: Mapping[str, Style]) -> Figure:
-    """The share of the oracle of one world's priors after each round of growth.
+def curriculum_figure(rows: pd.DataFrame, strong: Sequence[str], style: Mapping[str, Style]) -> Figure:
+    """The normalised score of one world's priors after each round of the horizon curriculum.
 
     Args:
-        rows: of `compare_rows.growth_rows`, of one world and of priors that see the same.
-        strong, style: see `share_figure`.
+        rows: of `curriculum_rows`, of one world and of priors with the same context.
+        strong, style: see `score_figure`.
 
     Raises:
         ValueError: there are none.
     """
     expect_some("rows", rows)
     figure, (axes,) = panels(1, 1, SMALL)
-    lengths = {row["round"]: row["length"] for row in rows}
-    for prior in dict.fromkeys(row["prior"] for row in rows):
-        own = sorted((row for row in rows if row["prior"] == prior), key=lambda row: int(row["round"]))
-        points = [(row["round"], row["oracle_share"], row["low"], row["high"]) for row in own]
-        _curve(axes, points, prior, style[prior], prior in strong)
-    axes.set_xticks(sorted(lengths), [f"{one}\n{lengths[one]}" for one in sorted(lengths)])
-    seeing = "" if rows[0]["sees"] == "nothing" else f", sees {rows[0]['sees']}"
-    _finish(axes, "round, and actions in a plan", "share of the oracle, %", rows[0]["world"] + seeing)
+    _curves(axes, rows, "round", strong, style)
+    lengths = dict(sorted(zip(rows["round"], rows["length"], strict=True)))
+    axes.set_xticks(list(lengths), [f"{one}\n{length}" for one, length in lengths.items()])
+    context = rows["sees"].iloc[0]
+    title = rows["world"].iloc[0] + ("" if context == "none" else f", {context} context")
+    _finish(axes, "round, and actions in a plan", title)
     return figure
 
 
-def _curve(
-    axes: Axes, points: Sequence[tuple[float, float, Number, Number]], name: str, style: Style, strong: bool
-) -> None:
-    color, line = style
-    if strong:
-        percent = [(at, *_percent(*estimate)) for at, *estimate in points]
-        band(axes, percent, color, short(name, 20), line)
-        axes.lines[-1].set(markersize=3, linewidth=1.6)
-    else:
-        axes.plot([one[0] for one in points], [100 * one[1] for one in points], line, color=color, lw=0.8, alpha=0.6)
+def _curves(axes: Axes, rows: pd.DataFrame, across: str, strong: Sequence[str], style: Mapping[str, Style]) -> None:
+    """A line a prior, with a band if it is one of `strong`."""
+    for prior, own in rows.sort_values(across, kind="stable").groupby("prior", sort=False):
+        color, line = style[prior]
+        points = own[[across, "oracle_share", "low", "high"]].astype("float64").to_numpy() * (1, 100, 100, 100)
+        if prior in strong:
+            band(axes, points.tolist(), color, short(prior, 20), line)
+            axes.lines[-1].set(markersize=3, linewidth=1.6)
+        else:
+            axes.plot(points[:, 0], points[:, 1], line, color=color, lw=0.8, alpha=0.6)
 
 
-def _finish(axes: Axes, across: str, up: str, title: str) -> None:
+def _finish(axes: Axes, across: str, title: str) -> None:
     low, high = axes.get_ylim()
     low = max(low, -20)
-    # The oracle's line has its place where it is near.
+    # The line of the optimum is drawn where it is near.
     near = high > 100 - 0.15 * (100 - low)
     axes.set_ylim(low, max(high, 100 + 0.03 * (100 - low)) if near else high)
     if near:
         axes.axhline(100, color=INK, lw=0.8, alpha=0.6)
-    axes.set(xlabel=across, ylabel=up, title=clean(title))
+    axes.set(xlabel=across, ylabel="normalised score, % of the optimum", title=clean(title))
     axes.grid(axis="y")
     axes.tick_params(labelsize=LETTERS)
     axes.xaxis.label.set_fontsize(LETTERS + 1)
@@ -145,11 +135,11 @@ def _finish(axes: Axes, across: str, up: str, title: str) -> None:
 
 
 @drawn
-def gap_figure(rows: Sequence[Mapping[str, Any]], better: tuple[str, str]) -> Figure:
-    """The difference between two kinds of priors in each world, points of the oracle; hollow where it may be chance.
+def gap_figure(rows: pd.DataFrame, better: tuple[str, str]) -> Figure:
+    """The difference between two kinds of priors in each world; hollow where it is not significant.
 
     Args:
-        rows: of `compare_pairs.words`.
+        rows: of `headline_rows`.
         better: what it means to be left, and right, of 0.
 
     Raises:
@@ -158,31 +148,25 @@ def gap_figure(rows: Sequence[Mapping[str, Any]], better: tuple[str, str]) -> Fi
     expect_some("rows", rows)
     figure, (axes,) = panels(1, 1, (PHONE, 1.1 + 0.3 * max(len(rows), 2)))
     axes.axvline(0, color=INK, lw=0.8)
-    for at, row in enumerate(reversed(rows)):
-        color = MORE if row["difference"] > 0 else FEWER
-        dot(axes, at, _percent(row["difference"], row["low"], row["high"]), color, hollow=row["better"] is None)
-    names_down(axes, [short(row["world"]) for row in reversed(rows)])
+    upwards = rows[::-1]
+    for at, (_, row) in enumerate(upwards.iterrows()):
+        estimate = [100 * float(row[name]) for name in ("difference", "low", "high")]
+        dot(axes, at, estimate, MORE if row["difference"] > 0 else FEWER, hollow=bool(pd.isna(row["better"])))
+    names_down(axes, [short(world) for world in upwards["world"]])
     reach = 1.05 * max(abs(end) for end in axes.get_xlim())
     axes.set_xlim(-reach, reach)
-    axes.set_xlabel("points of the oracle")
+    axes.set_xlabel(POINTS)
     axes.text(0, 1.01, f"← {better[0]}", color=FEWER, transform=axes.transAxes, fontsize=9, va="bottom")
     axes.text(1, 1.01, f"{better[1]} →", color=MORE, transform=axes.transAxes, fontsize=9, va="bottom", ha="right")
     return figure
 
 
-def _percent(*values: Number) -> Estimate:
-    mean, low, high = (None if value is None else 100 * value for value in values)
-    return mean, low, high
-
-
 @drawn
-def dots_figure(
-    estimates: Mapping[str, Mapping[str, Estimate]], style: Mapping[str, Style], label: str, most: int | None = None
-) -> Figure:
+def dots_figure(rows: pd.DataFrame, style: Mapping[str, Style], label: str, most: int | None = None) -> Figure:
     """A dot with its interval for each prior, by world.
 
     Args:
-        estimates: (mean, low, high) by world and prior; an infinite mean is an arrow at the edge.
+        rows: columns `world`, `prior`, `mean`, `low`, `high`; an infinite mean is an arrow at the edge.
         style: of the priors by name.
         label: of the axis.
         most: for numbers of plans up to so many, on a logarithmic axis; None: a linear axis with a line at 0.
@@ -190,10 +174,11 @@ def dots_figure(
     Raises:
         ValueError: there are none.
     """
-    expect_some("estimates", estimates)
-    priors = [prior for prior in style if any(prior in own for own in estimates.values())]
+    expect_some("rows", rows)
+    priors = [prior for prior in style if prior in set(rows["prior"])]
+    worlds = rows["world"].unique().tolist()[::-1]
     height = 0.3 + 0.12 * len(priors)
-    figure, (axes,) = panels(1, 1, (PHONE, 1.3 + height * len(estimates)))
+    figure, (axes,) = panels(1, 1, (PHONE, 1.3 + height * len(worlds)))
     limits = (1.0, float(most)) if most else (-np.inf, np.inf)
     if most:
         axes.set_xscale("log", base=2)
@@ -202,14 +187,14 @@ def dots_figure(
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         axes.minorticks_off()
     axes.axvline(most or 0, color=INK, lw=0.8, ls=":" if most else "-")
-    for at, own in enumerate(reversed(list(estimates.values()))):
-        for place, prior in enumerate(priors):
-            if prior in own:
-                shift = 0.7 * ((len(priors) - 1) / 2 - place) / len(priors)
-                dot(axes, at + shift, own[prior], style[prior][0], style[prior][1] != "-", limits)
-    for between in range(len(estimates) - 1):
+    for _, row in rows.iterrows():
+        color, line = style[row["prior"]]
+        shift = 0.7 * ((len(priors) - 1) / 2 - priors.index(row["prior"])) / len(priors)
+        estimate = [float(row[name]) for name in ("mean", "low", "high")]
+        dot(axes, worlds.index(row["world"]) + shift, estimate, color, line != "-", limits)
+    for between in range(len(worlds) - 1):
         axes.axhline(between + 0.5, color=INK, lw=0.5, alpha=0.25)
-    names_down(axes, [short(world) for world in reversed(list(estimates))])
+    names_down(axes, [short(world) for world in worlds])
     axes.grid(visible=False, axis="y")
     axes.grid(axis="x")
     axes.tick_params(axis="x", labelsize=LETTERS + 1)
@@ -224,28 +209,27 @@ def _mark(name: str, color: str, line: str) -> Line2D:
 
 
 @drawn
-def bits_figure(rows: Sequence[Mapping[str, Any]], style: Mapping[str, Style]) -> Figure:
-    """Held-out bits per action of one world's priors; hollow where a prior sees nothing and others see more.
+def bits_figure(rows: pd.DataFrame, style: Mapping[str, Style]) -> Figure:
+    """Held-out bits per action of one world's priors; hollow without context where others have one.
 
     Args:
-        rows: of `compare_rows.bits_rows`, of one world.
+        rows: of `bits_rows`, of one world.
         style: of the priors by name.
 
     Raises:
         ValueError: there are none.
     """
     expect_some("rows", rows)
-    priors = list(dict.fromkeys(row["prior"] for row in rows))
-    ways = list(dict.fromkeys(row["sees"] for row in rows))
+    priors, ways = rows["prior"].unique().tolist(), rows["sees"].unique().tolist()
     figure, (axes,) = panels(1, 1, (SMALL[0], 0.9 + 0.27 * max(len(priors), 2)))
-    for row in rows:
+    for _, row in rows.iterrows():
         shift = 0.5 * ((len(ways) - 1) / 2 - ways.index(row["sees"])) / len(ways)
-        estimate = (row["bits_per_action"], row["low"], row["high"])
-        hollow = len(ways) > 1 and row["sees"] == "nothing"
+        estimate = [float(row[name]) for name in ("bits_per_action", "low", "high")]
+        hollow = len(ways) > 1 and row["sees"] == "none"
         dot(axes, len(priors) - 1 - priors.index(row["prior"]) + shift, estimate, style[row["prior"]][0], hollow)
     names_down(axes, [short(prior, 16) for prior in reversed(priors)])
     axes.tick_params(labelsize=LETTERS)
-    axes.set(xlabel="bits per action", title=clean(rows[0]["world"]))
+    axes.set(xlabel="bits per action", title=clean(rows["world"].iloc[0]))
     axes.xaxis.label.set_fontsize(LETTERS + 1)
     return figure
 

@@ -1,115 +1,411 @@
-"""The report of a comparison: tables in the terminal, CSV files, `results.json`, and one HTML page."""
+"""The report of `python -m eval compare`: one document of tables and figures."""
 
-from collections.abc import Mapping, Sequence
-from itertools import chain
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 
-from eval.compare import findings, sections
-from eval.compare.efficiency import efficiency
-from eval.compare.findings import PLAIN, Comparison
-from eval.compare.pairs import paired, words
-from eval.compare.rows import Cells, Rows, bits_rows, growth_rows, rows
-from eval.compare.summary import reasons, reasons_in_words, reasons_section
-from neuroprior._files import versions, write_csv, write_json
-from neuroprior.report.page import Page, Section, write_page
-from neuroprior.report.study import printed
+from eval.compare import figures
+from eval.compare.figures import POINTS, Style
+from eval.compare.results import BEST, Key, Results, kind_of
+from neuroprior.report.document import Document, table
+from neuroprior.report.matrix_figures import transition_figure
+from neuroprior.report.page import FigureBox, Section, Table, breakable
 
-Settings = Mapping[str, Any]
+Row = Mapping[str, Any]
+
+FRAMES = ("rows", "paired", "efficiency", "bits", "words", "growth", "reasons", "over_worlds", "improvement")
+"""The tables of `Results` that are written to files."""
+
+HALF = "±: the longer side of the 95 % interval, over seeds."
+HOLM = "*: p < 0.05, corrected for all pairs of the world (Holm)."
 
 
-def compared(cells: Cells, num_plans: Sequence[int]) -> Comparison:
-    """All rows of a comparison.
+def document(results: Results, settings: Mapping[str, Any], command: str) -> Document:
+    """All that is printed and written of a comparison; the same results and settings give the same document.
+
+    Args:
+        results: the tables.
+        settings: how the runs were made, by name.
+        command: the command line that makes them again.
 
     Raises:
-        ValueError: there are no cells, or they lack one of the numbers of plans.
+        ValueError: the runs do not belong together, or lack one of the numbers of plans.
     """
-    if not cells:
-        raise ValueError("cells: at least one is expected; without any there is nothing to compare")
-    worlds = list(dict.fromkeys(cell["world"] for cell in cells))
-    cells = sorted(cells, key=lambda cell: (worlds.index(cell["world"]), int(cell["seed"])))
-    every = sorted({number for cell in cells for number in cell["budgets"]})
-    tables = {"paired": paired(cells, sorted(num_plans)), "words": words(cells, num_plans), "bits": bits_rows(cells)}
-    return Comparison(
-        cells,
-        sorted(num_plans),
-        rows=rows(cells, sorted(num_plans)),
-        curves=rows(cells, every),
-        efficiency=efficiency(cells),
-        growth=growth_rows(cells),
-        reasons=reasons(**tables, num_plans=num_plans),
-        **tables,
+    style = figures.styles([*results.rows["prior"].dropna(), *results.growth["prior"]])
+    sections = [
+        headlines(results),
+        reasons(results),
+        scores(results, style, False, "Normalised score against candidate plans"),
+        efficiency(results, style),
+        gains(results, style, "with minus without context", "What context adds"),
+        gains(results, style, "after minus before the curriculum", "What the horizon curriculum adds"),
+        scores(results, style, True, "Normalised score after the horizon curriculum"),
+        curriculum(results, style),
+        bits(results, style),
+        drawn_plans(results, style),
+        transitions(results),
+        about_worlds(results),
+        Section(
+            "Tables, world by world", tables=[one for world in results.worlds for one in tables_of(results, world)]
+        ),
+    ]
+    named = ", ".join(results.worlds) if len(results.worlds) <= 3 else f"{len(results.worlds)} worlds"
+    return Document(
+        f"Priors compared in {named}",
+        lead(results),
+        [section for section in sections if section.tables or section.figures],
+        {name: getattr(results, name) for name in FRAMES},
+        settings,
+        command,
     )
 
 
-def write_report(
-    cells: Cells, num_plans: Sequence[int], settings: Settings, command: str, folder: Path, console: Console
-) -> None:
-    """Print the tables, and write `report.html`, `results.json` and a CSV file for each kind of row.
+def lead(results: Results) -> str:
+    """In how many worlds the best neural prior is better than the best chain, without context and curriculum."""
+    words = results.words
+    best = words[(words["what"] == BEST) & (words["sees"] == "none") & (words["rounds"] == 0)]
+    seeds = f"Seeds: {len({run['seed'] for run in results.runs})}."
+    if best.empty:
+        return f"Neural priors and Markov chains were not compared. {seeds}"
+    better, worse = (int((best["better"] == best[side]).sum()) for side in ("first", "second"))
+    return (
+        f"With {results.shown:,} candidate plans the best neural prior is significantly better than the best Markov"
+        f" chain in {better} of {len(best)} worlds, and significantly worse in {worse} (no context, before the horizon"
+        f" curriculum). {seeds}"
+    )
 
-    The same cells and settings give the same files.
 
-    Args:
-        cells: of all worlds and seeds; worlds are reported in the order in which they come first.
-        num_plans: numbers of candidate plans that were asked for.
-        settings: how the cells were made, by name.
-        command: the command line.
-        folder: where to write.
-        console: where to print.
-
-    Raises:
-        ValueError: there are no cells, or they do not belong together.
-    """
-    comparison = compared(cells, num_plans)
-    made = [
-        findings.words_section(comparison),
-        reasons_section(comparison.reasons),
-        sections.share_section(comparison),
-        sections.efficiency_section(comparison),
-        findings.seeing_section(comparison),
-        findings.grown_gain_section(comparison),
-        sections.grown_section(comparison),
-        sections.growth_section(comparison.growth),
-        sections.bits_section(comparison),
-        sections.plans_section(comparison),
-        sections.transition_section(comparison),
-        sections.worlds_section(comparison),
-        sections.tables_section(comparison),
+def headlines(results: Results) -> Section:
+    """The answer: neural priors against Markov chains in every world, and over all worlds."""
+    words, tables, boxes = results.words, [], []
+    best = words["what"] == BEST
+    if len(words):
+        pairs = " (" + words["first"] + " - " + words["second"] + ")"
+        columns = {
+            "world": "label",
+            "context": _context,
+            "Markov" if best.all() else "second": lambda row: f"{100 * row['second_share']:.1f}",
+            "neural" if best.all() else "first": lambda row: f"{100 * row['first_share']:.1f}",
+            "difference": lambda row: _gap(row, isinstance(row["better"], str)),
+            "p": "p_value:.2g",
+            "Holm p": "p_holm:.2g",
+        }
+        caption = (
+            f"The best prior of each kind: normalised score, % of the optimum, with {results.shown:,} candidate plans,"
+            f" and the difference in percentage points. after: after the horizon curriculum. {HALF} Holm p: corrected"
+            " for the number of worlds; *: below 0.05."
+        )
+        labels = words["world"].map(breakable) + pairs.where(~best, "")
+        tables.append(table(words.assign(label=labels), columns, caption, align="llrrrrr"))
+    plain = results.paired[(results.paired["sees"] == "none") & (results.paired["rounds"] == "0")]
+    plain = plain[plain["what"] == BEST]
+    if len(plain):
+        caption = f"Best neural minus best Markov prior, percentage points, by candidate plans. {HALF} {HOLM}"
+        tables.append(_by_number(plain, plain["world"].map(breakable), plain.apply(_gap, axis=1), "world", caption))
+    for (sees, after), rows in words[best].groupby(["sees", words["rounds"] > 0], sort=False):
+        how = f"{sees.replace('none', 'no')} context, {'after' if after else 'before'} the horizon curriculum"
+        caption = f"Best neural minus best Markov prior with {results.shown:,} plans, {how}. Hollow: not significant."
+        alt = "; ".join(f"{row['world']} {100 * row['difference']:+.1f}" for _, row in rows.iterrows())
+        drawn = figures.gap_figure(rows, ("Markov better", "neural better"))
+        boxes.append(FigureBox(drawn, f"{caption} Intervals: 95 %, over seeds.", alt))
+    text = [
+        "The best prior of each kind is chosen on half of the seeds and compared on the other half, both ways, so that"
+        " the choice does not favour it. Intervals and p-values hold whichever prior is the best of its kind: better is"
+        " a prior that is better than every prior of the other kind (paired t-tests over seeds, corrected for the"
+        " number of priors by Bonferroni and for the number of worlds by Holm). The number of plans is the median of"
+        " those that were asked for."
     ]
-    parts = [section for section in made if section is not None]
-    _print(comparison, parts, console)
-    names = ("rows", "paired", "efficiency", "bits", "words", "growth", "reasons")
-    title = f"Priors compared in {', '.join(comparison.worlds)}"
-    if len(comparison.worlds) > 3:
-        title = f"Priors compared in {len(comparison.worlds)} worlds"
-    page = Page(title, findings.lead(comparison), command, _told(settings), parts)
-    _write(folder, page, {name: getattr(comparison, name) for name in names}, settings)
-    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+    return Section("Neural priors against Markov chains", text, [*tables, *_over_worlds(results)], boxes)
 
 
-def _print(comparison: Comparison, parts: Sequence[Section], console: Console) -> None:
-    """The tables of each world and those of the findings; below them the words, which are read first there."""
-    for world, tables in sections.world_tables(comparison).items():
-        for table in tables:
-            console.print(printed(world, table))
-    for table in parts[0].tables:
-        console.print(printed(parts[0].title, table))
-    why = reasons_in_words(comparison.reasons)
-    said = findings.told(comparison, PLAIN), findings.told_of_others(comparison), why, [findings.lead(comparison)]
-    for line in chain(*said):
-        console.print(line, highlight=False, markup=False)
+def _over_worlds(results: Results) -> Iterator[Table]:
+    means, pairs = results.over_worlds, results.improvement
+    if len(means):
+        caption = (
+            f"Over {len(results.worlds)} worlds: interquartile mean of the normalised score, % of the optimum, by"
+            f" candidate plans. {HALF}"
+        )
+        cells = [plus_minus(row, "interquartile_mean", 100) for _, row in means.iterrows()]
+        yield _by_number(means, _labels(means), cells, "prior", caption)
+    pairs = pairs[pairs["num_plans"] == results.shown]
+    if len(pairs):
+        caption = (
+            "Probability of improvement: in what share of worlds the first is better than the second with"
+            f" {results.shown:,} candidate plans. {HALF}"
+        )
+        labels = _labels(pairs.assign(prior=pairs["first"]))
+        columns = {"first": "label", "second": "second"}
+        share = {"probability": lambda row: plus_minus(row, "probability", 1, 2)}
+        yield table(pairs.assign(label=labels), columns | share, caption, align="llr")
 
 
-def _told(settings: Settings) -> dict[str, Any]:
-    return {**settings} | {f"version: {name}": number for name, number in versions().items()}
+def reasons(results: Results) -> Section:
+    """What may explain why networks are not better."""
+    text = (
+        "Every world in which the best neural prior is not significantly better. Where the best chain is near 100 %,"
+        " little is left to find. Where networks have no fewer bits than chains, they know no more of the plans'"
+        " structure. Where they have fewer, fewer samples are needed; but the best of many samples asks for many"
+        " different ones, which likelihood does not."
+    )
+    columns = {
+        "world": lambda row: breakable(row["world"]),
+        "context": _context,
+        "Markov": lambda row: f"{100 * row['markov_share']:.1f}",
+        "neural bits": "neural_bits:.2f",
+        "Markov bits": "markov_bits:.2f",
+        "ahead early": lambda row: "" if pd.isna(row["early"]) else f"{100 * row['early']:+.1f}",
+    }
+    caption = (
+        f"Markov: normalised score of the best chain with {results.shown:,} plans, % of the optimum. bits: the fewest"
+        " per held-out action, before the curriculum. ahead early: by how many percentage points networks are"
+        f" significantly better with {results.num_plans[0]:,} plans."
+    )
+    made = [table(results.reasons, columns, caption, align="llrrrr")] if len(results.reasons) else []
+    return Section("Where networks are not better", [text], made)
 
 
-def _write(folder: Path, page: Page, files: Mapping[str, Rows], settings: Settings) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, some in files.items():
-        if some:
-            write_csv(folder / f"{name}.csv", some)
-    write_json(folder / "results.json", {**files, "settings": {**settings}, "versions": versions()})
-    write_page(folder / "report.html", page)
+def scores(results: Results, style: Mapping[str, Style], after: bool, title: str) -> Section:
+    """Normalised scores against the number of plans, a figure a world; before or after the horizon curriculum."""
+    boxes, about = [], {run["world"]: run["about"] for run in results.runs}
+    for world, rows in results.curves[results.curves["sees"] == "none"].groupby("world", sort=False):
+        own = rows[((rows["rounds"] > 0) == after) | rows["prior"].isna() | (rows["prior"] == "uniform")]
+        if own["prior"].notna().any() and (own["rounds"].any() or not after):
+            last = own[own["num_plans"] == results.shown]
+            drawn = figures.score_figure(own, _strong(last), style)
+            boxes.append(_box(drawn, world, last, 100, "" if after else f"{world}: {about[world]}."))
+    text = [
+        "Bands: 95 % intervals over seeds. Thin lines: the other Markov chains. Dotted: the planner that tries all"
+        " short plans, at a cost of its own."
+    ]
+    return Section(title, text, (), boxes, beside=True)
+
+
+def efficiency(results: Results, style: Mapping[str, Style]) -> Section:
+    """How many plans are needed."""
+    rows = results.efficiency
+    rows = rows[(rows["prior"] != "uniform") & (rows["sees"] == "none") & (rows["rounds"] == 0)]
+    if rows.empty:
+        return Section("Search efficiency")
+    most = int(rows["most"].max())
+    high = rows["needed_high"].mask(rows["needed_high"].isna() & rows["needed_low"].notna(), rows["most"])
+    estimates = rows.assign(mean=rows["needed"].fillna(np.inf), low=rows["needed_low"], high=high)
+    drawn = figures.dots_figure(estimates, style, "candidate plans needed", most)
+    caption = f"Plans needed for what random search finds with {most:,}; arrow: more than that. Medians over seeds."
+    text = [f"How many plans from a prior find as much as {most:,} random ones. The numbers are in the tables below."]
+    return Section("Search efficiency", text, (), [FigureBox(drawn, caption, "plans needed by each prior, by world")])
+
+
+def gains(results: Results, style: Mapping[str, Style], what: str, title: str) -> Section:
+    """What priors gain by context, or by the horizon curriculum: a figure for each context and curriculum."""
+    rows = results.paired[(results.paired["what"] == what) & (results.paired["num_plans"] == results.shown)]
+    points = {"mean": 100 * rows["difference"], "low": 100 * rows["low"], "high": 100 * rows["high"]}
+    boxes = []
+    for (sees, rounds), own in rows.assign(prior=rows["first"], **points).groupby(["sees", "rounds"], sort=False):
+        how = f"{what.capitalize()} (context: {sees}; rounds: {rounds})"
+        caption = f"{how}, with {results.shown:,} plans. Intervals: 95 %, over seeds."
+        boxes.append(FigureBox(figures.dots_figure(own, style, POINTS), caption, how))
+    return Section(title, (), (), boxes)
+
+
+def curriculum(results: Results, style: Mapping[str, Style]) -> Section:
+    """Curves against rounds of the horizon curriculum, a figure a world and context."""
+    boxes = []
+    for (world, _), own in results.growth.groupby(["world", "sees"], sort=False):
+        last = own[own["round"] == own["round"].max()]
+        boxes.append(_box(figures.curriculum_figure(own, _strong(last), style), world, last, 100))
+    number = ", ".join(f"{one:,}" for one in sorted(results.growth["num_plans"].unique()))
+    text = [
+        "A prior learns from the best of all short plans, proposes longer ones, learns from the best of those, and so"
+        " on. Below the axis: the round, and the number of actions in its plans; each is compared with the best plans"
+        " of as many actions.",
+        f"{number} candidate plans, sampled at the temperature that is best in the validation worlds. Bands: 95 %"
+        " intervals over seeds; thin lines: the other Markov chains.",
+    ]
+    return Section("The horizon curriculum, round by round", text, (), boxes, beside=True)
+
+
+def bits(results: Results, style: Mapping[str, Style]) -> Section:
+    """Bits of held-out plans, a figure a world."""
+    rows = results.bits[(results.bits["rounds"] == 0) & (results.bits["prior"] != "uniform")]
+    boxes = [
+        _box(figures.bits_figure(own, style), world, own.assign(prior=_labels(own)), 1)
+        for world, own in rows.groupby("world", sort=False)
+    ]
+    text = [
+        "Bits per action of the held-out plans of the planner that tries all short ones: the fewer, the better a prior"
+        " predicts them. Hollow: without context; filled, below: with the initial or the per-step context. The numbers"
+        " are in the tables below."
+    ]
+    return Section("Bits per action of held-out plans", text, (), boxes, beside=True)
+
+
+def drawn_plans(results: Results, style: Mapping[str, Style]) -> Section:
+    """Plans drawn in the worlds."""
+    boxes = []
+    for run in results.runs:
+        for prior in (run.get("plans") or {"paths": ()})["paths"]:
+            drawn = figures.plans_figure(run["plans"], prior, style[prior][0], f"{run['world']}: {prior}")
+            boxes.append(FigureBox(drawn, "", f"plans of {prior} in {run['world']}"))
+    text = [
+        "Candidate plans of some priors from one start, after the last round of the curriculum. Square: the start;"
+        " dots: where plans end; green: rewards; grey: walls."
+    ]
+    return Section("Plans drawn in the worlds", text, (), boxes, beside=True)
+
+
+def transitions(results: Results) -> Section:
+    """Transition matrices of plans sampled from the priors: of the best chain, and of all priors that are no chains."""
+    boxes = []
+    rows = results.rows[(results.rows["sees"] == "none") & (results.rows["num_plans"] == results.shown)]
+    for world in results.worlds:
+        runs = [run for run in results.runs if run["world"] == world and run.get("transitions")]
+        strong = _strong(rows[rows["world"] == world])
+        for prior in runs[0]["transitions"] if runs else ():
+            if prior in strong and prior != "uniform":
+                matrices = np.array([run["transitions"][prior] for run in runs if prior in run["transitions"]])
+                # An action that never came has a row of zeros in its seed.
+                seeds = (matrices.sum(2, keepdims=True) > 0).sum(0)
+                mean = np.divide(matrices.sum(0), seeds, out=np.full(matrices.shape[1:], np.nan), where=seeds > 0)
+                names = runs[0]["action_names"] or [str(action) for action in range(len(mean))]
+                drawn = transition_figure(mean, names, f"{world}: {prior}", small=True)
+                boxes.append(FigureBox(drawn, "", f"transition matrix of {prior} in {world}"))
+    text = [
+        "How often each action follows each in plans sampled from a prior after the last round of the curriculum: means"
+        " over seeds."
+    ]
+    return Section("Transition matrices", text, (), boxes, beside=True)
+
+
+def about_worlds(results: Results) -> Section:
+    """What the worlds are."""
+    names = ["world", "length", "num_starts"]
+    runs = pd.DataFrame([{name: run[name] for name in names} for run in results.runs])
+    frame = runs.groupby("world", sort=False).agg("first").assign(seeds=runs["world"].value_counts()).reset_index()
+    columns = {"world": "world", "actions": "length", "starts": "num_starts:,", "seeds": "seeds"}
+    text = [
+        "Plans are learned from in training worlds and searched for in held-out ones. The normalised score is that of a"
+        " planner as a share of the optimum from the same starts; 0 is a plan of random moves where rewards can be"
+        " negative, else a score of 0."
+    ]
+    return Section("The worlds", text, [table(frame, columns, "actions: in a plan; starts: of each seed.")])
+
+
+def tables_of(results: Results, world: str) -> Iterator[Table]:
+    """Of a world: normalised scores and their differences, plans needed, bits, optimal starts and times."""
+    rows = results.rows[results.rows["world"] == world]
+    caption = f"{world}: normalised score, % of the optimum, by candidate plans. {HALF}"
+    for _, row in rows[rows["num_plans"].isna()].iterrows():
+        score = plus_minus(row, "oracle_share", 100)
+        caption += f" {row['planner'].capitalize()}, {row['model_steps']:,} model steps: {score}."
+    rows = rows[rows["num_plans"].notna()]
+    cells = [plus_minus(row, "oracle_share", 100) for _, row in rows.iterrows()]
+    yield _by_number(rows, _labels(rows), cells, "prior", caption, world)
+    paired = results.paired[results.paired["world"] == world]
+    if len(paired):
+        caption = f"{world}: differences between priors, percentage points, by candidate plans, paired. {HALF} {HOLM}"
+        labels, cells = paired.apply(_pair, axis=1), paired.apply(_gap, axis=1)
+        yield _by_number(paired, labels, cells, "first - second", caption, world)
+    needed = results.efficiency[results.efficiency["world"] == world]
+    if (needed["prior"] != "uniform").any():
+        most = f"{needed['most'].iloc[0]:,}"
+        columns = {
+            "prior": "label",
+            "plans needed": lambda row: _median(row, "needed", f"> {most}"),
+            "times fewer": lambda row: _median(row, "factor", "< 1"),
+            "reached": lambda row: f"{row['reached']} of {row['seeds']}",
+        }
+        caption = (
+            f"{world}: plans needed for what {most} random ones find; medians over seeds with 95 % intervals (sign"
+            " test). times fewer: than random search needs, which is less where it gains nothing by more. reached:"
+            f" seeds in which the prior did with {most} plans."
+        )
+        yield table(needed.assign(label=_labels(needed)), columns, caption, world)
+    bits = results.bits[(results.bits["world"] == world) & (results.bits["rounds"] == 0)]
+    if len(bits):
+        columns = {
+            "prior": "label",
+            "bits per action": lambda row: plus_minus(row, "bits_per_action", 1, 3),
+            "more": lambda row: plus_minus(row, "more", 1, 3, "+", ("more_low", "more_high")),
+        }
+        caption = f"{world}: bits per held-out action; more: than the best Markov chain of equal context, paired."
+        yield table(bits.assign(label=_labels(bits)), columns, caption, world)
+    last = rows[rows["num_plans"] == results.shown]
+    times = [f"{1000 * one:.3g}" if one == one else "" for one in last["seconds_per_decision"]]
+    caption = f"{world}: optimal in % of the starts, by candidate plans; ms: a decision with {results.shown:,} plans."
+    cells = [f"{100 * one:.1f}" for one in rows["at_oracle"]]
+    made = _by_number(rows, _labels(rows), cells, "prior", caption)
+    body = [[*row, time] for row, time in zip(made.rows, times, strict=True)]
+    yield Table([*made.headings, "ms"], body, caption, title=world)
+
+
+def _by_number(
+    rows: pd.DataFrame, labels: Sequence[str], cells: Sequence[str], heading: str, caption: str, title: str = ""
+) -> Table:
+    """A table with a row a label and a column a number of plans, of a label and a cell for each of `rows`."""
+    found = dict(zip(zip(labels, rows["num_plans"], strict=True), cells, strict=True))
+    numbers = sorted(rows["num_plans"].unique())
+    body = [[label, *(found.get((label, number), "") for number in numbers)] for label in dict.fromkeys(labels)]
+    return Table([heading, *(f"{number:,}" for number in numbers)], body, caption, title=title)
+
+
+def _box(drawn: Figure, world: str, rows: pd.DataFrame, factor: float, caption: str = "") -> FigureBox:
+    """A figure whose text for those who do not see it has the first number of each of `rows`."""
+    name = "oracle_share" if "oracle_share" in rows else "bits_per_action"
+    form = "{} {:.0f} %" if factor == 100 else "{} {:.3f}"
+    said = (form.format(row["prior"], factor * row[name]) for _, row in rows.iterrows())
+    return FigureBox(drawn, caption, f"{world}: {', '.join(said)}")
+
+
+def plus_minus(
+    row: Row, name: str, factor: float, digits: int = 1, sign: str = "", ends: tuple[str, str] = ("low", "high")
+) -> str:
+    """A mean with the longer side of its interval."""
+    mean, low, high = (row[one] for one in (name, *ends))
+    if pd.isna(mean):
+        return ""
+    text = f"{round(factor * mean, digits) + 0:{sign}.{digits}f}"  # no minus before 0.0
+    return text if pd.isna(low) else f"{text} ±{factor * max(high - mean, mean - low):.{digits}f}"
+
+
+def _gap(row: Row, significant: bool | None = None) -> str:
+    """A difference in percentage points, with a star where it is significant."""
+    star = row["p_holm"] < 0.05 if significant is None else significant
+    return plus_minus(row, "difference", 100, 1, "+") + ("*" if star else " " if row["seeds"] > 1 else "")
+
+
+def _labels(rows: pd.DataFrame) -> list[str]:
+    """Names of priors in tables."""
+    return [Key(*one).label for one in zip(rows["prior"], rows["sees"], rows["rounds"], strict=True)]
+
+
+def _context(row: Row) -> str:
+    return str(row["sees"]) + ", after" * (row["rounds"] > 0)
+
+
+def _pair(row: Row) -> str:
+    # Which priors are the best may differ with the number of plans.
+    pair = "best neural - best Markov" if row["what"] == BEST else f"{row['first']} - {row['second']}"
+    pair = row["first"] if row["first"] == row["second"] else pair
+    context = "" if row["sees"] == "none" else f", context {row['sees']}"
+    after = f", rounds {row['rounds']}" if "-" in row["rounds"] else ", after curriculum"
+    return f"{pair}{context}{'' if row['rounds'] == '0' else after}"
+
+
+def _median(row: Row, name: str, beyond: str) -> str:
+    """A median with its interval; `beyond` stands for what is missing."""
+    median, *ends = (
+        beyond if pd.isna(value) else f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
+        for value in (row[name], row[f"{name}_low"], row[f"{name}_high"])
+    )
+    # With fewer than 6 seeds there is no interval; else one of its ends is known where the median is.
+    return f"{median} ({ends[0]} to {ends[1]})" if median != beyond and ends != [beyond] * 2 else median
+
+
+def _strong(rows: pd.DataFrame) -> list[str]:
+    """The priors of rows to be drawn with a band: all but the chains that are not the best."""
+    ends = rows[rows["prior"].notna()].drop_duplicates("prior", keep="last").set_index("prior")["oracle_share"]
+    chains = ends[[kind_of(prior) == "markov" for prior in ends.index]]
+    return [prior for prior in ends.index if prior not in chains.index or prior == chains.idxmax()]

@@ -1,11 +1,10 @@
-"""One cell of `python -m eval compare`: everything about one world and one seed."""
+"""What `python -m eval compare` does for one world and one seed: collect plans, fit priors, and plan with them."""
 
-import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, fields, replace
-from functools import cached_property, partial
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 
@@ -13,70 +12,108 @@ from eval.compare.curves import (
     CLOSE,
     ROLLOUTS,
     TEMPERATURES,
+    Starts,
     best_temperature,
     curve,
     seconds_per_decision,
     starts_of,
 )
-from eval.compare.pictures import drawn_plans, transitions
-from eval.compare.recipes import MANY, NEURAL, ORDERS, RECIPE, TRAINING, WIDE, chain, macro, network
-from eval.compare.saved import load_for
-from eval.compare.settings import SEES, Settings
-from eval.worlds.foraging import Home
-from eval.worlds.splits import LAYOUTS, MAPS, SCRAMBLE
-from eval.worlds.suite import Task
+from eval.compare.priors import NEURAL, ORDERS, TRAINING, chain, load_for, macro, network
+from eval.worlds.suite import TASKS, Task
 from neuroprior import (
     ExhaustivePlanner,
+    GridWorld,
     Plans,
     Prior,
     UniformPrior,
     World,
     collect,
     extend_horizon,
+    sample_in_world,
 )
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
 
-GROWN_WITH = 64
-"""Candidate plans in the rounds of growth."""
+CONTEXTS: dict[str, Literal["plan", "step"] | None] = {"none": None, "initial": "plan", "per-step": "step"}
+"""The context of a prior: its name in options and tables, and how `collect` calls it."""
 
-JUDGED_WITH = 256
-"""Candidate plans with which temperatures are chosen, and growth is told."""
+CURRICULUM_PLANS = 64
+"""Candidate plans in the rounds of the horizon curriculum."""
 
-VERSION = 7
-"""Of the way in which a cell is done; counts up with each change of it."""
+VALIDATION_PLANS = 256
+"""Candidate plans with which temperatures are chosen, and rounds of the curriculum are compared."""
 
-CHOSEN_AT = 2
+VALIDATION_TIMES = 2
 """For each held-out start so many in the validation worlds, to choose temperatures at: differences are small."""
 
 TIMED_STARTS = 4
 """Starts planned from together when a decision is timed."""
 
+SAMPLED, DRAWN = 2000, 12
+"""Plans in which transitions are counted, and plans that are drawn in a figure."""
 
-def recipe() -> str:
-    """What decides a cell beside its world and settings; after a change of it, finished cells do not count.
+SHOWN = ("uniform", "markov-2", "gru")
+"""Priors whose plans are drawn in a figure."""
 
-    Changes of code are not seen: they count `VERSION` up.
+
+class Run(NamedTuple):
+    """One world and one seed."""
+
+    world: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """The name of its file, without ending."""
+        return f"{self.world}-{self.seed}"
+
+
+def runs_of(worlds: Sequence[str], seeds: int) -> list[Run]:
+    """All runs in some worlds, with seeds from 0."""
+    return [Run(world, seed) for world in worlds for seed in range(seeds)]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that decides the results of a run, beside its world and seed.
+
+    Attributes:
+        num_plans: numbers of candidate plans, powers of two.
+        kinds: of fitted priors: "markov", "macro", "gru", "transformer".
+        context: contexts of priors, see `CONTEXTS`; empty: those of the world (`Task`).
+        rounds: of the horizon curriculum, at most; a world has as many as it has lengths.
+        steps: of training of each neural prior in a round, at most.
+        starts: held-out starts to plan from.
+        training_starts: from so many starts, times `Task.times`, training plans are collected.
+        seed: of everything random.
+        priors: folders of saved priors.
+        lengths: actions in a plan, round by round of the horizon curriculum; empty: those of the world.
     """
-    priors = (ORDERS, RECIPE, WIDE, MANY, TRAINING)
-    return repr((priors, GROWN_WITH, JUDGED_WITH, ROLLOUTS, TEMPERATURES, CHOSEN_AT, TIMED_STARTS, VERSION))
+
+    num_plans: tuple[int, ...]
+    kinds: tuple[str, ...]
+    context: tuple[str, ...]
+    rounds: int
+    steps: int
+    starts: int
+    training_starts: int
+    seed: int
+    priors: tuple[str, ...] = ()
+    lengths: tuple[int, ...] = ()
+
+    @property
+    def budgets(self) -> list[int]:
+        """All powers of two up to the most candidates."""
+        return [2**k for k in range(max(self.num_plans).bit_length())]
 
 
-def digest(task: Task | Home) -> str:
-    """Eight letters for all that is said of a world but in words; after a change, its finished cells do not count."""
-    said = [_said(getattr(task, field.name)) for field in fields(task) if field.name != "about"]
-    return hashlib.sha256(repr((said, MAPS, LAYOUTS, SCRAMBLE)).encode()).hexdigest()[:8]
+def compare_run(run: Run, settings: Settings) -> dict[str, Any]:
+    """`compare_priors` in a world of the suite."""
+    return compare_priors(TASKS[run.world], run.seed, settings)
 
 
-def _said(value: Any) -> Any:
-    """A value, or the names of a function and its arguments."""
-    if isinstance(value, partial):
-        return _said(value.func), value.args, [(name, _said(given)) for name, given in sorted(value.keywords.items())]
-    return value.__qualname__ if callable(value) else value
-
-
-def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
-    """Collect, fit, grow and compare in the worlds of one seed.
+def compare_priors(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
+    """Collect plans, fit priors, extend their horizons and compare them, in the worlds of one seed.
 
     Args:
         task: the world.
@@ -84,7 +121,7 @@ def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
         settings: how much is done.
 
     Returns:
-        What `eval.compare.rows` reads.
+        What `eval.compare.results` reads.
 
     Raises:
         ValueError: too few plans or starts lead anywhere, or a saved prior does not fit the world.
@@ -96,45 +133,53 @@ def run_cell(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
         entries.append(tried_all)
     for one in contest.contestants():
         if one.length is not None:
-            growth.append(contest.growth(one, one.length))
+            growth.append(contest.curriculum_entry(one, one.length))
         if one.rounds in (0, contest.rounds):
             entries.append(contest.entry(one))
-        if one.sees == "nothing":
-            last[one.label] = one.prior  # which goes on learning until all are done
-    cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "length": task.length}
-    cell |= {"num_starts": settings.starts, "budgets": settings.budgets, "entries": entries, "growth": growth}
-    cell |= {"action_names": task.action_names}
+        if one.sees == "none":
+            last[one.label] = one.prior  # the object goes on learning until all rounds are done
+    found: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "length": task.length}
+    found |= {"num_starts": settings.starts, "budgets": settings.budgets, "entries": entries, "growth": growth}
+    found |= {"action_names": task.action_names}
     world = contest.worlds.held_out
-    cell |= {"transitions": {label: transitions(prior, world, contest.generator) for label, prior in last.items()}}
-    cell |= {"plans": drawn_plans(last, contest.starts, contest.generator) if seed == 0 else None}
-    return cell | {"seconds": perf_counter() - begin}
+    found |= {"transitions": {label: transitions(prior, world, contest.generator) for label, prior in last.items()}}
+    found |= {"plans": drawn_plans(last, contest.starts, contest.generator) if seed == 0 else None}
+    return found | {"seconds": perf_counter() - begin}
 
 
-def run_growth(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
-    """Grow all priors in the worlds of one seed, and plan with each after every round with plans of every length.
+def curriculum_run(run: Run, settings: Settings) -> dict[str, Any]:
+    """`compare_rounds` in a world of the suite."""
+    return compare_rounds(TASKS[run.world], run.seed, settings)
 
-    Args, raises: see `run_cell`.
+
+def compare_rounds(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
+    """Extend the horizons of all priors in the worlds of one seed; after every round, plan with plans of every length.
+
+    Args, raises: see `compare_priors`.
     """
     begin = perf_counter()
     contest = Contest(task, seed, settings)
     growth = [
-        contest.growth(one, length)
+        contest.curriculum_entry(one, length)
         for one in contest.contestants()
         for length in (contest.lengths if one.length is not None else ())
     ]
-    cell: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "growth": growth}
-    return cell | {"seconds": perf_counter() - begin}
+    found: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "growth": growth}
+    return found | {"seconds": perf_counter() - begin}
 
 
-def as_seen(plans: Plans, sees: str) -> Plans:
-    """Plans of which each step is seen, as priors that see less of them see them."""
+def with_context(plans: Plans, context: str) -> Plans:
+    """Plans with a context at each step, as priors of another context take them (see `CONTEXTS`)."""
     assert plans.context is not None
-    seen = {None: None, "plan": plans.context[:, 0], "step": plans.context}[SEES[sees]]
-    return replace(plans, context=seen)
+    kept = {None: None, "plan": plans.context[:, 0], "step": plans.context}[CONTEXTS[context]]
+    return replace(plans, context=kept)
 
 
 class Contestant(NamedTuple):
-    """A prior as it is after some rounds of growth, the plans of the last of which had `length` actions."""
+    """A prior after some rounds of the horizon curriculum, the last of which had plans of `length` actions.
+
+    `sees` is the name of its context; `length` is None for priors that do not take part in the curriculum.
+    """
 
     label: str
     sees: str
@@ -144,7 +189,7 @@ class Contestant(NamedTuple):
 
 
 class Contest:
-    """The worlds of a seed, what is learned from there, and where priors are compared."""
+    """The worlds of a seed, the plans that are collected there, and the starts from which priors are compared."""
 
     def __init__(self, task: Task, seed: int, settings: Settings, orders: Sequence[int] = ORDERS) -> None:
         self.task, self.settings, self.orders = task, settings, orders
@@ -153,57 +198,56 @@ class Contest:
         self.longer = (settings.lengths or task.lengths)[: settings.rounds]
         self.rounds, self.lengths = len(self.longer), tuple(sorted({task.depth, *self.longer}))
         self.training_starts = settings.training_starts * task.times
-        self.starts_at, self.chosen_at = (
+        self.starts_at, self.validation_at = (
             {
                 length: starts_of(task, world, number, length, self.generator)
                 for length in sorted({*self.lengths, task.length})
             }
             for world, number in (
                 (self.worlds.held_out, settings.starts),
-                (self.worlds.validation, CHOSEN_AT * settings.starts),
+                (self.worlds.validation, VALIDATION_TIMES * settings.starts),
             )
         )
         self.starts = self.starts_at[task.length]
-        self._heats: dict[tuple[str, str, int, int], float] = {}
+        self._temperatures: dict[tuple[str, str, int, int], float] = {}
 
     def contestants(self) -> Iterator[Contestant]:
-        """All priors, each after every round of its growth; the object is the same, and goes on learning."""
-        yield Contestant("uniform", "nothing", UniformPrior(self.worlds.training.num_actions), 0, None)
+        """All priors, each after every round of its curriculum; the object is the same, and goes on learning."""
+        yield Contestant("uniform", "none", UniformPrior(self.worlds.training.num_actions), 0, None)
         for folder in self.settings.priors:
             prior = load_for(folder, self.task.name, self.task.num_actions, self.task.action_names)
-            sees = next(name for name, per in SEES.items() if per == prior.context_per)
+            sees = next(name for name, per in CONTEXTS.items() if per == prior.context_per)
             yield Contestant(folder, sees, prior, 0, None)
-        for sees in self.settings.sees or self.task.sights:
+        for sees in self.settings.context or self.task.sights:
             if self.task.shows(sees):
                 yield from self._learners(sees)
 
-    def grown(self) -> Iterator[Contestant]:
-        """Each prior after its growth alone; saved priors and random plans do not grow."""
+    def after_curriculum(self) -> Iterator[Contestant]:
+        """Each prior after its last round alone; saved priors and the uniform prior have none."""
         return (one for one in self.contestants() if one.rounds == (0 if one.length is None else self.rounds))
 
     def _learners(self, sees: str) -> Iterator[Contestant]:
-        first = as_seen(self.first, sees)
+        first = with_context(self.first, sees)
         if "markov" in self.settings.kinds:
             for order in self.orders:
                 prior = chain(order, self.worlds.training, first, self.task.near)
-                yield from self._grown(f"markov-{order}", sees, prior, first, {})
+                yield from self._curriculum(f"markov-{order}", sees, prior, first, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
             prior = network(kind, self.worlds.training, first, draw_seed(self.generator))
-            yield from self._grown(kind, sees, prior, first, TRAINING | {"max_steps": self.settings.steps})
+            yield from self._curriculum(kind, sees, prior, first, TRAINING | {"max_steps": self.settings.steps})
+        if "macro" in self.settings.kinds and sees == "none":
+            yield from self._curriculum("macro", sees, macro(first), first, {})
 
-        if "macro" in self.settings.kinds and sees == "nothing":
-            yield from self._grown("macro", sees, macro(first), first, {})
-
-    def _grown(
+    def _curriculum(
         self, label: str, sees: str, prior: Prior, first: Plans, training: dict[str, Any]
     ) -> Iterator[Contestant]:
-        growth = extend_horizon(
+        rounds = extend_horizon(
             prior,
             first,
             self.worlds.training,
             self.longer,
             num_starts=self.training_starts,
-            num_plans=GROWN_WITH,
+            num_plans=CURRICULUM_PLANS,
             min_score=self.task.min_score,
             num_rollouts=ROLLOUTS,
             temperatures=TEMPERATURES,
@@ -211,8 +255,8 @@ class Contest:
             **self.task.scoring,
             **training,
         )
-        for rounds, _ in enumerate(growth):
-            yield Contestant(label, sees, prior, rounds, (self.task.depth, *self.longer)[rounds])
+        for number, _ in enumerate(rounds):
+            yield Contestant(label, sees, prior, number, (self.task.depth, *self.longer)[number])
 
     @cached_property
     def first(self) -> Plans:
@@ -220,8 +264,8 @@ class Contest:
         return self._collected(self.worlds.training, self.training_starts)
 
     @cached_property
-    def told(self) -> Plans:
-        """The same in the held-out worlds, on which bits are told."""
+    def held_out_plans(self) -> Plans:
+        """The same in the held-out worlds: the plans whose bits are computed."""
         return self._collected(self.worlds.held_out, self.training_starts // 4)
 
     def _collected(self, world: World, number: int) -> Plans:
@@ -229,34 +273,35 @@ class Contest:
         return collect(planner, world, number, context="step", min_score=self.task.min_score, generator=self.generator)
 
     def entry(self, one: Contestant) -> dict[str, Any]:
-        """What a prior's plans reach in the held-out worlds, and how well it tells those that were chosen there."""
-        starts, heat = self.starts, self._heat(one, self.task.length)
+        """What a prior's plans reach in the held-out worlds, and how well it predicts those that were chosen there."""
+        starts, temperature = self.starts, self._temperature(one, self.task.length)
         entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
-        entry |= {"temperature": heat}
-        entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, heat))
+        entry |= {"temperature": temperature}
+        entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, temperature))
         asked = self.settings.num_plans
-        timed = seconds_per_decision(starts, one.prior, asked, TIMED_STARTS, self.generator, heat)
+        timed = seconds_per_decision(starts, one.prior, asked, TIMED_STARTS, self.generator, temperature)
         seconds, steps = ([timed[b][k] if b in timed else None for b in self.settings.budgets] for k in (0, 1))
         entry |= {"seconds": seconds, "model_steps": steps}
-        scored = score(one.label, one.prior, as_seen(self.told, one.sees))
-        return entry | {"bits": scored.bits_per_action().mean, "actions": int(self.told.mask().sum())}
+        scored = score(one.label, one.prior, with_context(self.held_out_plans, one.sees))
+        return entry | {"bits": scored.bits_per_action().mean, "actions": int(self.held_out_plans.mask().sum())}
 
-    def growth(self, one: Contestant, length: int) -> dict[str, Any]:
+    def curriculum_entry(self, one: Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""
-        budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else JUDGED_WITH
-        heat = self._heat(one, length)
-        share = curve(self.starts_at[length], one.prior, [budget], self.generator, heat).share[0]
+        budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else VALIDATION_PLANS
+        temperature = self._temperature(one, length)
+        share = curve(self.starts_at[length], one.prior, [budget], self.generator, temperature).share[0]
         named = {"prior": one.label, "sees": one.sees, "round": one.rounds}
         return named | {"length": length, "num_plans": budget, "share": share}
 
-    def _heat(self, one: Contestant, length: int) -> float:
+    def _temperature(self, one: Contestant, length: int) -> float:
         """The temperature to sample plans of `length` actions at, chosen once; uniform plans are the same at all."""
         if one.label == "uniform":
             return 1.0
         key = one.label, one.sees, one.rounds, length
-        if key not in self._heats:
-            self._heats[key] = best_temperature(self.chosen_at[length], one.prior, JUDGED_WITH, self.generator)
-        return self._heats[key]
+        if key not in self._temperatures:
+            starts = self.validation_at[length]
+            self._temperatures[key] = best_temperature(starts, one.prior, VALIDATION_PLANS, self.generator)
+        return self._temperatures[key]
 
     def exhaustive(self) -> dict[str, Any] | None:
         """What all short plans reach; None where longer ones cost more, which would favour the short."""
@@ -267,13 +312,40 @@ class Contest:
         decision = planner.plan(self.worlds.held_out, self.starts.state, self.generator)
         seconds = (perf_counter() - begin) / self.settings.starts
         reached = float((decision.score >= self.starts.best - CLOSE).double().mean())
-        entry: dict[str, Any] = {
-            "planner": "exhaustive",
-            "prior": None,
-            "sees": "nothing",
-            "rounds": 0,
-            "depth": self.task.depth,
-        }
-        entry |= {"share": [self.starts.share(decision.score.double())], "at_oracle": [reached]}
-        entry |= {"score": [float(decision.score.double().mean())], "model_steps": [decision.model_steps]}
-        return entry | {"seconds": [seconds], "bits": None, "actions": 0}
+        entry: dict[str, Any] = {"planner": "exhaustive", "prior": None, "sees": "none", "rounds": 0}
+        entry |= {"depth": self.task.depth, "share": [self.starts.normalised(decision.score.double())]}
+        entry |= {"at_oracle": [reached], "score": [float(decision.score.double().mean())]}
+        return entry | {"model_steps": [decision.model_steps], "seconds": [seconds], "bits": None, "actions": 0}
+
+
+def transitions(prior: Prior, world: World, generator: torch.Generator) -> list[list[float]]:
+    """`A x A`: how often each action follows each in plans that are sampled from a prior."""
+    state = world.reset(SAMPLED, generator)
+    plans = sample_in_world(prior, world, state, 1, 16, generator=generator)[0][:, 0].long()
+    pair = plans[:, :-1] * world.num_actions + plans[:, 1:]
+    counts = pair.flatten().bincount(minlength=world.num_actions**2).view(world.num_actions, -1).double()
+    shares: list[list[float]] = (counts / counts.sum(1, keepdim=True).clamp(min=1)).tolist()
+    return shares
+
+
+def drawn_plans(priors: dict[str, Prior], starts: Starts, generator: torch.Generator) -> dict[str, Any] | None:
+    """The walls and rewards of a held-out grid, and plans of some priors from one start; None for other worlds."""
+    world = starts.world
+    if not isinstance(world, GridWorld) or world.edges == "torus":
+        return None
+    start = starts.state[:1]
+    layout, squares = int(world.layout(start)), world.height * world.width
+    rewards = world.reward[int(world.reward_map(start)), :: 4 if world.egocentric else 1]
+    found: dict[str, Any] = {"height": world.height, "width": world.width, "walls": world.walls[layout].tolist()}
+    found["reward"] = rewards[layout * squares : (layout + 1) * squares].view(world.height, world.width).tolist()
+    found["start"] = world.coordinates(start)[0].tolist()
+    found["paths"] = {}
+    for label in SHOWN:
+        if label in priors:
+            _, rollout = sample_in_world(
+                priors[label], world, start, DRAWN, starts.length, generator=generator, keep_states=True
+            )
+            assert rollout.states is not None
+            states = torch.cat([start.expand(DRAWN)[:, None], rollout.states[0]], 1)
+            found["paths"][label] = world.coordinates(states).tolist()
+    return found

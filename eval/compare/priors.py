@@ -1,0 +1,270 @@
+"""The priors of `python -m eval compare`: Markov chains with and without context, networks, and saved priors."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from neuroprior import GRUPrior, MacroPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World, load
+from neuroprior.analysis.comparison import score
+from neuroprior.plans import is_per_step
+from neuroprior.report.saved_priors import numbers
+
+ORDERS = range(5)
+"""Orders of the Markov chains."""
+
+MACROS, MACRO_ORDER = 16, 2
+"""Number of macro-actions, and the order of the chain over actions and macro-actions."""
+
+
+class UnlimitedGRU(GRUPrior):
+    """A GRU that carries its hidden state on beyond the length of the plans that it was trained on.
+
+    It predicts longer plans as well as a GRU that reads their last actions in a window, and is far quicker.
+    """
+
+    def prepare(self, plans: Plans | Tensor, window: int) -> Plans:
+        plans = super().prepare(plans, window)
+        self.window = None
+        return plans
+
+
+NEURAL: dict[str, Any] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
+
+RECIPE: dict[str, dict[str, Any]] = {"gru": {"lags": 1, "dropout": 0.2}, "transformer": {"dropout": 0.2}}
+"""Arguments of networks. In plans this short a GRU does not need its last inputs shown again, and is far quicker."""
+
+WIDE: dict[str, dict[str, Any]] = {"gru": {"hidden_size": 128}, "transformer": {"width": 128}}
+"""Further arguments of networks whose context has at least `MANY` features."""
+
+MANY = 50
+"""Features."""
+
+TRAINING = {"weight_decay": 0.3, "progress": False}
+"""Settings of the training of networks: there are few plans, which are learned from again and again."""
+
+VALIDATION = 0.2
+"""Share of the plans on which `ContextMarkov` chooses its features."""
+
+SAME = 1e-9
+"""Contexts whose hashes are nearer than this are the same."""
+
+
+def chain(order: int, world: World, plans: Plans, feature_sets: Sequence[tuple[int, ...]]) -> Prior:
+    """A Markov prior for plans like these, with their context if they have one."""
+    sizes = context_sizes(world, plans)
+    if sizes:
+        return ContextMarkov(plans.num_actions, order, feature_sets, **sizes)
+    return MarkovPrior(plans.num_actions, order)
+
+
+def macro(plans: Plans) -> MacroPrior:
+    """A chain over actions and macro-actions."""
+    return MacroPrior(plans.num_actions, MarkovPrior(plans.num_actions + MACROS, MACRO_ORDER))
+
+
+def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:
+    """A network, one of `NEURAL`, for plans like these, with their context if they have one."""
+    sizes = context_sizes(world, plans)
+    wide = WIDE[kind] if sizes.get("context_size", 0) >= MANY else {}
+    prior = NEURAL[kind](plans.num_actions, seed=seed, **sizes, **RECIPE[kind], **wide)
+    assert isinstance(prior, Prior)
+    return prior
+
+
+def context_sizes(world: World, plans: Plans) -> dict[str, Any]:
+    """The arguments that let a prior take the context of `plans`, which was observed in `world`."""
+    if plans.context is None:
+        return {}
+    if plans.context.is_floating_point():
+        return {"context_size": plans.context.shape[-1]}
+    assert isinstance(world, TabularWorld)
+    return {"num_contexts": world.num_states}
+
+
+class ContextIndex:
+    """Numbers contexts: each context that occurs in the training plans has a number, and all others share the last.
+
+    Args:
+        contexts: those that occur: floating point `[N, C]` (features), or integers `[N]`.
+        features: the features that count; None: all.
+    """
+
+    def __init__(self, contexts: Tensor, features: Sequence[int] | None = None) -> None:
+        self.columns = slice(None) if features is None else torch.tensor(features)
+        self.weights = torch.ones(0, dtype=torch.float64)
+        if contexts.is_floating_point():
+            # A sum with random weights tells features apart; one number is quicker to look up than many.
+            generator = torch.Generator().manual_seed(0)
+            self.weights = torch.rand(contexts[:, self.columns].shape[-1], generator=generator, dtype=torch.float64)
+        hashes = self._hash(contexts).sort().values
+        new = torch.ones_like(hashes, dtype=torch.bool)
+        new[1:] = hashes.diff() > SAME
+        self.hashes = hashes[new]
+
+    @property
+    def size(self) -> int:
+        """How many numbers there are, with the last."""
+        return len(self.hashes) + 1
+
+    def __call__(self, contexts: Tensor) -> Tensor:
+        """The numbers `[...]`, int64, of features `[..., C]` or integers `[...]`."""
+        value = self._hash(contexts)
+        place = torch.searchsorted(self.hashes, value - SAME / 2).clamp(max=len(self.hashes) - 1)
+        return torch.where((self.hashes[place] - value).abs() < SAME, place, len(self.hashes))
+
+    def _hash(self, contexts: Tensor) -> Tensor:
+        if contexts.is_floating_point():
+            return contexts[..., self.columns].double() @ self.weights
+        return contexts.double()
+
+
+class ContextMarkov(Prior):
+    """A Markov prior for contexts with many values: each context of the training plans is counted apart.
+
+    Of contexts with many features, most in held-out plans are new. So `fit` tries all features and each of
+    `feature_sets`, and takes those with which the prior predicts validation plans best. In a context that is new, the
+    prior predicts as a chain of the same order without context.
+
+    Args:
+        num_actions, order: see `MarkovPrior`.
+        feature_sets: sets of features.
+        num_contexts, context_size: see `Prior`.
+    """
+
+    def __init__(
+        self, num_actions: int, order: int, feature_sets: Sequence[tuple[int, ...]] = (), **sizes: int
+    ) -> None:
+        super().__init__(num_actions, **sizes)
+        self.order, self.feature_sets = order, tuple(feature_sets)
+        self.chain, self.fallback = MarkovPrior(num_actions, order, num_contexts=1), MarkovPrior(num_actions, order)
+        self.index = ContextIndex(torch.zeros(1, dtype=torch.long))
+
+    def fit(self, plans: Plans | Tensor, **settings: Any) -> Self:
+        """Choose the features, number the contexts, and count; returns self.
+
+        Raises:
+            ValueError: plans that a Markov prior cannot learn from, or without the context that this prior takes.
+        """
+        plans = self.training_plans(plans)
+        best: Sequence[int] | None = None
+        if self.feature_sets:
+            training, validation = plans.split(VALIDATION, torch.Generator().manual_seed(0))
+            self.fallback.fit(training, **settings)
+            bits = {
+                features: score("", self._count(training, features, settings), validation).bits_per_action().mean
+                for features in (None, *self.feature_sets)
+            }
+            best = min(bits, key=lambda features: bits[features])
+        self.fallback.fit(plans, **settings)
+        return self._count(plans, best, settings)
+
+    def _count(self, plans: Plans, features: Sequence[int] | None, settings: dict[str, Any]) -> Self:
+        context = plans.context
+        assert context is not None
+        flat = context.flatten(0, -2) if context.is_floating_point() else context.flatten()
+        self.index = ContextIndex(flat, features)
+        self.chain = MarkovPrior(self.num_actions, self.order, num_contexts=self.index.size)
+        self.chain.fit(replace(plans, context=self.index(context), context_names=None), **settings)
+        return self
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        if context is None:
+            raise ValueError("context: this prior takes a context, and none was given")
+        return self._combined(self.chain.start(batch_size, self.index(context)), self.fallback.start(batch_size))
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        number = None if context is None else self.index(context)
+        return self._combined(self.chain.step(action, state[:, 0], number), self.fallback.step(action, state[:, 1]))
+
+    def _combined(self, chain: tuple[Tensor, Tensor], fallback: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """The logits of the chain where its last context is known, else of the fallback; and the states of both."""
+        known = chain[1] % self.index.size < self.index.size - 1
+        return torch.where(known[:, None], chain[0], fallback[0]), torch.stack([chain[1], fallback[1]], -1)
+
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        if context is None:
+            raise ValueError("context: this prior takes a context, and none was given")
+        number = self.index(context)
+        known = (number if is_per_step(context) else number[:, None]) < self.index.size - 1
+        return torch.where(known[..., None], self.chain(plans, number), self.fallback(plans))
+
+
+class Renumbered(Prior):
+    """A saved prior whose actions have other numbers in a world.
+
+    Args:
+        prior: any prior.
+        number: `[A]`, int64: the prior's number of the world's action 0, 1, ...; a permutation.
+    """
+
+    def __init__(self, prior: Prior, number: Tensor) -> None:
+        super().__init__(prior.num_actions, prior.num_contexts, prior.context_size)
+        self.prior, self.context_per, self.context_names = prior, prior.context_per, prior.context_names
+        self.register_buffer("number", number)
+        if prior.action_names is not None:
+            self.action_names = tuple(prior.action_names[known] for known in number.tolist())
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = self.prior.start(batch_size, context)
+        return logits[:, self._number], state
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = self.prior.step(self._number[action], state, context)
+        return logits[:, self._number], state
+
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        logits = self.prior(self._number[plans.long()], context)
+        assert isinstance(logits, Tensor)
+        return logits[..., self._number]
+
+    def fit(self, plans: Plans | Tensor, **settings: Any) -> Self:
+        """Not possible: a saved prior is compared as it is.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError("a renumbered prior is not trained")
+
+    @property
+    def _number(self) -> Tensor:
+        assert isinstance(self.number, Tensor)
+        return self.number
+
+
+def load_for(folder: str, world: str, num_actions: int, action_names: Sequence[str] | None) -> Prior:
+    """The prior saved in a folder, with its actions numbered as in a world: by name if both have names.
+
+    Args:
+        folder: as `neuroprior.save` and `neuroprior fit` write it.
+        world: its name, for messages.
+        num_actions: of the world.
+        action_names: of the world; None: actions are matched by number.
+
+    Raises:
+        ValueError: the prior has other actions than the world, or samples an end symbol; or a file is damaged.
+        OSError: the folder, or a file in it, is not there.
+    """
+    prior = load(folder)
+    if prior.end is not None:
+        raise ValueError(f"{folder}: samples an end symbol, which is no action of a world; train without --data.end")
+    if prior.num_actions != num_actions:
+        raise ValueError(f"{folder}: knows {prior.num_actions} actions, the world {world} has {num_actions}")
+    if action_names is None or prior.action_names is None:
+        return prior
+    of_world = f" of the world {world}; it knows"
+    number = numbers(prior.action_names, action_names, f"{folder}: does not know the action", of_world)
+    return prior if bool((number == torch.arange(num_actions)).all()) else Renumbered(prior, number)
+
+
+def digests(folders: Sequence[str]) -> dict[str, str]:
+    """A digest of the files of each saved prior: results of another model in the same folder do not count."""
+    files = ("config.json", "model.safetensors")
+    return {
+        folder: hashlib.sha256(b"\0".join((Path(folder) / name).read_bytes() for name in files)).hexdigest()
+        for folder in folders
+    }

@@ -1,0 +1,491 @@
+"""From runs to tables of results: normalised scores, differences between priors, plans needed, bits, curriculum.
+
+A run is one world and one seed: worlds to learn in, worlds held out, and priors of its own. Runs are independent, so
+all intervals and tests are over the seeds of a world. Intervals are Student's, 95 %; those of medians (of numbers of
+plans, some of which are infinite) are those of the sign test.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from eval.compare.priors import NEURAL
+from neuroprior.analysis.statistics import (
+    Difference,
+    holm,
+    interquartile_mean,
+    mean_intervals,
+    probability_of_improvement,
+)
+
+Array = NDArray[np.float64]
+Runs = Sequence[Mapping[str, Any]]
+
+BEST = "best neural minus best Markov"
+LEARNED = ("neural", "markov", "other")
+"""Kinds of priors that have learned something."""
+
+PRIOR = ["prior", "sees", "rounds"]
+"""Columns that name a prior: its label, its context, and its rounds of the horizon curriculum."""
+
+CLOSE = 1e-9
+"""Normalised scores that differ by less are the same."""
+
+
+class Key(NamedTuple):
+    """The columns `PRIOR` of a row."""
+
+    prior: str
+    sees: str
+    rounds: int
+
+    @property
+    def kind(self) -> str:
+        """One of uniform, markov, neural, and other: macro, or the folder of a saved prior."""
+        return kind_of(self.prior)
+
+    @property
+    def label(self) -> str:
+        """Its name in tables."""
+        context = "" if self.sees == "none" else f", {self.sees} context"
+        return self.prior + context + (", after curriculum" if self.rounds else "")
+
+
+UNIFORM = Key("uniform", "none", 0)
+"""Random plans."""
+
+
+def kind_of(prior: str) -> str:
+    """The kind of a prior by its label, see `Key.kind`."""
+    if prior == "uniform":
+        return prior
+    if prior in NEURAL:
+        return "neural"
+    return "markov" if prior.removeprefix("markov-").isdecimal() else "other"
+
+
+class Pair(NamedTuple):
+    """Two sets of priors to be compared; of a set of several, the best."""
+
+    what: str
+    first: Sequence[Key]
+    second: Sequence[Key]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The tables of a comparison, each computed when it is first asked for.
+
+    Attributes:
+        runs: as `eval.compare.run.compare_priors` returns them.
+        num_plans: numbers of candidate plans that were asked for.
+
+    Raises:
+        ValueError: there are no runs, or (from the tables) they do not belong together.
+    """
+
+    runs: Runs
+    num_plans: Sequence[int]
+
+    def __post_init__(self) -> None:
+        if not self.runs:
+            raise ValueError("runs: at least one is expected; without any there is nothing to compare")
+        runs = sorted(self.runs, key=lambda run: (self.worlds.index(run["world"]), int(run["seed"])))
+        object.__setattr__(self, "runs", runs)
+        object.__setattr__(self, "num_plans", sorted(self.num_plans))
+
+    @cached_property
+    def worlds(self) -> list[str]:
+        """The worlds, in the order in which they come first."""
+        return list(dict.fromkeys(run["world"] for run in self.runs))
+
+    @property
+    def shown(self) -> int:
+        """The number of plans of `words`: the median of those that were asked for, not one chosen by its result."""
+        return self.num_plans[len(self.num_plans) // 2]
+
+    @cached_property
+    def scores(self) -> pd.DataFrame:
+        """A row a world, seed, planner, prior and number of plans: `share` (normalised score), `at_oracle` and so on.
+
+        A planner without candidate plans has one row, in which `num_plans` is missing.
+
+        Raises:
+            ValueError: a world has an entry twice, or runs with different numbers of plans.
+        """
+        budgets: dict[str, list[int]] = {}
+        lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds"]
+        entries, found = [], set()
+        for run in self.runs:
+            world, seed, numbers = run["world"], run["seed"], list(run["budgets"])
+            if budgets.setdefault(world, numbers) != numbers:
+                raise ValueError(f"{world}, seed {seed}: the numbers of plans are {numbers}, not {budgets[world]}")
+            for entry in run["entries"]:
+                named = {"world": world, "seed": seed} | {name: entry[name] for name in ("planner", *PRIOR)}
+                if (place := tuple(named.values())) in found:
+                    raise ValueError(f"{world}, seed {seed}: {entry['prior'] or entry['planner']} is there twice")
+                found.add(place)
+                named["num_plans"] = numbers if entry["prior"] else [None]
+                entries.append(named | {name: entry[name] for name in lists[1:]})
+        frame = pd.DataFrame(entries, columns=["world", "seed", "planner", *PRIOR, *lists]).explode(lists, True)
+        return frame.astype(dict.fromkeys(lists, "float64") | {"num_plans": "Int64"})
+
+    @cached_property
+    def _by_prior(self) -> dict[str, dict[Key, pd.DataFrame]]:
+        """In each world the normalised scores `[seed, num_plans]` of each prior."""
+        return {
+            str(world): {
+                Key(*key): one.pivot(index="seed", columns="num_plans", values="share")
+                for key, one in own.groupby(PRIOR, sort=False)
+            }
+            for world, own in self.scores[self.scores["prior"].notna()].groupby("world", sort=False)
+        }
+
+    @cached_property
+    def curves(self) -> pd.DataFrame:
+        """The normalised score: a row a world, planner, prior and number of plans, with its interval over seeds."""
+        by = ["world", "planner", *PRIOR, "num_plans"]
+        found = mean_intervals(self.scores, by, "share").rename(columns={"mean": "oracle_share", "n": "seeds"})
+        others = self.scores.groupby(by, sort=False, dropna=False)[["model_steps", "at_oracle", "seconds"]].mean()
+        found = found.join(others.reset_index(drop=True).rename(columns={"seconds": "seconds_per_decision"}))
+        found["model_steps"] = found["model_steps"].convert_dtypes()
+        columns = ["model_steps", "oracle_share", "low", "high", "at_oracle", "seconds_per_decision", "seeds"]
+        return found[[*by, *columns]]
+
+    @cached_property
+    def rows(self) -> pd.DataFrame:
+        """`curves` at the numbers of plans that were asked for.
+
+        Raises:
+            ValueError: runs do not have one of these.
+        """
+        for world, tables in self._by_prior.items():
+            known = next(iter(tables.values())).columns.tolist()
+            if missing := sorted(set(self.num_plans) - set(known)):
+                raise ValueError(f"num_plans: {world} has {known}, not {missing[0]}")
+        number = self.curves["num_plans"]
+        return self.curves[number.isna() | number.isin(self.num_plans)].reset_index(drop=True)
+
+    @cached_property
+    def paired(self) -> pd.DataFrame:
+        """Differences in the normalised score between priors with as many plans, over the seeds that have both.
+
+        What is compared: the best neural with the best Markov prior; each neural with each Markov prior; each saved or
+        macro prior with every other; after with before the horizon curriculum; with and without context. All else is
+        equal. The best are chosen on half of the seeds and compared on the other half, for both halves; their
+        intervals and p-values hold whichever are the best: see `best_difference`.
+
+        A row a world, pair and number of plans: the scores of the two (`first_share`, `second_share`; of the best, as
+        they were chosen for each seed on the other half), their `difference` with Student's interval (`low`, `high`),
+        `p_value` of the two-sided paired t-test, and `p_holm`, corrected for all rows of the world. With a single seed
+        there are scores and a difference and nothing else; the best are not chosen then.
+        """
+        gaps = (
+            (world, difference(tables, pair, number))
+            for world, tables in self._by_prior.items()
+            for pair in _pairs(tables)
+            for number in self.num_plans
+        )
+        found = pd.DataFrame([{"world": world} | gap for world, gap in gaps if gap], columns=["world", *GAP])
+        return found.assign(p_holm=corrected(found, ["world"]))
+
+    @cached_property
+    def words(self) -> pd.DataFrame:
+        """The answer in each world: the best neural against the best Markov prior of equal context and curriculum.
+
+        Where a world lacks one of the kinds, its two learned priors, or the best of them against random plans. A row a
+        world, context (`sees`) and number of rounds: that of the difference, with `p_holm` corrected for the number of
+        worlds in which the same was asked, and `better`, the name of the better prior where `p_holm` is below 0.05.
+        """
+        rows = []
+        for world, tables in self._by_prior.items():
+            for like in dict.fromkeys(key[1:] for key in tables if key.kind in LEARNED):
+                gaps = (difference(tables, pair, self.shown) for pair in _headlines(tables, like))
+                if gap := next(filter(None, gaps), None):  # the first pair that can be compared
+                    rows.append({"world": world} | gap | {"sees": like[0], "rounds": like[1]})
+        found = pd.DataFrame(rows, columns=["world", *GAP])
+        found["p_holm"] = corrected(found.assign(after=found["rounds"] > 0), ["sees", "after"])
+        better = found["first"].where(found["difference"] > 0, found["second"])
+        return found.assign(better=better.where(found["p_holm"] < 0.05))
+
+    @cached_property
+    def efficiency(self) -> pd.DataFrame:
+        """How many plans each prior needs for what random plans reach at the largest number: medians over seeds.
+
+        `factor` is how many times fewer that are than random plans need: these are as many as there are, unless fewer
+        reach the same already. Intervals are those of the sign test, 95 % at least, which hold for any distribution and
+        for seeds in which a prior does not get there; missing for fewer than 6 seeds. A missing number of plans, with
+        `reached` in less than all seeds, is more than `most`.
+        """
+        names = [f"{name}{end}" for name in ("needed", "factor") for end in ("", "_low", "_high")]
+        found = []
+        for world, tables in self._by_prior.items():
+            random = tables.get(UNIFORM, pd.DataFrame())
+            for key, own in tables.items():
+                seeds, budgets = own.index.intersection(random.index), own.columns.tolist()
+                if seeds.empty:
+                    continue
+                climbs = [optimize.isotonic_regression(random.loc[seed]).x for seed in seeds]
+                plans, others = (
+                    np.log2([needed(curve, budgets, climb[-1]) for curve, climb in zip(some, climbs, strict=True)])
+                    for some in (own.loc[seeds].to_numpy(), climbs)
+                )
+                row = (world, "sampling", *key, *_median(plans), *_median(others - plans))
+                found.append((*row, int(np.isfinite(plans).sum()), len(seeds), budgets[-1]))
+        columns = ["world", "planner", *PRIOR, *names, "reached", "seeds", "most"]
+        return pd.DataFrame(found, columns=columns)
+
+    @cached_property
+    def bits(self) -> pd.DataFrame:
+        """Held-out bits per action of each prior, and how many `more` than the best Markov chain takes.
+
+        The best chain of equal context, before the horizon curriculum: see `best_difference` for `more`, its interval
+        and its p-value, which is not corrected for the number of priors.
+        """
+        entries = [{"world": run["world"], "seed": run["seed"], **one} for run in self.runs for one in run["entries"]]
+        frame = pd.DataFrame(entries, columns=["world", "seed", *PRIOR, "bits"]).astype({"bits": "float64"})
+        frame, by = frame[frame["bits"].notna()], ["world", *PRIOR]
+        found = mean_intervals(frame, by, "bits").rename(columns={"mean": "bits_per_action", "n": "seeds"})
+        bits = {place: own.set_index("seed")["bits"] for place, own in frame.groupby(by, sort=False)}
+        more = []
+        for place, mine in bits.items():
+            like = (place[0], place[2], 0)
+            chains = [bits[one] for one in bits if (one[0], *one[2:]) == like and kind_of(one[1]) == "markov"]
+            values = -pd.concat([mine, *chains], axis=1, join="inner").to_numpy().T  # the fewer bits, the better
+            gap = best_difference(values[:1], values[1:]) if chains and values.shape[1] > 1 else [np.nan] * 4
+            more.append((-gap[0], -gap[2], -gap[1], gap[3]))
+        return found.join(pd.DataFrame(more, columns=["more", "more_low", "more_high", "p_value"]))
+
+    @cached_property
+    def growth(self) -> pd.DataFrame:
+        """The normalised score after each round of the horizon curriculum: a row a world, prior, round and length."""
+        names = ["world", "prior", "sees", "round", "length", "num_plans"]
+        entries = [{"world": run["world"], **one} for run in self.runs for one in run["growth"]]
+        found = mean_intervals(pd.DataFrame(entries, columns=[*names, "share"]), names, "share")
+        return found.rename(columns={"mean": "oracle_share", "n": "seeds"})
+
+    @cached_property
+    def reasons(self) -> pd.DataFrame:
+        """What may explain why the best neural prior is not better, wherever it is not.
+
+        A row a world, context and number of rounds: the best chain's normalised score (`markov_share`), the fewest
+        bits per action of a network and of a chain before the curriculum, when they learned from plans like the
+        held-out ones (`neural_bits`, `markov_bits`), and by how much networks are significantly ahead with the fewest
+        plans (`early`).
+        """
+        at = ["world", "sees", "rounds"]
+        best = self.words[(self.words["what"] == BEST) & (self.words["better"] != self.words["first"])]
+        found = best[[*at, "second_share"]].rename(columns={"second_share": "markov_share"})
+        for kind in ("neural", "markov"):
+            own = self.bits[(self.bits["rounds"] == 0) & [kind_of(prior) == kind for prior in self.bits["prior"]]]
+            fewest = own.groupby(["world", "sees"])["bits_per_action"].min().rename(f"{kind}_bits")
+            found = found.merge(fewest.reset_index(), "left", on=["world", "sees"])
+        early = self.paired[(self.paired["what"] == BEST) & (self.paired["num_plans"] == self.num_plans[0])]
+        early = early[(early["difference"] > 0) & (early["p_holm"] < 0.05) & (self.num_plans[0] < self.shown)]
+        early = early.astype({"rounds": "int64"}).rename(columns={"difference": "early"})
+        return found.merge(early[[*at, "early"]], "left", on=at)
+
+    @cached_property
+    def _matrices(self) -> dict[int, dict[Key, Array]]:
+        """By number of plans, the scores `[W, G]` of each prior that all W worlds have with all seeds; W, G >= 2.
+
+        Worlds have different numbers of rounds: `rounds` is 1 for all priors after the curriculum.
+        """
+        shape = len(self.worlds), len({run["seed"] for run in self.runs})
+        priors = self.scores[self.scores["prior"].notna()]
+        priors = priors.assign(rounds=(priors["rounds"] > 0).astype("int64"))
+        found: dict[int, dict[Key, Array]] = {number: {} for number in self.num_plans if min(shape) > 1}
+        for number, some in found.items():
+            for key, own in priors[priors["num_plans"] == number].groupby(PRIOR, sort=False):
+                values = own.pivot(index="world", columns="seed", values="share").dropna(axis=1).to_numpy()
+                if values.shape == shape:
+                    some[Key(*key)] = values
+        return found
+
+    @cached_property
+    def over_worlds(self) -> pd.DataFrame:
+        """The interquartile mean of the normalised score over worlds, of each prior that all worlds have.
+
+        Intervals are over seeds; `rounds` is 1 after the horizon curriculum.
+        """
+        found = [
+            (*key, number, *interquartile_mean(values), *values.shape)
+            for number, matrices in self._matrices.items()
+            for key, values in matrices.items()
+        ]
+        columns = [*PRIOR, "num_plans", "interquartile_mean", "low", "high", "worlds", "seeds"]
+        return pd.DataFrame(found, columns=columns)
+
+    @cached_property
+    def improvement(self) -> pd.DataFrame:
+        """The probability that the first of two priors is better in a world, of priors that all worlds have.
+
+        Each learned prior with random plans, and each that is no chain with each chain of equal context and curriculum.
+        """
+        found = [
+            (one.prior, other.prior, *one[1:], number, *probability_of_improvement(first, second), *first.shape)
+            for number, matrices in self._matrices.items()
+            for one, first in matrices.items()
+            for other, second in matrices.items()
+            if one.kind in LEARNED
+            and (other == UNIFORM or (other.kind == "markov" != one.kind and other[1:] == one[1:]))
+        ]
+        columns = ["first", "second", "sees", "rounds", "num_plans", "probability", "low", "high", "worlds", "seeds"]
+        return pd.DataFrame(found, columns=columns)
+
+
+def _pairs(tables: Mapping[Key, pd.DataFrame]) -> Iterator[Pair]:
+    keys = [key for key in tables if key.kind in LEARNED]
+    for like in dict.fromkeys(key[1:] for key in keys):
+        neural, markov = ([k for k in keys if (k.kind, k[1:]) == (kind, like)] for kind in ("neural", "markov"))
+        if neural and markov:
+            yield Pair(BEST, neural, markov)
+        yield from (Pair("neural minus Markov", [one], [other]) for one in neural for other in markov)
+    for place, key in enumerate(keys):
+        for later, other in enumerate(keys):
+            alike = other != key and other[1:] == key[1:]
+            if key.kind == "other" and alike and (other.kind != "other" or place < later):
+                yield Pair("other minus any", [key], [other])
+    for key in keys:
+        if key.rounds and (before := key._replace(rounds=0)) in keys:
+            yield Pair("after minus before the curriculum", [key], [before])
+    for key in keys:
+        if key.sees != "none" and (without := key._replace(sees="none")) in keys:
+            yield Pair("with minus without context", [key], [without])
+
+
+SIDES = ["first", "second", "first_share", "second_share"]
+GAP = ["what", *SIDES, "sees", "rounds", "num_plans", "difference", "low", "high", "p_value", "seeds"]
+
+
+def difference(tables: Mapping[Key, pd.DataFrame], pair: Pair, num_plans: int) -> dict[str, Any] | None:
+    """The columns `GAP` of a pair; None where the best would have to be chosen from a single seed."""
+    keys = [*pair.first, *pair.second]
+    values = pd.concat([tables[key][num_plans] for key in keys], axis=1, join="inner").to_numpy().T
+    first, second = values[: len(pair.first)], values[len(pair.first) :]
+    seeds, choice = values.shape[1], max(len(first), len(second)) > 1
+    if seeds < 1 + choice:
+        return None
+    best = [chosen(side) for side in (first, second)]
+    names = [
+        " / ".join(dict.fromkeys(some[place].prior for place in own))
+        for some, own in zip((pair.first, pair.second), best, strict=True)
+    ]
+    means = [float(side[own, np.arange(seeds)].mean()) for side, own in zip((first, second), best, strict=True)]
+    gap = best_difference(first, second) if seeds > 1 else (float((first - second).mean()), *[np.nan] * 3)
+    about = [
+        " - ".join(dict.fromkeys(str(key[place]) for key in (pair.first[0], pair.second[0])))
+        for place in (Key._fields.index("sees"), Key._fields.index("rounds"))
+    ]
+    return dict(zip(GAP, (pair.what, *names, *means, *about, num_plans, *gap, seeds), strict=True))
+
+
+def corrected(rows: pd.DataFrame, by: Sequence[str]) -> pd.Series:
+    """P-values corrected for the number of rows that agree in columns `by` (Holm's procedure); missing ones stay so."""
+
+    def correct(p_values: pd.Series) -> pd.Series:
+        known = p_values.dropna()
+        return pd.Series(holm(known.to_numpy(np.float64)), known.index).reindex(p_values.index)
+
+    return rows["p_value"].astype("float64").groupby([rows[name] for name in by]).transform(correct)
+
+
+def _headlines(tables: Mapping[Key, pd.DataFrame], like: tuple[str, int]) -> Iterator[Pair]:
+    """The pairs that answer the question, the best first, among priors of equal context and curriculum."""
+    keys = [key for key in tables if key.kind in LEARNED and key[1:] == like]
+    neural, markov = ([key for key in keys if key.kind == kind] for kind in ("neural", "markov"))
+    if neural and markov:
+        yield Pair(BEST, neural, markov)
+        yield Pair("neural minus Markov", neural[:1], markov[-1:])
+    elif len(keys) == 2:
+        yield Pair("learned minus other", keys[:1], keys[1:])
+    if UNIFORM in tables:
+        yield Pair("best learned minus random", keys, [UNIFORM])
+        yield Pair("learned minus random", keys[:1], [UNIFORM])
+
+
+def best_difference(first: Array, second: Array, level: float = 0.95) -> Difference:
+    """The best of K alternatives against the best of M others, values of the same G >= 2 seeds; more is better.
+
+    The difference is between those chosen by `chosen`. Its interval and p-value are those of the difference between
+    the truly best ones, whichever they are: the first has the better one where one of them is better than every one of
+    the second by one-sided paired t-tests at (1 - level) / 2K (intersection-union: Berger 1982; Bonferroni over the
+    K), and the second likewise with M. Differences of tests over the chosen ones alone would be called significant too
+    often: the choices depend on each other. With K = M = 1 this is Student's paired test.
+
+    Args:
+        first: `[K, G]`.
+        second: `[M, G]`.
+        level: of confidence.
+    """
+    seeds = np.arange(first.shape[1])
+    # Rounded, so that differences that are all the same have no spread.
+    mean = float(np.round(first[chosen(first), seeds] - second[chosen(second), seeds], 9).mean())
+    gaps = np.round(first[:, None] - second[None], 9)
+    means, errors, numbers = gaps.mean(-1), stats.sem(gaps, axis=-1), gaps.shape
+    ways = np.array(numbers[:2])
+    reach = stats.t.ppf(1 - (1 - level) / 2 / ways, len(seeds) - 1)
+    low = (means - reach[0] * errors).min(1).max()
+    high = (means + reach[1] * errors).max(0).min()
+    above, below = (_one_sided(sign * means, errors, len(seeds)) for sign in (1, -1))
+    # An estimate from two choices may, once in hundreds of times, lie beside what holds for the best.
+    mean = min(max(mean, float(low)), float(high))
+    p_value = 2 * min(ways[0] * above.max(1).min(), ways[1] * below.max(0).min())
+    return Difference(mean, float(low), float(high), float(min(p_value, 1)))
+
+
+def _one_sided(means: Array, errors: Array, number: int) -> Array:
+    """P-values of means above 0; of values without any spread, those of a sign test: few may agree by accident."""
+    t = np.divide(means, errors, out=np.zeros_like(means), where=errors > 0)
+    found: Array = np.where(errors > 0, stats.t.sf(t, number - 1), np.where(means > 0, 2.0**-number, 1))
+    return found
+
+
+def chosen(values: Array) -> NDArray[np.int64]:
+    """Of K alternatives `[K, G]` the best for each seed, by the mean over the half that the seed is not in: `[G]`.
+
+    The halves are the even and the odd seeds. A choice among noisy means favours what it chooses; on the other half its
+    worth is estimated without bias (cross-fitting: Chernozhukov et al. 2018, definition 3.1). One alternative needs no
+    choice; else G is at least 2.
+    """
+    seeds = np.arange(values.shape[1])
+    if len(values) == 1:
+        return np.zeros_like(seeds)
+    best = np.array([values[:, seeds % 2 == half].mean(1).argmax() for half in (1, 0)])
+    mine: NDArray[np.int64] = best[seeds % 2]
+    return mine
+
+
+def needed(curve: Array, budgets: Sequence[int], target: float) -> float:
+    """The number of plans at which a curve `[budgets]` of normalised scores reaches a target; infinite if it does not.
+
+    Interpolated between budgets on a logarithmic axis. More plans are never worse, so that the curve is made to climb
+    first (isotonic regression): else noise would cross the target too early.
+    """
+    climbing = optimize.isotonic_regression(curve).x
+    reached = np.flatnonzero(climbing >= target - CLOSE)
+    if not len(reached):
+        return float("inf")
+    place = int(reached[0])
+    if place == 0:
+        return float(budgets[0])
+    low, high = climbing[place - 1], climbing[place]
+    way = min(max((target - low) / (high - low), 0.0), 1.0)
+    return float(2 ** (np.log2(budgets[place - 1]) * (1 - way) + np.log2(budgets[place]) * way))
+
+
+def _median(logs: Array) -> tuple[float, ...]:
+    """The median of what has these base-2 logarithms, and the order statistics that hold the true one between them."""
+    ordered = np.sort(logs)
+    out = int(stats.binom.ppf(0.025, len(logs), 0.5)) - 1
+    # Of two in the middle of which one is infinite, the median is on the safe side.
+    middle = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    median = sum(middle) / 2 if np.isfinite(middle).all() else middle[int(np.isfinite(middle[0]))]
+    ends = (ordered[out], ordered[-1 - out]) if out >= 0 else (np.nan, np.nan)
+    return tuple(2.0**value if np.isfinite(value) else np.nan for value in (median, *ends))
