@@ -78,7 +78,7 @@ class ForagingOracle(Planner):
             arriving.append(worth)
             # A row a cell: whole rows are copied.
             torch.index_select(worth.flatten(1), 0, table.next_state.flatten(), out=acting)
-            if table.legal_actions is not None:
-                acting.masked_fill_(~table.legal_actions.view(-1, 1), -torch.inf)
+            if table.legal_table is not None:
+                acting.masked_fill_(~table.legal_table.view(-1, 1), -torch.inf)
             torch.amax(acting.view(cells, world.num_actions, batch * len(items)), 1, out=value.flatten(1))
         return arriving

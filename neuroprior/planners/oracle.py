@@ -54,8 +54,8 @@ def oracle(
             after = reward + discount * after
         elif left == 0:
             after = reward + after
-        if world.legal_actions is not None:
-            after = after.masked_fill(~world.legal_actions, -torch.inf)
+        if world.legal_table is not None:
+            after = after.masked_fill(~world.legal_table, -torch.inf)
         best = after.view(maps, states, actions).amax(-1)
         prefix = torch.maximum(prefix, best)
     return (prefix if any_prefix else best).view(-1)[state]

@@ -134,8 +134,8 @@ def patches(table: TabularWorld, num_seasons: int, radius: int, generator: torch
     reached.scatter_(1, table.cell(table.reset(num_seasons, generator))[:, None], 1.0)
     for _ in range(radius):
         further = reached[:, :, None].expand(-1, -1, table.num_actions).flatten(1)
-        if table.legal_actions is not None:
-            further = further * table.legal_actions.flatten()
+        if table.legal_table is not None:
+            further = further * table.legal_table.flatten()
         to = table.next_state.flatten().expand_as(further)
         reached = reached.scatter_reduce(1, to, further, "amax")
     place = places(table)

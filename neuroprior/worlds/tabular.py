@@ -27,7 +27,7 @@ class TabularWorld(World):
         reward: floating point. `[S]`: the reward of arriving in a cell. `[S, A]`: the reward of an action in a cell.
             With chance also `[S, A, K]`: the reward of an outcome. `[W, S]`, `[W, S, A]` and `[W, S, A, K]`: the same
             for W reward maps. Where a shape could mean two of these (S = A), give all dimensions, or `[1, S]`.
-        legal: `[S, A]` bool: which actions exist; None where all do. Every cell needs at least one. With chance every
+        legal_actions: `[S, A]` bool: which actions exist; None where all do. Every cell needs at least one. With chance every
             action must exist everywhere.
         action_names: A names, for tables and figures.
         probability: floating point `[S, A, K]`: the probability of each outcome; the K of an action sum to 1 within
@@ -48,21 +48,23 @@ class TabularWorld(World):
         self,
         next_state: Tensor,
         reward: Tensor,
-        legal: Tensor | None = None,
+        legal_actions: Tensor | None = None,
         action_names: Sequence[str] | None = None,
         *,
         probability: Tensor | None = None,
     ) -> None:
         next_state = torch.as_tensor(next_state)
-        _check_shapes(next_state, probability, legal)
+        _check_shapes(next_state, probability, legal_actions)
         self.num_states, self.num_actions = next_state.shape[:2]
         check_range("next_state", next_state, self.num_states, "states")
         self.chance = None if probability is None else Chance(torch.as_tensor(probability), next_state.device)
         self.stochastic = self.chance is not None
         self._set_maps(_reward_maps(torch.as_tensor(reward, device=next_state.device), next_state.shape))
         self.next_state = next_state.long().contiguous()
-        self.legal_actions = None if legal is None else _legal_table(torch.as_tensor(legal), self.next_state)
-        self.all_legal = self.legal_actions is None
+        self.legal_table = (
+            None if legal_actions is None else _checked_legal(torch.as_tensor(legal_actions), self.next_state)
+        )
+        self.all_legal = self.legal_table is None
         if action_names is not None and len(action_names) != self.num_actions:
             raise ValueError(f"action_names: {self.num_actions} names are expected, not {len(action_names)}")
         self.action_names = None if action_names is None else tuple(action_names)
@@ -89,8 +91,8 @@ class TabularWorld(World):
     def to(self, device: torch.device | str) -> "TabularWorld":
         """Move the tables to `device`; returns self."""
         self.next_state, self.reward = self.next_state.to(device), self.reward.to(device)
-        if self.legal_actions is not None:
-            self.legal_actions = self.legal_actions.to(device)
+        if self.legal_table is not None:
+            self.legal_table = self.legal_table.to(device)
         if self.chance is not None:
             self.chance.to(device)
         return self
@@ -211,9 +213,9 @@ class TabularWorld(World):
         return self.cell(state)
 
     def legal_actions(self, state: Tensor) -> Tensor:
-        if self.legal_actions is None:
+        if self.legal_table is None:
             return super().legal_actions(state)
-        return self.legal_actions[self.cell(state)]
+        return self.legal_table[self.cell(state)]
 
     def terminated(self, state: Tensor) -> Tensor:
         """Where every action stays, without reward."""
@@ -253,7 +255,7 @@ def _check_shapes(next_state: Tensor, probability: Tensor | None, legal: Tensor 
             f" not {str(probability.dtype).removeprefix('torch.')} of shape {list(probability.shape)}"
         )
     if legal is not None:
-        raise ValueError("legal: with probability every action must exist in every cell; leave legal out")
+        raise ValueError("legal_actions: with probability every action must exist in every cell; leave it out")
 
 
 def _reward_maps(reward: Tensor, table: torch.Size) -> Tensor:
@@ -284,13 +286,13 @@ def _reward_maps(reward: Tensor, table: torch.Size) -> Tensor:
     raise ValueError(f"reward: {', '.join(names[:-1])} or {names[-1]} with {sizes} is expected, not {list(shape)}")
 
 
-def _legal_table(legal: Tensor, next_state: Tensor) -> Tensor:
+def _checked_legal(legal: Tensor, next_state: Tensor) -> Tensor:
     if legal.dtype != torch.bool or legal.shape != next_state.shape:
         raise ValueError(
-            f"legal: bool of shape {list(next_state.shape)} is expected,"
+            f"legal_actions: bool of shape {list(next_state.shape)} is expected,"
             f" not {str(legal.dtype).removeprefix('torch.')} of shape {list(legal.shape)}"
         )
     stuck = (~legal.any(1)).nonzero()
     if len(stuck):
-        raise ValueError(f"legal[{int(stuck[0])}]: this state has no legal action; every state needs one")
+        raise ValueError(f"legal_actions[{int(stuck[0])}]: this state has no legal action; every state needs one")
     return legal.to(next_state.device)

@@ -102,7 +102,7 @@ def test_the_far_node_is_as_far_as_can_be():
 def chance(length: int) -> torch.Tensor:
     """`[127]`: the probability that so many uniform legal moves pass the water, by dynamic programming."""
     world = labyrinth(absorbing=True)
-    legal = world.legal_actions.double()
+    legal = world.legal_table.double()
     reached = (torch.arange(127) == WATER).double()
     for _ in range(length):
         reached = (legal * reached[world.next_state]).sum(1) / legal.sum(1)

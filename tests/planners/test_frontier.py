@@ -37,7 +37,7 @@ class Counted(TabularWorld):
     """Counts the steps that are taken."""
 
     def __init__(self, world: TabularWorld) -> None:
-        super().__init__(world.next_state, world.reward, world.legal_actions)
+        super().__init__(world.next_state, world.reward, world.legal_table)
         self.steps = 0
 
     def step(self, state, action, generator=None):
@@ -97,7 +97,7 @@ def test_nor_does_a_prior_that_is_sure_of_the_wrong_way_stop_it(temperature, noi
 
 def test_plans_are_legal_even_where_nothing_is_worth_anything():
     world = random_world(0, "WSA", legal=True)
-    world = TabularWorld(world.next_state, torch.full_like(world.reward, -torch.inf), world.legal_actions)
+    world = TabularWorld(world.next_state, torch.full_like(world.reward, -torch.inf), world.legal_table)
     state = world.reset(200, seeded(0))
     for how in ({}, {"any_prefix": True}):
         decision = FrontierPlanner(UniformPrior(3), 4, 100, **how).plan(world, state, seeded(1))

@@ -83,7 +83,7 @@ def test_impossible_rewards_are_no_trouble(share):
     """Where some, or all, scores are infinite, plans are legal, end where is said, and the best is found."""
     world = random_world(0, "WS", legal=True)
     reward = world.reward.masked_fill(torch.rand(world.reward.shape, generator=seeded(1)) < share, -torch.inf)
-    world = TabularWorld(world.next_state, reward, world.legal_actions)
+    world = TabularWorld(world.next_state, reward, world.legal_table)
     state = world.reset(60, seeded(0))
     decision = MCTSPlanner(UniformPrior(3), 3, 60).plan(world, state, seeded(0))
     assert torch.equal(decision.score, oracle(world, state, 3))

@@ -191,7 +191,7 @@ def changed(*where_value):
         ({"probability": changed(1, 0, 0, -0.1)}, ["probability[1, 0, 0]", "-0.1"]),
         ({"probability": changed(2, 1, 1, torch.nan)}, ["probability[2, 1, 1]", "nan"]),
         ({"probability": changed(2, 1, 1, torch.inf)}, ["probability[2, 1, 1]", "inf"]),
-        ({"legal": torch.ones(3, 2, dtype=torch.bool)}, ["legal", "probability"]),
+        ({"legal_actions": torch.ones(3, 2, dtype=torch.bool)}, ["legal", "probability"]),
         ({"reward": torch.rand(3, 2, 3)}, ["reward", "[W, S, A, K]", "K = 2", "[3, 2, 3]"]),
     ],
 )

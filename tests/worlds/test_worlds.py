@@ -262,9 +262,9 @@ TABLE = torch.tensor([[0, 1, 2], [2, 1, 0], [1, 1, 1], [3, 0, 0]])
         ({"reward": torch.tensor(1.0)}, ["reward"]),
         ({"reward": torch.tensor([0, 1, float("nan"), 0])}, ["reward", "2", "NaN"]),
         ({"reward": torch.ones(4, dtype=torch.complex64)}, ["reward", "complex64"]),
-        ({"legal": torch.ones(4, 2, dtype=torch.bool)}, ["legal", "[4, 2]"]),
-        ({"legal": torch.ones(4, 3)}, ["legal", "float32"]),
-        ({"legal": torch.arange(4)[:, None] != torch.tensor([2, 2, 2])}, ["legal", "2"]),
+        ({"legal_actions": torch.ones(4, 2, dtype=torch.bool)}, ["legal", "[4, 2]"]),
+        ({"legal_actions": torch.ones(4, 3)}, ["legal", "float32"]),
+        ({"legal_actions": torch.arange(4)[:, None] != torch.tensor([2, 2, 2])}, ["legal", "2"]),
         ({"action_names": ["a", "b"]}, ["action_names", "3", "2"]),
     ],
 )
