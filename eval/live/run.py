@@ -1,40 +1,32 @@
-"""One cell of `python -m eval live`: agents in the same world, with the same food, that differ in their prior."""
+"""One run of `python -m eval live`: agents in the same world, with the same food, that differ in their prior."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, NamedTuple
 
 import torch
 
-from eval.compare.recipes import RECIPE, UnlimitedGRU
-from eval.compare.settings import LiveSettings
-from eval.worlds.foraging import Home
-from neuroprior import (
-    Agent,
-    ForagingOracle,
-    ForagingWorld,
-    MarkovPrior,
-    Planner,
-    Prior,
-    SamplingPlanner,
-    TabularWorld,
-    UniformPrior,
-    patches,
-)
+from eval.worlds.foraging import FORAGING_WORLDS
+from eval.worlds.runs import Run
 from neuroprior._random import draw_seed
+from neuroprior.agents.agent import Agent
+from neuroprior.planners import ForagingOracle, Planner, SamplingPlanner
+from neuroprior.priors import GRUPrior, MarkovPrior, Prior, UniformPrior
+from neuroprior.worlds import ForagingWorld, TabularWorld, patches
 
-ORDERS = {"nothing": 3, "each step": 2}
-"""Of chains, by what they see."""
+ORDERS = {"none": 3, "per-step": 2}
+"""Orders of the Markov priors, by their context."""
 
 PARTS = 8
-"""Of a season, over which rewards are added up."""
+"""Parts of a season, in each of which the mean reward is taken."""
 
 DISCOUNT = 0.95
 
 FORESIGHT = 4
-"""The oracle's plans are so many times as long as the others': it always knows of food."""
+"""The oracle's plans are so many times as long as the others': they always reach food."""
 
-EVERY = 4
+REPLAN_EVERY = 4
 """Actions that are executed of each plan."""
 
 LEARN_EVERY = {"markov": 16, "gru": 64}
@@ -46,17 +38,39 @@ TRAINING = {"markov": None, "gru": {"max_steps": 40, "weight_decay": 0.3, "progr
 HALF_LIFE = 96
 """Steps after which half of what was executed is forgotten."""
 
-VERSION = 2
-"""Of the way in which a cell is done; counts up with each change of it."""
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """All that decides the results of a run, beside its world and seed.
+
+    Attributes:
+        kinds: of priors that learn: "markov", "gru".
+        period: steps in a season.
+        seasons: their number.
+        agents: in each world; they share a prior.
+        items: of food.
+        num_plans: candidates of each decision.
+        length: actions in a plan.
+        seed: of everything random.
+    """
+
+    kinds: tuple[str, ...]
+    period: int
+    seasons: int
+    agents: int
+    items: int
+    num_plans: int
+    length: int
+    seed: int
 
 
-class Life(NamedTuple):
-    """How an agent lives.
+class Condition(NamedTuple):
+    """What is compared in a world.
 
     Attributes:
         prior: "uniform", or the kind of a prior that learns; "oracle": none.
-        sees: what the prior sees, see `eval.compare.settings.SEES`.
-        learns: "never"; "before": in a season before its life, and never again; "online": as long as it lives.
+        sees: the context of the prior: "none" or "per-step"; "full" for the oracle, which knows the state.
+        learns: "never"; "before": in a season before the run; "online": during the run.
         warm: whether the rest of the last plan is a candidate.
     """
 
@@ -66,75 +80,67 @@ class Life(NamedTuple):
     warm: bool = True
 
 
-def lives(kinds: tuple[str, ...]) -> Iterator[Life]:
+RANDOM, ORACLE = Condition("uniform", "none", "never"), Condition("oracle", "full", "never")
+
+
+def conditions(kinds: Sequence[str]) -> Iterator[Condition]:
     """All that are compared."""
-    yield Life("uniform", "nothing", "never", warm=False)
-    yield Life("uniform", "nothing", "never")
+    yield RANDOM._replace(warm=False)
+    yield RANDOM
     for kind in kinds:
         for sees in ORDERS:
-            yield Life(kind, sees, "before")
-            yield Life(kind, sees, "online")
-            if sees == "each step":
-                yield Life(kind, sees, "online", warm=False)
-    yield Life("oracle", "everything", "never")
+            yield Condition(kind, sees, "before")
+            yield Condition(kind, sees, "online")
+            if sees == "per-step":
+                yield Condition(kind, sees, "online", warm=False)
+    yield ORACLE
 
 
-def run_live(home: Home, seed: int, settings: LiveSettings) -> dict[str, Any]:
-    """Let agents of each kind live in the world of one seed, from the same states and with food in the same patches.
-
-    Args:
-        home: where.
-        seed: of the world and of everything that is drawn in it.
-        settings: how much is done.
+def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
+    """Run the agents of each condition in the world of one seed, from the same states and with the same seasons.
 
     Returns:
-        `entries`, one of each life: the mean `rewards` a step of each eighth of a season, and the `seconds` of a step.
+        `entries`, one of each condition: the mean `rewards` a step in each part of each season, the `model_steps` of a
+        step, and its `seconds`.
     """
-    begin = perf_counter()
-    generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
-    table = home.table(settings.seed * 10_000 + seed)
-    # One season more than is lived through: that in which priors learn that learn before.
-    growth = patches(table, settings.seasons + 1, home.radius, generator)
+    task = FORAGING_WORLDS[run.world]
+    generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + run.seed)
+    table = task.table(settings.seed * 10_000 + run.seed)
+    # There is one season more than those of the run: priors that learn before the run learn in it.
+    growth = patches(table, settings.seasons + 1, task.radius, generator)
     world = ForagingWorld(table, growth, settings.period, settings.items)
     state, own = world.reset(settings.agents, generator), draw_seed(generator)
+    steps = settings.period * settings.seasons
     entries = []
-    for life in lives(settings.kinds):
+    for condition in conditions(settings.kinds):
         drawn = torch.Generator().manual_seed(own)
-        prior = _prior(life, table, own)
-        if life.learns == "before":
+        prior = _prior(condition, table, own)
+        if condition.learns == "before":
             before = world.reset(settings.agents, drawn)
-            before[:, 1] = settings.period * settings.seasons
-            _agent(life, world, prior, world.regrow(before, drawn), settings, drawn).run(settings.period)
-        start = perf_counter()
-        agent = _agent(life, world, prior, state, settings, drawn, life.learns == "online")
-        done = agent.run(settings.period * settings.seasons)
+            before[:, 1] = steps
+            _agent(condition, world, prior, world.regrow(before, drawn), settings, drawn).run(settings.period)
+        begin = perf_counter()
+        done = _agent(condition, world, prior, state, settings, drawn, condition.learns == "online").run(steps)
         rewards = done.rewards.double().mean(0).view(-1, settings.period // PARTS).mean(1)
-        seconds = (perf_counter() - start) / len(done.rewards[0]) / settings.agents
-        entry: dict[str, Any] = life._asdict() | {"rewards": rewards.tolist(), "seconds": seconds}
-        entries.append(entry | {"model_steps": done.model_steps / len(done.rewards[0])})
-    cell: dict[str, Any] = {"world": home.name, "seed": seed, "about": home.about, "period": settings.period}
-    cell |= {"places": float((growth > 0).sum(1).double().mean()), "of": world.num_places}
-    return cell | {"entries": entries, "seconds": perf_counter() - begin}
+        entry: dict[str, Any] = condition._asdict() | {"rewards": rewards.tolist()}
+        entry |= {"seconds": (perf_counter() - begin) / steps / settings.agents}
+        entries.append(entry | {"model_steps": done.model_steps / steps})
+    found: dict[str, Any] = {"world": run.world, "seed": run.seed, "about": task.about, "period": settings.period}
+    return found | {"places": float((growth > 0).sum(1).double().mean()), "entries": entries}
 
 
-def recipe() -> str:
-    """What decides a cell beside its world and settings; after a change of it, finished cells do not count."""
-    decides = (ORDERS, PARTS, DISCOUNT, FORESIGHT, EVERY, LEARN_EVERY, TRAINING, HALF_LIFE, RECIPE["gru"], VERSION)
-    return repr(decides)
-
-
-def _prior(life: Life, table: TabularWorld, seed: int) -> Prior:
+def _prior(condition: Condition, table: TabularWorld, seed: int) -> Prior:
     """A prior that has learned nothing yet."""
-    seeing = {"num_contexts": table.num_states} if life.sees == "each step" else {}
-    if life.prior == "markov":
-        return MarkovPrior(table.num_actions, ORDERS[life.sees], **seeing)
-    if life.prior == "gru":
-        return UnlimitedGRU(table.num_actions, seed=seed, **seeing, **RECIPE["gru"])
+    context = {"num_contexts": table.num_states} if condition.sees == "per-step" else {}
+    if condition.prior == "markov":
+        return MarkovPrior(table.num_actions, ORDERS[condition.sees], **context)
+    if condition.prior == "gru":
+        return GRUPrior(table.num_actions, lags=1, dropout=0.2, seed=seed, **context)
     return UniformPrior(table.num_actions)
 
 
 def _agent(
-    life: Life,
+    condition: Condition,
     world: ForagingWorld,
     prior: Prior,
     state: torch.Tensor,
@@ -143,23 +149,23 @@ def _agent(
     learns: bool = True,
 ) -> Agent:
     planner: Planner = ForagingOracle(FORESIGHT * settings.length, DISCOUNT)
-    if life.prior != "oracle":
+    if condition != ORACLE:
         # The rest of the last plan is one more candidate: without it there is one more plan.
-        number = settings.num_plans + (not life.warm)
+        number = settings.num_plans + (not condition.warm)
         planner = SamplingPlanner(prior, settings.length, number, objective="return", discount=DISCOUNT)
-    often = LEARN_EVERY.get(life.prior)
+    often = LEARN_EVERY.get(condition.prior)
     return Agent(
         world,
         planner,
         prior,
         state,
-        replan_every=EVERY,
+        replan_every=REPLAN_EVERY,
         change=world.regrow,
-        warm_start=life.warm,
+        warm_start=condition.warm,
         learn_every=often if learns else None,
         plan_length=settings.length,
         retention=0.5 ** ((often or 1) / HALF_LIFE),
         min_score=0.0,
         generator=generator,
-        training=TRAINING.get(life.prior),
+        training=TRAINING.get(condition.prior),
     )

@@ -1,20 +1,21 @@
-"""The worlds that agents live in for `python -m eval live`: tables in which food grows."""
+"""The worlds of `python -m eval live`: tables in which food grows. To add one, add it to `FORAGING_WORLDS`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
-from neuroprior import TabularWorld, egocentric, gridworld, labyrinth, maze
+from neuroprior.worlds import TabularWorld, egocentric, gridworld, labyrinth, maze
 
 
 @dataclass(frozen=True)
-class Home:
+class ForagingTask:
     """A table in which food grows.
 
     Attributes:
-        name: as in `HOMES`.
+        name: as in `FORAGING_WORLDS`.
         about: what it is.
-        table: makes that of a seed.
-        radius: of a patch of food, in actions, see `neuroprior.patches`.
+        table: makes the table of a seed.
+        radius: of a patch of food, in actions, see `neuroprior.worlds.patches`.
     """
 
     name: str
@@ -31,23 +32,18 @@ def _maze(seed: int) -> TabularWorld:
     return maze(15, 15, seed=seed)
 
 
-def _egocentric(seed: int) -> TabularWorld:
-    return egocentric(maze(15, 15, seed=seed))
+_tasks = (
+    ForagingTask("forage_grid", "a grid of 20 x 20, a torus", _grid, 2),
+    ForagingTask("forage_maze", "a maze of 15 x 15 squares, seen from above", _maze, 5),
+    ForagingTask(
+        "forage_egocentric",
+        "a maze of 15 x 15 squares, for an agent that turns and goes forward",
+        lambda seed: egocentric(_maze(seed)),
+        8,
+    ),
+    ForagingTask("forage_labyrinth", "the labyrinth of the mice, 127 nodes of a binary tree", lambda seed: labyrinth(), 3),
+)
+FORAGING_WORLDS = {task.name: task for task in _tasks}
+"""By name. A patch covers from a thirtieth (grid) to a twelfth (labyrinth) of each."""
 
-
-def _labyrinth(seed: int) -> TabularWorld:
-    return labyrinth()
-
-
-HOMES = {
-    home.name: home
-    for home in (
-        Home("forage_grid", "a grid of 20 x 20, a torus", _grid, 2),
-        Home("forage_maze", "a maze of 15 x 15 squares, seen from above", _maze, 5),
-        Home(
-            "forage_egocentric", "a maze of 15 x 15 squares, for an agent that turns and goes forward", _egocentric, 8
-        ),
-        Home("forage_labyrinth", "the labyrinth of the mice, 127 nodes of a binary tree", _labyrinth, 3),
-    )
-}
-"""By their names in tables. A patch covers from a thirtieth (grid) to a twelfth (labyrinth) of each."""
+ForagingWorldName = Literal[tuple(FORAGING_WORLDS)]  # type: ignore[valid-type]

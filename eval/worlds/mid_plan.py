@@ -1,25 +1,22 @@
-"""Planning anew in the middle of a plan, in `python -m eval compare`: the rest of the last plan is what is seen."""
+"""Replanning in the middle of a plan, in `python -m eval compare`: the context is the rest of the last plan."""
 
 import torch
 from torch import Tensor, nn
 
-from neuroprior import TabularWorld, World
 from neuroprior.planners import Planner
+from neuroprior.worlds import TabularWorld, World
 
 
-class UnderWay(World):
-    """A world in which plans start where others are under way, and the rest of those is what is seen.
+class MidPlanWorld(World):
+    """A world in which plans start in the middle of earlier plans, and the rest of those is observed.
 
-    A state is the inner world's, and the actions that are left of the plan that was under way at the start: these stay
-    as they are from step to step, so that they are the context of a whole plan.
+    A state is the inner world's state and the actions that were left of the earlier plan at the start. These do not
+    change from step to step, so that they are the context of a whole plan.
 
     Args:
         world: the inner world.
-        planner: chooses the plans that are under way, of R + `taken` actions.
-        taken: so many of their actions are executed.
-
-    Attributes:
-        world: the inner world.
+        planner: chooses the earlier plans, of R + `taken` actions.
+        taken: how many of their actions are executed.
     """
 
     def __init__(self, world: TabularWorld, planner: Planner, taken: int) -> None:
@@ -28,7 +25,7 @@ class UnderWay(World):
         self.action_names = world.action_names
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """States `[batch_size, 1 + R]`: of the inner world, some steps after a start, and the actions that are left."""
+        """States `[batch_size, 1 + R]`, int64: the inner world's after `taken` actions, and the R actions left."""
         state = self.world.reset(batch_size, generator)
         plan = self.planner.plan(self.world, state, generator).plan.long()
         for t in range(self.taken):
@@ -40,7 +37,7 @@ class UnderWay(World):
         return torch.cat([inner[:, None], state[:, 1:]], 1), reward
 
     def observe(self, state: Tensor) -> Tensor:
-        """The actions that are left, one by one: float32 `[N, R * A]`."""
+        """The actions that are left, one-hot: float32 `[N, R * A]`."""
         return nn.functional.one_hot(state[:, 1:], self.num_actions).flatten(1).float()
 
     def legal_actions(self, state: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Where plans are learned from and where priors are compared in `python -m eval compare`: three worlds a seed."""
+"""How the three worlds of a seed are made in `python -m eval compare`: for training, validation and comparison."""
 
 from collections.abc import Callable
 from copy import copy
@@ -8,29 +8,29 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from eval.worlds import minigrid as minigrid_worlds
-from eval.worlds.mid_plan import UnderWay
-from neuroprior import ExhaustivePlanner, PocketCube, TabularWorld, World, from_gymnasium, maze
-from neuroprior.worlds import EpisodicWorld, goal_direction
+from eval.worlds import minigrid
+from eval.worlds.mid_plan import MidPlanWorld
+from neuroprior.planners import ExhaustivePlanner
+from neuroprior.worlds import EpisodicWorld, PocketCube, TabularWorld, World, from_gymnasium, goal_direction, maze
 
 MAPS = 100
 """Reward maps or layouts in each of the three worlds of a seed, where they cost nothing to make."""
 
 LAYOUTS = (8, 2, 2)
-"""The same, for layouts of MiniGrid, whose states are searched one by one."""
+"""The same for layouts of MiniGrid, whose states are enumerated one by one."""
 
 SCRAMBLE = 9
 """Random moves before the cube is to be solved."""
 
-
 LAST, TAKEN = 7, 3
-"""Actions of the plan that is under way, and how many of them were executed."""
+"""Mid-plan: the actions of the earlier plan, and how many of them were executed."""
 
 
 class Worlds(NamedTuple):
-    """Worlds of a seed: plans are collected in `training`, priors are compared in `held_out`.
+    """The worlds of a seed.
 
-    Temperatures are chosen in `validation`: where they have learned priors are surer of themselves than elsewhere.
+    Plans are collected in `training`, and priors are compared in `held_out`. Sampling temperatures are chosen in
+    `validation`, since priors are more certain in the world that they learned in.
     """
 
     training: World
@@ -38,18 +38,18 @@ class Worlds(NamedTuple):
     held_out: World
 
 
-def unlike(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
-    """Worlds of seeds of their own."""
+def from_seeds(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
+    """Three worlds made by `make(seed=..., **how)`, each with a seed of its own."""
     return Worlds(*(make(seed=len(Worlds._fields) * seed + part, **how) for part in range(len(Worlds._fields))))
 
 
-def layouts(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
+def grid_layouts(seed: int, make: Callable[..., World], **how: Any) -> Worlds:
     """Grids with new walls and new rewards."""
-    return unlike(seed, make, num_layouts=MAPS, reward_power=8.0, view=2, **how)
+    return from_seeds(seed, make, num_layouts=MAPS, reward_power=8.0, view=2, **how)
 
 
-def split(seed: int, name: str) -> Worlds:
-    """One environment, started in any state that can be reached: a random half to learn from, a quarter held out."""
+def split_starts(seed: int, name: str) -> Worlds:
+    """One Gymnasium environment whose reachable states are split: half for training, a quarter each for the others."""
     world = from_gymnasium(name, starts="any")
     assert isinstance(world, EpisodicWorld)
     where = world.starts.nonzero()[:, 0]
@@ -60,19 +60,19 @@ def split(seed: int, name: str) -> Worlds:
     return Worlds(*parts)
 
 
-def lake(seed: int, slippery: bool) -> Worlds:
-    """Frozen lakes with holes of their own."""
+def frozen_lakes(seed: int, slippery: bool) -> Worlds:
+    """Frozen lakes, each with holes of its own."""
     from gymnasium.envs.toy_text.frozen_lake import generate_random_map
 
     def make(seed: int) -> World:
         holes = generate_random_map(size=8, seed=seed)
         return from_gymnasium("FrozenLake-v1", desc=holes, is_slippery=slippery, starts="any")
 
-    return unlike(seed, make)
+    return from_seeds(seed, make)
 
 
 class _Scrambles(PocketCube):
-    """The cube with some quarters of its scrambled states, told by their number: those of one are never in another."""
+    """The cube, started in some quarters of its scrambled states, which a hash assigns to the quarters."""
 
     def __init__(self, *quarters: int) -> None:
         super().__init__("half", SCRAMBLE, absorbing=True)
@@ -86,40 +86,39 @@ class _Scrambles(PocketCube):
         return own[:batch_size]
 
 
-def scrambles(seed: int) -> Worlds:
-    """Cubes, the same for all seeds."""
+def scrambled_cubes(seed: int) -> Worlds:
+    """Cubes, the same for all seeds; no start of one is a start of another."""
     return Worlds(_Scrambles(0, 1), _Scrambles(2), _Scrambles(3))
 
 
-def minigrid(seed: int, environment: str) -> Worlds:
+def minigrid_layouts(seed: int, environment: str) -> Worlds:
     """Layouts of MiniGrid, each seed with its own; plans may start anywhere."""
     bounds = pairwise(accumulate(LAYOUTS, initial=seed * sum(LAYOUTS)))
-    return Worlds(*(minigrid_worlds.layouts(environment, range(first, last)) for first, last in bounds))
-
-
-def _guided(seed: int) -> World:
-    """Mazes with goals, whose direction is seen beside the squares around: how far it is, and on which side."""
-    world = maze(reward="goal", egocentric=True, num_layouts=MAPS, view=2, seed=seed)
-    around, direction = world.observe, goal_direction(world)
-
-    def seen(state: Tensor) -> Tensor:
-        away = direction(state)
-        return torch.cat([around(state), away / world.width, away.sign()], -1)
-
-    world.observe = seen  # type: ignore[method-assign]
-    return world
+    return Worlds(*(minigrid.layouts(environment, range(first, last)) for first, last in bounds))
 
 
 def goal_mazes(seed: int) -> Worlds:
-    """Mazes with goals."""
-    return unlike(seed, _guided)
+    """Mazes with goals; the squares around the agent and the distance and side of the goal are observed."""
+
+    def make(seed: int) -> World:
+        world = maze(reward="goal", egocentric=True, num_layouts=MAPS, view=2, seed=seed)
+        around, direction = world.observe, goal_direction(world)
+
+        def observe(state: Tensor) -> Tensor:
+            away = direction(state)
+            return torch.cat([around(state), away / world.width, away.sign()], -1)
+
+        world.observe = observe  # type: ignore[method-assign]
+        return world
+
+    return from_seeds(seed, make)
 
 
-def under_way(seed: int) -> Worlds:
-    """The egocentric mazes after the first moves of the best of all plans of seven."""
+def mid_plan(seed: int) -> Worlds:
+    """The egocentric mazes after the first moves of the best of all plans of `LAST` moves."""
 
-    def middle(world: World) -> UnderWay:
+    def middle(world: World) -> MidPlanWorld:
         assert isinstance(world, TabularWorld)
-        return UnderWay(world, ExhaustivePlanner(LAST), TAKEN)
+        return MidPlanWorld(world, ExhaustivePlanner(LAST), TAKEN)
 
-    return Worlds(*map(middle, layouts(seed, maze, egocentric=True)))
+    return Worlds(*map(middle, grid_layouts(seed, maze, egocentric=True)))

@@ -1,6 +1,10 @@
-"""The worlds of `python -m eval compare`, and what is optimised, seen and learned from in each."""
+"""The worlds of `python -m eval compare`, `depth` and `grow`: what is optimised, observed and learned from in each.
 
-from collections.abc import Callable
+To add a world, add a `Task` to `_tasks` below. Its `worlds` makes three worlds for a seed, mostly with a function of
+`eval.worlds.splits`. A world that is no `TabularWorld` also needs its optimum in `best_score`.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -8,25 +12,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from eval.worlds import minigrid as minigrid_worlds
-from eval.worlds.mid_plan import UnderWay
-from eval.worlds.splits import (
-    LAST,
-    MAPS,
-    TAKEN,
-    Worlds,
-    goal_mazes,
-    lake,
-    layouts,
-    minigrid,
-    scrambles,
-    split,
-    under_way,
-    unlike,
-)
-from neuroprior import PocketCube, TabularWorld, World, four_rooms, gridworld, maze, oracle
+from eval.worlds import minigrid, splits
+from eval.worlds.mid_plan import MidPlanWorld
+from neuroprior.planners import oracle
+from neuroprior.worlds import PocketCube, TabularWorld, World, four_rooms, gridworld, maze
 from neuroprior.worlds.cube import FACES
 from neuroprior.worlds.grid import MOVES, TURNS
+
+Context = Literal["none", "initial", "per-step"]
+"""The context that a prior is given: none, what is observed at the start, or what is observed before each action."""
 
 
 @dataclass(frozen=True)
@@ -36,34 +30,37 @@ class Task:
     Attributes:
         name: as in `TASKS`.
         action_names: of its actions, in the order of their numbers.
-        about: what it is, what differs between the worlds of a seed, and what is optimised.
+        about: what it is, what is optimised, and what differs between the worlds of a seed.
         worlds: makes the worlds of a seed.
         depth: of the exhaustive planner whose plans are learned from first.
-        lengths: numbers of actions in the plans of the rounds of growth; the last is that of the comparison.
-        objective, discount, any_prefix: what planners optimise, see `neuroprior.Planner`.
+        lengths: numbers of actions in the plans of the horizon curriculum, round by round; the last is that of the
+            comparison.
+        objective, discount, any_prefix: what planners optimise, see `neuroprior.planners.Planner`.
         min_score: plans that scored no more than this are not learned from; None: all are.
-        sees: what `World.observe` of these worlds shows, for priors that see; None: nothing that would be of use.
-        near: sets of its features; chains may see one of them alone, as they must have met what they see.
-        sights: what priors see where nothing else is asked for, see `eval.compare.settings.SEES`.
-        times: plans are looked for from so many times as many starts, where most starts lead nowhere.
-        numbered: what is seen is the number of a state, which is of no use at the start, as other starts are held out.
+        observation: what `World.observe` of these worlds returns, for priors with context; None: nothing of use.
+        state_number: the observation is the number of a state, which is of no use as initial context, since other
+            starts are held out.
+        feature_sets: sets of the observed features; Markov priors may be given one of them alone, since they have to
+            meet a context in training to know it.
+        contexts: those that priors are compared with where no others are asked for.
+        start_factor: plans are collected from so many times as many starts, where most starts lead nowhere.
     """
 
     name: str
     action_names: tuple[str, ...]
     about: str
-    worlds: Callable[[int], Worlds]
+    worlds: Callable[[int], splits.Worlds]
     depth: int
     lengths: tuple[int, ...]
     objective: Literal["terminal", "return"] = "terminal"
     discount: float = 1.0
     any_prefix: bool = False
     min_score: float | None = None
-    sees: str | None = None
-    near: tuple[tuple[int, ...], ...] = ()
-    sights: tuple[str, ...] = ("nothing",)
-    times: int = 1
-    numbered: bool = False
+    observation: str | None = None
+    state_number: bool = False
+    feature_sets: tuple[tuple[int, ...], ...] = ()
+    contexts: tuple[Context, ...] = ("none",)
+    start_factor: int = 1
 
     @property
     def num_actions(self) -> int:
@@ -75,34 +72,52 @@ class Task:
         """Actions in the plans that are compared."""
         return self.lengths[-1]
 
-    def shows(self, sees: str) -> bool:
-        """Whether priors that see so much (see `eval.compare.settings.SEES`) are shown something of use."""
-        if self.sees is None or sees == "nothing":
-            return sees == "nothing"
-        return sees == "each step" or not self.numbered
-
     @property
     def scoring(self) -> dict[str, Any]:
         """What planners optimise, as their arguments."""
         return {"objective": self.objective, "discount": self.discount, "any_prefix": self.any_prefix}
 
+    def offers(self, context: Context) -> bool:
+        """Whether this context is of use here; none always is."""
+        if context == "none":
+            return True
+        return self.observation is not None and not (self.state_number and context == "initial")
 
+
+_ENDS = "the reward where a plan ends; new walls and rewards held out"
+_SQUARES = "which of the 24 squares around it are free"
+# Of the squares around, five rows of five without the middle: the eight nearest, and those that actions lead or turn to.
+_EIGHT = (6, 7, 8, 11, 12, 15, 16, 17)
+
+_moving: dict[str, Any] = {
+    "action_names": MOVES,
+    "depth": 5,
+    "lengths": (10, 16),
+    "observation": _SQUARES,
+    "feature_sets": (_EIGHT, (7, 11, 12, 16)),
+    "contexts": ("none", "initial"),
+    "start_factor": 2,
+}
+_turning: dict[str, Any] = {"action_names": TURNS, "depth": 7, "lengths": (11, 16), "start_factor": 2}
 # Later is worth less, so that the best plans go straight there.
 _goal: dict[str, Any] = {"objective": "return", "discount": 0.95, "min_score": 0.0}
-_neighbours = "which of the 24 squares around it are free"
-# The eight squares around, and those that actions lead or turn to, of five rows of five without the one in the middle.
-_nearest = ((6, 7, 8, 11, 12, 15, 16, 17), (7, 11, 12))
-_nearest_of_four = (_nearest[0], (7, 11, 12, 16))
-_grid_about = "the reward where a plan ends; new walls and rewards held out"
+_states: dict[str, Any] = {"state_number": True, "contexts": ("none", "per-step")}
+_lake: dict[str, Any] = {"action_names": ("left", "down", "right", "up"), "depth": 5, "lengths": (9, 14)}
 
 
 def _minigrid(name: str, about: str, environment: str) -> Task:
-    """One of MiniGrid's worlds."""
-    how: dict[str, Any] = {"near": minigrid_worlds.NEAR, "sights": ("nothing", "each step"), "times": 3} | _goal
-    about = f"MiniGrid {about}; reaching it; new layouts held out"
-    sees = "the seven by seven squares before it"
     return Task(
-        name, minigrid_worlds.MOVES, about, partial(minigrid, environment=environment), 5, (9, 16), sees=sees, **how
+        name,
+        minigrid.MOVES,
+        f"MiniGrid {about}; reaching it; new layouts held out",
+        partial(splits.minigrid_layouts, environment=environment),
+        5,
+        (9, 16),
+        observation="the seven by seven squares before it",
+        feature_sets=minigrid.NEAR,
+        contexts=("none", "per-step"),
+        start_factor=3,
+        **_goal,
     )
 
 
@@ -111,115 +126,85 @@ _tasks = (
         "grid",
         MOVES,
         "the paper's grid: 20 x 20, a torus, independent rewards; the reward where a plan ends; new rewards held out",
-        partial(unlike, make=gridworld, edges="torus", num_worlds=MAPS),
+        partial(splits.from_seeds, make=gridworld, edges="torus", num_worlds=splits.MAPS),
         4,
         (6, 8),
     ),
     Task(
         "four_rooms",
-        MOVES,
-        f"four rooms, 13 x 13, doors at random places, four moves; {_grid_about}",
-        partial(layouts, make=four_rooms),
-        5,
-        (10, 16),
-        sees=_neighbours,
-        near=_nearest_of_four,
-        sights=("nothing", "start"),
-        times=2,
+        about=f"four rooms, 13 x 13, doors at random places, four moves; {_ENDS}",
+        worlds=partial(splits.grid_layouts, make=four_rooms),
+        **_moving,
     ),
     Task(
         "maze",
-        MOVES,
-        f"mazes with some loops, 15 x 15, four moves; {_grid_about}",
-        partial(layouts, make=maze),
-        5,
-        (10, 16),
-        sees=_neighbours,
-        near=_nearest_of_four,
-        sights=("nothing", "start"),
-        times=2,
+        about=f"mazes with some loops, 15 x 15, four moves; {_ENDS}",
+        worlds=partial(splits.grid_layouts, make=maze),
+        **_moving,
     ),
     Task(
         "egocentric",
-        TURNS,
-        f"the same mazes for an agent that turns left, turns right or goes forward; {_grid_about}",
-        partial(layouts, make=maze, egocentric=True),
-        7,
-        (11, 16),
-        sees=_neighbours + ", as it is turned",
-        near=_nearest,
-        sights=("nothing", "start", "each step"),
-        times=2,
+        about=f"the same mazes for an agent that turns left, turns right or goes forward; {_ENDS}",
+        worlds=partial(splits.grid_layouts, make=maze, egocentric=True),
+        observation=f"{_SQUARES}, as it is turned",
+        feature_sets=(_EIGHT, (7, 11, 12)),
+        contexts=("none", "initial", "per-step"),
+        **_turning,
     ),
     Task(
         "goal_maze",
-        TURNS,
-        "the same mazes with a goal, and one more way to look: where the goal lies; reaching it; new walls and goals"
-        " held out",
-        goal_mazes,
-        7,
-        (11, 16),
-        sees=_neighbours + ", and how far ahead and aside the goal is",
-        # With the side on which the goal is, and no more, chains meet the same sights again.
-        near=tuple((*squares, 26, 27) for squares in _nearest),
-        sights=("nothing", "each step"),
-        times=8,
-        **_goal,
+        about="the same mazes with a goal, whose direction is observed too; reaching it; new walls and goals held out",
+        worlds=splits.goal_mazes,
+        observation=f"{_SQUARES}, and how far ahead and aside the goal is",
+        # With the side on which the goal is, and no more, Markov priors meet the same contexts again.
+        feature_sets=((*_EIGHT, 26, 27), (7, 11, 12, 26, 27)),
+        contexts=("none", "per-step"),
+        **_turning | _goal | {"start_factor": 8},
     ),
     Task(
-        "under_way",
-        TURNS,
-        f"the egocentric mazes, planning anew after the first {TAKEN} of {LAST} moves; {_grid_about}",
-        under_way,
-        7,
-        (11, 16),
-        sees="what is left of the last plan",
-        near=tuple(tuple(range(len(TURNS) * left)) for left in (1, 2)),
-        sights=("nothing", "start"),
-        times=2,
+        "mid_plan",
+        about=f"the egocentric mazes, planning anew after the first {splits.TAKEN} of {splits.LAST} moves; {_ENDS}",
+        worlds=splits.mid_plan,
+        observation="what is left of the last plan",
+        feature_sets=tuple(tuple(range(len(TURNS) * left)) for left in (1, 2)),
+        contexts=("none", "initial"),
+        **_turning,
     ),
     Task(
         "taxi",
         ("south", "north", "east", "west", "pickup", "dropoff"),
         "Taxi: fetch a passenger and bring it; the sum of rewards; a quarter of all states to start from held out",
-        partial(split, name="Taxi-v4"),
+        partial(splits.split_starts, name="Taxi-v4"),
         5,
         (10, 16),
         "return",
-        sees="the whole state",
-        numbered=True,
-        sights=("nothing", "each step"),
+        observation="the whole state",
+        **_states,
     ),
     Task(
         "cliff",
         MOVES,
         "CliffWalking: go around a cliff; the sum of rewards; a quarter of all squares to start from held out",
-        partial(split, name="CliffWalking-v1"),
+        partial(splits.split_starts, name="CliffWalking-v1"),
         5,
         (10, 16),
         "return",
-        sees="the square",
-        numbered=True,
-        sights=("nothing", "each step"),
+        observation="the square",
+        **_states,
     ),
     Task(
         "frozen_lake",
-        ("left", "down", "right", "up"),
-        "FrozenLake, 8 x 8, not slippery: to the goal, between holes; reaching it; new lakes held out",
-        partial(lake, slippery=False),
-        5,
-        (9, 14),
-        **_goal,
+        about="FrozenLake, 8 x 8, not slippery: to the goal, between holes; reaching it; new lakes held out",
+        worlds=partial(splits.frozen_lakes, slippery=False),
+        **_lake | _goal,
     ),
     Task(
         "slippery",
-        ("left", "down", "right", "up"),
-        "FrozenLake, 8 x 8, slippery: a third of the moves go where they should; how likely a plan reaches the goal;"
-        " new lakes held out",
-        partial(lake, slippery=True),
-        5,
-        (9, 14),
-        "return",
+        about="FrozenLake, 8 x 8, slippery: a third of the moves go where they should; how likely a plan reaches the"
+        " goal; new lakes held out",
+        worlds=partial(splits.frozen_lakes, slippery=True),
+        objective="return",
+        **_lake,
     ),
     _minigrid("minigrid_four_rooms", "FourRooms: to a goal square, seven actions", "MiniGrid-FourRooms-v0"),
     _minigrid(
@@ -234,26 +219,39 @@ _tasks = (
         "cube",
         tuple(face + turn for face in FACES for turn in ("", "2", "'")),
         "the 2 x 2 x 2 cube after nine random moves, half turns too; passing the solved state; a quarter held out",
-        scrambles,
+        splits.scrambled_cubes,
         4,
         (6, 7, 8),
-        sees="the whole cube",
-        sights=("nothing", "each step"),
-        times=8,
+        observation="the whole cube",
+        contexts=("none", "per-step"),
+        start_factor=8,
         **_goal,
     ),
 )
 TASKS = {task.name: task for task in _tasks}
 """By name."""
 
+WorldName = Literal[tuple(TASKS)]  # type: ignore[valid-type]
+"""A name of `TASKS`, as the type of an option."""
+
+
+def check_contexts(worlds: Sequence[str], contexts: Sequence[Context]) -> None:
+    """Raise ValueError where contexts are asked for, and none of them is of use in one of the worlds."""
+    useless = [world for world in worlds if contexts and not any(map(TASKS[world].offers, contexts))]
+    if useless:
+        raise ValueError(f"context: {useless[0]} offers no context of use; leave it out, or add none to --context")
+
 
 def best_score(task: Task, world: World, state: Tensor, length: int) -> Tensor:
-    """What the best plan of `length` actions (with chance, the best policy) scores from each of `state [B]`: `[B]`."""
+    """The optimum from each of `state [B]`: `[B]`, what the best plan of `length` actions scores.
+
+    In stochastic worlds: what the best policy scores in the mean.
+    """
     if isinstance(world, PocketCube):
         distance = world.distance(state)
         there = (distance > 0) & (distance <= length)
         return torch.where(there, task.discount ** (distance.float() - 1), 0.0)
-    if isinstance(world, UnderWay):
+    if isinstance(world, MidPlanWorld):
         return best_score(task, world.world, state[:, 0], length)
     assert isinstance(world, TabularWorld)
     return oracle(world, state, length, **task.scoring)

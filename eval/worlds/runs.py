@@ -1,0 +1,149 @@
+"""The runs of an experiment, a world and a seed each, and statistics over the seeds of each world.
+
+All intervals are Student's, over the seeds of a world: these are what is independent.
+"""
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+from jsonargparse.typing import restricted_number_type
+
+from neuroprior.analysis.statistics import holm, interquartile_mean, paired_difference, probability_of_improvement
+from neuroprior.report.document import Column, table
+from neuroprior.report.page import Table
+
+MAKERS = ("gymnasium", "minigrid")
+"""Packages of which another version may make other worlds."""
+
+Seed = restricted_number_type("Seed", int, [(">=", 0), ("<", 2**40)], docstring="A seed of everything random.")
+PowerOfTwo = Literal[tuple(2**k for k in range(21))]  # type: ignore[valid-type]
+
+
+class Run(NamedTuple):
+    """A world, by its name, and the number of a seed."""
+
+    world: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and files."""
+        return f"{self.world}-{self.seed}"
+
+
+def runs_of(worlds: Sequence[str], seeds: int) -> list[Run]:
+    """A run for each of the worlds and each of `seeds` seeds."""
+    return [Run(world, seed) for world in worlds for seed in range(seeds)]
+
+
+def check_distinct(**options: Sequence[Any]) -> None:
+    """Raise ValueError, naming the option, where a list is empty or holds something twice."""
+    for name, given in options.items():
+        if not given:
+            raise ValueError(f"{name}: at least one is expected")
+        if len(set(given)) < len(given):
+            raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, given))}")
+
+
+def command_line(name: str) -> str:
+    """The command line that this program was started with, or that of the command with its defaults."""
+    given = sys.argv[1:] if sys.argv[1:2] == [name] else [name]
+    return "python -m eval " + shlex.join(given)
+
+
+def paired_differences(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """How much higher `first` is than `second`, paired by seed, for each group of rows; see `paired_difference`.
+
+    Args:
+        pairs: a row a seed of each group: the columns `by`, one of which is `world`, `first` and `second`.
+        by: the columns that define the groups.
+
+    Returns:
+        A row for each group of at least two seeds: the columns `by`, `difference`, `low`, `high`, `p_value` of the
+        two-sided test, and `p_holm`, corrected for all tests in the same world.
+    """
+    # Rounded, so that differences that are equal but for rounding errors have no spread.
+    pairs = pairs.assign(gap=(pairs["first"] - pairs["second"]).round(12))
+    rows = [
+        (*place, *paired_difference(own, np.zeros(len(own))))
+        for place, own in pairs.groupby(list(by), sort=False)["gap"]
+        if len(own) > 1
+    ]
+    found = pd.DataFrame(rows, columns=[*by, "difference", "low", "high", "p_value"])
+    return found.assign(p_holm=found.groupby("world")["p_value"].transform(holm))
+
+
+def across_worlds(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """`first` and `second` over several worlds: interquartile means, and how often `first` is higher.
+
+    Args:
+        pairs: see `paired_differences`; of one row a world, seed and group.
+        by: the columns that define the groups, without `world`.
+
+    Returns:
+        A row for each group with at least two worlds, and two seeds that all its worlds have: the columns `by`;
+        `worlds` and `seeds`, how many; `first` and `second`, the interquartile means over worlds; `improvement`, the
+        probability that `first` is higher in a world drawn at random; each with its `_low` and `_high`.
+    """
+    rows = []
+    for place, own in pairs.groupby(list(by), sort=False):
+        first, second = (own.pivot(index="world", columns="seed", values=side) for side in ("first", "second"))
+        seeds = first.columns[first.notna().all() & second.notna().all()]
+        if len(first) > 1 and len(seeds) > 1:
+            a, b = first[seeds].to_numpy(), second[seeds].to_numpy()
+            aggregates = (*interquartile_mean(a), *interquartile_mean(b), *probability_of_improvement(a, b))
+            rows.append((*place, *a.shape, *aggregates))
+    names = [name + end for name in ("first", "second", "improvement") for end in ("", "_low", "_high")]
+    return pd.DataFrame(rows, columns=[*by, "worlds", "seeds", *names])
+
+
+def significance(gaps: pd.DataFrame, what: str) -> str:
+    """How many of `paired_differences` are significant, in one line."""
+    if gaps.empty:
+        return f"{what}: differences need at least two seeds."
+    clear = gaps[gaps["p_holm"] < 0.05]
+    more = int((clear["difference"] > 0).sum())
+    return (
+        f"{what}: {len(clear)} of {len(gaps)} differences are significant (p < 0.05, Holm's correction for all tests in"
+        f" a world): {more} positive, {len(clear) - more} negative."
+    )
+
+
+def difference_table(
+    gaps: pd.DataFrame, world: str, names: Mapping[str, Column], unit: str, factor: float = 1
+) -> Table:
+    """`paired_differences` in one world as a table; `names`: the columns that name a row, by heading."""
+    columns = dict(names) | {
+        "difference": lambda row: f"{factor * row['difference']:+.1f}",
+        "95 % interval": lambda row: f"{factor * row['low']:+.1f} to {factor * row['high']:+.1f}",
+        "p": lambda row: f"{row['p_holm']:.3f}" if row["p_holm"] >= 0.001 else "< .001",
+    }
+    caption = f"Differences in {unit}, paired by seed; p: corrected for all tests in this world (Holm)."
+    return table(gaps[gaps["world"] == world], columns, caption, f"{world}: differences", "l" * len(names) + "rrr")
+
+
+def across_table(
+    found: pd.DataFrame, names: Mapping[str, Column], first: str, second: str, unit: str, factor: float
+) -> Table:
+    """`across_worlds` as a table; `names`: the columns that name a row, by heading; `first`, `second`: headings."""
+    columns = dict(names) | {
+        "worlds": "worlds",
+        first: lambda row: plus_minus(row, "first", factor, low="first_low"),
+        second: lambda row: plus_minus(row, "second", factor, low="second_low"),
+        "P(better)": lambda row: "{improvement:.2f} ({improvement_low:.2f} to {improvement_high:.2f})".format(**row),
+    }
+    caption = (
+        f"Interquartile means over worlds of {unit}, and the probability of improvement in a world drawn at random;"
+        " Student's 95 % intervals over seeds."
+    )
+    return table(found, columns, caption, "Over worlds", "l" * len(names) + "rrrr")
+
+
+def plus_minus(row: Any, name: str, factor: float = 1, digits: int = 1, low: str = "low") -> str:
+    """A mean with half of its interval, which is symmetric; the mean alone of a single seed."""
+    mean = f"{factor * row[name]:.{digits}f}"
+    return mean if pd.isna(row[low]) else f"{mean} ±{factor * (row[name] - row[low]):.{digits}f}"
