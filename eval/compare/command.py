@@ -1,166 +1,105 @@
 """`python -m eval compare`: do neural priors help a planner more than Markov chains, in many worlds at equal budget?"""
 
-import shlex
-import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from rich.console import Console
+from jsonargparse.typing import NonNegativeInt, PositiveInt, restricted_number_type
 
-from eval.compare import planner_report
-from eval.compare import run as compare_cell
-from eval.compare import settings as compare_settings
-from eval.compare.jobs import Cell, Study, cells_of, run_cells
-from eval.compare.planners import PLANNERS, PlannerSettings, check_planners, run_planners
-from eval.compare.recipes import NEURAL
-from eval.compare.report import write_report
-from eval.compare.saved import load_for
-from eval.compare.settings import Settings
-from eval.worlds.suite import TASKS
+from eval.compare.planners import PlannerName, PlannerSettings, compare_planners
+from eval.compare.priors import NEURAL, load_for
+from eval.compare.report import document
+from eval.compare.results import Results
+from eval.compare.run import Settings, compare_run
+from eval.worlds.runs import MAKERS, PowerOfTwo, Seed, check_distinct, command_line, runs_of
+from eval.worlds.suite import TASKS, Context
+from neuroprior._jobs import JobRun
+from neuroprior.report.document import publish
 
 KINDS = ("markov", "macro", *NEURAL)
-SEES = tuple(compare_settings.SEES)
-MOST_PLANS = 2**20
-LISTS: dict[str, dict[str, Any]] = {
-    "worlds": {"default": list(TASKS), "choices": tuple(TASKS), "help": "worlds to compare priors in"},
-    "num_plans": {"type": int, "default": [16, 64, 256, 1024, 4096], "help": "candidate plans, powers of two"},
-    "priors": {"help": "model folders to compare, such as `python -m train` writes; nothing is fitted without --kinds"},
-    "kinds": {"choices": KINDS, "help": "kinds of priors that are fitted; all of them by default"},
-    "planners": {"help": f"compare planners with the same priors instead: {', '.join(PLANNERS)}"},
-    "sees": {"choices": SEES, "help": "what priors see: nothing but the plan so far, or more; as suits each world"},
-}
-"""Options that take several words."""
+"""Kinds of priors that can be fitted."""
+
+WorldName = Literal[tuple(TASKS)]  # type: ignore[valid-type]
+Kind = Literal[KINDS]  # type: ignore[valid-type]
+TrainingStarts = restricted_number_type("TrainingStarts", int, (">=", 8), docstring="Enough to validate on some.")
 
 
 def compare(
-    worlds: list[str] = list(TASKS),  # noqa: B006
-    seeds: int = 20,
-    num_plans: Sequence[int] = (16, 64, 256, 1024, 4096),
-    priors: list[str] | None = None,
-    kinds: list[str] | None = None,
-    planners: list[str] | None = None,
-    sees: list[str] | None = None,
-    rounds: int = 4,
-    steps: int = 600,
-    starts: int = 32,
-    training_starts: int = 1000,
-    seed: int = 0,
-    processes: int | None = None,
+    worlds: Sequence[WorldName] = tuple(TASKS),
+    seeds: PositiveInt = 20,
+    num_plans: Sequence[PowerOfTwo] = (16, 64, 256, 1024, 4096),
+    priors: Sequence[str] | None = None,
+    kinds: Sequence[Kind] | None = None,
+    planners: Sequence[PlannerName] | None = None,
+    context: Sequence[Context] | None = None,
+    rounds: NonNegativeInt = 4,
+    steps: PositiveInt = 600,
+    starts: PositiveInt = 32,
+    training_starts: TrainingStarts = 1000,
+    seed: Seed = 0,
+    processes: PositiveInt | None = None,
+    dask: str | None = None,
     out: str = "runs/compare",
 ) -> None:
     """Do neural priors help a planner more than Markov chains, in many worlds at equal budget?
 
     In each world, for each seed: a planner without a prior plans in training worlds, priors learn from its plans, and
-    planners draw candidate plans from each prior in held-out worlds. Prints tables; writes them (CSV), results.json and
-    report.html to a folder. Interrupted, the same command goes on; `torchrun -m eval compare` shares the work out.
+    planners sample candidate plans from each prior in held-out worlds. Prints tables; writes them (CSV), results.json
+    and report.html to a folder. Interrupted, the same command goes on.
 
     Args:
-        worlds: to compare priors in.
+        worlds: worlds to compare priors in.
         seeds: repeats in each world, each with worlds (training, validation, held-out) and priors of its own; intervals
             are over them.
         num_plans: numbers of candidate plans, powers of two.
-        priors: model folders to compare, such as `python -m train` writes.
-        kinds: of priors that are fitted: markov, macro (a chain of order 2 over actions and 16 macro-actions, which
-            sees nothing), gru, transformer; all by default, but none where there are saved ones.
-        planners: some of sampling, distinct, frontier, mcts, cross-entropy, halving and replanning (these two in worlds
-            with chance): they are compared, not priors, at as many model steps, with uniform plans, a chain of order 3
-            and the networks of --kinds, after growth.
-        sees: what priors see: nothing but the plan so far, the start as well, or each step; by default nothing and, in
-            worlds where it could help, one or both of the others (with --planners the last of them alone).
-        rounds: of horizon growth, at most (worlds have two or three): a prior learns from plans found with it,
-            each time longer ones; 0: none.
-        steps: of training of each neural prior, at most.
+        priors: model folders to compare, such as `neuroprior fit` writes.
+        kinds: kinds of priors that are fitted: markov, macro (a chain of order 2 over actions and 16 macro-actions,
+            without context), gru, transformer; all by default, but none if there are saved ones.
+        planners: some of sampling, distinct, frontier, mcts, cross-entropy, halving and replanning (these two in
+            stochastic worlds): they are compared, not priors, at as many model steps, with uniform plans, a chain of
+            order 3 and the networks of --kinds, after the horizon curriculum.
+        context: contexts of priors: none (the plan so far alone), initial (the first observation too) or per-step; by
+            default none and, in worlds where it could help, one or both of the others (with --planners the last alone).
+        rounds: rounds of the horizon curriculum, at most (worlds have two or three): a prior learns from plans found
+            with it, each time longer ones; 0: none.
+        steps: steps of training of each neural prior, at most.
         starts: held-out starts to plan from.
-        training_starts: from so many starts plans are collected to learn from; from several times as many in worlds
-            where most starts lead nowhere.
+        training_starts: from so many starts training plans are collected; from several times as many in worlds where
+            most starts lead nowhere.
         seed: of everything random.
-        processes: how many cells, a world and a seed each, are done at a time; all cores by default, and a single one
-            in each process that torchrun started.
-        out: folder for the report, and for finished cells, from which an interrupted run goes on.
+        processes: how many runs, a world and a seed each, are done at a time; all cores by default.
+        dask: address of a Dask scheduler whose workers do the runs, such as tcp://host:8786.
+        out: folder for the report, and for finished runs, from which an interrupted command goes on.
     """
     saved = tuple(priors or ())
-    if kinds is None:
-        kinds = [] if saved else list(KINDS)
-    if not kinds and not saved:
+    fitted = tuple(([] if saved else KINDS) if kinds is None else kinds)
+    if not fitted and not saved:
         raise ValueError("kinds: at least one kind of prior, or --priors, is expected")
-    settings = Settings(
-        tuple(num_plans), tuple(kinds), tuple(sees or ()), rounds, steps, starts, training_starts, seed, saved
-    )
-    if planners is not None:
-        settings = PlannerSettings(**vars(settings), planners=tuple(planners))
-    check(worlds, seeds, processes, settings)
+    given = {"worlds": worlds, "num_plans": num_plans, "priors": saved, "kinds": fitted, "context": context}
+    check_distinct(**{name: some for name, some in given.items() if some or name in ("worlds", "num_plans")})
+    useless = [world for world in worlds if context and not any(map(TASKS[world].offers, context))]
+    if useless:
+        raise ValueError(f"context: {useless[0]} has none that would be of use; leave it out, or add none to --context")
     check_saved(saved, worlds)
-    folder = Path(out)
-    if isinstance(settings, PlannerSettings):
-        compare_planners(settings, cells_of(worlds, seeds), processes, folder)
+    how = (tuple(num_plans), fitted, tuple(context or ()), rounds, steps, starts, training_starts, seed, saved)
+    if planners is not None:
+        compare_planners(PlannerSettings(*how, planners=tuple(planners)), worlds, seeds, out, processes, dask)
         return
-    study = Study.prepare(folder, settings, compare_cell.run_cell)
-    cells = run_cells(study, cells_of(worlds, seeds), processes)
-    if cells is not None:
-        told = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-        write_report(cells, num_plans, settings=told, command=command("compare"), folder=folder, console=Console())
-
-
-def compare_planners(settings: PlannerSettings, cells: Sequence[Cell], processes: int | None, folder: Path) -> None:
-    """The comparison of planners; see `compare`."""
-    worlds = list(dict.fromkeys(cell.world for cell in cells))
-    check_planners(settings.planners, worlds)
-    study = Study.prepare(folder, settings, run_planners)
-    done = run_cells(study, cells, processes)
-    if done is not None:
-        told = {"worlds": worlds, "seeds": len(cells) // len(worlds)} | asdict(settings)
-        planner_report.write_report(done, told, folder, Console(), command("compare"))
-
-
-def check(worlds: Sequence[str], seeds: int, processes: int | None, settings: Settings) -> None:
-    """Raise ValueError, naming the option, where one is out of range, not known or given twice."""
-    planners = settings.planners if isinstance(settings, PlannerSettings) else ()
-    words = {"worlds": (worlds, TASKS), "kinds": (settings.kinds, KINDS), "sees": (settings.sees, SEES)}
-    words["planners"] = planners, PLANNERS
-    for name, (given, known) in words.items():
-        check_known(name, given, known)
-    lists = {"worlds": worlds, "num_plans": settings.num_plans}
-    for name, some in lists.items():
-        if not some:
-            raise ValueError(f"{name}: at least one is expected")
-    more = {name: getattr(settings, name) for name in ("sees", "kinds", "priors", "lengths")} | {"planners": planners}
-    for name, some in (lists | more).items():
-        check_once(name, some)
-    for number in settings.num_plans:
-        if not 1 <= number <= MOST_PLANS or number & (number - 1):
-            raise ValueError(f"num_plans: powers of two from 1 to {MOST_PLANS:,} are expected, not {number}")
-    least = {"rounds": 0, "steps": 1, "starts": 1, "training_starts": 8}
-    numbers = {name: getattr(settings, name) for name in least} | {"seeds": seeds}
-    if processes is not None:
-        numbers["processes"] = processes
-    for name, number in numbers.items():
-        if number < least.get(name, 1):
-            raise ValueError(f"{name}: at least {least.get(name, 1)} is expected, not {number}")
-    if not 0 <= settings.seed < 2**40:
-        raise ValueError(f"seed: an integer from 0 to 2**40 - 1 is expected, not {settings.seed}")
-    blind = [world for world in worlds if settings.sees and not any(map(TASKS[world].shows, settings.sees))]
-    if blind:
-        raise ValueError(f"sees: {blind[0]} shows nothing that would be of use; leave it out, or add nothing to --sees")
-
-
-def check_known(name: str, given: Sequence[str], known: Collection[str]) -> None:
-    """Raise ValueError where a word that was given for an option is not known."""
-    if unknown := [word for word in given if word not in known]:
-        raise ValueError(f"{name}: {unknown[0]!r} is not known; there are {', '.join(known)}")
-
-
-def check_once(name: str, given: Sequence[Any]) -> None:
-    """Raise ValueError where something was given twice for an option."""
-    if len(set(given)) < len(given):
-        raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, given))}")
+    settings, folder = Settings(*how), Path(out)
+    work = partial(compare_run, settings=settings)
+    jobs = JobRun(work, folder / "runs", settings.asked, name=attrgetter("name"), packages=MAKERS)
+    found = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title="compare")
+    shown: dict[str, Any] = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
+    publish(document(Results(found, num_plans), shown, command_line("compare")), folder)
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
-    """Raise ValueError unless saved priors know the actions and sights of all worlds; before hours of work."""
-    shown: dict[str, torch.Tensor] = {}  # by world: some take long to make
+    """Raise ValueError unless saved priors have the actions and contexts of all worlds; before hours of work."""
+    observations: dict[str, torch.Tensor] = {}  # by world: some take long to make
     for folder in folders:
         if folder == "uniform" or folder in KINDS or folder.startswith("markov-"):
             raise ValueError(f"priors: {folder} is also the name of a fitted prior; give the folder as ./{folder}")
@@ -168,16 +107,10 @@ def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
             task = TASKS[world]
             prior = load_for(folder, world, task.num_actions, task.action_names)
             if prior.takes_context:
-                if world not in shown:
+                if world not in observations:
                     held_out = task.worlds(0).held_out
-                    shown[world] = held_out.observe(held_out.reset(1, torch.Generator().manual_seed(0)))
+                    observations[world] = held_out.observe(held_out.reset(1, torch.Generator().manual_seed(0)))
                 try:
-                    prior.check_context_of(shown[world], 1)
+                    prior.check_context_of(observations[world], 1)
                 except ValueError as error:
-                    raise ValueError(f"{folder}: does not see what the world {world} shows ({error})") from error
-
-
-def command(name: str) -> str:
-    """The command line that this program was started with, or that of its defaults."""
-    given = sys.argv[1:] if sys.argv[1:2] == [name] else [name]
-    return "python -m eval " + shlex.join(given)
+                    raise ValueError(f"{folder}: its context is not what the world {world} offers ({error})") from error

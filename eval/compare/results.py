@@ -283,7 +283,7 @@ class Results:
         best = self.words[(self.words["what"] == BEST) & (self.words["better"] != self.words["first"])]
         found = best[[*at, "second_share"]].rename(columns={"second_share": "markov_share"})
         for kind in ("neural", "markov"):
-            own = self.bits[(self.bits["rounds"] == 0) & [kind_of(prior) == kind for prior in self.bits["prior"]]]
+            own = self.bits[(self.bits["rounds"] == 0) & (self.bits["prior"].map(kind_of) == kind)]
             fewest = own.groupby(["world", "sees"])["bits_per_action"].min().rename(f"{kind}_bits")
             found = found.merge(fewest.reset_index(), "left", on=["world", "sees"])
         early = self.paired[(self.paired["what"] == BEST) & (self.paired["num_plans"] == self.num_plans[0])]
@@ -428,7 +428,7 @@ def best_difference(first: Array, second: Array, level: float = 0.95) -> Differe
     # Rounded, so that differences that are all the same have no spread.
     mean = float(np.round(first[chosen(first), seeds] - second[chosen(second), seeds], 9).mean())
     gaps = np.round(first[:, None] - second[None], 9)
-    means, errors, numbers = gaps.mean(-1), stats.sem(gaps, axis=-1), gaps.shape
+    means, errors, numbers = gaps.mean(-1), gaps.std(-1, ddof=1) / np.sqrt(len(seeds)), gaps.shape
     ways = np.array(numbers[:2])
     reach = stats.t.ppf(1 - (1 - level) / 2 / ways, len(seeds) - 1)
     low = (means - reach[0] * errors).min(1).max()

@@ -18,8 +18,9 @@ from eval.compare.curves import (
     seconds_per_decision,
     starts_of,
 )
-from eval.compare.priors import NEURAL, ORDERS, TRAINING, chain, load_for, macro, network
-from eval.worlds.suite import TASKS, Task
+from eval.compare.priors import NEURAL, ORDERS, TRAINING, chain, digests, load_for, macro, network
+from eval.worlds.runs import Run
+from eval.worlds.suite import TASKS, Context, Task
 from neuroprior import (
     ExhaustivePlanner,
     GridWorld,
@@ -34,7 +35,7 @@ from neuroprior import (
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
 
-CONTEXTS: dict[str, Literal["plan", "step"] | None] = {"none": None, "initial": "plan", "per-step": "step"}
+CONTEXTS: dict[Context, Literal["plan", "step"] | None] = {"none": None, "initial": "plan", "per-step": "step"}
 """The context of a prior: its name in options and tables, and how `collect` calls it."""
 
 CURRICULUM_PLANS = 64
@@ -56,23 +57,6 @@ SHOWN = ("uniform", "markov-2", "gru")
 """Priors whose plans are drawn in a figure."""
 
 
-class Run(NamedTuple):
-    """One world and one seed."""
-
-    world: str
-    seed: int
-
-    @property
-    def name(self) -> str:
-        """The name of its file, without ending."""
-        return f"{self.world}-{self.seed}"
-
-
-def runs_of(worlds: Sequence[str], seeds: int) -> list[Run]:
-    """All runs in some worlds, with seeds from 0."""
-    return [Run(world, seed) for world in worlds for seed in range(seeds)]
-
-
 @dataclass(frozen=True)
 class Settings:
     """All that decides the results of a run, beside its world and seed.
@@ -84,7 +68,7 @@ class Settings:
         rounds: of the horizon curriculum, at most; a world has as many as it has lengths.
         steps: of training of each neural prior in a round, at most.
         starts: held-out starts to plan from.
-        training_starts: from so many starts, times `Task.times`, training plans are collected.
+        training_starts: from so many starts, times `Task.start_factor`, training plans are collected.
         seed: of everything random.
         priors: folders of saved priors.
         lengths: actions in a plan, round by round of the horizon curriculum; empty: those of the world.
@@ -92,7 +76,7 @@ class Settings:
 
     num_plans: tuple[int, ...]
     kinds: tuple[str, ...]
-    context: tuple[str, ...]
+    context: tuple[Context, ...]
     rounds: int
     steps: int
     starts: int
@@ -105,6 +89,11 @@ class Settings:
     def budgets(self) -> list[int]:
         """All powers of two up to the most candidates."""
         return [2**k for k in range(max(self.num_plans).bit_length())]
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings with the digests of the files of saved priors, to tell finished runs of others apart."""
+        return asdict(self) | {"digests": digests(self.priors)}
 
 
 def compare_run(run: Run, settings: Settings) -> dict[str, Any]:
@@ -168,7 +157,7 @@ def compare_rounds(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
     return found | {"seconds": perf_counter() - begin}
 
 
-def with_context(plans: Plans, context: str) -> Plans:
+def with_context(plans: Plans, context: Context) -> Plans:
     """Plans with a context at each step, as priors of another context take them (see `CONTEXTS`)."""
     assert plans.context is not None
     kept = {None: None, "plan": plans.context[:, 0], "step": plans.context}[CONTEXTS[context]]
@@ -182,7 +171,7 @@ class Contestant(NamedTuple):
     """
 
     label: str
-    sees: str
+    sees: Context
     prior: Prior
     rounds: int
     length: int | None
@@ -197,7 +186,7 @@ class Contest:
         self.worlds = task.worlds(settings.seed * 10_000 + seed)
         self.longer = (settings.lengths or task.lengths)[: settings.rounds]
         self.rounds, self.lengths = len(self.longer), tuple(sorted({task.depth, *self.longer}))
-        self.training_starts = settings.training_starts * task.times
+        self.training_starts = settings.training_starts * task.start_factor
         self.starts_at, self.validation_at = (
             {
                 length: starts_of(task, world, number, length, self.generator)
@@ -218,19 +207,19 @@ class Contest:
             prior = load_for(folder, self.task.name, self.task.num_actions, self.task.action_names)
             sees = next(name for name, per in CONTEXTS.items() if per == prior.context_per)
             yield Contestant(folder, sees, prior, 0, None)
-        for sees in self.settings.context or self.task.sights:
-            if self.task.shows(sees):
+        for sees in self.settings.context or self.task.contexts:
+            if self.task.offers(sees):
                 yield from self._learners(sees)
 
     def after_curriculum(self) -> Iterator[Contestant]:
         """Each prior after its last round alone; saved priors and the uniform prior have none."""
         return (one for one in self.contestants() if one.rounds == (0 if one.length is None else self.rounds))
 
-    def _learners(self, sees: str) -> Iterator[Contestant]:
+    def _learners(self, sees: Context) -> Iterator[Contestant]:
         first = with_context(self.first, sees)
         if "markov" in self.settings.kinds:
             for order in self.orders:
-                prior = chain(order, self.worlds.training, first, self.task.near)
+                prior = chain(order, self.worlds.training, first, self.task.feature_sets)
                 yield from self._curriculum(f"markov-{order}", sees, prior, first, {})
         for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
             prior = network(kind, self.worlds.training, first, draw_seed(self.generator))
@@ -239,7 +228,7 @@ class Contest:
             yield from self._curriculum("macro", sees, macro(first), first, {})
 
     def _curriculum(
-        self, label: str, sees: str, prior: Prior, first: Plans, training: dict[str, Any]
+        self, label: str, sees: Context, prior: Prior, first: Plans, training: dict[str, Any]
     ) -> Iterator[Contestant]:
         rounds = extend_horizon(
             prior,

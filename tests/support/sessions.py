@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 
 def wait_for(what: Callable[[], object], seconds: float = 120) -> None:
-    """Wait until something is so."""
+    """Wait until a condition holds."""
     until = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < until, "it takes too long"
@@ -25,22 +25,22 @@ def gone(leader: int) -> bool:
 
 
 def interrupted(running: subprocess.Popen[str], how: signal.Signals, once: Callable[[], object]) -> tuple[str, str]:
-    """Stop a program that leads a session, once something is so, and wait until nobody is left behind.
+    """Stop a program that leads a session, once a condition holds, and wait until no process is left.
 
     Args:
         running: the program.
-        how: SIGINT, which all of the session get, as from a terminal; another signal is for the program alone.
-        once: when.
+        how: SIGINT goes to the whole session, as from a terminal; another signal to the program alone.
+        once: the condition.
 
     Returns:
-        What it had printed, and told of errors.
+        What it printed, and its errors.
     """
     try:
         wait_for(once)
         (os.killpg if how == signal.SIGINT else os.kill)(running.pid, how)
-        told = running.communicate(timeout=60)
+        output = running.communicate(timeout=60)
         wait_for(lambda: gone(running.pid), 60)
     finally:
         if not gone(running.pid):
             os.killpg(running.pid, signal.SIGKILL)
-    return told
+    return output

@@ -1,4 +1,4 @@
-"""Made-up cells of a comparison, for tests: what they hold is known."""
+"""Made-up runs of a comparison, for tests, with known results."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,15 +9,15 @@ import numpy as np
 BUDGETS = [2**k for k in range(13)]
 ACTIONS = ["up", "right", "down", "left"]
 TIMES = {"uniform": 1.0, "markov-1": 4.0, "markov-2": 8.0, "gru": 16.0}
-"""How many random plans a plan from each prior is worth."""
+"""How many random plans one plan of each prior is worth."""
 
 
 def curve(times: float, shift: float = 0.0, most: int = BUDGETS[-1]) -> list[float]:
-    """Shares that climb by as much with every doubling of the plans; `times` random plans are worth one."""
+    """Normalised scores that climb by as much with every doubling of the plans; `times` random plans are worth one."""
     return [(math.log2(budget) + math.log2(times)) / (2 * math.log2(most)) + shift for budget in BUDGETS]
 
 
-def entry(prior: str | None, share: Sequence[float], sees: str = "nothing", rounds: int = 0, **more: Any) -> dict:
+def entry(prior: str | None, share: Sequence[float], sees: str = "none", rounds: int = 0, **more: Any) -> dict:
     steps = [8 * budget for budget in BUDGETS[: len(share)]]
     seconds = [None if place % 2 else 0.001 * (place + 1) for place in range(len(share))]
     own = {"planner": "sampling", "prior": prior, "sees": sees, "rounds": rounds, "share": list(share)}
@@ -25,7 +25,7 @@ def entry(prior: str | None, share: Sequence[float], sees: str = "nothing", roun
     return own | {"seconds": seconds, "bits": None, "actions": 0} | more
 
 
-def cell(world: str, seed: int, entries: Sequence[dict], **more: Any) -> dict[str, Any]:
+def run(world: str, seed: int, entries: Sequence[dict], **more: Any) -> dict[str, Any]:
     made = {"world": world, "seed": seed, "about": f"a made-up world called {world}", "length": 8, "num_starts": 32}
     made |= {"seconds": 1.5, "budgets": list(BUDGETS), "entries": list(entries), "growth": []}
     return made | {"action_names": ACTIONS, "plans": None} | more
@@ -36,21 +36,21 @@ def worlds(
     seeds: int,
     times: Mapping[str, float] = TIMES,
     noise: float = 0.02,
-    sees: Sequence[str] = ("nothing",),
+    sees: Sequence[str] = ("none",),
     rounds: int = 0,
 ) -> list[dict[str, Any]]:
-    """Cells of several worlds with everything there can be; priors that see, or have grown, are worth twice as many."""
+    """Runs with everything there can be; a prior with context, or after the curriculum, is worth twice as many plans."""
     rng, made = np.random.default_rng(0), []
     for world in names:
         for seed in range(seeds):
             bumps = {prior: float(bump) for prior, bump in zip(times, rng.normal(0, noise, len(times)), strict=True)}
             entries = [entry(None, [0.6], planner="exhaustive", depth=4)]
             for prior, worth in times.items():
-                for way in sees if prior != "uniform" else ("nothing",):
-                    for grown in sorted({0, rounds}) if prior != "uniform" else (0,):
-                        share = curve(worth * 2 ** ((way != "nothing") + (grown > 0)), bumps[prior])
-                        bits = 2.0 - math.log2(worth) / 8 - 0.1 * (way != "nothing") + bumps[prior]
-                        entries.append(entry(prior, share, way, grown, bits=bits, actions=4000))
+                for way in sees if prior != "uniform" else ("none",):
+                    for after in sorted({0, rounds}) if prior != "uniform" else (0,):
+                        share = curve(worth * 2 ** ((way != "none") + (after > 0)), bumps[prior])
+                        bits = 2.0 - math.log2(worth) / 8 - 0.1 * (way != "none") + bumps[prior]
+                        entries.append(entry(prior, share, way, after, bits=bits, actions=4000))
             growth = [
                 {"prior": prior, "sees": way, "round": one, "length": 4 + 2 * one, "num_plans": 256, "share": share}
                 for prior, worth in times.items()
@@ -60,7 +60,7 @@ def worlds(
             pictures = {"transitions": {prior: rng.dirichlet(np.ones(4), 4).tolist() for prior in times}}
             if seed == 0:
                 pictures["plans"] = drawing(rng, list(times))
-            made.append(cell(world, seed, entries, growth=growth if rounds else [], **pictures))
+            made.append(run(world, seed, entries, growth=growth if rounds else [], **pictures))
     return made
 
 

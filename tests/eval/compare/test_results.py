@@ -1,0 +1,373 @@
+"""From runs to tables: closed forms on made-up runs, intervals that cover, tests with few false alarms."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from eval.compare.results import BEST, Results, best_difference, chosen, needed
+from neuroprior.analysis.statistics import (
+    holm,
+    interquartile_mean,
+    mean_interval,
+    paired_difference,
+    probability_of_improvement,
+)
+from neuroprior.report.document import records
+from tests.support.compare_runs import BUDGETS, TIMES, curve, entry, run, worlds
+
+ASKED = (16, 256, 4096)
+
+
+def found(frame: pd.DataFrame, **wanted: Any) -> list[dict[str, Any]]:
+    """The rows of a frame that have these values; missing ones are None, as in results.json."""
+    return [row for row in records(frame) if all(row[name] == value for name, value in wanted.items())]
+
+
+def two(first: list[float], second: list[float], names: tuple[str, str] = ("gru", "markov-1"), world: str = "maze"):
+    """Runs of two priors that have one score each, seed by seed, with any number of plans."""
+    pairs = zip(first, second, strict=True)
+    priors = [[entry(name, [share] * 13) for name, share in zip(names, pair, strict=True)] for pair in pairs]
+    return [run(world, seed, own) for seed, own in enumerate(priors)]
+
+
+def test_rows_hold_means_over_seeds():
+    runs = worlds(["maze"], 3)
+    made = Results(runs, ASKED).rows
+    assert len(made) == 1 + len(TIMES) * len(ASKED)
+    (row,) = found(made, prior="gru", num_plans=256)
+    shares = [one["share"][8] for r in runs for one in r["entries"] if one["prior"] == "gru"]
+    assert (row["oracle_share"], row["low"], row["high"]) == pytest.approx(mean_interval(shares))
+    assert row["at_oracle"] == pytest.approx(np.mean(shares) / 2)
+    assert (row["model_steps"], row["seeds"]) == (2048, 3)
+    assert row["seconds_per_decision"] == pytest.approx(0.009)
+    (row,) = found(made, planner="exhaustive")
+    assert (row["num_plans"], row["prior"], row["model_steps"]) == (None, None, 8)
+    # Without spread there is no interval but the value.
+    assert row["low"] == row["high"] == pytest.approx(0.6)
+    (row,) = found(Results(runs, [32]).rows, prior="gru")
+    assert row["seconds_per_decision"] is None
+    alone = records(Results(runs[:1], ASKED).rows)
+    assert all(row["low"] is row["high"] is None and row["seeds"] == 1 for row in alone)
+
+
+def test_unlike_runs_are_refused():
+    runs = worlds(["maze"], 2)
+    with pytest.raises(ValueError, match="runs: at least one is expected"):
+        Results([], ASKED)
+    with pytest.raises(ValueError, match="maze, seed 1: uniform is there twice"):
+        _ = Results([*runs, run("maze", 1, [entry("uniform", curve(1))])], ASKED).rows
+    with pytest.raises(ValueError, match="maze, seed 2: the numbers of plans are"):
+        _ = Results([*runs, run("maze", 2, []) | {"budgets": [1, 2]}], ASKED).rows
+    with pytest.raises(ValueError, match=r"num_plans: maze has \[1, 2, .*\], not 100"):
+        _ = Results(runs, [16, 100]).rows
+
+
+@settings(max_examples=5, deadline=None)
+@given(order=st.permutations(range(6)))
+def test_the_order_of_seeds_does_not_matter(order):
+    runs = worlds(["maze", "taxi"], 3, {"uniform": 1.0, "markov-1": 2.0, "gru": 4.0})
+    mixed, ordered = Results(sorted((runs[k] for k in order), key=lambda one: one["world"]), [16]), Results(runs, [16])
+    for name in ("rows", "paired", "efficiency", "bits", "over_worlds"):
+        assert records(getattr(mixed, name)) == records(getattr(ordered, name))
+
+
+def test_what_a_curve_needs():
+    assert needed(np.array(curve(8)), BUDGETS, curve(1)[-1]) == pytest.approx(4096 / 8)
+    assert needed(np.array(curve(1)), BUDGETS, curve(1)[5]) == pytest.approx(32)
+    assert needed(np.array(curve(3)), BUDGETS, curve(1)[-1]) == pytest.approx(4096 / 3)
+    assert needed(np.array([0.5, 0.6]), [1, 2], 0.3) == 1
+    assert needed(np.array([0.5, 0.6]), [1, 2], 0.7) == np.inf
+    # A random peak is no crossing: made to climb, the curve is 0, 0.3, 0.3, 0.6.
+    assert needed(np.array([0.0, 0.5, 0.1, 0.6]), [1, 2, 4, 8], 0.45) == pytest.approx(2**2.5)
+
+
+def test_efficiency_is_how_many_random_plans_one_is_worth():
+    made = Results(worlds(["maze"], 20, {**TIMES, "transformer": 0.5}, noise=0), ASKED).efficiency
+    for prior, times in TIMES.items():
+        (row,) = found(made, prior=prior)
+        assert [row[f"needed{end}"] for end in ("", "_low", "_high")] == pytest.approx([4096 / times] * 3)
+        assert [row[f"factor{end}"] for end in ("", "_low", "_high")] == pytest.approx([times] * 3)
+        assert (row["reached"], row["seeds"], row["most"]) == (20, 20, 4096)
+    (row,) = found(made, prior="transformer")
+    assert all(row[f"{name}{end}"] is None for name in ("needed", "factor") for end in ("", "_low", "_high"))
+    assert row["reached"] == 0
+
+
+def test_random_plans_that_gain_nothing_by_more_count_as_fewer():
+    """Random search reaches all there is with 256 plans, a prior that is worth 4 with 64: not 4096 / 64 times fewer."""
+    flat = [min(share, curve(1)[8]) for share in curve(1)]
+    runs = [run("maze", seed, [entry("uniform", flat), entry("gru", curve(4))]) for seed in range(6)]
+    uniform, gru = records(Results(runs, ASKED).efficiency)
+    assert (uniform["needed"], uniform["factor"]) == pytest.approx((256, 1))
+    assert (gru["needed"], gru["factor"]) == pytest.approx((64, 4))
+
+
+def test_medians_have_the_intervals_of_the_sign_test():
+    """With 20 seeds, between the 6th and the 15th; with fewer than 6, none; seeds that never get there count."""
+    times = [2.0 ** (seed / 4) for seed in range(20)]
+    runs = [run("maze", s, [entry("uniform", curve(1)), entry("gru", curve(t))]) for s, t in enumerate(times)]
+    row = records(Results(runs, ASKED).efficiency)[1]
+    assert (row["factor_low"], row["factor_high"]) == pytest.approx((times[5], times[14]))
+    assert row["factor"] == pytest.approx((times[9] * times[10]) ** 0.5)
+    test = stats.quantile_test(times).confidence_interval(0.95)
+    assert (row["factor_low"], row["factor_high"]) == pytest.approx((test.low, test.high))
+    assert records(Results(runs[:5], ASKED).efficiency)[1]["factor_low"] is None
+    late = [run("maze", s, [entry("uniform", curve(1)), entry("gru", curve(0.5 if s < 8 else 2))]) for s in range(20)]
+    row = records(Results(late, ASKED).efficiency)[1]
+    assert (row["needed"], row["needed_low"], row["needed_high"]) == (pytest.approx(2048), pytest.approx(2048), None)
+    assert (row["factor"], row["factor_low"], row["reached"]) == (pytest.approx(2), None, 12)
+
+
+def test_the_best_are_chosen_on_the_other_half():
+    # The first is best on even seeds, the second on odd ones.
+    assert chosen(np.array([[3.0, 0, 3, 0], [0, 2.0, 0, 2]])).tolist() == [1, 0, 1, 0]
+    assert chosen(np.array([[3.0, 3, 3, 3], [0, 2.0, 0, 2]])).tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.3])
+def test_choosing_the_best_is_no_advantage(gap):
+    """Five chains against two neural priors, the best of each alike, in 1,000 comparisons of 20 seeds.
+
+    Intervals of 95 % at least: more than 85 misses have a probability below 1e-6, and so has a mean difference of
+    alternatives that are all alike beyond 5 standard errors. A t-test of the chosen ones alone has more false alarms
+    than that, and the best by mean would seem better for being chosen among more.
+    """
+    draws = np.random.default_rng(0).normal(0, 1, (1000, 7, 20))
+    draws[:, [1, 3, 4, 5, 6]] -= gap
+    found = [best_difference(one[:2], one[2:]) for one in draws]
+    misses = sum(not one.low <= 0 <= one.high for one in found)
+    assert misses <= 85
+    assert [one.p_value < 0.05 for one in found] == [not one.low <= 0 <= one.high for one in found]
+    seeds = np.arange(20)
+    alone = [one[:2][chosen(one[:2]), seeds] - one[2:][chosen(one[2:]), seeds] for one in draws]
+    if gap:
+        assert (stats.ttest_1samp(alone, 0, axis=1).pvalue < 0.05).sum() > 85
+    else:
+        gaps = [one.mean for one in found]
+        error = np.std(gaps) / len(gaps) ** 0.5
+        assert abs(np.mean(gaps)) < 5 * error
+        assert np.mean(draws[:, :2].mean(2).max(1) - draws[:, 2:].mean(2).max(1)) < -5 * error
+
+
+def test_intervals_hold_for_the_best_whichever_they_are():
+    """True differences between the best from -2 to 2, in 1,000 comparisons: at most 85 misses, as above."""
+    rng = np.random.default_rng(1)
+    worth = rng.normal(0, 1, (1000, 5))
+    true = worth[:, :2].max(1) - worth[:, 2:].max(1)
+    draws = worth[..., None] + rng.normal(0, 1, (1000, 5, 12))
+    found = [best_difference(one[:2], one[2:]) for one in draws]
+    assert sum(not one.low <= gap <= one.high for one, gap in zip(found, true, strict=True)) <= 85
+    # They are no wider than they must be: most of the large differences are significant.
+    large = [one for one, gap in zip(found, true, strict=True) if gap > 1.5]
+    assert sum(one.low > 0 for one in large) > 0.8 * len(large) > 50
+
+
+def test_one_against_one_is_students_test():
+    first, second = np.random.default_rng(0).normal(0, 1, (2, 1, 9))
+    assert best_difference(first, second) == pytest.approx(paired_difference(first[0], second[0]))
+    whole = np.arange(9.0)[None]
+    for more in (1, -1, 0):
+        assert best_difference(whole + more, whole) == paired_difference(whole[0] + more, whole[0])
+
+
+def test_pairs():
+    runs = worlds(["maze"], 6, sees=("none", "initial"), rounds=1)
+    made = Results(runs, [16, 256]).paired
+    # Twice two contexts and rounds; one neural prior and two chains; two numbers of plans.
+    after, context = "after minus before the curriculum", "with minus without context"
+    assert made["what"].value_counts().to_dict() == {BEST: 8, "neural minus Markov": 16, after: 12, context: 12}
+    assert made["p_holm"].tolist() == pytest.approx(holm(made["p_value"]).tolist())
+    (row,) = found(made, what="neural minus Markov", second="markov-1", sees="none", rounds="0", num_plans=16)
+    shares = {
+        prior: [
+            one["share"][4] for r in runs for one in r["entries"] if (one["prior"], *place(one)) == (prior, "none", 0)
+        ]
+        for prior in ("gru", "markov-1")
+    }
+    gaps = np.subtract(shares["gru"], shares["markov-1"])
+    assert (row["difference"], row["low"], row["high"]) == pytest.approx(mean_interval(gaps))
+    assert row["p_value"] == pytest.approx(stats.ttest_1samp(gaps, 0).pvalue)
+    # Twice as many plans are worth 1 / 24; without spread the test is that of signs.
+    for row in (*found(made, what=after), *found(made, what=context)):
+        assert (row["difference"], row["low"], row["high"]) == pytest.approx([1 / 24] * 3, abs=1e-8)
+        assert row["p_value"] == 2.0**-5
+    assert {row["rounds"] for row in found(made, what=after)} == {"1 - 0"}
+    assert {row["sees"] for row in found(made, what=context)} == {"initial - none"}
+
+
+def place(one: dict[str, Any]) -> tuple[str, int]:
+    return one["sees"], one["rounds"]
+
+
+def test_saved_priors_meet_all_others():
+    names = ("uniform", "markov-1", "runs/gru", "runs/new")
+    runs = [run("maze", s, [entry(name, curve(1)) for name in names]) for s in range(3)]
+    made = Results(runs, [16]).paired
+    pairs = list(zip(made["first"], made["second"], strict=True))
+    assert pairs == [("runs/gru", "markov-1"), ("runs/gru", "runs/new"), ("runs/new", "markov-1")]
+
+
+def test_seeds_that_lack_one_of_a_pair_are_left_out():
+    runs = two([0.5, 0.6, 0.7], [0.4, 0.4, 0.4])
+    runs[1]["entries"].pop()
+    (row,) = found(Results(runs, [16]).paired, what="neural minus Markov")
+    assert (row["seeds"], row["difference"]) == (2, pytest.approx(0.2))
+
+
+def answer(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """The first row of the headline differences."""
+    return records(Results(runs, [16]).words)[0]
+
+
+def test_headline_differences():
+    rng = np.random.default_rng(0)
+    low, noise = [0.5] * 10, rng.normal(0, 0.01, 10)
+    better = answer(two(list(0.52 + noise), low))
+    assert (better["first"], better["second"], better["better"]) == ("gru", "markov-1", "gru")
+    assert (better["difference"], better["low"], better["high"]) == pytest.approx(mean_interval(0.02 + noise))
+    assert (better["num_plans"], better["seeds"]) == (16, 10)
+    worse = answer(two(low, list(0.52 + noise)))
+    assert worse["better"] == "markov-1"
+    assert (-worse["difference"], -worse["high"], -worse["low"]) == pytest.approx(mean_interval(0.02 + noise))
+    alike = answer(two(list(0.5 + noise - noise.mean()), low))
+    assert alike["better"] is None
+    assert alike["low"] < 0 < alike["high"]
+    assert answer(two(low, low))["better"] is None
+    alone = answer(two([0.6], [0.5]))
+    assert (alone["difference"], alone["seeds"]) == (pytest.approx(0.1), 1)
+    assert alone["low"] is alone["p_value"] is alone["p_holm"] is alone["better"] is None
+    assert answer(two(list(0.52 + noise), low, ("runs/a", "runs/b")))["better"] == "runs/a"
+    lone = answer(two(list(0.52 + noise), low, ("markov-3", "uniform")))
+    assert (lone["second"], lone["better"]) == ("uniform", "markov-3")
+    assert Results([run("maze", 0, [entry("uniform", curve(1))])], [16]).words.empty
+
+
+def test_headlines_are_about_the_best_of_several():
+    several = answer(worlds(["maze"], 10, {**TIMES, "transformer": 64.0}, noise=0.001))
+    assert (several["first"], several["second"], several["better"]) == ("transformer", "markov-2", "transformer")
+    chains = answer(worlds(["maze"], 10, {"uniform": 1, "markov-1": 2, "markov-2": 2, "markov-3": 2}))
+    assert chains["better"] == chains["first"]
+    assert set(chains["first"].split(" / ")) <= {"markov-1", "markov-2", "markov-3"}
+    assert chains["second"] == "uniform"
+
+
+def test_headlines_are_corrected_for_the_number_of_worlds():
+    """A difference that is significant in one world alone is not among ten others without any difference."""
+    gaps = np.array([0.02, 0.05, -0.01, 0.03, 0.01, 0.04])
+    alone = two(list(0.5 + gaps), [0.5] * 6)
+    assert answer(alone)["better"] == "gru"
+    noise = np.array([0.01, -0.01, 0.02, -0.02, 0.01, -0.01])
+    others = [one for n in range(10) for one in two(list(0.5 + noise), [0.5] * 6, world=f"world {n}")]
+    first = answer([*alone, *others])
+    assert first["better"] is None
+    assert first["p_value"] < 0.05 < first["p_holm"] == pytest.approx(11 * first["p_value"])
+
+
+def test_aggregates_over_worlds():
+    """Interquartile means and probabilities of improvement, of the scores `[world, seed]` of priors."""
+    made = Results(runs := worlds(["maze", "grid", "cube", "taxi", "cliff"], 4), ASKED)
+
+    def scores(prior: str) -> np.ndarray:
+        return np.array([one["share"][8] for r in runs for one in r["entries"] if one["prior"] == prior]).reshape(5, 4)
+
+    (row,) = found(made.over_worlds, prior="gru", num_plans=256)
+    expected = interquartile_mean(scores("gru"))
+    assert (row["interquartile_mean"], row["low"], row["high"]) == pytest.approx(expected)
+    assert (row["worlds"], row["seeds"]) == (5, 4)
+    assert len(made.over_worlds) == len(TIMES) * len(ASKED)
+    (row,) = found(made.improvement, first="gru", second="markov-2", num_plans=256)
+    expected = probability_of_improvement(scores("gru"), scores("markov-2"))
+    assert (row["probability"], row["low"], row["high"]) == pytest.approx(expected)
+    pairs = {(row["first"], row["second"]) for row in records(made.improvement)}
+    chains = {("gru", "markov-1"), ("gru", "markov-2")}
+    assert pairs == chains | {(prior, "uniform") for prior in TIMES if prior != "uniform"}
+    # A prior that one of the worlds or seeds lacks has no aggregate.
+    runs[0]["entries"] = [one for one in runs[0]["entries"] if one["prior"] != "gru"]
+    assert set(Results(runs, ASKED).over_worlds["prior"]) == {"uniform", "markov-1", "markov-2"}
+    assert Results(worlds(["maze"], 4), ASKED).over_worlds.empty
+
+
+def test_bits():
+    made = Results(worlds(["maze"], 6, noise=0, sees=("none", "initial")), ASKED).bits
+    (gru,) = found(made, prior="gru", sees="initial")
+    assert gru["bits_per_action"] == pytest.approx(2 - 4 / 8 - 0.1)
+    # One bit per eight-fold worth: markov-2 takes 1 / 8 more, whatever the context.
+    assert (gru["more"], gru["more_low"], gru["more_high"]) == pytest.approx([-1 / 8] * 3)
+    assert found(made, prior="markov-2", sees="none")[0]["more"] == 0
+    runs = [run("maze", s, [entry("gru", curve(1), bits=1.0), entry("markov-1", curve(1))]) for s in range(3)]
+    (row,) = records(Results(runs, ASKED).bits)
+    assert (row["bits_per_action"], row["more"], row["p_value"], row["seeds"]) == (1.0, None, None, 3)
+
+
+def test_rounds_of_the_curriculum():
+    made = Results(worlds(["maze"], 3, noise=0, rounds=2), ASKED).growth
+    assert len(made) == 3 * len(TIMES)
+    (row,) = found(made, prior="gru", round=2)
+    assert (row["length"], row["num_plans"], row["seeds"]) == (8, 256, 3)
+    assert row["oracle_share"] == pytest.approx(curve(16)[-1])
+    assert Results(worlds(["maze"], 1), ASKED).growth.empty
+
+
+def explained(chain: float, network: float, bits: tuple[float, float], early: float = 0.0) -> Results:
+    """Results for the scores of a chain and a network with all numbers of plans, and their bits; 6 seeds."""
+    runs = []
+    for seed in range(6):
+        noise = 0.001 * (-1) ** seed
+        shares = {"markov-1": [chain + noise] * 13, "gru": [network - noise] * 13}
+        shares["gru"][BUDGETS.index(16)] += early
+        runs.append(run("maze", seed, [entry(n, shares[n], bits=own) for n, own in zip(shares, bits, strict=True)]))
+    return Results(runs, ASKED)
+
+
+def test_both_scores_are_of_the_same_choice():
+    """Which of two chains is better changes from half to half: the one that was chosen is not the better one there."""
+    runs = []
+    for seed in range(6):
+        odd = seed % 2
+        chains = {"markov-1": 0.7 - 0.1 * odd, "markov-2": 0.6 + 0.1 * odd}
+        shares = chains | {"gru": 0.64 + 0.001 * (seed // 2)}
+        runs.append(run("maze", seed, [entry(name, [share] * 13, bits=1.0) for name, share in shares.items()]))
+    (row,) = records(Results(runs, ASKED).words)
+    assert (row["second_share"], row["first_share"]) == pytest.approx((0.6, 0.641))
+    assert row["difference"] == pytest.approx(0.041)
+
+
+def test_a_better_network_needs_no_reason():
+    results = explained(0.6, 0.7, (1.5, 1.4))
+    assert results.reasons.empty
+    (row,) = records(results.words)
+    assert (row["second_share"], row["first_share"], row["difference"]) == pytest.approx((0.6, 0.7, 0.1))
+    assert row["better"] == "gru"
+
+
+@pytest.mark.parametrize(
+    ("shares", "bits", "early"),
+    [
+        ((0.99, 0.9), (1.2, 1.5), 0.0),
+        ((0.99, 0.99), (1.5, 1.2), 0.0),
+        ((0.7, 0.7), (1.5, 1.5), 0.0),
+        ((0.7, 0.7), (1.5, 1.2), 0.1),
+        ((0.7, 0.6), (1.5, 1.2), 0.0),
+    ],
+)
+def test_reasons(shares, bits, early):
+    (row,) = records(explained(*shares, bits, early).reasons)
+    assert row["markov_share"] == pytest.approx(shares[0], abs=0.002)
+    assert (row["markov_bits"], row["neural_bits"]) == pytest.approx(bits)
+    assert row["early"] == (pytest.approx(early) if early else None)
+
+
+def test_one_number_of_plans_is_not_fewer_than_itself():
+    runs = []
+    for seed in range(6):
+        shares = {"markov-1": 0.7, "gru": 0.7 + (0.02 if seed else -0.01)}
+        entries = [entry(name, [share] * 13, bits=2 - share) for name, share in shares.items()]
+        runs += [run(world, seed, entries) for world in ("maze", "grid", "cube")]
+    found = Results(runs, (256,)).reasons
+    assert len(found) == 3
+    assert found["early"].isna().all()
