@@ -1,258 +1,133 @@
-"""The report of `python -m eval compare --planners`: what planners find with the same priors, at equal model steps."""
+"""The report of `python -m eval compare --planners` and `depth`: planners with the same priors at equal model steps."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
-from rich.console import Console
 
-from eval.compare.rows import Array, Cells, Rows, corrected, estimated
-from eval.compare.sections import plus_minus
-from neuroprior._files import versions, write_csv, write_json
-from neuroprior.analysis.statistics import paired_difference
+from eval.worlds.runs import across_table, across_worlds, difference_table, paired_differences, plus_minus, significance
+from neuroprior.analysis.statistics import mean_intervals
+from neuroprior.report.document import Document, table
 from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
-from neuroprior.report.page import FigureBox, Page, Section, Table, write_page
-from neuroprior.report.study import printed
+from neuroprior.report.page import FigureBox, Section, Table
 
-PLAIN = "sampling"
-"""The planner that the others are compared with."""
-
-ABOUT = (
-    "Planners compared",
-    "The same priors, the same number of steps in a model of the world: what do other planners make of them?",
-)
-
-Place = tuple[str, str, str, str, int]
-"""World, planner, prior, what it sees, number of plans."""
+PLACE = ["world", "planner", "prior", "sees", "num_plans"]
+NAMES = {"prior": "prior", "context": "sees", "planner": "planner"}
 
 
-def planner_rows(cells: Cells) -> Rows:
-    """The share of the oracle: a row a world, planner, prior and number of plans, with its interval over seeds."""
-    found = _found(cells)
-    shares = estimated(np.array([some["share"] for some in own.values()]) for own in found.values())
-    return [
-        _named(place)
-        | {
-            "model_steps": float(np.mean([some["model_steps"] for some in own.values()])),
-            "oracle_share": share["mean"],
-            "low": share["low"],
-            "high": share["high"],
-            "seconds_per_decision": float(np.mean([some["seconds"] for some in own.values()])),
-            "seeds": share["seeds"],
-        }
-        for (place, own), share in zip(found.items(), shares, strict=True)
-    ]
+def planner_document(
+    results: Sequence[Mapping[str, Any]],
+    settings: Mapping[str, Any],
+    command: str,
+    baseline: str = "sampling",
+    title: str = "Planners compared",
+) -> Document:
+    """The tables and figures of the results of `planner_run`.
 
-
-def paired_rows(cells: Cells, plain: str = PLAIN) -> Rows:
-    """How much further than `plain` each planner comes with the same prior and as many model steps.
-
-    A row a world, planner, prior and number of plans: the `difference` in the share of the oracle, paired over seeds,
-    with Student's interval (`low`, `high`), `p_value` of the two-sided t-test, and `p_holm`, corrected for all rows of
-    the world. Nothing where there is a single seed, or no `plain`.
+    Args:
+        results: of all runs; each `entries` has a row a planner, prior and number of plans.
+        settings, command: as the page shows them.
+        baseline: the planner that the others are compared with.
+        title: of the page.
     """
-    found, rows = _found(cells), []
-    for place, own in found.items():
-        rival = found.get((place[0], plain, *place[2:]))
-        if place[1] == plain or rival is None or len(common := [seed for seed in own if seed in rival]) < 2:
-            continue
-        first, second = (_shares(side, common) for side in (own, rival))
-        gap = paired_difference(first, second)
-        rows.append(_named(place) | {"difference": gap.mean, "low": gap.low, "high": gap.high, "p_value": gap.p_value})
-    return corrected(rows)
+    frame = pd.DataFrame([{k: one[k] for k in ("world", "seed")} | entry for one in results for entry in one["entries"]])
+    rows, pairs = planner_rows(frame), planner_pairs(frame, baseline)
+    gaps = paired_differences(pairs, PLACE)
+    # Worlds offer unlike contexts: of each, the last counts.
+    last = pairs.drop_duplicates(["world", "planner", "prior", "num_plans", "seed"], keep="last")
+    across = across_worlds(last, ["prior", "planner", "num_plans"])
+    most = frame["num_plans"].max()
+    score = "normalised score, % of the optimum"
+    tables, boxes = [], []
+    for world, about in {one["world"]: one["about"] for one in results}.items():
+        here, learned = rows[rows["world"] == world], gaps[(gaps["world"] == world) & (gaps["prior"] != "uniform")]
+        tables.append(planner_table(here, gaps, baseline))
+        if len(shown := learned[learned["num_plans"] == most]):
+            above = f"{world}, {most:,} plans: differences to {baseline}"
+            tables.append(difference_table(shown, above, NAMES, score, 100))
+        alt = f"Normalised score in {world} against model steps, a line a planner; the numbers are in the tables."
+        caption = f"{world}: {about}. Bands: Student's 95 % intervals over seeds."
+        boxes.append(FigureBox(planner_figure(here), caption, alt))
+    if len(shown := across[across["num_plans"] == most]):
+        names = {"prior": "prior", "planner": "planner"}
+        tables.append(across_table(shown, names, "score", baseline, f"the {score}, {most:,} plans", 100))
+    lead = significance(gaps, f"Normalised scores against {baseline}")
+    sections = [
+        Section("Normalised score against model steps", [], figures=boxes),
+        Section("Tables", [], tables),
+    ]
+    frames = {"rows": rows, "paired": gaps, "across": across}
+    return Document(title, lead, sections, frames, settings, command, {"words": [lead]})
 
 
-def _found(cells: Cells) -> dict[Place, dict[int, dict[str, float]]]:
-    """By place and seed: share, model steps and seconds."""
-    found: dict[Place, dict[int, dict[str, float]]] = {}
-    for cell in cells:
-        for entry in cell["entries"]:
-            for k, number in enumerate(cell["num_plans"]):
-                place = cell["world"], entry["planner"], entry["prior"], entry["sees"], number
-                some = {what: entry[what][k] for what in ("share", "model_steps", "seconds")}
-                found.setdefault(place, {})[cell["seed"]] = some
-    return found
-
-
-def _named(place: Place) -> dict[str, Any]:
-    return dict(zip(("world", "planner", "prior", "sees", "num_plans"), place, strict=True))
-
-
-def _shares(own: Mapping[int, Mapping[str, float]], seeds: Sequence[int]) -> Array:
-    return np.array([own[seed]["share"] for seed in seeds], dtype=np.float64)
-
-
-def table(rows: Rows, gaps: Rows, world: str, plain: str = PLAIN) -> Table:
-    """Shares of the oracle in one world, a row a prior and planner; stars where it cannot be chance."""
-    own = [row for row in rows if row["world"] == world]
-    numbers = _numbers(own)
-    sure = {_key(row) for row in gaps if row["world"] == world and row["p_holm"] < 0.05}
-    at = {_key(row): row for row in own}
-    names = dict.fromkeys((row["prior"], row["sees"], row["planner"]) for row in own)
-    sights = {row["sees"] for row in own if row["prior"] != "uniform"}
-    seen = f" Learned priors see {next(iter(sights))}." if len(sights) == 1 else ""
-    cells = []
-    for name in names:
-        found = [at[(*name, number)] for number in numbers]
-        told = [plus_minus(row, "oracle_share", 100, 1) + "*" * (_key(row) in sure) for row in found]
-        prior = _prior(found[0]) if len(sights) > 1 else name[0]
-        cells.append([prior, name[2], *told, _milliseconds(found[-1])])
-    seeds = max(row["seeds"] for row in own)
-    over = f" ±: the wider half of 95 % bootstrap intervals over {seeds} seeds." if seeds > 1 else " A single seed."
-    star = f" *: p < 0.05 against {plain} with the same prior, corrected for all of this table." if sure else ""
-    length = round(max(row["model_steps"] / row["num_plans"] for row in own))
-    caption = (
-        f"{world}: share of the oracle, %, with so many plans of {length} model steps each, or as many steps otherwise"
-        f" spent; and how long a decision takes with the most.{seen}{over}{star}"
+def planner_rows(frame: pd.DataFrame) -> pd.DataFrame:
+    """The normalised score with its interval over seeds, a row a world, planner, prior and number of plans."""
+    found = mean_intervals(frame, PLACE, "share")
+    means = frame.groupby(PLACE, sort=False)[["model_steps", "seconds"]].mean().reset_index(drop=True)
+    return found[PLACE].assign(
+        model_steps=means["model_steps"],
+        oracle_share=found["mean"],
+        low=found["low"],
+        high=found["high"],
+        seconds_per_decision=means["seconds"],
+        seeds=found["n"],
     )
-    headings = ("prior", "planner", *(f"{number:,} plans" for number in numbers), "ms")
-    return Table(headings, cells, caption, "ll" + "r" * (len(numbers) + 1))
 
 
-def words(rows: Rows, gaps: Rows, world: str, plain: str = PLAIN) -> str:
-    """A line of plain words: what each planner adds to the best prior's samples, with the most plans."""
-    own = [row for row in rows if row["world"] == world]
-    most = max(row["num_plans"] for row in own)
-    told = f"{world}, {most:,} plans:"
-    clear, unclear = [], []
-    for row in gaps:
-        if row["world"] == world and row["num_plans"] == most and row["prior"] != "uniform":
-            gap = f"{row['planner']} with {_prior(row)} {100 * row['difference']:+.1f}"
-            interval = f"({100 * row['low']:+.1f} to {100 * row['high']:+.1f})"
-            (clear if row["p_holm"] < 0.05 else unclear).append(f"{gap} {interval}")
-    if not clear and not unclear:
-        return f"{told} differences need several seeds, {plain}, and another planner."
-    parts = [f"{', '.join(clear)} points of the oracle against {plain} with the same prior"] if clear else []
-    if unclear:
-        parts.append(f"cannot be told apart from {plain} in so many tests: {', '.join(unclear)}")
-    return f"{told} {'; '.join(parts)}."
+def planner_pairs(frame: pd.DataFrame, baseline: str) -> pd.DataFrame:
+    """A row a world, planner, prior, number of plans and seed: its score `first`, and `second` that of the baseline."""
+    same = [name for name in [*PLACE, "seed"] if name != "planner"]
+    base = frame[frame["planner"] == baseline]
+    others = frame[frame["planner"] != baseline]
+    return others.merge(base[[*same, "share"]], on=same).rename(columns={"share_x": "first", "share_y": "second"})
 
 
-def _numbers(rows: Rows) -> list[int]:
-    """The numbers of plans."""
-    return sorted({row["num_plans"] for row in rows})
-
-
-def _prior(row: Mapping[str, Any]) -> str:
-    return str(row["prior"]) + ("" if row["sees"] == "nothing" else f", sees {row['sees']}")
-
-
-def _milliseconds(row: Mapping[str, Any]) -> str:
-    value = 1000 * row["seconds_per_decision"]
-    return f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
-
-
-def _key(row: Mapping[str, Any]) -> tuple[str, str, str, int]:
-    return row["prior"], row["sees"], row["planner"], row["num_plans"]
+def planner_table(rows: pd.DataFrame, gaps: pd.DataFrame, baseline: str) -> Table:
+    """Normalised scores in one world, a row a prior and planner; stars mark significant differences."""
+    own = rows.merge(gaps[[*PLACE, "p_holm"]], "left", PLACE)
+    own["score"] = [plus_minus(r, "oracle_share", 100) + "*" * bool(r["p_holm"] < 0.05) for _, r in own.iterrows()]
+    cells = own.pivot_table("score", ["prior", "sees", "planner"], "num_plans", aggfunc="first", sort=False)
+    cells = cells.sort_index(axis=1).rename(columns=lambda number: f"{number:,} plans")
+    slowest = own[own["num_plans"] == own["num_plans"].max()].set_index(["prior", "sees", "planner"])
+    cells["ms"] = 1000 * slowest["seconds_per_decision"]
+    seeds, length = own["seeds"].max(), round((own["model_steps"] / own["num_plans"]).max())
+    over = f" ±: half of Student's 95 % interval over {seeds} seeds." if seeds > 1 else " A single seed."
+    star = f" *: p < 0.05 against {baseline} with the same prior, corrected for all tests in this world (Holm)."
+    caption = (
+        f"Normalised score, % of the optimum, with so many plans of {length} model steps each, or as many steps"
+        f" otherwise spent; ms: of a decision with the most.{over}" + star * bool((own["p_holm"] < 0.05).any())
+    )
+    columns = NAMES | {name: name for name in cells.columns} | {"ms": "ms:.3g"}
+    return table(cells.reset_index(), columns, caption, rows["world"].iloc[0], "lll" + "r" * len(cells.columns))
 
 
 @drawn
-def planner_figure(rows: Rows) -> Figure:
-    """Share of the oracle against model steps in one world, a panel a prior, a line a planner.
+def planner_figure(rows: pd.DataFrame) -> Figure:
+    """Normalised score against model steps in one world, a panel a prior, a line a planner.
 
     Raises:
         ValueError: there are no rows.
     """
     expect_some("rows", rows)
-    priors = list(dict.fromkeys(_prior(row) for row in rows))
-    planners = list(dict.fromkeys(row["planner"] for row in rows))
+    planners = list(dict.fromkeys(rows["planner"]))
+    styles = dict(zip(planners, lines(planners), strict=True))
     # Most planners spend all steps that they may.
-    places = sorted({max(int(row["model_steps"]) for row in rows if row["num_plans"] == n) for n in _numbers(rows)})
+    places = rows.groupby("num_plans")["model_steps"].max().astype(int)
+    priors = list(rows.groupby(["prior", "sees"], sort=False))
     figure, axes = panels(1, len(priors), (WIDTH, 3.2), sharey=True)
-    for panel, prior in zip(axes, priors, strict=True):
-        for planner, (color, line) in zip(planners, lines(planners), strict=True):
-            own = [row for row in rows if _prior(row) == prior and row["planner"] == planner]
-            if own:
-                points = [(row["model_steps"], row["oracle_share"], row["low"], row["high"]) for row in own]
-                band(panel, sorted(points), color, planner, line)
+    for panel, ((prior, context), own) in zip(axes, priors, strict=True):
+        for planner, some in own.groupby("planner", sort=False):
+            points = some[["model_steps", "oracle_share", "low", "high"]].sort_values("model_steps")
+            color, style = styles[planner]
+            band(panel, list(points.itertuples(index=False, name=None)), color, planner, style)
         panel.set_xscale("log", base=2)
         panel.set_xticks(places, [f"{place:,}" for place in places])
-        panel.set_title(prior)
-        panel.set_xlabel("model steps a decision")
+        panel.set_title(prior if context == "none" else f"{prior}, context: {context}")
+        panel.set_xlabel("model steps per start")
         panel.grid(axis="y")
-    axes[0].set_ylabel("share of the oracle")
-    axes[0].yaxis.set_major_formatter(PercentFormatter(1))
+    axes[0].set_ylabel("normalised score, % of the optimum")
+    axes[0].yaxis.set_major_formatter(PercentFormatter(1, symbol=""))
     legend(figure, axes[0].get_legend_handles_labels()[0])
     return figure
-
-
-def write_report(
-    cells: Cells,
-    settings: Mapping[str, Any],
-    folder: Path,
-    console: Console,
-    command: str,
-    plain: str = PLAIN,
-    about: tuple[str, str] = ABOUT,
-) -> None:
-    """Print the tables, and write `report.html`, `results.json`, `rows.csv` and `paired.csv`.
-
-    Args:
-        cells: what was found.
-        settings, command: to tell on the page.
-        folder: for the files.
-        console: for the tables.
-        plain: the planner that the others are compared with.
-        about: the title of the page, and a line below it.
-    """
-    rows, gaps = planner_rows(cells), paired_rows(cells, plain)
-    worlds = list(dict.fromkeys(row["world"] for row in rows))
-    made = {world: table(rows, gaps, world, plain) for world in worlds}
-    found = Findings(rows, gaps, [words(rows, gaps, world, plain) for world in worlds], made)
-    figures = Section("Share of the oracle against model steps", [], figures=list(_boxes(rows, cells, worlds)))
-    publish(found, figures, about, settings, folder, console, command)
-
-
-class Findings(NamedTuple):
-    """What a comparison of planners, or of agents, found.
-
-    Attributes:
-        rows, paired: of the files of that name.
-        words: a line a world.
-        tables: by world.
-    """
-
-    rows: Rows
-    paired: Rows
-    words: list[str]
-    tables: Mapping[str, Table]
-
-
-def publish(
-    found: Findings,
-    figures: Section,
-    about: tuple[str, str],
-    settings: Mapping[str, Any],
-    folder: Path,
-    console: Console,
-    command: str,
-) -> None:
-    """Print what was found, and write it; see `write_report`."""
-    for world, one in found.tables.items():
-        console.print(printed(world, one))
-    console.print("\n".join(found.words), highlight=False, markup=False)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, some in (("rows", found.rows), ("paired", found.paired)):
-        if some:
-            write_csv(folder / f"{name}.csv", some)
-        else:
-            (folder / f"{name}.csv").unlink(missing_ok=True)  # of an earlier run
-    results = {"rows": found.rows, "paired": found.paired, "words": found.words}
-    write_json(folder / "results.json", results | {"settings": dict(settings), "versions": versions()})
-    tables = Section("Tables", [], tables=list(found.tables.values()))
-    sections = [Section("In plain words", found.words), figures, tables]
-    shown = dict(settings) | {f"version: {name}": number for name, number in versions().items()}
-    write_page(folder / "report.html", Page(*about, command, shown, sections))
-    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _boxes(rows: Rows, cells: Cells, worlds: Sequence[str]) -> Iterator[FigureBox]:
-    about = {cell["world"]: cell["about"] for cell in cells}
-    for world in worlds:
-        own = [row for row in rows if row["world"] == world]
-        alt = f"Share of the oracle in {world} against model steps, a line a planner; the numbers are in the tables."
-        caption = f"{world}: {about[world]}. Bands: 95 % bootstrap intervals over seeds."
-        yield FigureBox((planner_figure(own)), caption, alt)

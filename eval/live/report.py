@@ -47,8 +47,9 @@ def live_document(
     tables = []
     for world in about:
         tables.append(live_table(rows, gaps, world))
-        if (gaps["world"] == world).any():
-            tables.append(difference_table(gaps, world, NAMES | {"against": "against"}, "food eaten in 100 steps"))
+        if len(own := gaps[gaps["world"] == world]):
+            names = NAMES | {"against": "against"}
+            tables.append(difference_table(own, f"{world}: differences", names, "food eaten in 100 steps"))
     if len(across):
         tables.append(across_table(across, NAMES, "agent", "random", "food eaten, % of the oracle's", 100))
     sections = [Section("Food eaten against time", [], figures=boxes), Section("Tables", [], tables)]

@@ -6,11 +6,11 @@ All intervals are Student's, over the seeds of a world: these are what is indepe
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jsonargparse.typing import restricted_number_type
+from jsonargparse.typing import extend_base_type, restricted_number_type
 
 from neuroprior.analysis.statistics import holm, interquartile_mean, paired_difference, probability_of_improvement
 from neuroprior.report.document import Column, table
@@ -20,7 +20,14 @@ MAKERS = ("gymnasium", "minigrid")
 """Packages of which another version may make other worlds."""
 
 Seed = restricted_number_type("Seed", int, [(">=", 0), ("<", 2**40)], docstring="A seed of everything random.")
-PowerOfTwo = Literal[tuple(2**k for k in range(21))]  # type: ignore[valid-type]
+
+
+def _check_power(_: type, value: Any) -> None:
+    if int(value) not in [2**k for k in range(21)]:
+        raise ValueError(f"{value} does not conform to restriction: a power of two from 1 to 2**20")
+
+
+PowerOfTwo = extend_base_type("PowerOfTwo", int, _check_power, "A power of two.")
 
 
 class Run(NamedTuple):
@@ -114,16 +121,16 @@ def significance(gaps: pd.DataFrame, what: str) -> str:
 
 
 def difference_table(
-    gaps: pd.DataFrame, world: str, names: Mapping[str, Column], unit: str, factor: float = 1
+    gaps: pd.DataFrame, title: str, names: Mapping[str, Column], unit: str, factor: float = 1
 ) -> Table:
-    """`paired_differences` in one world as a table; `names`: the columns that name a row, by heading."""
+    """`paired_differences` of one world as a table; `names`: the columns that name a row, by heading."""
     columns = dict(names) | {
         "difference": lambda row: f"{factor * row['difference']:+.1f}",
         "95 % interval": lambda row: f"{factor * row['low']:+.1f} to {factor * row['high']:+.1f}",
         "p": lambda row: f"{row['p_holm']:.3f}" if row["p_holm"] >= 0.001 else "< .001",
     }
     caption = f"Differences in {unit}, paired by seed; p: corrected for all tests in this world (Holm)."
-    return table(gaps[gaps["world"] == world], columns, caption, f"{world}: differences", "l" * len(names) + "rrr")
+    return table(gaps, columns, caption, title, "l" * len(names) + "rrr")
 
 
 def across_table(
