@@ -16,14 +16,13 @@ from eval.compare.report import document
 from eval.compare.results import Results
 from eval.compare.run import Settings, compare_run
 from eval.worlds.runs import MAKERS, PowerOfTwo, Seed, check_distinct, command_line, runs_of
-from eval.worlds.suite import TASKS, Context
+from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
 from neuroprior._jobs import JobRun
 from neuroprior.report.document import publish
 
 KINDS = ("markov", "macro", *NEURAL)
 """Kinds of priors that can be fitted."""
 
-WorldName = Literal[tuple(TASKS)]  # type: ignore[valid-type]
 Kind = Literal[KINDS]  # type: ignore[valid-type]
 TrainingStarts = restricted_number_type("TrainingStarts", int, (">=", 8), docstring="Enough to validate on some.")
 
@@ -81,9 +80,7 @@ def compare(
         raise ValueError("kinds: at least one kind of prior, or --priors, is expected")
     given = {"worlds": worlds, "num_plans": num_plans, "priors": saved, "kinds": fitted, "context": context}
     check_distinct(**{name: some for name, some in given.items() if some or name in ("worlds", "num_plans")})
-    useless = [world for world in worlds if context and not any(map(TASKS[world].offers, context))]
-    if useless:
-        raise ValueError(f"context: {useless[0]} has none that would be of use; leave it out, or add none to --context")
+    check_contexts(worlds, context or ())
     check_saved(saved, worlds)
     how = (tuple(num_plans), fitted, tuple(context or ()), rounds, steps, starts, training_starts, seed, saved)
     if planners is not None:
@@ -91,7 +88,8 @@ def compare(
         return
     settings, folder = Settings(*how), Path(out)
     work = partial(compare_run, settings=settings)
-    jobs = JobRun(work, folder / "runs", settings.asked, name=attrgetter("name"), packages=MAKERS)
+    asked = {"command": "compare", **settings.asked}
+    jobs = JobRun(work, folder / "runs", asked, name=attrgetter("name"), packages=MAKERS)
     found = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title="compare")
     shown: dict[str, Any] = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
     publish(document(Results(found, num_plans), shown, command_line("compare")), folder)
