@@ -28,17 +28,17 @@ TrainingStarts = restricted_number_type("TrainingStarts", int, (">=", 8), docstr
 
 
 def compare(
-    worlds: Sequence[WorldName] = tuple(TASKS),
+    worlds: Sequence[WorldName] = tuple(TASKS),  # type: ignore[valid-type]
     seeds: PositiveInt = 20,
     num_plans: Sequence[PowerOfTwo] = (16, 64, 256, 1024, 4096),
     priors: Sequence[str] | None = None,
     kinds: Sequence[Kind] | None = None,
-    planners: Sequence[PlannerName] | None = None,
+    planners: Sequence[PlannerName] | None = None,  # type: ignore[valid-type]
     context: Sequence[Context] | None = None,
     rounds: NonNegativeInt = 4,
     steps: PositiveInt = 600,
     starts: PositiveInt = 32,
-    training_starts: TrainingStarts = 1000,
+    training_starts: TrainingStarts = 1000,  # type: ignore[valid-type]
     seed: Seed = 0,
     processes: PositiveInt | None = None,
     dask: str | None = None,
@@ -78,8 +78,9 @@ def compare(
     fitted = tuple(([] if saved else KINDS) if kinds is None else kinds)
     if not fitted and not saved:
         raise ValueError("kinds: at least one kind of prior, or --priors, is expected")
-    given = {"worlds": worlds, "num_plans": num_plans, "priors": saved, "kinds": fitted, "context": context}
-    check_distinct(**{name: some for name, some in given.items() if some or name in ("worlds", "num_plans")})
+    check_distinct(worlds=worlds, num_plans=num_plans)
+    more = {"priors": saved, "kinds": fitted, "context": tuple(context or ())}
+    check_distinct(**{name: given for name, given in more.items() if given})
     check_contexts(worlds, context or ())
     check_saved(saved, worlds)
     how = (tuple(num_plans), fitted, tuple(context or ()), rounds, steps, starts, training_starts, seed, saved)

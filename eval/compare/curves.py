@@ -55,21 +55,6 @@ class Starts:
         return float(gained.mean() / most.mean())
 
 
-@dataclass(frozen=True)
-class Curve:
-    """What was reached with each number of candidates: means over starts.
-
-    Attributes:
-        share: normalised score.
-        at_oracle: share of starts at which an optimal plan was found.
-        score: score.
-    """
-
-    share: list[float]
-    at_oracle: list[float]
-    score: list[float]
-
-
 def starts_of(task: Task, world: World, number: int, length: int, generator: torch.Generator) -> Starts:
     """Random starts; if rewards are never negative, only those with an optimum above 0.
 
@@ -121,27 +106,31 @@ def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.
 
 def best_temperature(starts: Starts, prior: Prior, budget: int, generator: torch.Generator) -> float:
     """The one of `TEMPERATURES` at which a prior's plans reach the most from these starts."""
-    shares = {t: curve(starts, prior, [budget], generator, t).share[0] for t in TEMPERATURES}
+    shares = {t: curve(starts, prior, [budget], generator, t)["share"][0] for t in TEMPERATURES}
     return max(shares, key=lambda t: shares[t])
 
 
 def curve(
     starts: Starts, prior: Prior, budgets: list[int], generator: torch.Generator, temperature: float = 1.0
-) -> Curve:
+) -> dict[str, list[float]]:
     """What a sampling planner reaches with each number of candidates.
 
     The largest number is drawn once from each start. Smaller numbers are blocks of it, each block a decision.
+
+    Returns:
+        For each number, means over starts: `share`, the normalised score; `at_oracle`, the share of starts at which an
+        optimal plan was found; `score`.
     """
     estimated, exact = candidate_scores(starts, planner_of(starts, prior, max(budgets), temperature), generator)
-    found = Curve([], [], [])
+    found: dict[str, list[float]] = {"share": [], "at_oracle": [], "score": []}
     for budget in budgets:
         blocks = estimated.shape[1] // budget
         shape = (len(estimated), blocks, budget)
         chosen = estimated[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
         score = exact[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0].double()
-        found.share.append(starts.normalised(score.mean(1)))
-        found.at_oracle.append(float((score >= starts.best[:, None] - CLOSE).double().mean()))
-        found.score.append(float(score.mean()))
+        found["share"].append(starts.normalised(score.mean(1)))
+        found["at_oracle"].append(float((score >= starts.best[:, None] - CLOSE).double().mean()))
+        found["score"].append(float(score.mean()))
     return found
 
 

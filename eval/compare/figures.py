@@ -1,4 +1,8 @@
-"""Figures of a comparison of priors: curves against plans and rounds, dots with intervals, plans drawn in a world."""
+"""Figures of a comparison of priors: curves against plans and rounds, dots with intervals, plans drawn in a world.
+
+Each takes rows of a table of `eval.compare.results` and the colour and line of each prior by name (`styles`);
+curves of priors that are not `strong` are thin lines without a band. Without rows a ValueError is raised.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -54,16 +58,9 @@ def styles(priors: Iterable[str]) -> dict[str, Style]:
 
 @drawn
 def score_figure(rows: pd.DataFrame, strong: Sequence[str], style: Mapping[str, Style]) -> Figure:
-    """The normalised score of one world's priors against the number of candidate plans.
+    """The normalised score of one world's priors against the number of candidate plans: rows of `Results.curves`.
 
-    Args:
-        rows: of `score_rows`, of one world, with all numbers of plans; a row without a number of plans is drawn as a
-            line across.
-        strong: priors drawn with a band; other ones are thin lines.
-        style: of the priors by name.
-
-    Raises:
-        ValueError: there are none.
+    A row without a number of plans is drawn as a line across.
     """
     expect_some("rows", rows)
     figure, (axes,) = panels(1, 1, SMALL)
@@ -83,15 +80,7 @@ def score_figure(rows: pd.DataFrame, strong: Sequence[str], style: Mapping[str, 
 
 @drawn
 def curriculum_figure(rows: pd.DataFrame, strong: Sequence[str], style: Mapping[str, Style]) -> Figure:
-    """The normalised score of one world's priors after each round of the horizon curriculum.
-
-    Args:
-        rows: of `curriculum_rows`, of one world and of priors with the same context.
-        strong, style: see `score_figure`.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """The normalised score of one world's priors after each round of the horizon curriculum: `Results.growth`."""
     expect_some("rows", rows)
     figure, (axes,) = panels(1, 1, SMALL)
     _curves(axes, rows, "round", strong, style)
@@ -105,7 +94,8 @@ def curriculum_figure(rows: pd.DataFrame, strong: Sequence[str], style: Mapping[
 
 def _curves(axes: Axes, rows: pd.DataFrame, across: str, strong: Sequence[str], style: Mapping[str, Style]) -> None:
     """A line a prior, with a band if it is one of `strong`."""
-    for prior, own in rows.sort_values(across, kind="stable").groupby("prior", sort=False):
+    for prior in rows["prior"].unique():
+        own = rows[rows["prior"] == prior].sort_values(across)
         color, line = style[prior]
         points = own[[across, "oracle_share", "low", "high"]].astype("float64").to_numpy() * (1, 100, 100, 100)
         if prior in strong:
@@ -123,7 +113,7 @@ def _finish(axes: Axes, across: str, title: str) -> None:
     axes.set_ylim(low, max(high, 100 + 0.03 * (100 - low)) if near else high)
     if near:
         axes.axhline(100, color=INK, lw=0.8, alpha=0.6)
-    axes.set(xlabel=across, ylabel="normalised score, % of the optimum", title=clean(title))
+    axes.set(xlabel=across, ylabel="normalised score,\n% of the optimum", title=clean(title))
     axes.grid(axis="y")
     axes.tick_params(labelsize=LETTERS)
     axes.xaxis.label.set_fontsize(LETTERS + 1)
@@ -136,14 +126,9 @@ def _finish(axes: Axes, across: str, title: str) -> None:
 
 @drawn
 def gap_figure(rows: pd.DataFrame, better: tuple[str, str]) -> Figure:
-    """The difference between two kinds of priors in each world; hollow where it is not significant.
+    """The difference between two kinds of priors in each world, rows of `Results.words`; hollow: not significant.
 
-    Args:
-        rows: of `headline_rows`.
-        better: what it means to be left, and right, of 0.
-
-    Raises:
-        ValueError: there are none.
+    `better`: what it means to be left, and right, of 0.
     """
     expect_some("rows", rows)
     figure, (axes,) = panels(1, 1, (PHONE, 1.1 + 0.3 * max(len(rows), 2)))
@@ -170,9 +155,6 @@ def dots_figure(rows: pd.DataFrame, style: Mapping[str, Style], label: str, most
         style: of the priors by name.
         label: of the axis.
         most: for numbers of plans up to so many, on a logarithmic axis; None: a linear axis with a line at 0.
-
-    Raises:
-        ValueError: there are none.
     """
     expect_some("rows", rows)
     priors = [prior for prior in style if prior in set(rows["prior"])]
@@ -210,15 +192,7 @@ def _mark(name: str, color: str, line: str) -> Line2D:
 
 @drawn
 def bits_figure(rows: pd.DataFrame, style: Mapping[str, Style]) -> Figure:
-    """Held-out bits per action of one world's priors; hollow without context where others have one.
-
-    Args:
-        rows: of `bits_rows`, of one world.
-        style: of the priors by name.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """Held-out bits per action, rows of `Results.bits`; hollow without context where other rows have one."""
     expect_some("rows", rows)
     priors, ways = rows["prior"].unique().tolist(), rows["sees"].unique().tolist()
     figure, (axes,) = panels(1, 1, (SMALL[0], 0.9 + 0.27 * max(len(priors), 2)))

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from neuroprior.priors.matching import numbers
 from torch import Tensor
 
 from neuroprior import GRUPrior, MacroPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World, load
 from neuroprior.analysis.comparison import score
 from neuroprior.plans import is_per_step
+from neuroprior.priors.matching import numbers
 
 ORDERS = range(5)
 """Orders of the Markov chains."""

@@ -1,22 +1,24 @@
 """The report of `python -m eval compare`: one document of tables and figures."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from neuroprior.report.figures import transition_figure
 
 from eval.compare import figures
 from eval.compare.figures import POINTS, Style
-from eval.compare.results import BEST, Key, Results, kind_of
-from neuroprior.report.document import Document, table
+from eval.compare.results import BEST, Key, Results, grouped, kind_of
+from eval.worlds.runs import across_table
+from neuroprior.report.document import Column, Document, table
+from neuroprior.report.figures import transition_figure
 from neuroprior.report.page import FigureBox, Section, Table, breakable
 
-Row = Mapping[str, Any]
+Row = Any
+Columns = dict[str, Column]
 
-FRAMES = ("rows", "paired", "efficiency", "bits", "words", "growth", "reasons", "over_worlds", "improvement")
+FRAMES = ("rows", "paired", "efficiency", "bits", "words", "growth", "reasons", "across")
 """The tables of `Results` that are written to files."""
 
 HALF = "±: the longer side of the 95 % interval, over seeds."
@@ -84,7 +86,7 @@ def headlines(results: Results) -> Section:
     best = words["what"] == BEST
     if len(words):
         pairs = " (" + words["first"] + " - " + words["second"] + ")"
-        columns = {
+        columns: Columns = {
             "world": "label",
             "context": _context,
             "Markov" if best.all() else "second": lambda row: f"{100 * row['second_share']:.1f}",
@@ -105,7 +107,7 @@ def headlines(results: Results) -> Section:
     if len(plain):
         caption = f"Best neural minus best Markov prior, percentage points, by candidate plans. {HALF} {HOLM}"
         tables.append(_by_number(plain, plain["world"].map(breakable), plain.apply(_gap, axis=1), "world", caption))
-    for (sees, after), rows in words[best].groupby(["sees", words["rounds"] > 0], sort=False):
+    for (sees, after), rows in grouped(words[best].assign(after=words["rounds"] > 0), ["sees", "after"]):
         how = f"{sees.replace('none', 'no')} context, {'after' if after else 'before'} the horizon curriculum"
         caption = f"Best neural minus best Markov prior with {results.shown:,} plans, {how}. Hollow: not significant."
         alt = "; ".join(f"{row['world']} {100 * row['difference']:+.1f}" for _, row in rows.iterrows())
@@ -118,28 +120,11 @@ def headlines(results: Results) -> Section:
         " number of priors by Bonferroni and for the number of worlds by Holm). The number of plans is the median of"
         " those that were asked for."
     ]
-    return Section("Neural priors against Markov chains", text, [*tables, *_over_worlds(results)], boxes)
-
-
-def _over_worlds(results: Results) -> Iterator[Table]:
-    means, pairs = results.over_worlds, results.improvement
-    if len(means):
-        caption = (
-            f"Over {len(results.worlds)} worlds: interquartile mean of the normalised score, % of the optimum, by"
-            f" candidate plans. {HALF}"
-        )
-        cells = [plus_minus(row, "interquartile_mean", 100) for _, row in means.iterrows()]
-        yield _by_number(means, _labels(means), cells, "prior", caption)
-    pairs = pairs[pairs["num_plans"] == results.shown]
-    if len(pairs):
-        caption = (
-            "Probability of improvement: in what share of worlds the first is better than the second with"
-            f" {results.shown:,} candidate plans. {HALF}"
-        )
-        labels = _labels(pairs.assign(prior=pairs["first"]))
-        columns = {"first": "label", "second": "second"}
-        share = {"probability": lambda row: plus_minus(row, "probability", 1, 2)}
-        yield table(pairs.assign(label=labels), columns | share, caption, align="llr")
+    if len(across := results.across):
+        unit = f"the normalised score, % of the optimum, with {results.shown:,} candidate plans"
+        names = {"prior": "label", "baseline": "baseline"}
+        tables.append(across_table(across.assign(label=_labels(across)), names, "score", "baseline's", unit, 100))
+    return Section("Neural priors against Markov chains", text, tables, boxes)
 
 
 def reasons(results: Results) -> Section:
@@ -150,7 +135,7 @@ def reasons(results: Results) -> Section:
         " structure. Where they have fewer, fewer samples are needed; but the best of many samples asks for many"
         " different ones, which likelihood does not."
     )
-    columns = {
+    columns: Columns = {
         "world": lambda row: breakable(row["world"]),
         "context": _context,
         "Markov": lambda row: f"{100 * row['markov_share']:.1f}",
@@ -170,7 +155,7 @@ def reasons(results: Results) -> Section:
 def scores(results: Results, style: Mapping[str, Style], after: bool, title: str) -> Section:
     """Normalised scores against the number of plans, a figure a world; before or after the horizon curriculum."""
     boxes, about = [], {run["world"]: run["about"] for run in results.runs}
-    for world, rows in results.curves[results.curves["sees"] == "none"].groupby("world", sort=False):
+    for (world,), rows in grouped(results.curves[results.curves["sees"] == "none"], ["world"]):
         own = rows[((rows["rounds"] > 0) == after) | rows["prior"].isna() | (rows["prior"] == "uniform")]
         if own["prior"].notna().any() and (own["rounds"].any() or not after):
             last = own[own["num_plans"] == results.shown]
@@ -203,8 +188,9 @@ def gains(results: Results, style: Mapping[str, Style], what: str, title: str) -
     rows = results.paired[(results.paired["what"] == what) & (results.paired["num_plans"] == results.shown)]
     points = {"mean": 100 * rows["difference"], "low": 100 * rows["low"], "high": 100 * rows["high"]}
     boxes = []
-    for (sees, rounds), own in rows.assign(prior=rows["first"], **points).groupby(["sees", "rounds"], sort=False):
-        how = f"{what.capitalize()} (context: {sees}; rounds: {rounds})"
+    rows = rows.assign(prior=rows["first"], after=rows["rounds"] != "0", **points)
+    for (sees, after), own in grouped(rows, ["sees", "after"]):
+        how = f"{what.capitalize()} (context: {sees}{', after' * bool(after and sees.endswith(' - none'))})"
         caption = f"{how}, with {results.shown:,} plans. Intervals: 95 %, over seeds."
         boxes.append(FigureBox(figures.dots_figure(own, style, POINTS), caption, how))
     return Section(title, (), (), boxes)
@@ -213,7 +199,7 @@ def gains(results: Results, style: Mapping[str, Style], what: str, title: str) -
 def curriculum(results: Results, style: Mapping[str, Style]) -> Section:
     """Curves against rounds of the horizon curriculum, a figure a world and context."""
     boxes = []
-    for (world, _), own in results.growth.groupby(["world", "sees"], sort=False):
+    for (world, _), own in grouped(results.growth, ["world", "sees"]):
         last = own[own["round"] == own["round"].max()]
         boxes.append(_box(figures.curriculum_figure(own, _strong(last), style), world, last, 100))
     number = ", ".join(f"{one:,}" for one in sorted(results.growth["num_plans"].unique()))
@@ -232,7 +218,7 @@ def bits(results: Results, style: Mapping[str, Style]) -> Section:
     rows = results.bits[(results.bits["rounds"] == 0) & (results.bits["prior"] != "uniform")]
     boxes = [
         _box(figures.bits_figure(own, style), world, own.assign(prior=_labels(own)), 1)
-        for world, own in rows.groupby("world", sort=False)
+        for (world,), own in grouped(rows, ["world"])
     ]
     text = [
         "Bits per action of the held-out plans of the planner that tries all short ones: the fewer, the better a prior"
@@ -306,12 +292,12 @@ def tables_of(results: Results, world: str) -> Iterator[Table]:
     paired = results.paired[results.paired["world"] == world]
     if len(paired):
         caption = f"{world}: differences between priors, percentage points, by candidate plans, paired. {HALF} {HOLM}"
-        labels, cells = paired.apply(_pair, axis=1), paired.apply(_gap, axis=1)
-        yield _by_number(paired, labels, cells, "first - second", caption, world)
+        pairs, gaps = paired.apply(_pair, axis=1), paired.apply(_gap, axis=1)
+        yield _by_number(paired, pairs, gaps, "first - second", caption, world)
     needed = results.efficiency[results.efficiency["world"] == world]
     if (needed["prior"] != "uniform").any():
         most = f"{needed['most'].iloc[0]:,}"
-        columns = {
+        columns: Columns = {
             "prior": "label",
             "plans needed": lambda row: _median(row, "needed", f"> {most}"),
             "times fewer": lambda row: _median(row, "factor", "< 1"),
@@ -342,9 +328,10 @@ def tables_of(results: Results, world: str) -> Iterator[Table]:
 
 
 def _by_number(
-    rows: pd.DataFrame, labels: Sequence[str], cells: Sequence[str], heading: str, caption: str, title: str = ""
+    rows: pd.DataFrame, labels: Iterable[str], cells: Iterable[str], heading: str, caption: str, title: str = ""
 ) -> Table:
     """A table with a row a label and a column a number of plans, of a label and a cell for each of `rows`."""
+    labels = list(labels)
     found = dict(zip(zip(labels, rows["num_plans"], strict=True), cells, strict=True))
     numbers = sorted(rows["num_plans"].unique())
     body = [[label, *(found.get((label, number), "") for number in numbers)] for label in dict.fromkeys(labels)]
@@ -382,13 +369,13 @@ def _labels(rows: pd.DataFrame) -> list[str]:
 
 
 def _context(row: Row) -> str:
-    return str(row["sees"]) + ", after" * (row["rounds"] > 0)
+    return f"{row['sees']}{', after' if row['rounds'] else ''}"
 
 
 def _pair(row: Row) -> str:
     # Which priors are the best may differ with the number of plans.
     pair = "best neural - best Markov" if row["what"] == BEST else f"{row['first']} - {row['second']}"
-    pair = row["first"] if row["first"] == row["second"] else pair
+    pair = str(row["first"]) if row["first"] == row["second"] else pair
     context = "" if row["sees"] == "none" else f", context {row['sees']}"
     after = f", rounds {row['rounds']}" if "-" in row["rounds"] else ", after curriculum"
     return f"{pair}{context}{'' if row['rounds'] == '0' else after}"
@@ -396,10 +383,10 @@ def _pair(row: Row) -> str:
 
 def _median(row: Row, name: str, beyond: str) -> str:
     """A median with its interval; `beyond` stands for what is missing."""
-    median, *ends = (
+    median, *ends = [
         beyond if pd.isna(value) else f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
         for value in (row[name], row[f"{name}_low"], row[f"{name}_high"])
-    )
+    ]
     # With fewer than 6 seeds there is no interval; else one of its ends is known where the median is.
     return f"{median} ({ends[0]} to {ends[1]})" if median != beyond and ends != [beyond] * 2 else median
 

@@ -16,13 +16,8 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from eval.compare.priors import NEURAL
-from neuroprior.analysis.statistics import (
-    Difference,
-    holm,
-    interquartile_mean,
-    mean_intervals,
-    probability_of_improvement,
-)
+from eval.worlds.runs import across_worlds
+from neuroprior.analysis.statistics import Difference, holm, mean_intervals
 
 Array = NDArray[np.float64]
 Runs = Sequence[Mapping[str, Any]]
@@ -83,7 +78,7 @@ class Results:
     """The tables of a comparison, each computed when it is first asked for.
 
     Attributes:
-        runs: as `eval.compare.run.compare_priors` returns them.
+        runs: as `eval.compare.run.compare_run` returns them.
         num_plans: numbers of candidate plans that were asked for.
 
     Raises:
@@ -140,18 +135,20 @@ class Results:
     def _by_prior(self) -> dict[str, dict[Key, pd.DataFrame]]:
         """In each world the normalised scores `[seed, num_plans]` of each prior."""
         return {
-            str(world): {
+            world: {
                 Key(*key): one.pivot(index="seed", columns="num_plans", values="share")
-                for key, one in own.groupby(PRIOR, sort=False)
+                for key, one in grouped(own, PRIOR)
             }
-            for world, own in self.scores[self.scores["prior"].notna()].groupby("world", sort=False)
+            for (world,), own in grouped(self.scores[self.scores["prior"].notna()], ["world"])
         }
 
     @cached_property
     def curves(self) -> pd.DataFrame:
         """The normalised score: a row a world, planner, prior and number of plans, with its interval over seeds."""
         by = ["world", "planner", *PRIOR, "num_plans"]
-        found = mean_intervals(self.scores, by, "share").rename(columns={"mean": "oracle_share", "n": "seeds"})
+        found: pd.DataFrame = mean_intervals(self.scores, by, "share").rename(
+            columns={"mean": "oracle_share", "n": "seeds"}
+        )
         others = self.scores.groupby(by, sort=False, dropna=False)[["model_steps", "at_oracle", "seconds"]].mean()
         found = found.join(others.reset_index(drop=True).rename(columns={"seconds": "seconds_per_decision"}))
         found["model_steps"] = found["model_steps"].convert_dtypes()
@@ -170,7 +167,7 @@ class Results:
             if missing := sorted(set(self.num_plans) - set(known)):
                 raise ValueError(f"num_plans: {world} has {known}, not {missing[0]}")
         number = self.curves["num_plans"]
-        return self.curves[number.isna() | number.isin(self.num_plans)].reset_index(drop=True)
+        return self.curves.loc[number.isna() | number.isin(self.num_plans)].reset_index(drop=True)
 
     @cached_property
     def paired(self) -> pd.DataFrame:
@@ -228,7 +225,7 @@ class Results:
         for world, tables in self._by_prior.items():
             random = tables.get(UNIFORM, pd.DataFrame())
             for key, own in tables.items():
-                seeds, budgets = own.index.intersection(random.index), own.columns.tolist()
+                seeds, budgets = own.index.intersection(random.index), [int(number) for number in own.columns]
                 if seeds.empty:
                     continue
                 climbs = [optimize.isotonic_regression(random.loc[seed]).x for seed in seeds]
@@ -251,8 +248,10 @@ class Results:
         entries = [{"world": run["world"], "seed": run["seed"], **one} for run in self.runs for one in run["entries"]]
         frame = pd.DataFrame(entries, columns=["world", "seed", *PRIOR, "bits"]).astype({"bits": "float64"})
         frame, by = frame[frame["bits"].notna()], ["world", *PRIOR]
-        found = mean_intervals(frame, by, "bits").rename(columns={"mean": "bits_per_action", "n": "seeds"})
-        bits = {place: own.set_index("seed")["bits"] for place, own in frame.groupby(by, sort=False)}
+        found: pd.DataFrame = mean_intervals(frame, by, "bits").rename(
+            columns={"mean": "bits_per_action", "n": "seeds"}
+        )
+        bits = {place: own.set_index("seed")["bits"] for place, own in grouped(frame, by)}
         more = []
         for place, mine in bits.items():
             like = (place[0], place[2], 0)
@@ -267,7 +266,7 @@ class Results:
         """The normalised score after each round of the horizon curriculum: a row a world, prior, round and length."""
         names = ["world", "prior", "sees", "round", "length", "num_plans"]
         entries = [{"world": run["world"], **one} for run in self.runs for one in run["growth"]]
-        found = mean_intervals(pd.DataFrame(entries, columns=[*names, "share"]), names, "share")
+        found: pd.DataFrame = mean_intervals(pd.DataFrame(entries, columns=[*names, "share"]), names, "share")
         return found.rename(columns={"mean": "oracle_share", "n": "seeds"})
 
     @cached_property
@@ -292,52 +291,25 @@ class Results:
         return found.merge(early[[*at, "early"]], "left", on=at)
 
     @cached_property
-    def _matrices(self) -> dict[int, dict[Key, Array]]:
-        """By number of plans, the scores `[W, G]` of each prior that all W worlds have with all seeds; W, G >= 2.
-
-        Worlds have different numbers of rounds: `rounds` is 1 for all priors after the curriculum.
-        """
-        shape = len(self.worlds), len({run["seed"] for run in self.runs})
-        priors = self.scores[self.scores["prior"].notna()]
-        priors = priors.assign(rounds=(priors["rounds"] > 0).astype("int64"))
-        found: dict[int, dict[Key, Array]] = {number: {} for number in self.num_plans if min(shape) > 1}
-        for number, some in found.items():
-            for key, own in priors[priors["num_plans"] == number].groupby(PRIOR, sort=False):
-                values = own.pivot(index="world", columns="seed", values="share").dropna(axis=1).to_numpy()
-                if values.shape == shape:
-                    some[Key(*key)] = values
-        return found
-
-    @cached_property
-    def over_worlds(self) -> pd.DataFrame:
-        """The interquartile mean of the normalised score over worlds, of each prior that all worlds have.
-
-        Intervals are over seeds; `rounds` is 1 after the horizon curriculum.
-        """
-        found = [
-            (*key, number, *interquartile_mean(values), *values.shape)
-            for number, matrices in self._matrices.items()
-            for key, values in matrices.items()
-        ]
-        columns = [*PRIOR, "num_plans", "interquartile_mean", "low", "high", "worlds", "seeds"]
-        return pd.DataFrame(found, columns=columns)
-
-    @cached_property
-    def improvement(self) -> pd.DataFrame:
-        """The probability that the first of two priors is better in a world, of priors that all worlds have.
+    def across(self) -> pd.DataFrame:
+        """Pairs of priors over all worlds that have both, at `shown` plans; see `across_worlds`.
 
         Each learned prior with random plans, and each that is no chain with each chain of equal context and curriculum.
+        Worlds have different numbers of rounds: `rounds` is 1 after the curriculum.
         """
-        found = [
-            (one.prior, other.prior, *one[1:], number, *probability_of_improvement(first, second), *first.shape)
-            for number, matrices in self._matrices.items()
-            for one, first in matrices.items()
-            for other, second in matrices.items()
-            if one.kind in LEARNED
-            and (other == UNIFORM or (other.kind == "markov" != one.kind and other[1:] == one[1:]))
-        ]
-        columns = ["first", "second", "sees", "rounds", "num_plans", "probability", "low", "high", "worlds", "seeds"]
-        return pd.DataFrame(found, columns=columns)
+        own = self.scores[(self.scores["num_plans"] == self.shown) & self.scores["prior"].notna()]
+        own = own.assign(rounds=(own["rounds"] > 0).astype("int64"), kind=own["prior"].map(kind_of))
+        own = own[["world", "seed", *PRIOR, "kind", "share"]]
+        chains, random = own[own["kind"] == "markov"], own[own["kind"] == "uniform"].drop(columns=["sees", "rounds"])
+        others = own[own["kind"].isin(["neural", "other"])].merge(chains, on=["world", "seed", "sees", "rounds"])
+        pairs = pd.concat([others, own[own["kind"] != "uniform"].merge(random, on=["world", "seed"])])
+        names = {"prior_x": "prior", "prior_y": "baseline", "share_x": "first", "share_y": "second"}
+        return across_worlds(pairs.rename(columns=names), ["prior", "sees", "rounds", "baseline"])
+
+
+def grouped(frame: pd.DataFrame, by: Sequence[str]) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """The groups of a frame in order of appearance, each with its values of the columns `by`."""
+    yield from frame.groupby(list(by), sort=False)
 
 
 def _pairs(tables: Mapping[Key, pd.DataFrame]) -> Iterator[Pair]:

@@ -1,6 +1,6 @@
 """What `python -m eval compare` does for one world and one seed: collect plans, fit priors, and plan with them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from time import perf_counter
@@ -78,6 +78,11 @@ class Settings:
     priors: tuple[str, ...] = ()
     lengths: tuple[int, ...] = ()
 
+    def __post_init__(self) -> None:
+        # Numbers of a command line may be of jsonargparse's types, which other processes cannot unpickle.
+        for name in ("rounds", "steps", "starts", "training_starts", "seed"):
+            object.__setattr__(self, name, int(getattr(self, name)))
+
     @property
     def budgets(self) -> list[int]:
         """All powers of two up to the most candidates."""
@@ -89,18 +94,13 @@ class Settings:
         return asdict(self) | {"digests": digests(self.priors)}
 
 
-def compare_run(run: Run, settings: Settings) -> dict[str, Any]:
-    """`compare_priors` in a world of the suite."""
-    return compare_priors(TASKS[run.world], run.seed, settings)
-
-
-def compare_priors(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
+def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
     """Collect plans, fit priors, extend their horizons and compare them, in the worlds of one seed.
 
     Args:
-        task: the world.
-        seed: of these worlds and of everything that is drawn in them.
+        run: the world, and the seed of its worlds and of everything that is drawn in them.
         settings: how much is done.
+        tasks: the worlds by name.
 
     Returns:
         What `eval.compare.results` reads.
@@ -108,8 +108,8 @@ def compare_priors(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
     Raises:
         ValueError: too few plans or starts lead anywhere, or a saved prior does not fit the world.
     """
-    begin = perf_counter()
-    contest = Contest(task, seed, settings)
+    begin, task = perf_counter(), tasks[run.world]
+    contest = Contest(task, run.seed, settings)
     entries, growth, last = [], [], {}
     if (tried_all := contest.exhaustive()) is not None:
         entries.append(tried_all)
@@ -120,33 +120,28 @@ def compare_priors(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
             entries.append(contest.entry(one))
         if one.sees == "none":
             last[one.label] = one.prior  # the object goes on learning until all rounds are done
-    found: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "length": task.length}
+    found: dict[str, Any] = {"world": run.world, "seed": run.seed, "about": task.about, "length": task.length}
     found |= {"num_starts": settings.starts, "budgets": settings.budgets, "entries": entries, "growth": growth}
     found |= {"action_names": task.action_names}
     world = contest.worlds.held_out
     found |= {"transitions": {label: transitions(prior, world, contest.generator) for label, prior in last.items()}}
-    found |= {"plans": drawn_plans(last, contest.starts, contest.generator) if seed == 0 else None}
+    found |= {"plans": drawn_plans(last, contest.starts, contest.generator) if run.seed == 0 else None}
     return found | {"seconds": perf_counter() - begin}
 
 
-def curriculum_run(run: Run, settings: Settings) -> dict[str, Any]:
-    """`compare_rounds` in a world of the suite."""
-    return compare_rounds(TASKS[run.world], run.seed, settings)
-
-
-def compare_rounds(task: Task, seed: int, settings: Settings) -> dict[str, Any]:
+def curriculum_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
     """Extend the horizons of all priors in the worlds of one seed; after every round, plan with plans of every length.
 
-    Args, raises: see `compare_priors`.
+    Args, raises: see `compare_run`.
     """
-    begin = perf_counter()
-    contest = Contest(task, seed, settings)
+    begin, task = perf_counter(), tasks[run.world]
+    contest = Contest(task, run.seed, settings)
     growth = [
         contest.curriculum_entry(one, length)
         for one in contest.contestants()
         for length in (contest.lengths if one.length is not None else ())
     ]
-    found: dict[str, Any] = {"world": task.name, "seed": seed, "about": task.about, "growth": growth}
+    found: dict[str, Any] = {"world": run.world, "seed": run.seed, "about": task.about, "growth": growth}
     return found | {"seconds": perf_counter() - begin}
 
 
@@ -259,7 +254,7 @@ class Contest:
         starts, temperature = self.starts, self._temperature(one, self.task.length)
         entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
         entry |= {"temperature": temperature}
-        entry |= asdict(curve(starts, one.prior, self.settings.budgets, self.generator, temperature))
+        entry |= curve(starts, one.prior, self.settings.budgets, self.generator, temperature)
         asked = self.settings.num_plans
         timed = seconds_per_decision(starts, one.prior, asked, TIMED_STARTS, self.generator, temperature)
         seconds, steps = ([timed[b][k] if b in timed else None for b in self.settings.budgets] for k in (0, 1))
@@ -271,7 +266,7 @@ class Contest:
         """What a prior's plans of `length` actions reach."""
         budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else VALIDATION_PLANS
         temperature = self._temperature(one, length)
-        share = curve(self.starts_at[length], one.prior, [budget], self.generator, temperature).share[0]
+        share = curve(self.starts_at[length], one.prior, [budget], self.generator, temperature)["share"][0]
         named = {"prior": one.label, "sees": one.sees, "round": one.rounds}
         return named | {"length": length, "num_plans": budget, "share": share}
 

@@ -18,6 +18,7 @@ TYPES = {
     "PositiveFloat": "a number above 0",
     "ClosedUnitInterval": "a number from 0 to 1",
     "OpenUnitInterval": "a number between 0 and 1",
+    "PowerOfTwo": "a power of two",
     "bool": "true or false",
     "str": "a text",
 }
@@ -116,7 +117,14 @@ def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -
         settings = parser.parse_args(list(arguments))
     except ArgumentError as error:
         raise ValueError(_one_line(str(error), hints)) from error
-    return function(**settings.as_dict())
+    return function(**{name: _plain(value) for name, value in settings.as_dict().items()})
+
+
+def _plain(value: Any) -> Any:
+    """A value without the parser's own types, which other processes could not read."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return next((kind(value) for kind in (int, float) if isinstance(value, kind) and type(value) is not bool), value)
 
 
 def _item_of(hint: Any) -> Any:
@@ -148,8 +156,9 @@ def _expected(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return f"one of {', '.join(map(str, get_args(hint)))}"
     name = getattr(hint, "__name__", str(hint))
-    bounds = ", ".join(f"{sign} {bound}" for sign, bound in getattr(hint, "_restrictions", ()))
-    return TYPES.get(name, f"a number {bounds}" if bounds else name)
+    if name not in TYPES and hasattr(hint, "_expression"):  # a restricted number
+        return f"{_expected(hint._type)} {hint._expression.replace('v', '')}"
+    return TYPES.get(name, name)
 
 
 def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None) -> int:

@@ -25,7 +25,8 @@ from tests.support.sources import refuses
 
 SETTINGS = Settings((2, 4), ("markov",), ("none",), 1, 3, 4, 5, 0)
 RUNS = runs_of(["maze", "grid"], 3)
-OPTIONS = ("compare", "--worlds", "maze", "grid", "--seeds", "3", "--num-plans", "4")
+OPTIONS = ("compare", "--worlds", "maze", "grid", "--seeds", "3", "--num-plans", "4", "--seed", "1")
+OPTIONS += ("--training-starts", "9", "--steps", "5")  # what a command line gives goes to other processes
 
 
 def jobs_in(folder: Path, run=made_up, **changes) -> JobRun:

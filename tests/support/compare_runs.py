@@ -39,7 +39,7 @@ def worlds(
     sees: Sequence[str] = ("none",),
     rounds: int = 0,
 ) -> list[dict[str, Any]]:
-    """Runs with everything there can be; a prior with context, or after the curriculum, is worth twice as many plans."""
+    """Runs with everything there can be; with context, or after the curriculum, a plan is worth twice as many."""
     rng, made = np.random.default_rng(0), []
     for world in names:
         for seed in range(seeds):

@@ -99,7 +99,7 @@ def test_printed(everything):
         row for row in results["rows"] if (row["world"], row["prior"], row["num_plans"]) == ("maze", "uniform", 256)
     )
     half = max(row["high"] - row["oracle_share"], row["oracle_share"] - row["low"])
-    line = [line for line in lines if line.strip().startswith("uniform") and line.count("±") == 3][1]
+    line = next(line for line in lines if line.strip().startswith("uniform") and line.count("±") == 3)
     assert line.split()[3:5] == [f"{100 * row['oracle_share']:.1f}", f"±{100 * half:.1f}"]
     (best,) = (row for row in results["words"] if (row["world"], row["sees"], row["rounds"]) == ("maze", "none", 0))
     line = next(line for line in lines if line.split()[:2] == ["maze", "none"]).split()

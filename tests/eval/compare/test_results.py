@@ -72,7 +72,7 @@ def test_unlike_runs_are_refused():
 def test_the_order_of_seeds_does_not_matter(order):
     runs = worlds(["maze", "taxi"], 3, {"uniform": 1.0, "markov-1": 2.0, "gru": 4.0})
     mixed, ordered = Results(sorted((runs[k] for k in order), key=lambda one: one["world"]), [16]), Results(runs, [16])
-    for name in ("rows", "paired", "efficiency", "bits", "over_worlds"):
+    for name in ("rows", "paired", "efficiency", "bits", "across"):
         assert records(getattr(mixed, name)) == records(getattr(ordered, name))
 
 
@@ -269,27 +269,25 @@ def test_headlines_are_corrected_for_the_number_of_worlds():
 
 
 def test_aggregates_over_worlds():
-    """Interquartile means and probabilities of improvement, of the scores `[world, seed]` of priors."""
-    made = Results(runs := worlds(["maze", "grid", "cube", "taxi", "cliff"], 4), ASKED)
+    """Interquartile means and probabilities of improvement, of the scores `[world, seed]` of pairs of priors."""
+    made = Results(runs := worlds(["maze", "grid", "cube", "taxi", "cliff"], 4, rounds=2), ASKED)
 
-    def scores(prior: str) -> np.ndarray:
-        return np.array([one["share"][8] for r in runs for one in r["entries"] if one["prior"] == prior]).reshape(5, 4)
+    def scores(prior: str, rounds: int) -> np.ndarray:
+        own = [one for r in runs for one in r["entries"] if (one["prior"], one["rounds"]) == (prior, rounds)]
+        return np.array([one["share"][8] for one in own]).reshape(5, 4)
 
-    (row,) = found(made.over_worlds, prior="gru", num_plans=256)
-    expected = interquartile_mean(scores("gru"))
-    assert (row["interquartile_mean"], row["low"], row["high"]) == pytest.approx(expected)
-    assert (row["worlds"], row["seeds"]) == (5, 4)
-    assert len(made.over_worlds) == len(TIMES) * len(ASKED)
-    (row,) = found(made.improvement, first="gru", second="markov-2", num_plans=256)
-    expected = probability_of_improvement(scores("gru"), scores("markov-2"))
-    assert (row["probability"], row["low"], row["high"]) == pytest.approx(expected)
-    pairs = {(row["first"], row["second"]) for row in records(made.improvement)}
+    for rounds in (0, 2):
+        (row,) = found(made.across, prior="gru", baseline="markov-2", rounds=min(rounds, 1))
+        first, second = scores("gru", rounds), scores("markov-2", rounds)
+        assert (row["first"], row["first_low"], row["first_high"]) == pytest.approx(interquartile_mean(first))
+        assert (row["second"], row["second_low"], row["second_high"]) == pytest.approx(interquartile_mean(second))
+        better = (row["improvement"], row["improvement_low"], row["improvement_high"])
+        assert better == pytest.approx(probability_of_improvement(first, second))
+        assert (row["worlds"], row["seeds"]) == (5, 4)
+    pairs = {(row["prior"], row["baseline"]) for row in records(made.across)}
     chains = {("gru", "markov-1"), ("gru", "markov-2")}
     assert pairs == chains | {(prior, "uniform") for prior in TIMES if prior != "uniform"}
-    # A prior that one of the worlds or seeds lacks has no aggregate.
-    runs[0]["entries"] = [one for one in runs[0]["entries"] if one["prior"] != "gru"]
-    assert set(Results(runs, ASKED).over_worlds["prior"]) == {"uniform", "markov-1", "markov-2"}
-    assert Results(worlds(["maze"], 4), ASKED).over_worlds.empty
+    assert Results(worlds(["maze"], 4), ASKED).across.empty
 
 
 def test_bits():

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from eval.compare import run as compare_run
+from eval.compare import run as run_module
 from eval.compare.curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
-from eval.compare.run import Contest, Settings, compare_priors, compare_rounds
+from eval.compare.run import Contest, Settings, compare_run, curriculum_run
 from eval.worlds.mid_plan import MidPlanWorld
+from eval.worlds.runs import Run
 from eval.worlds.splits import Worlds, from_seeds
 from eval.worlds.suite import TASKS, Task, best_score
 from neuroprior import ExhaustivePlanner, MarkovPrior, TabularWorld, UniformPrior, collect, save
@@ -29,6 +30,10 @@ TINY = Task(
     (5,),
     observation="the squares around it",
 )
+
+
+def run_in(task: Task, seed: int, settings: Settings) -> dict:
+    return compare_run(Run(task.name, seed), settings, {task.name: task})
 
 
 def bandit(actions: int, probability: float | None = None) -> TabularWorld:
@@ -54,12 +59,12 @@ def test_the_curve_of_a_lottery():
     starts = starts_of(one_step(world), world, 50, 1, seeded(0))
     budgets = [1, 2, 4, 8, 16]
     found = curve(starts, UniformPrior(5), [*budgets, 4096], seeded(1))
-    for budget, share, at in zip(budgets, found.share, found.at_oracle, strict=False):
+    for budget, share, at in zip(budgets, found["share"], found["at_oracle"], strict=False):
         truth = 1 - 0.8**budget
         error = (truth * (1 - truth) / (50 * 4096 // budget)) ** 0.5
         assert share == pytest.approx(truth, abs=6 * error)
         assert at == pytest.approx(share, abs=1e-9)
-    assert found.share[-1] == found.at_oracle[-1] == 1.0
+    assert found["share"][-1] == found["at_oracle"][-1] == 1.0
 
 
 def test_in_stochastic_worlds_plans_count_for_their_expected_score():
@@ -67,8 +72,8 @@ def test_in_stochastic_worlds_plans_count_for_their_expected_score():
     world = bandit(4, 0.3)
     starts = starts_of(one_step(world), world, 20, 1, seeded(0))
     found = curve(starts, UniformPrior(4), [1, 64], seeded(1))
-    assert found.share == pytest.approx([1.0, 1.0])
-    assert found.score == pytest.approx([0.3, 0.3])
+    assert found["share"] == pytest.approx([1.0, 1.0])
+    assert found["score"] == pytest.approx([0.3, 0.3])
     decision = planner_of(starts, UniformPrior(4), 64, 1.0).plan(world, starts.state, seeded(2))
     assert float(decision.score.mean()) > 0.3  # as the planner estimates
 
@@ -122,7 +127,7 @@ def test_a_decision_is_timed_at_some_of_the_starts():
 
 @pytest.fixture(scope="module")
 def run() -> dict:
-    return compare_priors(TINY, 0, SMALL)
+    return run_in(TINY, 0, SMALL)
 
 
 def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
@@ -152,8 +157,8 @@ def test_the_same_seed_gives_the_same_results(run):
         entries = [{key: value for key, value in one.items() if key != "seconds"} for one in found["entries"]]
         return json.dumps(kept | {"entries": entries})
 
-    assert results(compare_priors(TINY, 0, SMALL)) == results(run)
-    other = compare_priors(TINY, 1, replace(SMALL, kinds=(), context=("none",)))
+    assert results(run_in(TINY, 0, SMALL)) == results(run)
+    other = run_in(TINY, 1, replace(SMALL, kinds=(), context=("none",)))
     for found, same in zip(other["entries"], run["entries"], strict=False):  # what needs no training
         assert found["prior"] == same["prior"]
         assert found["share"] != same["share"]
@@ -161,9 +166,9 @@ def test_the_same_seed_gives_the_same_results(run):
 
 def test_a_world_decides_contexts_and_the_number_of_training_starts(monkeypatch):
     asked = []
-    monkeypatch.setattr(compare_run, "collect", lambda *given, **how: asked.append(given[2]) or collect(*given, **how))
+    monkeypatch.setattr(run_module, "collect", lambda *given, **how: asked.append(given[2]) or collect(*given, **how))
     task = replace(TINY, contexts=("none", "initial"), start_factor=3)
-    found = compare_priors(task, 0, replace(SMALL, kinds=("markov",), context=(), rounds=0))
+    found = run_in(task, 0, replace(SMALL, kinds=("markov",), context=(), rounds=0))
     assert {one["sees"] for one in found["entries"]} == {"none", "initial"}
     assert sorted(asked) == [22, 90]
 
@@ -189,14 +194,14 @@ def test_numbers_of_states_are_no_initial_context():
 def test_saved_priors_are_compared_as_they_are(tmp_path):
     plans = collect(ExhaustivePlanner(3), TINY.worlds(0).training, 40, generator=seeded(0))
     folder = str(save(MarkovPrior(3, 1).fit(plans), tmp_path / "mine"))
-    found = compare_priors(TINY, 0, replace(SMALL, kinds=(), priors=(folder,)))
+    found = run_in(TINY, 0, replace(SMALL, kinds=(), priors=(folder,)))
     assert [one["prior"] for one in found["entries"]] == [None, "uniform", folder]
     assert found["growth"] == []
 
 
 def test_the_curriculum_alone_with_lengths_of_its_own():
     settings = replace(SMALL, kinds=("markov",), context=("none",), rounds=2, lengths=(4, 6), num_plans=(8,))
-    found = compare_rounds(TINY, 0, settings)
+    found = curriculum_run(Run("tiny", 0), settings, {"tiny": TINY})
     assert {(one["round"], one["length"]) for one in found["growth"]} == {(r, n) for r in range(3) for n in (3, 4, 6)}
     assert {one["num_plans"] for one in found["growth"]} == {8}
 
@@ -238,8 +243,8 @@ def test_temperatures_are_chosen_where_priors_did_not_learn(monkeypatch):
         return 1.0
 
     worlds = TINY.worlds(0)
-    monkeypatch.setattr(compare_run, "best_temperature", spy)
-    compare_priors(replace(TINY, worlds=lambda seed: worlds), 0, SMALL)
+    monkeypatch.setattr(run_module, "best_temperature", spy)
+    run_in(replace(TINY, worlds=lambda seed: worlds), 0, SMALL)
     assert all(starts.world is worlds.validation for starts in chosen)
     # Five chains and a network with two contexts: before the curriculum at lengths 3 and 5, after it at 5.
     assert [sum(starts.length == length for starts in chosen) for length in (3, 5)] == [12, 24]
