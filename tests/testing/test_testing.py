@@ -327,7 +327,7 @@ def test_worlds_of_ones_own_conform(world: type[World]) -> None:
         (Unchecked, "must raise ValueError"),
         (Unannounced, "`stochastic` is False"),
         (Calm, "rewards of rollout do not fit"),
-        (Lucky, "different chance"),
+        (Lucky, "different random numbers"),
         (Biased, "do not fit those of steps"),
         (Stuck, "without any legal action"),
         (Unsaid, "all_legal is True"),
