@@ -10,9 +10,9 @@ import torch
 import yaml
 from jsonargparse import ArgumentError
 from lightning import Trainer
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.utilities.rank_zero import rank_zero_only
+from lightning_utilities.core.rank_zero import rank_zero_only
 
 from neuroprior._files import write_whole
 from neuroprior.cli.fit_recipe import PlansData, PriorModel, recipe_path, recipes

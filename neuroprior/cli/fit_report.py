@@ -44,7 +44,7 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
                 row = dict.fromkeys(row, None) | {"model": baseline.model}
             rows.append(row | {"how": baseline.how, "validation_bits": baseline.validation_bits})
     frame = pd.DataFrame([*rows, _row(trained, trained) | {"how": "", "validation_bits": None}])
-    best = frame.loc[frame.validation_bits.astype(float).idxmin()]
+    best = frame.iloc[int(frame.validation_bits.astype(float).argmin())]
     console.print(_table(frame, best.model, data))
     write_json(
         folder / "metrics.json",
@@ -87,7 +87,7 @@ def learning_curve(name: str, curve: pd.DataFrame, baseline: str, baseline_bits:
     axes.plot(curve.step, curve.train_bits, color="#9aa5b1", label="training plans", marker=".")
     axes.plot(curve.step, curve.validation_bits, color="#0b6e99", label="validation plans", marker="o")
     axes.axhline(baseline_bits, color="#c7522a", linestyle="--", label=f"{baseline}, validation plans")
-    kept = curve.loc[curve.validation_bits.idxmin()]
+    kept = curve.iloc[int(curve.validation_bits.argmin())]
     axes.plot(kept.step, kept.validation_bits, "o", ms=13, mfc="none", color="#0b6e99", label="kept")
     axes.set(xlabel="step", ylabel="bits per action", title=f"Learning curve, {name}")
     axes.legend(frameon=False)

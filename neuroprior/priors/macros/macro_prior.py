@@ -252,7 +252,7 @@ class _Parses(NamedTuple):
         count = parses.row.bincount(minlength=batch)
         turn = torch.arange(len(parses.row), device=parses.row.device) - (count.cumsum(0) - count)[parses.row]
         wide = max(int(count.max()) if batch else 0, 1)
-        parts = []
+        parts: list[Tensor] = []
         for part in (parses.weight.float(), parses.place, parses.log_probs, parses.state):
             padded = part.new_full((batch, wide, *part.shape[1:]), 0 if parts else -torch.inf)
             padded[parses.row, turn] = part
