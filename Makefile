@@ -21,7 +21,7 @@ test: check
 check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy neuroprior
+	$(BIN)/mypy neuroprior train eval
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench

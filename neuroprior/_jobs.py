@@ -31,8 +31,8 @@ PACKAGES = ("neuroprior", "eval")
 class JobRun(Generic[Job, Result]):
     """Jobs whose results are kept in a folder, so that an interrupted run can be resumed.
 
-    A result is found again only if the same was asked of the same code: the folder's name is a digest of `asked`, of the
-    source that does the work, and of the versions of the packages it depends on.
+    A result is found again only if the same was asked of the same code: the name of the folder is a digest of `asked`,
+    of the source that does the work, and of the versions of the packages it depends on.
 
     Args:
         run: does a job and returns its result. It can be pickled, and is called in one thread.

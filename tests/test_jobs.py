@@ -24,7 +24,8 @@ def test_results_come_in_the_order_of_the_jobs(processes: int, tmp_path: Path, c
     assert own == (processes == 1)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 4
-    assert lines[-1].startswith("squares: 4/4 ") and lines[-1].endswith(" 0:00:00 left)")
+    assert lines[-1].startswith("squares: 4/4 ")
+    assert lines[-1].endswith(" 0:00:00 left)")
 
 
 def test_finished_jobs_are_not_done_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -165,6 +166,6 @@ def test_a_cluster_does_the_jobs_though_a_worker_is_killed(cluster, tmp_path: Pa
 def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     began = time.monotonic()
-    with pytest.raises(ValueError, match="no scheduler answers at tcp://127.0.0.1:1"):
+    with pytest.raises(ValueError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1"):
         JobRun(jobs.square, tmp_path, {}).do([1, 2], dask="tcp://127.0.0.1:1")
     assert time.monotonic() - began < 60

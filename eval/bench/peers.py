@@ -82,7 +82,8 @@ class PlainGRU(nn.Module):
     def forward(self, plans: Tensor) -> Tensor:
         """Logits `[N, L, A]` of each action of `plans [N, L]`."""
         before = nn.functional.pad(plans[:, :-1].long(), (1, 0), value=self.num_actions)
-        return self.head(self.gru(self.embedding(before))[0])
+        logits: Tensor = self.head(self.gru(self.embedding(before))[0])
+        return logits
 
     @torch.no_grad()
     def sample(self, num_plans: int, length: int) -> Tensor:
@@ -213,7 +214,8 @@ def pomegranate_sample(plans: Tensor, order: int, num_plans: int, length: int) -
         drawn = chain.sample(num_plans)
         while drawn.shape[1] < length:
             drawn = torch.cat([drawn, chain.distributions[-1].sample(num_plans, drawn[:, -order:])[:, None]], 1)
-        return drawn[:, :, 0]
+        plans: Tensor = drawn[:, :, 0]
+        return plans
 
     return run
 
@@ -252,7 +254,7 @@ def numba_rollout(next_state: Tensor, reward: Tensor, state: Tensor, plans: Tens
 
     # Numbers without a sign are quicker to index with.
     arrays = next_state.numpy().astype(np.uint32), reward.numpy(), state.numpy(), plans.numpy()
-    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     return lambda: loop(*arrays)
 
 
@@ -301,7 +303,7 @@ def vector_env(name: str, plans: Tensor) -> Run:
     actions = plans.long().numpy()
 
     def run() -> Any:
-        envs.reset(seed=[0] * len(actions))
+        envs.reset(seed=[0] * len(actions))  # type: ignore[arg-type]
         total = np.zeros(len(actions))
         for t in range(actions.shape[1]):
             total += envs.step(actions[:, t])[1]
@@ -329,7 +331,7 @@ def mctx_search(next_state: Tensor, reward: Tensor, state: Tensor, simulations: 
 
     policy = mctx.gumbel_muzero_policy if gumbel else mctx.muzero_policy
 
-    @jax.jit
+    @jax.jit  # type: ignore[untyped-decorator]
     def search(key: Any) -> Any:
         root = mctx.RootFnOutput(prior_logits=nothing[0], value=nothing[1], embedding=begin)
         return policy((), key, root, step, simulations, max_depth=depth).action

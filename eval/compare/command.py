@@ -28,12 +28,12 @@ TrainingStarts = restricted_number_type("TrainingStarts", int, (">=", 8), docstr
 
 
 def compare(
-    worlds: Sequence[WorldName] = tuple(TASKS),  # type: ignore[valid-type]
+    worlds: Sequence[WorldName] = tuple(TASKS),
     seeds: PositiveInt = 20,
     num_plans: Sequence[PowerOfTwo] = (16, 64, 256, 1024, 4096),
     priors: Sequence[str] | None = None,
     kinds: Sequence[Kind] | None = None,
-    planners: Sequence[PlannerName] | None = None,  # type: ignore[valid-type]
+    planners: Sequence[PlannerName] | None = None,
     context: Sequence[Context] | None = None,
     rounds: NonNegativeInt = 4,
     steps: PositiveInt = 600,

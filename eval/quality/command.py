@@ -140,8 +140,8 @@ def quality(
 
 def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
     prior, began = source.make(kind), time.perf_counter()
-    how = {} if kind is MarkovPrior else {"generator": torch.Generator().manual_seed(seed), "progress": False}
-    prior.fit(training, **how)
+    settings = {} if kind is MarkovPrior else {"progress": False}
+    prior.fit(training, generator=torch.Generator().manual_seed(seed), **settings)
     seconds = time.perf_counter() - began
     with torch.no_grad():
         taken = prior.action_log_probs(test).double()

@@ -14,11 +14,11 @@ from neuroprior.priors import Prior, load
 
 def sample(
     folder: str,
-    num_plans: PositiveInt = 100,  # type: ignore[valid-type]
-    length: PositiveInt = 20,  # type: ignore[valid-type]
+    num_plans: PositiveInt = 100,
+    length: PositiveInt = 20,
     context: str | None = None,
-    temperature: PositiveFloat = 1.0,  # type: ignore[valid-type]
-    seed: NonNegativeInt = 0,  # type: ignore[valid-type]
+    temperature: PositiveFloat = 1.0,
+    seed: NonNegativeInt = 0,
     out: str | None = None,
 ) -> None:
     """Sample new plans from a saved prior, with the names of its actions.

@@ -61,7 +61,7 @@ def test_the_four_commands(installed: Path, tmp_path: Path) -> None:
     assert "bits per action" in scored.stdout
     plans = pd.read_csv(tmp_path / "score" / "plans.csv")
     groups = pd.read_csv(tmp_path / "score" / "groups.csv")
-    assert len(plans) == 24 and len(groups) == 8
+    assert (len(plans), len(groups)) == (24, 8)
     assert plans["log_likelihood"].sum() == pytest.approx(groups["log_likelihood"].sum())
     said = run(installed, tmp_path, "sample", "gru", "--num-plans", "7", "--length", "5").stdout.splitlines()
     actions = [json.loads(line)["actions"] for line in said if "actions" in json.loads(line)]
@@ -80,4 +80,5 @@ def test_bad_input_is_one_line(installed: Path, tmp_path: Path) -> None:
         (["paint"], "there are fit, report, score, sample"),
     ):
         said = run(installed, tmp_path, *words, code=2).stderr
-        assert len(said.splitlines()) == 1 and says in said
+        assert len(said.splitlines()) == 1
+        assert says in said
