@@ -73,7 +73,7 @@ def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
             yield file
         os.replace(partial, path)
     except OSError as error:
-        # A full disk does not tell which file it was.
+        # A full disk error does not name the file.
         if error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error

@@ -12,7 +12,7 @@ def generator_on(generator: torch.Generator | None, device: torch.device | str) 
         device: where the numbers will be drawn.
 
     Returns:
-        `generator` itself where it lives on the same kind of device; else one on `device` that is seeded by a draw from
+        `generator` itself where it is on the same kind of device; else one on `device` that is seeded by a draw from
         it, so that a CPU generator makes a GPU's draws reproducible too.
     """
     device = torch.device(device)

@@ -112,9 +112,9 @@ def test_the_worlds_own_rewards_do_not_matter():
 
 
 def test_progress_is_reported():
-    seen = []
-    q_learning(gridworld(3, 3), 4, steps=7, progress=lambda done, steps: seen.append((done, steps)))
-    assert seen == [(n, 7) for n in range(1, 8)]
+    observed = []
+    q_learning(gridworld(3, 3), 4, steps=7, progress=lambda done, steps: observed.append((done, steps)))
+    assert observed == [(n, 7) for n in range(1, 8)]
 
 
 @pytest.mark.parametrize(

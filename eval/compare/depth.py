@@ -41,7 +41,7 @@ def depth(
     dask: str | None = None,
     out: str = "runs/depth",
 ) -> None:
-    """How deep should one plan: many short plans or few long ones, and can their scores tell?
+    """How deep should one plan: many short plans or few long ones, and can the scores show which?
 
     With as many steps in a model of the world, planners sample from the same prior: plans of 2, 4, 8 actions and so on,
     and plans whose horizon is chosen by the scores of the first of them. All plans may end after any of their actions.

@@ -40,7 +40,7 @@ LETTERS = 8
 """Size of text in small figures, points."""
 
 WALL, REWARD = (0.49, 0.51, 0.55), (0.18, 0.62, 0.36)
-"""Colours of what stands in a drawn world, seen on light and dark pages."""
+"""Colours of what stands in a drawn world, legible on light and dark pages."""
 
 JITTER = 0.17
 """How far the paths of a drawing are moved apart, squares."""

@@ -98,7 +98,7 @@ class ContextIndex:
         self.columns = slice(None) if features is None else torch.tensor(features)
         self.weights = torch.ones(0, dtype=torch.float64)
         if contexts.is_floating_point():
-            # A sum with random weights tells features apart; one number is quicker to look up than many.
+            # A sum with random weights distinguishes features; one number is quicker to look up than many.
             generator = torch.Generator().manual_seed(0)
             self.weights = torch.rand(contexts[:, self.columns].shape[-1], generator=generator, dtype=torch.float64)
         hashes = self._hash(contexts).sort().values

@@ -90,7 +90,7 @@ class Settings:
 
     @property
     def asked(self) -> dict[str, Any]:
-        """The settings with the digests of the files of saved priors, to tell finished runs of others apart."""
+        """The settings with the digests of the files of saved priors, which distinguish finished runs."""
         return asdict(self) | {"digests": digests(self.priors)}
 
 

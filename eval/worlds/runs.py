@@ -67,7 +67,7 @@ def finished(
     Args:
         command: the name of the experiment.
         work: does a run, `work(run, settings=settings)`.
-        settings: a dataclass; its property `asked`, if it has one, says what tells finished runs apart.
+        settings: a dataclass; its property `asked`, if it has one, says what distinguishes finished runs.
         worlds, seeds: see `runs_of`.
         out: the folder of the experiment; finished runs are kept in `runs` below it.
         processes, dask: see `JobRun.do`.

@@ -16,7 +16,7 @@ def rows_of(values: Tensor, row: Tensor) -> Tensor:
     Rows of states with spare room get as much room again.
     """
     base = values._base
-    if base is None or values.dim() != 2 or grown(values, values.shape[1]) is None:
+    if base is None or values.dim() != 2 or extended(values, values.shape[1]) is None:
         return _selected(values, row)
     taken = _selected(base, row)
     setattr(taken, MARK, True)
@@ -39,7 +39,7 @@ def states_with_room(like: Tensor, size: int, room: int) -> Tensor:
     return taken[:, :size]
 
 
-def grown(state: Tensor, size: int) -> Tensor | None:
+def extended(state: Tensor, size: int) -> Tensor | None:
     """`state [N, ...]` together with its spare room, `[N, size]`; None where it has not so much room."""
     base = state._base
     if (

@@ -230,24 +230,24 @@ def test_damaged_checkpoints(tmp_path):
         with refuses(word):
             restore_agent(other, tmp_path)
     path = tmp_path / "agent.json"
-    told = json.loads(path.read_text())
+    text = json.loads(path.read_text())
     for content, word in (
         ("{", "not JSON"),
         ("[]", "not a checkpoint"),
-        (json.dumps(told | {"version": 9}), "not a checkpoint"),
-        (json.dumps({k: v for k, v in told.items() if k != "weights"}), "weights"),
-        (json.dumps(told | {"agent": []}), "agent"),
-        (json.dumps(told | {"prior": 3}), "prior"),
-        (json.dumps(told | {"time": "x"}), "time"),
-        (json.dumps(told | {"recent": [1, "x"]}), "recent"),
-        (json.dumps(told | {"recent": [1] * 9}), "recent"),
-        (json.dumps(told | {"sha256": "0"}), "truncated"),
+        (json.dumps(text | {"version": 9}), "not a checkpoint"),
+        (json.dumps({k: v for k, v in text.items() if k != "weights"}), "weights"),
+        (json.dumps(text | {"agent": []}), "agent"),
+        (json.dumps(text | {"prior": 3}), "prior"),
+        (json.dumps(text | {"time": "x"}), "time"),
+        (json.dumps(text | {"recent": [1, "x"]}), "recent"),
+        (json.dumps(text | {"recent": [1] * 9}), "recent"),
+        (json.dumps(text | {"sha256": "0"}), "truncated"),
     ):
         path.write_text(content)
         with refuses(word):
             restore_agent(agent(), tmp_path)
-    path.write_text(json.dumps(told))
-    weights = tmp_path / told["weights"]
+    path.write_text(json.dumps(text))
+    weights = tmp_path / text["weights"]
     weights.write_bytes(weights.read_bytes()[:-10])
     with refuses("truncated"):
         restore_agent(agent(), tmp_path)

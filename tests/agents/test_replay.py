@@ -10,7 +10,7 @@ from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 
 def numbered(first, number, context=False):
-    """Plans that can be told apart."""
+    """Plans that differ."""
     which = torch.arange(first, first + number)
     return Plans(which[:, None].repeat(1, 2), 100_000, context=which if context else None)
 

@@ -73,8 +73,8 @@ def test_it_finds_what_the_oracle_does_when_it_may_try_all(seed, how, kind, lega
     assert decision.model_steps * len(state) == world.steps <= num_plans * length * len(state)
     best = oracle(world, state, length, **how).double()
     assert (decision.score <= best + 1e-5).all()
-    told, ends = score_of(planner, world, state, decision)
-    assert torch.allclose(told.double(), decision.score.double(), atol=1e-6)
+    score, ends = score_of(planner, world, state, decision)
+    assert torch.allclose(score.double(), decision.score.double(), atol=1e-6)
     assert torch.equal(ends, decision.final_state)
     if num_plans >= 18:
         assert torch.allclose(decision.score.double(), best, atol=1e-5)
@@ -141,8 +141,8 @@ def test_the_context_is_the_observation_of_each_plans_state():
     for _ in range(6):
         plans.append((right[state], state))
         state = world.step(state, right[state])[0]
-    actions, seen = (torch.stack(part, 1) for part in zip(*plans, strict=True))
-    prior = MarkovPrior(4, 0, num_contexts=30).fit(Plans(actions, 4, context=seen))
+    actions, observed = (torch.stack(part, 1) for part in zip(*plans, strict=True))
+    prior = MarkovPrior(4, 0, num_contexts=30).fit(Plans(actions, 4, context=observed))
     decision = FrontierPlanner(prior, 6, 1, objective="return", noise=False).plan(world, world.reset(20, seeded(4)))
     assert (decision.score == 6).all()
 

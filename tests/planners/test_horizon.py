@@ -148,6 +148,6 @@ def test_a_small_comparison(tmp_path, capsys):
 )
 def test_bad_options(given, word, tmp_path, capsys):
     assert main([*SMALL, *given, "--out", str(tmp_path)]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert word in told
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert word in text

@@ -215,11 +215,11 @@ def test_collect(context, maps):
     elif context == "plan":
         assert torch.equal(plans.context, state % 20)
     else:
-        now, seen = state, []
+        now, observed = state, []
         for t in range(3):
-            seen.append(world.observe(now))
+            observed.append(world.observe(now))
             now, _ = world.step(now, plans.actions[:, t].long())
-        assert torch.equal(plans.context, torch.stack(seen, 1))
+        assert torch.equal(plans.context, torch.stack(observed, 1))
 
 
 def test_collect_from_random_starts_has_the_closed_form_on_a_torus():

@@ -65,9 +65,9 @@ def test_inclusion_gives_means_without_bias(num_plans):
     probs = distribution(prior, 4)
     value = torch.rand(81, generator=seeded(1), dtype=torch.double)
     found = sample_distinct(prior, num_plans, 4, num_sets=MANY, generator=seeded(0))
-    told = (value[plan_number(found.plans, 3)] * found.log_prob.exp() / found.inclusion).sum(1)
-    assert abs(float(told.mean() - (value * probs).sum())) < 6 * float(told.std()) / MANY**0.5
-    assert float(told.std()) > 0
+    estimate = (value[plan_number(found.plans, 3)] * found.log_prob.exp() / found.inclusion).sum(1)
+    assert abs(float(estimate.mean() - (value * probs).sum())) < 6 * float(estimate.std()) / MANY**0.5
+    assert float(estimate.std()) > 0
 
 
 @pytest.mark.parametrize("kind", [UniformPrior, MarkovPrior, GRUPrior, TransformerPrior])
@@ -139,11 +139,11 @@ def test_the_most_probable_plans(actions, length, batch, seed, share):
     prior = TablePrior.random(actions, length, batch, seed)
     number = max(int(actions**length * share), 1)
     plans, log_prob = most_probable(prior, number, length, torch.arange(batch))
-    for own, (mine, told) in enumerate(zip(plans, log_prob, strict=True)):
+    for own, (mine, log_probs) in enumerate(zip(plans, log_prob, strict=True)):
         probs = distribution(prior, length, torch.tensor(own))
         assert len(mine.unique(dim=0)) == number
-        assert torch.allclose(probs[plan_number(mine, actions)], told.exp())
-        assert torch.allclose(told.exp(), probs.sort(descending=True).values[:number])
+        assert torch.allclose(probs[plan_number(mine, actions)], log_probs.exp())
+        assert torch.allclose(log_probs.exp(), probs.sort(descending=True).values[:number])
 
 
 def test_the_greedy_plan_need_not_be_the_most_probable():

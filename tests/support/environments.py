@@ -43,7 +43,7 @@ class Layouts(Corridor):
 
 
 class Keys(Corridor):
-    """Two switches that cannot be seen, as a set of numbers, and the second opens only after the first."""
+    """Two switches that are hidden, as a set of numbers, and the second opens only after the first."""
 
     def __init__(self):
         super().__init__()
@@ -65,8 +65,8 @@ class Light(Corridor):
         if self.clock % 3:
             self.clock += 1
             return self.place, 0.0, False, False, {}
-        seen, _, _, _, info = super().step(action)
-        return seen, 0.0, False, False, info
+        observed, _, _, _, info = super().step(action)
+        return observed, 0.0, False, False, info
 
 
 class Fuse(Corridor):
@@ -137,18 +137,18 @@ class Uncopied(Corridor):
     """Holds what cannot be copied: a generator."""
 
     def reset(self, *, seed=None, options=None):
-        seen, info = super().reset(seed=seed)
+        observed, info = super().reset(seed=seed)
         self.hidden = (n for n in range(3))
-        return seen, info
+        return observed, info
 
 
 class Opaque(Corridor):
     """Holds what can be copied but not read: a match of a regular expression."""
 
     def reset(self, *, seed=None, options=None):
-        seen, info = super().reset(seed=seed)
+        observed, info = super().reset(seed=seed)
         self.hidden = re.match("a", "a")
-        return seen, info
+        return observed, info
 
 
 class Hidden(Corridor):

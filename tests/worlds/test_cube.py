@@ -14,7 +14,7 @@ QUARTER_TURNS = [1, 6, 27, 120, 534, 2256, 8969, 33058, 114149, 360508, 930588, 
 NUM_STATES = 3_674_160
 
 # The independent model: 24 stickers, each at a corner (x, y, z) and facing one way. A turn carries those of its face
-# round: u (+z) clockwise seen from above, r (+x) from the right, f (-y) from the front.
+# round: u (+z) clockwise looked at from above, r (+x) from the right, f (-y) from the front.
 STICKERS = [
     (corner, way)
     for corner in itertools.product((-1, 1), repeat=3)
@@ -118,11 +118,11 @@ def test_observations():
     world = cube()
     assert world.observe(torch.tensor([0]))[0].view(10, 7)[:7].equal(torch.eye(7))
     state = world.reset(3000, seeded(4)).unique()
-    seen = world.observe(state)
-    assert seen.shape == (len(state), 70)
-    assert seen.dtype == torch.float32
-    assert (seen.sum(1) == 14).all()
-    assert len(seen.unique(dim=0)) == len(state)
+    observed = world.observe(state)
+    assert observed.shape == (len(state), 70)
+    assert observed.dtype == torch.float32
+    assert (observed.sum(1) == 14).all()
+    assert len(observed.unique(dim=0)) == len(state)
 
 
 def test_a_planner_solves_what_is_near():

@@ -15,11 +15,11 @@ NAMES = ("CartPole-v1", "MountainCar-v0")
 
 def real_trajectory(env, seed, actions, first=0):
     """Observations and rewards of a trajectory, and how many of the actions were taken."""
-    seen, _ = env.reset(seed=seed)
-    observations, rewards = [seen], []
+    first_observed, _ = env.reset(seed=seed)
+    observations, rewards = [first_observed], []
     for action in actions:
-        seen, reward, terminated, truncated, _ = env.step(action + first)
-        observations.append(seen)
+        first_observed, reward, terminated, truncated, _ = env.step(action + first)
+        observations.append(first_observed)
         rewards.append(reward)
         if terminated or truncated:
             break
@@ -43,7 +43,7 @@ def test_rollouts_are_the_environments(name):
             assert rollout.rewards[b, p].tolist() == pytest.approx(rewards + [0.0] * (25 - taken))
             assert rollout.states[b, p, :, 1].tolist() == [min(t + 1, taken) for t in range(25)]
             shown = world.observe(rollout.states[b, p])
-            assert shown[:taken].tolist() == [pytest.approx(seen.tolist()) for seen in observations[1:]]
+            assert shown[:taken].tolist() == [pytest.approx(first_observed.tolist()) for first_observed in observations[1:]]
             assert rollout.final_state[b, p].equal(rollout.states[b, p, -1])
     assert world.num_layouts == 2
     assert world.layout(rollout.final_state).tolist() == [[0] * 6, [1] * 6]
@@ -107,11 +107,11 @@ def test_replays_go_on_only_from_their_own_history(kept):
     world.max_kept = other.max_kept = kept
     plans = torch.randint(2, (1, 12, 8), generator=seeded(6))
     whole = world.rollout(world.reset(1), plans, keep_states=True)
-    seen = world.observe(whole.states[0].flatten(0, 1)).view(12, 8, -1)
+    first_observed = world.observe(whole.states[0].flatten(0, 1)).view(12, 8, -1)
     state = other.reset(12)
     for t in range(8):  # step by step, the last row's environment is there when the first row's is needed
         state, reward = other.step(state, plans[0, :, t])
-        assert other.observe(state).equal(seen[:, t])
+        assert other.observe(state).equal(first_observed[:, t])
         assert reward.equal(whole.rewards[0, :, t])
 
 

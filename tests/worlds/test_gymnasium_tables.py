@@ -37,14 +37,14 @@ def test_the_table_does_what_the_environment_does(name):
     state, ends = env.reset(seed=0)[0], 0
     for _ in range(5000):
         action = int(env.action_space.sample())
-        seen, reward, terminated, _, _ = env.step(action)
+        observed, reward, terminated, _, _ = env.step(action)
         after, gained = world.step(torch.tensor([state]), torch.tensor([action]))
         assert float(gained) == pytest.approx(reward)
         assert bool(world.ended[after]) == terminated
         if not terminated:
-            assert int(after) == seen
+            assert int(after) == observed
         ends += terminated
-        state = env.reset()[0] if terminated else seen
+        state = env.reset()[0] if terminated else observed
     assert ends > 0 or name == "CliffWalking-v1"
 
 

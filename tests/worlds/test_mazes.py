@@ -120,9 +120,9 @@ def test_views_square_by_square(edges, radius):
     plain = GridWorld(4, 5, edges, torch.zeros(2, 60), walls=WALLS, view=radius)
     for world in (plain, egocentric(plain)):
         state = torch.arange(2 * world.num_states)
-        seen = world.observe(state)
-        assert seen.dtype == torch.float32
-        assert torch.equal(seen, local_view(world, radius)(state))
+        observed = world.observe(state)
+        assert observed.dtype == torch.float32
+        assert torch.equal(observed, local_view(world, radius)(state))
         for s in range(0, len(state), 7):
             (row, column), layout = world.coordinates(state[s]).tolist(), int(world.layout(state[s]))
             heading = int(world.heading(state[s])) if world.egocentric else 0
@@ -137,7 +137,7 @@ def test_views_square_by_square(edges, radius):
                         there = [there[0] % 4, there[1] % 5]
                     inside = 0 <= there[0] < 4 and 0 <= there[1] < 5
                     want.append(float(inside and not WALLS[layout, there[0], there[1]]))
-            assert seen[s].tolist() == want
+            assert observed[s].tolist() == want
 
 
 @pytest.mark.parametrize("egocentric", [False, True])
@@ -160,9 +160,9 @@ def test_who_follows_the_direction_is_at_the_goal(egocentric):
 def test_a_view_turns_with_the_agent():
     walls = torch.tensor([[[1, 1, 1], [1, 0, 0], [1, 1, 1]]]).bool()  # a dead end, open to the right
     world = GridWorld(3, 3, "wall", torch.zeros(1, 9), walls=walls, egocentric=True, view=1)
-    seen = world.observe(torch.arange(16, 20))
+    observed = world.observe(torch.arange(16, 20))
     # The eight squares around: ahead is number 1, to the left 3, to the right 4, behind 6.
-    assert seen.nonzero().tolist() == [[0, 4], [1, 1], [2, 3], [3, 6]]
+    assert observed.nonzero().tolist() == [[0, 4], [1, 1], [2, 3], [3, 6]]
 
 
 @pytest.mark.parametrize("turns", [False, True])

@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from neuroprior._checks import check_sizes
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
-from neuroprior.sampling.rows import grown, states_with_room
+from neuroprior.sampling.rows import extended, states_with_room
 
 
 class TransformerPrior(NeuralPrior):
@@ -121,7 +121,7 @@ class TransformerPrior(NeuralPrior):
         before = state[:, past : past + kept].clone()  # the cache will be written there
         size = cached + kept + self.input_size
         x, line = self.embedding(new[:, None], hidden[:, :recent])
-        after = None if room is None else grown(state, size)
+        after = None if room is None else extended(state, size)
         if after is None:
             free = (room or 0) * (self.cache_size + self.input_size)
             after = state.new_empty(len(state), size) if room is None else states_with_room(state, size, free)

@@ -21,8 +21,8 @@ SMALL += ["--num-plans", "4", "16"]
 def test_a_small_comparison(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     assert main([*SMALL, "--out", str(out)]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "grid, 16 plans:" in told
+    text = " ".join(capsys.readouterr().out.split())
+    assert "grid, 16 plans:" in text
     results = json.loads((out / "results.json").read_text())
     rows = results["rows"]
     names = {"world", "planner", "prior", "num_plans", "model_steps", "oracle_share", "low", "high"}

@@ -128,7 +128,7 @@ def test_aggregates_over_worlds_are_shares_of_the_oracle():
 )
 def test_bad_options(given, word, tmp_path, capsys):
     assert main([*SMALL, *given, "--out", str(tmp_path)]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert word in told
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert word in text
     assert not list(tmp_path.iterdir())
