@@ -1,8 +1,9 @@
 """Reading and writing plans: one function each for all kinds of files; datasets of Minari; trajectories in memory."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from neuroprior.plans.io.columns import check_names
 from neuroprior.plans.io.csv import read_csv, write_csv
@@ -17,7 +18,21 @@ __all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", 
 MINARI = "minari:"
 """Before the name of a Minari dataset, where a file may be given."""
 
-READERS = {".csv": read_csv, ".tsv": read_csv, ".jsonl": read_jsonl, ".npz": read_npz}
+
+class FileKind(NamedTuple):
+    """How one kind of file is read and written."""
+
+    read: Callable[..., Plans]
+    write: Callable[..., None]
+
+
+FILES = {
+    ".csv": FileKind(read_csv, write_csv),
+    ".tsv": FileKind(read_csv, write_csv),
+    ".jsonl": FileKind(read_jsonl, write_jsonl),
+    ".npz": FileKind(read_npz, write_npz),
+}
+"""The kinds of files, by suffix."""
 
 
 def read_plans(
@@ -56,7 +71,7 @@ def read_plans(
         return read_minari(path.removeprefix(MINARI))
     place = Path(path)
     names = check_names(num_actions, action_names)
-    return READERS[_suffix(place)](place, num_actions, names)
+    return FILES[_suffix(place)].read(place, num_actions, names)
 
 
 def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | None = None) -> None:
@@ -78,7 +93,7 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
     """
     place = Path(path)
     suffix = _suffix(place)
-    if layout is not None and READERS[suffix] is not read_csv:
+    if layout is not None and FILES[suffix].read is not read_csv:
         raise ValueError(f"layout: for CSV files only, not for {place}")
     if not len(plans):
         raise ValueError(f"{place}: no plans to write")
@@ -88,17 +103,15 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
             raise ValueError(f"{place}: a context of no features; use None")
         if not context.float().isfinite().all():
             raise ValueError(f"{place}: features too large for the 32 bits in which they are read")
-    if READERS[suffix] is read_csv:
+    if FILES[suffix].read is read_csv:
         write_csv(plans, place, layout)
-    elif suffix == ".jsonl":
-        write_jsonl(plans, place)
     else:
-        write_npz(plans, place)
+        FILES[suffix].write(plans, place)
 
 
 def _suffix(path: Path) -> str:
-    if path.suffix.lower() not in READERS:
+    if path.suffix.lower() not in FILES:
         raise ValueError(
-            f"{path}: a file of the kind {', '.join(READERS)} is expected, not {path.suffix or 'no suffix'!r}"
+            f"{path}: a file of the kind {', '.join(FILES)} is expected, not {path.suffix or 'no suffix'!r}"
         )
     return path.suffix.lower()
