@@ -116,7 +116,7 @@ def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
     trained = frame.index[-1]
 
     def how(row: Any) -> str:
-        return ", ".join(part for part in (row.how, "context" * ("context" in str(row.inputs))) if part)
+        return ", ".join(part for part in (row.how, "context" * ("context" in str(row.sees))) if part)
 
     def bits(row: Any) -> str:
         known = not pd.isna(row.bits_per_action)

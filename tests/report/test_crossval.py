@@ -115,7 +115,7 @@ def test_scores_are_those_of_fits_by_hand(kind, grouped, skip, tmp_path):
     mask[:, :skip] = False
     compared = 0
     for model in found.models:
-        assert (model.name, model.inputs) == (model.score.model, model.score.sees)
+        assert (model.name, model.inputs) == (model.score.model, model.score.inputs)
         if model.name not in ("markov-0", "markov-1", "markov-3", "context tree"):
             continue
         blind = model.inputs == ACTIONS

@@ -43,7 +43,9 @@ def test_rollouts_are_the_environments(name):
             assert rollout.rewards[b, p].tolist() == pytest.approx(rewards + [0.0] * (25 - taken))
             assert rollout.states[b, p, :, 1].tolist() == [min(t + 1, taken) for t in range(25)]
             shown = world.observe(rollout.states[b, p])
-            assert shown[:taken].tolist() == [pytest.approx(first_observed.tolist()) for first_observed in observations[1:]]
+            assert shown[:taken].tolist() == [
+                pytest.approx(first_observed.tolist()) for first_observed in observations[1:]
+            ]
             assert rollout.final_state[b, p].equal(rollout.states[b, p, -1])
     assert world.num_layouts == 2
     assert world.layout(rollout.final_state).tolist() == [[0] * 6, [1] * 6]

@@ -55,15 +55,17 @@ def test_chains_have_the_context_of_networks():
     _, number = plans.context.flatten(0, 1).unique(dim=0, return_inverse=True)
     counted = replace(plans, context=number.view(60, 3))
     plain = MarkovPrior(3, 2, num_contexts=int(number.max()) + 1).fit(counted)
-    predicted = prior.log_prob(plans.actions, plans.context)
-    assert torch.allclose(predicted, plain.log_prob(counted.actions, counted.context), atol=1e-5)
+    predicted = prior.log_prob(Plans(plans.actions, prior.num_actions, context=plans.context))
+    assert torch.allclose(
+        predicted, plain.log_prob(Plans(counted.actions, plain.num_actions, context=counted.context)), atol=1e-5
+    )
     assert torch.allclose(predicted, stepped(prior, plans), atol=1e-5)
     grid = gridworld(4, 4)
     plans = collect(ExhaustivePlanner(2), grid, 20, context="step")
     assert context_sizes(grid, plans) == {"num_contexts": 16}
-    predicted = chain(1, grid, plans, ()).fit(plans).log_prob(plans.actions, plans.context)
+    predicted = chain(1, grid, plans, ()).fit(plans).log_prob(plans)
     assert torch.allclose(
-        predicted, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans.actions, plans.context)
+        predicted, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans)
     )
     assert isinstance(chain(1, grid, replace(plans, context=None), ()), MarkovPrior)
     assert network("gru", grid, plans, 0).num_contexts == 16
@@ -78,11 +80,15 @@ def test_in_new_contexts_a_chain_predicts_as_without_context(per):
     prior, plain = ContextMarkov(2, 2, context_size=3), MarkovPrior(2, 2).fit(actions)
     prior.fit(Plans(actions, 2, context=context))
     other = context + 5
-    assert torch.allclose(prior.log_prob(actions, other), plain.log_prob(actions), atol=1e-6)
+    assert torch.allclose(
+        prior.log_prob(Plans(actions, prior.num_actions, context=other)), plain.log_prob(actions), atol=1e-6
+    )
     if per == "step":
         half = torch.where(torch.arange(6)[:, None] < 3, context, other)
         plans = Plans(actions, 2, context=half)
-        assert torch.allclose(stepped(prior, plans), prior.log_prob(actions, half), atol=1e-5)
+        assert torch.allclose(
+            stepped(prior, plans), prior.log_prob(Plans(actions, prior.num_actions, context=half)), atol=1e-5
+        )
 
 
 def stepped(prior: Prior, plans: Plans) -> torch.Tensor:
@@ -180,7 +186,10 @@ def test_context_goes_to_the_prior(per, tmp_path):
     found = load_for(saved(tmp_path, prior, plans), "maze", 3, ("down", "up", "right"))
     assert (found.context_per, found.num_contexts) == (per, 25)
     some, contexts = every_plan(3, 3), torch.randint(25, (27,) if per == "plan" else (27, 3), generator=seeded(3))
-    torch.testing.assert_close(found.log_prob(some, contexts), prior.log_prob(torch.tensor([2, 0, 1])[some], contexts))
+    torch.testing.assert_close(
+        found.log_prob(Plans(some, found.num_actions, context=contexts)),
+        prior.log_prob(Plans(torch.tensor([2, 0, 1])[some], prior.num_actions, context=contexts)),
+    )
 
 
 def test_a_planner_takes_it(tmp_path):
