@@ -164,7 +164,7 @@ def test_features_are_for_neural_models_alone(kind, tmp_path):
     for fold, (learned, held) in enumerate(folds(plans, 2, 3)):
         seed = 3000 + fold
         prior = GRUPrior(3, context_size=2, seed=seed).fit(
-            plans[learned], seeded(seed), max_steps=STEPS, progress=False
+            plans[learned], generator=seeded(seed), max_steps=STEPS, progress=False
         )
         with torch.no_grad():
             want[held] = -prior.action_log_probs(plans[held]) / math.log(2)
