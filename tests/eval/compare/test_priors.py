@@ -64,9 +64,7 @@ def test_chains_have_the_context_of_networks():
     plans = collect(ExhaustivePlanner(2), grid, 20, context="step")
     assert context_sizes(grid, plans) == {"num_contexts": 16}
     predicted = chain(1, grid, plans, ()).fit(plans).log_prob(plans)
-    assert torch.allclose(
-        predicted, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans)
-    )
+    assert torch.allclose(predicted, MarkovPrior(4, 1, num_contexts=16).fit(plans).log_prob(plans))
     assert isinstance(chain(1, grid, replace(plans, context=None), ()), MarkovPrior)
     assert network("gru", grid, plans, 0).num_contexts == 16
 
