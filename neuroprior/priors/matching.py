@@ -27,14 +27,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
         raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")
-    names, actions = learned_names(prior), plans.actions
-    if names is not None and plans.action_names is not None:
-        number = numbers(names, plans.action_names, f"{name}: does not know the action", "; it knows")
-        actions = number[actions.long()]
-    plans = replace(plans, actions=actions, num_actions=known, action_names=None)
-    if prior.context_names is not None and plans.context_names is not None and plans.context is not None:
-        number = numbers(prior.context_names, plans.context_names, f"{name}: does not know the context", "; it knows")
-        plans = replace(plans, context=number[plans.context.long()], context_names=None)
+    plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
     if not prior.takes_context:
         plans = replace(plans, context=None, context_names=None)
     return plans if prior.end is None else plans.with_end()
@@ -45,8 +38,27 @@ def learned_names(prior: Prior) -> list[str] | None:
     return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
 
 
+def renumbered(
+    plans: Plans, num_actions: int, names: Sequence[str] | None, context_names: Sequence[str] | None, where: str
+) -> Plans:
+    """The plans with actions and contexts numbered as in these names; as they are where one side has no names.
+
+    Raises:
+        ValueError: a name is unknown, or there are too many actions; the message begins with `where`.
+    """
+    actions, context, unknown = plans.actions, plans.context, " is unknown; known are"
+    if names is not None and plans.action_names is not None:
+        actions = numbers(names, plans.action_names, f"{where}: the action", unknown)[actions.long()]
+    if context is None or context_names is None or plans.context_names is None:
+        context_names = plans.context_names
+    else:
+        context = numbers(context_names, plans.context_names, f"{where}: the context", unknown)[context.long()]
+    plans = replace(plans, actions=actions, num_actions=num_actions, action_names=names)
+    return replace(plans, context=context, context_names=context_names)
+
+
 def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:
-    """The number under which each of the names is known, int64.
+    """The number under which each of the names is known.
 
     Raises:
         ValueError: a name is not known; it stands between `before` and `after`, and those that are follow.

@@ -14,6 +14,7 @@ from neuroprior._jobs import Progress
 from neuroprior.plans import Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
+from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.report.document import Document, write_document
 from neuroprior.report.fits import ACTIONS, CONTEXT, Design, counted
 from neuroprior.report.scores import (
@@ -22,8 +23,6 @@ from neuroprior.report.scores import (
     evaluate,
     evaluate_saved,
     jobs,
-    learned_names,
-    renumbered,
 )
 from neuroprior.report.sections import SECTIONS, describe
 

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from math import log
 from pathlib import Path
@@ -20,6 +20,7 @@ from neuroprior.analysis import Reliability
 from neuroprior.analysis.comparison import ORDERS, Score, score_bits, unit_name, units
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior
+from neuroprior.priors.matching import match_plans
 from neuroprior.report import fits
 from neuroprior.report.fits import ACTIONS, CONTEXT, COUNTED, KINDS, Arrays, Design, Job, counted, split
 
@@ -208,14 +209,8 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Eval
 
 
 def _saved(name: str, prior: Prior, plans: Plans, skip: int) -> Model:
-    known = prior.num_actions - (prior.end is not None)
-    if plans.num_actions > known:
-        raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")
-    plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
+    plans = match_plans(plans, prior, name)
     inputs = CONTEXT if prior.takes_context else ACTIONS
-    if not prior.takes_context:
-        plans = replace(plans, context=None, context_names=None)
-    plans = plans if prior.end is None else plans.with_end()
     mask = counted(plans, skip)
     try:
         arrays = fits.score_arrays(prior, plans, mask, units(plans, mask))
@@ -226,41 +221,6 @@ def _saved(name: str, prior: Prior, plans: Plans, skip: int) -> Model:
     sums = arrays.get("calibration")
     calibration = None if sums is None else Reliability(torch.from_numpy(sums))
     return Model(name, inputs, type(prior).__name__, bits, score, calibration)
-
-
-def learned_names(prior: Prior) -> list[str] | None:
-    """The names of the actions that a prior has learned, without that of its end symbol; None for numbers."""
-    return None if prior.action_names is None else [n for a, n in enumerate(prior.action_names) if a != prior.end]
-
-
-def renumbered(
-    plans: Plans, num_actions: int, names: Sequence[str] | None, context_names: Sequence[str] | None, where: str
-) -> Plans:
-    """The plans with actions and contexts numbered as in these names; as they are where one side has no names.
-
-    Raises:
-        ValueError: a name is unknown, or there are too many actions; the message begins with `where`.
-    """
-    actions, context, unknown = plans.actions, plans.context, " is unknown; known are"
-    if names is not None and plans.action_names is not None:
-        actions = numbers(names, plans.action_names, f"{where}: the action", unknown)[actions.long()]
-    if context is None or context_names is None or plans.context_names is None:
-        context_names = plans.context_names
-    else:
-        context = numbers(context_names, plans.context_names, f"{where}: the context", unknown)[context.long()]
-    plans = replace(plans, actions=actions, num_actions=num_actions, action_names=names)
-    return replace(plans, context=context, context_names=context_names)
-
-
-def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str) -> Tensor:
-    """The number under which each of the names is known.
-
-    Raises:
-        ValueError: a name is not known; it stands between `before` and `after`, and those that are follow.
-    """
-    if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(known)}")
-    return torch.tensor([known.index(name) for name in names])
 
 
 def _digest(plans: Plans) -> str:
