@@ -57,7 +57,7 @@ def file_section(found: Evaluation) -> Part:
 def describe(plans: Plans) -> dict[str, Any]:
     """How many plans there are, of which lengths, with which context."""
     lengths = plans.mask().sum(1)
-    context = "nothing"
+    context = "none"
     if plans.context is not None:
         kind = "features" if plans.context.is_floating_point() else f"{_num_contexts(plans)} contexts"
         context = f"{kind}, {'at each step' if is_per_step(plans.context) else 'once a plan'}"

@@ -103,6 +103,7 @@ def test_plans_end_where_the_world_terminates():
     assert min(due[1:]) < 4
 
 
+@pytest.mark.slow
 def test_forgetting_follows_the_food():
     """Food moves to another patch: what an agent has learned there helps it to find the next, once it has forgotten."""
     world = foraging(period=160)

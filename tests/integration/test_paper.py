@@ -70,6 +70,7 @@ def test_paper_writes_tables_and_figures(small_run: Path) -> None:
     assert not list(small_run.glob(".*"))
 
 
+@pytest.mark.slow
 def test_same_seed_same_results_in_80_columns(
     small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

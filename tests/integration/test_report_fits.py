@@ -73,6 +73,7 @@ def test_the_entropy_rate_is_reached(second_order):
     }
 
 
+@pytest.mark.slow
 def test_a_mixture_is_as_good_as_its_experts(second_order, tmp_path):
     """Its stacked expert knows the chain by counts, the large GRU has hardly learned in 20 steps."""
     plans = markov_plans(second_order[1], 400, 30, 1)
@@ -210,7 +211,7 @@ def program(plans: Path, out: Path) -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
 def test_an_interrupted_run_goes_on(how, alone):
     """Ctrl-C or a killed main process: nobody is left behind, nothing that is finished is done again.
 

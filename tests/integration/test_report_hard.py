@@ -61,6 +61,7 @@ def test_hard_files_have_a_report(what, tmp_path, recwarn):
     assert not [warning.message for warning in recwarn if "neuroprior" in str(warning.filename)]
 
 
+@pytest.mark.slow
 def test_long_plans_of_many_actions(tmp_path):
     assert len(bits(report(chain(2, 2500, 57), tmp_path, folds=2))) == 9
 

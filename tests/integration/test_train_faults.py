@@ -117,6 +117,7 @@ def test_half_precision(tmp_path):
     assert prior.log_prob(torch.tensor([[0, 1, 2]])).isfinite().all()
 
 
+@pytest.mark.slow
 def test_two_processes_learn_from_long_plans_what_one_does(tmp_path):
     """In windows, with the hidden state carried over, and as many pieces as two processes cannot share evenly."""
     actions = (torch.arange(9 * 300).view(9, 300) // 3 + torch.arange(9)[:, None]) % 4

@@ -11,6 +11,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from neuroprior.cli.__main__ import main
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -72,13 +74,23 @@ def test_the_four_commands(installed: Path, tmp_path: Path) -> None:
 
 
 def test_bad_input_is_one_line(installed: Path, tmp_path: Path) -> None:
-    for words, says in (
+    said = run(installed, tmp_path, "sample", "nowhere", "--num-plans", "0", code=2).stderr
+    assert said == "error: num_plans: an integer of at least 1 is expected, not 0\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
         (["score", "nowhere", "plans.csv"], "nowhere"),
-        (["sample", "nowhere", "--num-plans", "0"], "num_plans: an integer of at least 1 is expected, not 0"),
+        (["sample", "nowhere"], "nowhere"),
         (["fit", "--config", "gruu", "--data.file", "x.csv"], "gru"),
         (["report", "nowhere.csv"], "nowhere.csv"),
+        (["example", "."], "is there already"),
         (["paint"], "there are fit, report, score, sample"),
-    ):
-        said = run(installed, tmp_path, *words, code=2).stderr
-        assert len(said.splitlines()) == 1
-        assert says in said
+    ],
+)
+def test_each_command_names_what_is_wrong(words: list[str], says: str, capsys: pytest.CaptureFixture) -> None:
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert says in said

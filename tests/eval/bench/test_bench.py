@@ -147,6 +147,7 @@ def test_mctx_finds_the_action_that_pays(gumbel):
     assert np.asarray(action).tolist().count(2) >= 15
 
 
+@pytest.mark.slow
 def test_the_program(tmp_path, capsys):
     jobs = ["evaluate", "sample_gru", "sample_markov", "fit_markov"]
     assert main(["bench", "--jobs", *jobs, "--repetitions", "1", "--scale", str(SMALL), "--out", str(tmp_path)]) == 0

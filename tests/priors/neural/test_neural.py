@@ -27,7 +27,7 @@ def torus_plans():
     return Plans(best_plans(100_000, seed=0), 4)
 
 
-@BOTH
+@pytest.mark.parametrize("kind", [GRUPrior, pytest.param(TransformerPrior, marks=pytest.mark.slow)])
 def test_divergence_from_the_torus_source(kind, torus_plans):
     """With default settings but fewer steps, in bits per action over all 256 plans; Markov-2 is at .01387 at best."""
     prior = kind(4).fit(torus_plans, generator=seeded(0), max_steps=300, progress=False)
