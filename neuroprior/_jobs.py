@@ -178,13 +178,12 @@ def _unordered(
             parallel = Parallel(n_jobs=number, batch_size=1, pre_dispatch="all", return_as="generator_unordered")
             results = parallel(tasks)
             try:
-                yield from results
+                with warnings.catch_warnings():
+                    warnings.filterwarnings("ignore", module="joblib")  # it remarks on jobs that are given up
+                    yield from results
             except TerminatedWorkerError as error:
                 raise MemoryError("a process was killed, probably for want of memory; try --processes 1") from error
             finally:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)  # joblib remarks on the jobs that are given up
-                    results.close()
                 if not dask:
                     _stop_workers()
 
