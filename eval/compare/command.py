@@ -1,11 +1,8 @@
 """`python -m eval compare`: do neural priors help a planner more than Markov chains, in many worlds at equal budget?"""
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from functools import partial
-from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt, restricted_number_type
@@ -15,9 +12,8 @@ from eval.compare.priors import NEURAL, load_for
 from eval.compare.report import document
 from eval.compare.results import Results
 from eval.compare.run import Settings, compare_run
-from eval.worlds.runs import MAKERS, PowerOfTwo, Seed, check_distinct, command_line, runs_of
+from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, command_line, finished
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
-from neuroprior._jobs import JobRun
 from neuroprior.report.document import publish
 
 KINDS = ("markov", "macro", *NEURAL)
@@ -87,13 +83,8 @@ def compare(
     if planners is not None:
         compare_planners(PlannerSettings(*how, planners=tuple(planners)), worlds, seeds, out, processes, dask)
         return
-    settings, folder = Settings(*how), Path(out)
-    work = partial(compare_run, settings=settings)
-    asked = {"command": "compare", **settings.asked}
-    jobs = JobRun(work, folder / "runs", asked, name=attrgetter("name"), packages=MAKERS)
-    found = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title="compare")
-    shown: dict[str, Any] = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-    publish(document(Results(found, num_plans), shown, command_line("compare")), folder)
+    found, shown = finished("compare", compare_run, Settings(*how), worlds, seeds, out, processes, dask)
+    publish(document(Results(found, num_plans), shown, command_line("compare")), Path(out))
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:
