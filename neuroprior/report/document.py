@@ -35,6 +35,7 @@ class Document:
         command: the command line that makes them again.
         results: further JSON values for `results.json`.
         keys: the keys of frames in `results.json` where they are not the names of the CSV files.
+        former_names: of columns, by their present name: files hold these columns under both names.
     """
 
     title: str
@@ -45,6 +46,16 @@ class Document:
     command: str = ""
     results: Mapping[str, Any] = field(default_factory=dict)
     keys: Mapping[str, str] = field(default_factory=dict)
+    former_names: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def written(self) -> dict[str, pd.DataFrame]:
+        """The frames as files hold them: with their columns under former names, too."""
+        former = self.former_names
+        return {
+            name: frame.assign(**{former[column]: frame[column] for column in frame.columns if column in former})
+            for name, frame in self.frames.items()
+        }
 
 
 def publish(document: Document, folder: Path, console: Console | None = None) -> None:
@@ -79,7 +90,7 @@ def write_document(document: Document, folder: Path) -> None:
         OSError: the files cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_frames(folder, document.frames)
+    write_frames(folder, document.written)
     write_json(folder / "results.json", results_of(document))
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
     write_page(folder / "report.html", Page(document.title, document.lead, document.command, shown, document.sections))
@@ -87,7 +98,7 @@ def write_document(document: Document, folder: Path) -> None:
 
 def results_of(document: Document) -> dict[str, Any]:
     """What `results.json` holds: the rows of each frame, further results, settings and versions."""
-    rows = {document.keys.get(name, name): records(frame) for name, frame in document.frames.items()}
+    rows = {document.keys.get(name, name): records(frame) for name, frame in document.written.items()}
     return {**rows, **document.results, "settings": dict(document.settings), "versions": versions()}
 
 
