@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from neuroprior import Plans
 from neuroprior.plans import is_per_step, read_plans, write_plans
-from neuroprior.plans.io.columns import number_in
+from neuroprior.plans.columns import number_in
 
 NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
 SUFFIXES = (".npz", ".jsonl", ".csv", ".tsv")

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from neuroprior.plans.io.columns import check_names
+from neuroprior.plans.columns import check_names
 from neuroprior.plans.io.csv import read_csv, write_csv
 from neuroprior.plans.io.jsonl import read_jsonl, write_jsonl
 from neuroprior.plans.io.minari import read_minari, write_minari

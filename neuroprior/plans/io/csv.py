@@ -12,18 +12,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from neuroprior._files import written_whole
-from neuroprior.plans.io.columns import (
-    Column,
-    Floats,
-    Integers,
-    Names,
-    Place,
-    assembled,
-    check_distinct,
-    named,
-    number_in,
-    open_text,
-)
+from neuroprior.plans.columns import Column, Floats, Integers, Names, Place, check_distinct, named, number_in, open_text
+from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans, is_per_step
 
 ROWS_AT_ONCE = 2**10

@@ -11,20 +11,19 @@ from typing import Any, NoReturn
 import numpy as np
 
 from neuroprior._files import written_whole
-from neuroprior.plans.io.columns import (
+from neuroprior.plans.columns import (
     LARGEST_INTEGER,
     Column,
     Floats,
     Integers,
     Names,
     Place,
-    assembled,
     check_distinct,
     check_names,
     named,
     open_text,
-    renamed,
 )
+from neuroprior.plans.io.assembly import assembled, renamed
 from neuroprior.plans.plans import Plans, is_per_step
 
 HEADER = ("num_actions", "action_names", "context_names", "group_names", "end")

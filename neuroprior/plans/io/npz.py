@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._files import written_whole
-from neuroprior.plans.io.columns import Names, check_file, renamed
+from neuroprior.plans.columns import Names, check_file
+from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
 
 NUMBERS = ("actions", "lengths", "context", "group")

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neuroprior.plans.io.columns import LARGEST_INTEGER, Integers, assembled, check_names
+from neuroprior.plans.columns import LARGEST_INTEGER, Integers, check_names
+from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans, is_per_step
 
 

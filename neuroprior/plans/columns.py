@@ -1,16 +1,12 @@
-"""What the readers of files share: opening them, columns of numbers or names, and plans put together from columns."""
+"""What the readers of plans share: opening files, columns of numbers or names, padding."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-
-from neuroprior.plans.plans import Plans, action_dtype
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.float32]
@@ -230,66 +226,7 @@ def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> 
     return names
 
 
-def assembled(
-    source: str,
-    lengths: Integers,
-    actions: Integers,
-    num_actions: int | None = None,
-    action_names: Names | None = None,
-    context: Integers | Floats | None = None,
-    per_step: bool = False,
-    context_names: Names | None = None,
-    group: Integers | None = None,
-    group_names: Names | None = None,
-    end: int | None = None,
-) -> Plans:
-    """`Plans` of N plans whose S actions stand end to end, padded to the longest.
-
-    Args:
-        source: the file, for messages.
-        lengths: `[N]`.
-        actions: `[S]`.
-        num_actions: None for one more than the largest.
-        action_names: None for none.
-        context: `[N]` or `[N, C]`, or, if `per_step`, `[S]` or `[S, C]`.
-        per_step: see `context`.
-        context_names: None for none.
-        group: `[N]`.
-        group_names: None for none.
-        end: the end symbol.
-
-    Raises:
-        ValueError: they are no `Plans`; the message names the source.
-    """
-    if action_names is not None:
-        if num_actions not in (None, len(action_names)):
-            raise ValueError(f"{source}: {len(action_names)} names of {num_actions} actions; give action_names")
-        num_actions = len(action_names)
-    if num_actions is None and not len(actions):
-        raise ValueError(f"{source}: no plan has an action, so num_actions must be given")
-    num_actions = int(actions.max()) + 1 if num_actions is None else num_actions
-    dtype = torch.empty(0, dtype=action_dtype(num_actions)).numpy().dtype
-    longest = int(lengths.max()) if len(lengths) else 0
-    if context is not None:
-        context = context if context.dtype == np.float32 else context.astype(np.int64)
-        context = _padded(context, lengths, source) if per_step else context
-    try:
-        return Plans(
-            torch.from_numpy(_padded(actions.astype(dtype), lengths, source)),
-            num_actions,
-            None if end is None and (lengths == longest).all() else torch.from_numpy(lengths),
-            action_names,
-            None if context is None else torch.from_numpy(context),
-            None if group is None else torch.from_numpy(group.astype(np.int64)),
-            context_names,
-            group_names,
-            end,
-        )
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from error
-
-
-def _padded(values: NDArray[Any], lengths: Integers, source: str) -> NDArray[Any]:
+def padded(values: NDArray[Any], lengths: Integers, source: str) -> NDArray[Any]:
     """`[N, L, ...]` of values `[S, ...]`, zero after the end of a plan; ValueError if these are too many entries."""
     longest = int(lengths.max()) if len(lengths) else 0
     shape = (len(lengths), longest, *values.shape[1:])
@@ -301,33 +238,6 @@ def _padded(values: NDArray[Any], lengths: Integers, source: str) -> NDArray[Any
         )
     if len(values) == len(lengths) * longest:
         return values.reshape(shape)
-    padded = np.zeros(shape, values.dtype)
-    padded[np.arange(longest) < lengths[:, None]] = values
-    return padded
-
-
-def renamed(plans: Plans, names: Names | None, source: str) -> Plans:
-    """The same plans with actions numbered as in `names`; those that have no names yet are given them.
-
-    Raises:
-        ValueError: an action's name is none of `names`, or their number is another.
-    """
-    if names is None or (plans.action_names is not None and tuple(plans.action_names) == names):
-        return plans
-    old = plans.action_names
-    if old is None:
-        if plans.num_actions != len(names):
-            raise ValueError(f"{source}: {plans.num_actions} actions, but {len(names)} names of actions are given")
-        return replace(plans, action_names=names)
-    unknown = next((name for name in old if name not in names), None)
-    if unknown is not None:
-        raise ValueError(f"{source}: action {unknown!r} is none of {', '.join(names)}")
-    number = torch.tensor([names.index(name) for name in old])
-    return replace(
-        plans,
-        actions=number[plans.actions.long()],
-        num_actions=len(names),
-        lengths=plans.mask().sum(1) if plans.end is not None else plans.lengths,
-        action_names=names,
-        end=None if plans.end is None else int(number[plans.end]),
-    )
+    wide = np.zeros(shape, values.dtype)
+    wide[np.arange(longest) < lengths[:, None]] = values
+    return wide
