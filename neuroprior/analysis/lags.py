@@ -210,6 +210,9 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
         context=context,
         group=plans.group[plan] if plans.group is not None and grouped else units(plans, start_here)[plan, start],
         group_names=plans.group_names if grouped else None,
+        durations=None,
+        condition=None,
+        condition_names=None,
     )
 
 

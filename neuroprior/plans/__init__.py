@@ -10,9 +10,11 @@ from neuroprior.plans.io import (
     write_plans,
 )
 from neuroprior.plans.plans import Plans, action_dtype, all_plans, check_context, is_per_step
+from neuroprior.plans.tables import Columns
 
 __all__ = [
     "BLOCKS",
+    "Columns",
     "FEWEST_UNITS",
     "Plans",
     "action_dtype",

@@ -22,6 +22,15 @@ BLOCK = 2**20
 """Entries that a column holds as Python's integers or texts before they become an array."""
 
 
+MISSING_LABELS = frozenset(("", "nan", "na", "n/a", "<na>", "null", "?", "-"))
+"""What stands for no label in tables, in lower case."""
+
+
+def is_missing(text: str) -> bool:
+    """Whether a cell holds no label."""
+    return text.strip().lower() in MISSING_LABELS
+
+
 def check_file(path: Path) -> None:
     """Raise FileNotFoundError for no file, ValueError for a directory or an empty file."""
     if path.is_dir():
@@ -161,6 +170,9 @@ class Column(dict[str, int]):
             known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
             wrong = next((i for i, label in enumerate(labels) if label not in self.names), None)
             return None if wrong is None else (wrong, f"{self.what} {labels[wrong]!r} is none of {known}")
+        missing = [i for i, label in enumerate(labels) if self.what == "action" and is_missing(label)]
+        if missing:
+            return missing[0], f"action {labels[missing[0]]!r} means no label; give action_names if it is an action"
         # One subject called 12b makes names of the other subjects' numbers; a name among numbers of actions or contexts
         # is rather a slip, and would renumber them all.
         is_number = [number is not None for number in numbers]

@@ -73,4 +73,6 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
         context=context,
         group=None,
         group_names=None,
+        durations=None if plans.durations is None else plans.durations[0][place.clamp(max=length - 1)],
+        condition=None if plans.condition is None else plans.condition.expand(parts),
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,6 +10,7 @@ from torch.nn import functional
 
 from neuroprior._checks import check_range, is_integer
 from neuroprior._random import generator_on
+from neuroprior.plans.tables import Columns, Missing, fields_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,11 @@ class Plans:
         context_names: names of the context indices, numbered from 0, or None.
         group_names: names of the groups, numbered from 0, or None.
         end: the action that stands for the end of the plan (see `with_end`), or None. It may only be a plan's last.
+        durations: how long each action took, floating point `[N, L]`, stored as float32: at least 0, NaN where it is
+            not known; None for plans without times. The unit is the user's.
+        condition: integers `[N]`: what plans are compared by, such as the treatment of the subject; None for none.
+        condition_names: names of the conditions, numbered from 0, or None.
+        notes: what a reader of files has to say of them, a line each.
 
     Raises:
         ValueError: a shape, dtype or value is wrong; the message says which and where.
@@ -42,6 +49,10 @@ class Plans:
     context_names: Sequence[str] | None = None
     group_names: Sequence[str] | None = None
     end: int | None = None
+    durations: Tensor | None = None
+    condition: Tensor | None = None
+    condition_names: Sequence[str] | None = None
+    notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.num_actions, int) or self.num_actions < 1:
@@ -62,15 +73,30 @@ class Plans:
         object.__setattr__(self, "actions", actions.to(action_dtype(self.num_actions)))
         if self.action_names is not None and len(self.action_names) != self.num_actions:
             raise ValueError(f"action_names: {self.num_actions} are expected, not {len(self.action_names)}")
-        if self.group is not None:
-            object.__setattr__(self, "group", torch.as_tensor(self.group))
-            if not is_integer(self.group):
-                raise ValueError(f"group: integers are expected, not {str(self.group.dtype).removeprefix('torch.')}")
-            _check_shape("group", self.group, (num,))
+        for what in ("group", "condition"):
+            if getattr(self, what) is not None:
+                values = torch.as_tensor(getattr(self, what))
+                object.__setattr__(self, what, values)
+                if not is_integer(values):
+                    raise ValueError(f"{what}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
+                _check_shape(what, values, (num,))
+        if self.durations is not None:
+            durations = torch.as_tensor(self.durations)
+            _check_shape("durations", durations, (num, length))
+            if not durations.is_floating_point():
+                durations = durations.float()
+            wrong = ((durations < 0) | durations.isinf()) & self.mask()
+            if wrong.any():
+                where = wrong.nonzero()[0].tolist()
+                raise ValueError(
+                    f"durations{where}: {float(durations[tuple(where)])}; finite times from 0 are expected"
+                )
+            object.__setattr__(self, "durations", durations.float().masked_fill(~self.mask(), 0))
         if self.context is not None:
             object.__setattr__(self, "context", torch.as_tensor(self.context))
             check_context(self.context, num, length)
         _check_names("group", self.group, self.group_names)
+        _check_names("condition", self.condition, self.condition_names)
         _check_names("context", self.context, self.context_names)
 
     def _check_end(self, actions: Tensor) -> None:
@@ -117,7 +143,62 @@ class Plans:
             lengths=pick(self.lengths),
             context=pick(self.context),
             group=pick(self.group),
+            durations=pick(self.durations),
+            condition=pick(self.condition),
         )
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: Any,
+        *,
+        action: str | None = None,
+        plan: str | None = None,
+        context: str | Sequence[str] | None = None,
+        group: str | None = None,
+        condition: str | None = None,
+        start: str | None = None,
+        stop: str | None = None,
+        duration: str | None = None,
+        missing: Missing = "gap",
+        merge_repeats: bool = False,
+        max_gap: float | None = None,
+        num_actions: int | None = None,
+        action_names: Sequence[str] | None = None,
+    ) -> "Plans":
+        """Plans of a table of events, one action a row.
+
+        Whole numbers are indices, and other labels names, which are numbered in sorted order. Labels count without
+        space at their ends; a label that is empty, NaN, NA, N/A, null, ? or - is missing. What was noticed (gaps,
+        names that are nearly the same, columns without use) stands in `notes`.
+
+        Args:
+            frame: a pandas frame.
+            action, plan, context, group, condition, start, stop, duration: names of its columns, see `Columns`; where
+                one is not given, the column of that very name is taken, if there is one.
+            missing: what rows without a label do: a "gap" ends the plan, and another one begins after it; as "label"
+                they count as an action, "missing"; "error" refuses them. Without groups the parts of a plan become one.
+            merge_repeats: take the same label in successive rows for one action, as in tables with a row a frame; it
+                lasts as long as they do together, or as many rows as they are where no times are known.
+            max_gap: a longer pause between the end of an action and the start of the next one ends the plan, too; in
+                the unit of `start` (seconds, for times of day and dates). None: no pause does.
+            num_actions: A; None: the number of names, else the largest action + 1.
+            action_names: A names in the order of their numbers; None: the names that occur, sorted.
+
+        Raises:
+            ValueError: a column is not there, or an entry is wrong; the message names the row.
+        """
+        columns = Columns(action, plan, context, group, condition, start, stop, duration)
+        fields = fields_of(
+            frame,
+            columns,
+            missing=missing,
+            merge_repeats=merge_repeats,
+            max_gap=max_gap,
+            num_actions=num_actions,
+            action_names=action_names,
+        )
+        return cls(**fields)
 
     def with_end(self, name: str = "end") -> "Plans":
         """The same plans, each closed by one action more, number A, that stands for the end of the plan.
@@ -152,6 +233,7 @@ class Plans:
             action_names=names,
             context=context,
             end=self.num_actions,
+            durations=None if self.durations is None else functional.pad(self.durations, (0, 1)),
         )
 
     def without_end(self) -> "Plans":
@@ -174,6 +256,7 @@ class Plans:
             action_names=None if self.action_names is None else self.action_names[:-1],
             context=context[:, :longest] if context is not None and is_per_step(context) else context,
             end=None,
+            durations=None if self.durations is None else self.durations[:, :longest],
         )
 
     def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple["Plans", "Plans"]:
@@ -215,6 +298,7 @@ class Plans:
             actions=self.actions[:, first:stop],
             lengths=None if self.lengths is None else torch.full_like(self.lengths, stop - first),
             context=context[:, first:stop] if context is not None and is_per_step(context) else context,
+            durations=None if self.durations is None else self.durations[:, first:stop],
         )
 
 

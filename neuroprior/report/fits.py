@@ -267,7 +267,8 @@ def _after(plans: Plans, skip: int) -> Plans:
     skip = min(max(skip, 0), max(plans.max_length - 1, 0))
     lengths = (plans.mask().sum(1) - skip).clamp(min=0)
     context = plans.context[:, skip:] if is_per_step(plans.context) and plans.context is not None else plans.context
-    return replace(plans, actions=plans.actions[:, skip:], lengths=lengths, context=context)
+    durations = None if plans.durations is None else plans.durations[:, skip:]
+    return replace(plans, actions=plans.actions[:, skip:], lengths=lengths, context=context, durations=durations)
 
 
 def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:

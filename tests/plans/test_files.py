@@ -1,6 +1,7 @@
 """Files of plans: what is written comes back, and what others write is read as they mean it."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from neuroprior import Plans
 from neuroprior.plans import is_per_step, read_plans, write_plans
-from neuroprior.plans.columns import number_in
+from neuroprior.plans.columns import is_missing, number_in
 
 NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
 SUFFIXES = (".npz", ".jsonl", ".csv", ".tsv")
@@ -20,7 +21,8 @@ FLOATS = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
 def in_csv(name):
-    return bool(name) and name == name.strip() and not set(name) & set("\r\n") and number_in(name) is None
+    plain = name == name.strip() and not set(name) & set("\r\n")
+    return plain and number_in(name) is None and not is_missing(name)
 
 
 @st.composite
@@ -50,6 +52,12 @@ def plans_of_all_kinds(draw, shortest=0, names=NAMES):
     elif kind != "none":
         context = numbers(4, num, longest) * there if kind.endswith("step") else numbers(4, num)
     group_names = some_names(3) if draw(st.booleans()) else None
+    condition_names = some_names(2) if draw(st.booleans()) else None
+    durations = None
+    if draw(st.booleans()):
+        size = num * longest
+        some = st.floats(0, 2.0**100, width=32) | st.just(math.nan)
+        durations = torch.tensor(draw(st.lists(some, min_size=size, max_size=size))).reshape(num, longest)
     return Plans(
         actions,
         num_actions,
@@ -59,6 +67,9 @@ def plans_of_all_kinds(draw, shortest=0, names=NAMES):
         numbers(3, num) if group_names or draw(st.booleans()) else None,
         some_names(4) if kind.startswith("name") else None,
         group_names,
+        durations=durations,
+        condition=numbers(2, num) if condition_names or draw(st.booleans()) else None,
+        condition_names=condition_names,
     )
 
 
@@ -69,14 +80,17 @@ def called(numbers, names):
 def assert_same(one, other, numbering=True):
     """The same plans; with `numbering` False, contexts and groups need have the same names only, not numbers."""
     assert (one.num_actions, one.end) == (other.num_actions, other.end)
-    for key in ("actions", "lengths", "context", "group"):
+    assert (one.durations is None) == (other.durations is None)
+    if one.durations is not None:
+        assert torch.equal(one.durations.nan_to_num(-1), other.durations.nan_to_num(-1))
+    for key in ("actions", "lengths", "context", "group", "condition"):
         a, b = getattr(one, key), getattr(other, key)
         assert (a is None) == (b is None), key
         names = f"{key}_names"
         if a is None:
             continue
         assert a.shape == b.shape
-        if numbering or (key != "group" and not getattr(one, names, None)):
+        if numbering or (key not in ("group", "condition") and not getattr(one, names, None)):
             assert a.dtype == b.dtype
             assert torch.equal(a, b), key
         elif a.dim() == 2:  # names of contexts; what stands beyond a plan's end does not count
@@ -87,7 +101,8 @@ def assert_same(one, other, numbering=True):
             assert list(map(str, called(a, getattr(one, names)))) == list(map(str, called(b, getattr(other, names))))
     assert one.action_names == other.action_names
     if numbering:
-        assert (one.context_names, one.group_names) == (other.context_names, other.group_names)
+        for what in ("context", "group", "condition"):
+            assert getattr(one, f"{what}_names") == getattr(other, f"{what}_names")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".jsonl"])
@@ -107,7 +122,8 @@ def test_csv_holds_actions_contexts_and_groups(tmp_path_factory, suffix, layout,
     path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
     write_plans(plans, path, layout=layout)
     back = read_plans(path, num_actions=plans.num_actions, action_names=plans.action_names)
-    if layout == "step" and plans.context is not None and not is_per_step(plans.context):
+    by_step = layout == "step" or plans.durations is not None
+    if by_step and plans.context is not None and not is_per_step(plans.context):
         plans, back = (replace(p, context=None, context_names=None) for p in (plans, back))
     assert_same(back, plans, numbering=False)
 

@@ -1,9 +1,9 @@
 """Reading and writing plans: one function each for all kinds of files; datasets of Minari; trajectories in memory."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from neuroprior.plans.columns import check_names
 from neuroprior.plans.io.csv import read_csv, write_csv
@@ -12,6 +12,7 @@ from neuroprior.plans.io.minari import read_minari, write_minari
 from neuroprior.plans.io.npz import read_npz, write_npz
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
 from neuroprior.plans.plans import Plans
+from neuroprior.plans.tables import Columns, Missing
 
 __all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
 
@@ -36,21 +37,30 @@ FILES = {
 
 
 def read_plans(
-    path: str | os.PathLike[str], *, num_actions: int | None = None, action_names: Sequence[str] | None = None
+    path: str | os.PathLike[str],
+    *,
+    num_actions: int | None = None,
+    action_names: Sequence[str] | None = None,
+    columns: Columns | Mapping[str, Any] | None = None,
+    missing: Missing = "gap",
+    merge_repeats: bool = False,
+    max_gap: float | None = None,
 ) -> Plans:
     """Plans of a file, by its suffix, or of a Minari dataset: `minari:` and its name, see `read_minari`.
 
     - `.npz`: arrays named like the attributes of `Plans`; only `actions [N, L]` is required. Nothing is unpickled.
-    - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and optionally `context` and
-      `group`; other keys are ignored. A context is an integer or a name; a list of these, one for each action; features
-      of the plan, a list of numbers (at least one in the file with a decimal point, else all are taken for integers);
-      or features of each step, a list of lists; all plans of a file have the same kind. The first line may have, in
-      place of `actions`, any of `num_actions`, `action_names`, `context_names`, `group_names` and `end`.
-    - `.csv`, `.tsv` (commas, semicolons or tabs) with one plan a row: columns `action_1`, `action_2`, ..., empty after
-      a plan's end; or no header, and all cells are actions. Or with one step a row: columns `plan` and `action`; the
-      rows of a plan stand together, in the order of its steps. Both may have `context` (integers or names) or
-      `context_1`, `context_2`, ... (features), of the plan or of the step, and `group`, the same on all rows of a plan.
-      Other columns are ignored.
+    - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and optionally `context`,
+      `group`, `condition` and `durations`, a list of numbers; other keys are ignored. A context is an integer or a
+      name; a list of these, one for each action; features of the plan, a list of numbers (at least one in the file with
+      a decimal point, else all are taken for integers); or features of each step, a list of lists; all plans of a file
+      have the same kind. The first line may have, in place of `actions`, any of `num_actions`, `action_names`,
+      `context_names`, `group_names`, `condition_names` and `end`.
+    - `.csv`, `.tsv` (commas, semicolons or tabs) with one action a row: columns `plan` and `action`, and perhaps
+      `context` (or `context_1`, `context_2`, ..., features), `group`, `condition`, `start`, `stop` or `duration`; or
+      other columns, which `columns` names. See `Plans.from_dataframe`. The rows of a plan stand together, in their
+      order, unless there is a `start`.
+    - `.csv`, `.tsv` with one plan a row: columns `action_1`, `action_2`, ..., empty after a plan's end, and perhaps a
+      context, `group` and `condition`; or no header, and all cells are actions.
 
     Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if any of them is not a
     number.
@@ -59,6 +69,8 @@ def read_plans(
         path: the file or dataset.
         num_actions: A; None for what the file says, else the number of names, else the largest action + 1.
         action_names: A names in the order of their numbers; without them the names are sorted.
+        columns: of a CSV file with one action a row: which hold what, if they have other names; `Columns` or a dict.
+        missing, merge_repeats, max_gap: of such a file, see `Plans.from_dataframe`.
 
     Returns:
         N plans, padded to the longest: context and group are int64, features float32 (`.npz`: as they are).
@@ -66,12 +78,21 @@ def read_plans(
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: an argument or the file is wrong; the message names the file and the line or the array.
+        ImportError: a file with one action a row needs pandas, and it is not installed.
     """
-    if isinstance(path, str) and path.startswith(MINARI):
+    given = columns if isinstance(columns, Columns | None) else {k: v for k, v in columns.items() if v is not None}
+    table: dict[str, Any] = {"columns": given} if given not in (None, {}, Columns()) else {}
+    table |= {"missing": missing} if missing != "gap" else {}
+    table |= {"merge_repeats": True} if merge_repeats else {}
+    table |= {} if max_gap is None else {"max_gap": max_gap}
+    is_dataset = isinstance(path, str) and path.startswith(MINARI)
+    if table and (is_dataset or FILES[_suffix(Path(path))].read is not read_csv):
+        raise ValueError(f"{next(iter(table))}: for CSV files with one action a row only, not for {path}")
+    if isinstance(path, str) and is_dataset:
         return read_minari(path.removeprefix(MINARI))
     place = Path(path)
     names = check_names(num_actions, action_names)
-    return FILES[_suffix(place)].read(place, num_actions, names)
+    return FILES[_suffix(place)].read(place, num_actions, names, **table)
 
 
 def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | None = None) -> None:

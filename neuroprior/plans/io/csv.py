@@ -5,49 +5,62 @@ import math
 import re
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import torch
 
 from neuroprior._files import written_whole
-from neuroprior.plans.columns import Column, Floats, Integers, Names, Place, check_distinct, named, number_in, open_text
+from neuroprior.plans.columns import (
+    Column,
+    Floats,
+    Integers,
+    Names,
+    check_distinct,
+    is_missing,
+    named,
+    number_in,
+    open_text,
+)
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior.plans.tables import fields_of
 
 ROWS_AT_ONCE = 2**10
 """Rows that are parsed together; a few times faster than blocks that exceed the processor's cache."""
 
 DELIMITERS = (",", ";", "\t")
 OUR_WORDS = re.compile(r"plan|action(_1)?|context_1")
+OUR_COLUMNS = re.compile(r"plan|group|condition|start|stop|duration|(action|context)(_\d+)?")
 OTHER_WORDS = re.compile(r"session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code")
 Row = list[str]
 T = TypeVar("T")
 
 
-def read_csv(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:
+def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
     """Plans of a CSV file: see `read_plans`."""
-    sheet = _Sheet(path)
-    at = sheet.columns
+    sheet = _Sheet(path, bool(table))
     action_columns = sheet.numbered("action") if sheet.has_header else list(range(sheet.width))
-    by_step = not action_columns
-    if by_step:
-        if not {"plan", "action"} <= at.keys():
-            raise ValueError(f"{path}, line 1: both columns 'plan' and 'action', or 'action_1', are expected")
-        action_columns = [at["action"]]
+    if table or not action_columns:
+        return _read_events(sheet, num_actions=num_actions, action_names=action_names, **table)
+    at = sheet.columns
+    if "action" in at:
+        raise ValueError(f"{path}, line 1: 'action' and 'action_1'; one of them is expected")
     feature_columns = sheet.numbered("context")
     if "context" in at and feature_columns:
         raise ValueError(f"{path}, line 1: 'context' and 'context_1'; one of them is expected")
-    actions, plan_names = Column("action", action_names, num_actions, untyped=True, blank=not by_step), Column("plan")
-    others = {what: Column(what, untyped=True) for what in ("context", "group") if what in at}
+    actions = Column("action", action_names, num_actions, untyped=True, blank=True)
+    others = {what: Column(what, untyped=True) for what in ("context", "group", "condition") if what in at}
 
     def parse(rows: list[Row]) -> tuple[Integers, Integers, Floats | None, list[Integers]]:
         flat, sizes = _actions(actions, action_columns, rows)
         features = _features(rows, feature_columns) if feature_columns else None
         return flat, sizes, features, [other.look_up([row[at[what]] for row in rows]) for what, other in others.items()]
 
-    all_sizes, all_features, all_lines, plan_of = [], [], [], []
+    all_sizes, all_features, all_lines = [], [], []
     for block_lines, rows in sheet.blocks():
         flat, block_sizes, features, numbers = sheet.parse(parse, block_lines, rows)
         actions.add_numbers(flat)
@@ -55,13 +68,11 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None) ->
             other.add_numbers(block)
         if features is not None:
             all_features.append(features)
-        if by_step:
-            plan_of.append(plan_names.look_up([row[at["plan"]].strip() for row in rows]))
         all_sizes.append(block_sizes)
         all_lines.append(block_lines.astype(np.uint32))
     sizes, lines = np.concatenate(all_sizes), np.concatenate(all_lines)
     if not len(lines):
-        raise ValueError(f"{path}: a header and no {'step' if by_step else 'plan'} below it")
+        raise ValueError(f"{path}: a header and no plan below it")
     ends = np.cumsum(sizes)
 
     def place(row: int) -> str:
@@ -71,15 +82,37 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None) ->
     found = {what: other.finish(place) for what, other in others.items()}
     context, context_names = found.get("context", (np.concatenate(all_features) if all_features else None, None))
     group, group_names = found.get("group", (None, None))
-    if by_step:
-        starts = _starts(np.concatenate(plan_of), list(plan_names), place)
-        sizes = np.diff(np.append(starts, len(lines)))
-        if group is not None:
-            wrong = np.flatnonzero(group != np.repeat(group[starts], sizes))
-            if wrong.size:
-                raise ValueError(f"{place(wrong[0])}: another group than on the plan's first row; a plan has one group")
-            group = group[starts]
-    return assembled(str(path), sizes, flat, num_actions, names, context, by_step, context_names, group, group_names)
+    plans = assembled(str(path), sizes, flat, num_actions, names, context, False, context_names, group, group_names)
+    if "condition" in found:
+        number, condition_names = found["condition"]
+        condition = torch.from_numpy(number.astype(np.int64))
+        plans = replace(plans, condition=condition, condition_names=condition_names)
+    return plans
+
+
+def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
+    """Plans of a file with one action a row; see `Plans.from_dataframe`."""
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise ImportError(
+            f"{sheet.path}: files with one action a row need pandas: pip install 'neuroprior[report]'"
+        ) from error
+    if not sheet.columns:
+        raise ValueError(f"{sheet.path}, line 1: a header is expected, and this looks like data")
+    blocks = list(sheet.blocks())
+    lines = np.concatenate([lines for lines, _ in blocks])
+    frame = pd.DataFrame([row for _, rows in blocks for row in rows], columns=sheet.header, dtype=object)
+    if not table.keys() - {"num_actions", "action_names"} and not {"plan", "action"} <= sheet.columns.keys():
+        raise ValueError(
+            f"{sheet.path}, line 1: both columns 'plan' and 'action', or 'action_1', are expected; or say which"
+            " columns they are (--columns.action, --columns.plan)"
+        )
+    try:
+        return Plans(**fields_of(frame, place=lambda i: f"{sheet.path}, line {lines[i]}", of=str(sheet.path), **table))
+    except ValueError as error:
+        named = str(sheet.path) in str(error)
+        raise error if named else ValueError(f"{sheet.path}: {error}") from None
 
 
 def _actions(actions: Column, columns: list[int], rows: list[Row]) -> tuple[Integers, Integers]:
@@ -112,28 +145,6 @@ def _float(text: str) -> float:
         return math.nan
 
 
-def _starts(plan: Integers, names: list[str], place: Place) -> Integers:
-    """The rows on which a plan begins, from the number of each row's plan in order of appearance, and their names.
-
-    Raises:
-        ValueError: a plan without a name, or in two pieces.
-    """
-    if "" in names:
-        row = int((plan == names.index("")).argmax())
-        raise ValueError(f"{place(row)}: plan: an empty cell; the name or number of the plan is expected")
-    starts = np.flatnonzero(np.diff(plan, prepend=-1))
-    again = np.flatnonzero(plan[starts] != np.arange(len(starts)))
-    if again.size:
-        # Two pieces may be one plan in a file sorted by time, or two plans of subjects whose plans are each counted
-        # from 1: only the user can know.
-        row = int(starts[again[0]])
-        raise ValueError(
-            f"{place(row)}: plan {names[plan[row]]!r} goes on after another plan; sort the rows by plan, or give each"
-            " plan a name of its own"
-        )
-    return starts
-
-
 class _Sheet:
     """A CSV file: its columns, and its rows in blocks.
 
@@ -141,13 +152,14 @@ class _Sheet:
         path: the file.
         has_header: whether the first row names the columns; else it is data.
         columns: the position of each column by its name, in lower case; empty without a header.
+        header: the names of the columns as they are.
         width: the number of cells of every row.
 
     Raises:
         ValueError: an empty file, one that is not UTF-8 or not CSV, or a header with a column twice.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, has_header: bool = False) -> None:
         self.path = path
         with open_text(path) as file:
             sample = next((line for line in file if line.strip()), "")
@@ -157,16 +169,18 @@ class _Sheet:
             raise ValueError(f"{path}: no rows; plans are expected")
         self.width = len(first)
         names = _words(first)
-        self.has_header = any(OUR_WORDS.fullmatch(name) for name in names)
+        self.header = [cell.strip() for cell in first]
+        self.has_header = has_header or any(OUR_WORDS.fullmatch(name) for name in names)
         if self.has_header:
-            known = [name for name in names if re.fullmatch(r"plan|group|(action|context)(_\d+)?", name)]
+            known = [name for name in names if OUR_COLUMNS.fullmatch(name)]
             twice = next((name for name in known if known.count(name) > 1), None)
             if twice is not None:
                 raise ValueError(f"{path}, line 1: the column {twice!r} is there twice")
         elif other := next((name for name in names if OTHER_WORDS.fullmatch(name)), None):
             raise ValueError(
-                f"{path}, line 1: looks like a header ({other!r}) without a column 'action' (or 'action_1', ...); name"
-                " the column of the actions 'action', and the one that says to which plan a row belongs 'plan'"
+                f"{path}, line 1: looks like a header ({other!r}) without a column 'action' (or 'action_1', ...); say"
+                " which column holds the actions (--columns.action), and which says to which plan a row belongs"
+                " (--columns.plan)"
             )
         self.columns = {name: i for i, name in enumerate(names)} if self.has_header else {}
 
@@ -263,7 +277,7 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
     lengths = plans.mask().sum(1)
     if not lengths.any():
         raise ValueError(f"{path}: CSV cannot hold plans of which none has an action")
-    for what in ("action", "context", "group"):
+    for what in ("action", "context", "group", "condition"):
         names = getattr(plans, f"{what}_names")
         check_distinct(f"{what}_names", names)
         for name in names or ():
@@ -272,12 +286,16 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
                     f"{path}: {what}_names: CSV cannot hold {name!r}; names without line breaks and without space at"
                     " either end are expected"
                 )
-            if what == "context" and number_in(name) is not None:
+            if is_missing(name):
+                raise ValueError(f"{path}: {what}_names: CSV cannot hold {name!r}, which would be read as missing")
+            if what in ("action", "context") and number_in(name) is not None:
                 raise ValueError(f"{path}: {what}_names: CSV cannot hold {name!r}, which would be read as a number")
-    per_step = is_per_step(plans.context)
+    per_step = is_per_step(plans.context) or plans.durations is not None
     by_step = layout == "step" or (layout is None and per_step)
     if per_step and not by_step:
-        raise ValueError(f"{path}: a context per step cannot be written with one plan a row; use layout='step'")
+        raise ValueError(
+            f"{path}: a context or a duration per step cannot be written with one plan a row; use layout='step'"
+        )
     if by_step and not lengths.all():
         raise ValueError(
             f"{path}: plan {int((lengths == 0).nonzero()[0])} has no actions, and no row with layout='step'"
@@ -294,22 +312,35 @@ def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
     if plans.context is not None:
         features = plans.context.shape[-1] if plans.context.is_floating_point() else 0
         header += [f"context_{i + 1}" for i in range(features)] or ["context"]
-    yield header + ["group"] * (plans.group is not None)
+    header += [what for what in ("group", "condition") if getattr(plans, what) is not None]
+    yield header + ["duration"] * (plans.durations is not None)
     for start in range(0, len(plans), 2**14):
         some = plans[start : start + 2**14]
         none: list[list[Any]] = [[]] * len(some)
         contexts = none if some.context is None else named(some.context.tolist(), plans.context_names)
-        groups = none if some.group is None else [[group] for group in named(some.group.tolist(), plans.group_names)]
+        own = [
+            named(values.tolist(), names)
+            for values, names in ((some.group, plans.group_names), (some.condition, plans.condition_names))
+            if values is not None
+        ]
+        groups = [list(entry) for entry in zip(*own, strict=True)] if own else none
+        times = None if some.durations is None else some.durations.tolist()
         actions, lengths = named(some.actions.tolist(), plans.action_names), some.mask().sum(1).tolist()
         for i, (taken, length, context, group) in enumerate(
             zip(actions, lengths, contexts, groups, strict=True), start
         ):
             if by_step:
                 yield from (
-                    [i, taken[t], *_as_list(context[t] if per_step else context), *group] for t in range(length)
+                    [i, taken[t], *_as_list(context[t] if per_step else context), *group, *_time(times, i - start, t)]
+                    for t in range(length)
                 )
             else:
                 yield [*taken[:length], *[""] * (width - length), *_as_list(context), *group]
+
+
+def _time(times: list[list[float]] | None, plan: int, step: int) -> list[float | str]:
+    """The duration of an action, in a list; empty where it is not known, none where there are no durations."""
+    return [] if times is None else [times[plan][step] if times[plan][step] == times[plan][step] else ""]
 
 
 def _as_list(value: Any) -> list[Any]:

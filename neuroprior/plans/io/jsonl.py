@@ -1,14 +1,17 @@
 """Plans in JSON lines: one plan a line, `{"actions": [0, 2, 1], "context": 4, "group": "mouse 7"}`."""
 
 import json
+import math
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+import torch
 
 from neuroprior._files import written_whole
 from neuroprior.plans.columns import (
@@ -22,12 +25,16 @@ from neuroprior.plans.columns import (
     check_names,
     named,
     open_text,
+    padded,
 )
 from neuroprior.plans.io.assembly import assembled, renamed
 from neuroprior.plans.plans import Plans, is_per_step
 
-HEADER = ("num_actions", "action_names", "context_names", "group_names", "end")
+HEADER = ("num_actions", "action_names", "context_names", "group_names", "condition_names", "end")
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
+
+OF_PLANS = ("group", "condition")
+"""What a plan has one of."""
 
 KINDS = {
     "none": "no context",
@@ -64,7 +71,7 @@ def read_jsonl(path: Path, num_actions: int | None, action_names: Names | None) 
 
 def write_jsonl(plans: Plans, path: Path) -> None:
     """Write a JSONL file; its first line holds what the others do not: `num_actions`, names, `end`."""
-    for key in ("action_names", "context_names", "group_names"):
+    for key in ("action_names", "context_names", "group_names", "condition_names"):
         check_distinct(key, getattr(plans, key))
     header = {key: getattr(plans, key) for key in HEADER if getattr(plans, key) is not None}
     with written_whole(path) as file:
@@ -74,12 +81,18 @@ def write_jsonl(plans: Plans, path: Path) -> None:
             columns = {"actions": named(some.actions.tolist(), plans.action_names)}
             if some.context is not None:
                 columns["context"] = named(some.context.tolist(), plans.context_names)
-            if some.group is not None:
-                columns["group"] = named(some.group.tolist(), plans.group_names)
+            for what in OF_PLANS:
+                values = getattr(some, what)
+                if values is not None:
+                    columns[what] = named(values.tolist(), getattr(plans, f"{what}_names"))
+            if some.durations is not None:
+                known = some.durations.tolist()
+                columns["durations"] = [[None if time != time else time for time in times] for times in known]
             for length, *values in zip(some.mask().sum(1).tolist(), *columns.values(), strict=True):
                 row = dict(zip(columns, values, strict=True))
-                for key in ("actions", "context") if is_per_step(plans.context) else ("actions",):
-                    row[key] = row[key][:length]
+                for key in ("actions", "durations", *(["context"] if is_per_step(plans.context) else [])):
+                    if key in row:
+                        row[key] = row[key][:length]
                 file.write(json.dumps(row, ensure_ascii=False) + "\n")
 
 
@@ -124,10 +137,11 @@ class _Rows:
         if self.end is not None and type(self.end) is not int:
             raise ValueError(f"end: an action's number is expected, not {_short(self.end)}")
         self.actions = Column("action", self.action_names, None if own is not None else self.num_actions)
-        self.groups = Column("group", _header_names(header, "group_names"))
+        self.of_plans = {what: Column(what, _header_names(header, f"{what}_names")) for what in OF_PLANS}
         self.contexts = _Contexts(_header_names(header, "context_names"))
         self.action_kind: type | None = None
-        self.group_kind: type | None = None
+        self.kind_of: dict[str, type] = {}
+        self.durations: array[float] | None = None
         self.lengths, self.lines = array("q"), array("q")
 
     def add(self, line: int, row: dict[str, Any]) -> None:
@@ -147,19 +161,41 @@ class _Rows:
         if actions and self.action_kind is int and not 0 <= min(actions) <= max(actions) < LARGEST_INTEGER:
             wrong = next(action for action in actions if not 0 <= action < LARGEST_INTEGER)
             raise ValueError(f"action {_short(wrong)} is out of range; 0 or more is expected")
-        group = row.get("group")
-        if not self.lines:
-            self.group_kind = type(group)
-        if type(group) is not self.group_kind or self.group_kind not in (int, str, type(None)):
-            raise ValueError(f"group: {_short(group)}; an integer or a name in every plan, or in none, is expected")
-        if type(group) is int and not -LARGEST_INTEGER < group < LARGEST_INTEGER:
-            raise ValueError(f"group: {_short(group)} is too large")
+        for what in OF_PLANS:
+            self._check_entry(what, row.get(what))
+        durations = self._durations(row.get("durations"), len(actions))
         self.contexts.add(row.get("context"))
         self.actions.add(actions)
-        if isinstance(group, int | str):
-            self.groups.add((group,))
+        for what, column in self.of_plans.items():
+            if isinstance(row.get(what), int | str):
+                column.add((row[what],))
+        if self.durations is not None:
+            self.durations.extend(durations)
         self.lengths.append(len(actions))
         self.lines.append(line)
+
+    def _check_entry(self, what: str, entry: Any) -> None:
+        """Check the group or the condition of a plan."""
+        kind = self.kind_of.setdefault(what, type(entry)) if not self.lines else self.kind_of[what]
+        if type(entry) is not kind or kind not in (int, str, type(None)):
+            raise ValueError(f"{what}: {_short(entry)}; an integer or a name in every plan, or in none, is expected")
+        if type(entry) is int and not -LARGEST_INTEGER < entry < LARGEST_INTEGER:
+            raise ValueError(f"{what}: {_short(entry)} is too large")
+
+    def _durations(self, entry: Any, length: int) -> list[float]:
+        """The durations of a plan, NaN for null; none where the plans have none."""
+        if not self.lines and entry is not None:
+            self.durations = array("f")
+        if (entry is None) != (self.durations is None):
+            raise ValueError("durations: a list in every plan, or in none, is expected")
+        if entry is None:
+            return []
+        if type(entry) is not list or len(entry) != length:
+            raise ValueError(f"durations: a list of {length} times, one for each action, is expected")
+        for value in entry:
+            if value is not None and (type(value) not in (int, float) or not 0 <= value <= LARGEST_FLOAT):
+                raise ValueError(f"durations: {_short(value)}; times of at least 0, or null, are expected")
+        return [math.nan if value is None else value for value in entry]
 
     def plans(self) -> Plans:
         """All plans; ValueError names the line of what is wrong with one."""
@@ -173,7 +209,8 @@ class _Rows:
             return plan(bisect_right(ends, i))
 
         actions, names = self.actions.finish(step)
-        group, group_names = self.groups.finish(plan)
+        own = {what: column.finish(plan) for what, column in self.of_plans.items()}
+        group, group_names = own["group"]
         context, context_names, per_step = self.contexts.finish(lengths, plan, step)
         plans = assembled(
             str(self.path),
@@ -188,6 +225,13 @@ class _Rows:
             group_names,
             self.end,
         )
+        if self.durations is not None:
+            times = torch.from_numpy(padded(np.array(self.durations), lengths, str(self.path)))
+            plans = replace(plans, durations=times)
+        condition, condition_names = own["condition"]
+        if len(condition):
+            numbers = torch.from_numpy(condition.astype(np.int64))
+            plans = replace(plans, condition=numbers, condition_names=condition_names)
         return renamed(plans, self.given_names, str(self.path))
 
 

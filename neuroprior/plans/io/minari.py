@@ -82,6 +82,8 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
     lengths = plans.mask().sum(1).tolist()
     if not lengths or min(lengths) == 0:
         raise ValueError(f"{dataset_id}: Minari cannot hold {'a plan without actions' if lengths else 'no plans'}")
+    if plans.durations is not None or plans.condition is not None:
+        raise ValueError(f"{dataset_id}: Minari cannot hold durations or conditions; write .npz or .jsonl")
     context, space = _context_of_steps(plans)
     shown = Plans(plans.actions, plans.num_actions, plans.lengths, context=context)
     buffers = [

@@ -13,8 +13,8 @@ from neuroprior.plans.columns import Names, check_file
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
 
-NUMBERS = ("actions", "lengths", "context", "group")
-NAMES = ("action_names", "context_names", "group_names")
+NUMBERS = ("actions", "lengths", "context", "group", "durations", "condition")
+NAMES = ("action_names", "context_names", "group_names", "condition_names")
 
 
 def read_npz(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:

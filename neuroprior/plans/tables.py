@@ -1,0 +1,448 @@
+"""Plans of a table of events, one action a row, as behaviour is coded in a laboratory.
+
+Needs pandas (`pip install 'neuroprior[report]'`), which holds the table.
+"""
+
+import contextlib
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neuroprior.plans.columns import Column, Floats, Integers, Names, check_names, is_missing, number_in, padded
+
+Missing = Literal["gap", "label", "error"]
+MISSING: tuple[Missing, ...] = ("gap", "label", "error")
+
+UNLABELLED = "missing"
+"""The action of rows without a label, where these are to count as one."""
+
+CLOCK, DATE = r"\s*(\d+:)?\d+:\d+([.,]\d*)?\s*", r"\s*\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([T ].*)?\s*"
+"""Times that are no numbers: hours, minutes and seconds, or a date and perhaps a time of day."""
+
+SHOWN = 8
+"""Names in a note; more are left out."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Which columns of a table of events hold what; where none is given, the column of that name, if there is one.
+
+    Attributes:
+        action: what was done: names, or whole numbers from 0.
+        plan: which rows belong together, such as the session; with a group, the same name in two groups is two plans.
+            Without it each group is one plan, and without a group the whole table is one.
+        context: what was known when the action was chosen: a column of names or whole numbers, or columns of features.
+        group: what is independent, such as the animal.
+        condition: what is to be compared, such as the treatment or the genotype; one for each plan.
+        start: when the action began: numbers, times of day or dates; the rows of a plan are put in this order.
+        stop: when it ended, as `start`.
+        duration: how long it took, in place of `stop`.
+    """
+
+    action: str | None = None
+    plan: str | None = None
+    context: str | Sequence[str] | None = None
+    group: str | None = None
+    condition: str | None = None
+    start: str | None = None
+    stop: str | None = None
+    duration: str | None = None
+
+
+class Table:
+    """A table of events with its columns found.
+
+    Args:
+        frame: a pandas frame.
+        columns: where they are, or a dict of the same.
+        place: what messages call a row, by its number in the frame.
+        of: the table itself in messages, such as the name of its file.
+
+    Raises:
+        ValueError: a column is not there, twice, or the action's is not known.
+    """
+
+    def __init__(
+        self, frame: Any, columns: Columns | Mapping[str, Any] | None, place: Callable[[int], str], of: str = "table"
+    ) -> None:
+        self.frame, self.place, self.of = frame, place, of
+        try:
+            given = asdict(columns if isinstance(columns, Columns) else Columns(**(columns or {})))
+        except TypeError as error:
+            raise ValueError(f"columns: some of {', '.join(asdict(Columns()))} are expected ({error})") from None
+        context = given.pop("context")
+        features = [context] if isinstance(context, str) else list(context or ())
+        self.at = {what: self._find(what, name) for what, name in given.items() if name is not None}
+        self.context = [self._find("context", name) for name in features]
+        taken = {*self.at.values(), *self.context}
+        usual = {str(name).strip().lower(): i for i, name in reversed(list(enumerate(frame.columns))) if i not in taken}
+        for what in given:
+            if what not in self.at and what in usual:
+                self.at[what] = usual[what]
+        if not self.context:
+            numbered = [f"context_{i}" for i in range(1, 1 + len(frame.columns))]
+            self.context = [usual[name] for name in ("context", *numbered) if name in usual]
+        if "action" not in self.at:
+            raise ValueError(
+                f"{of}: no column 'action'; say which holds the actions (columns.action) of {self._names()}"
+            )
+        twice = [name for i, name in enumerate(frame.columns) if list(self.at.values()).count(i) > 1]
+        if twice:
+            raise ValueError(f"columns: {twice[0]!r} is given for {' and '.join(self._uses(twice[0]))}")
+
+    def _names(self) -> str:
+        return ", ".join(map(str, self.frame.columns))
+
+    def _uses(self, name: str) -> list[str]:
+        return [what for what, i in self.at.items() if self.frame.columns[i] == name]
+
+    def _find(self, what: str, name: str) -> int:
+        """The position of a column by its name; by its name in lower case where that is the only one."""
+        names = list(map(str, self.frame.columns))
+        found = [i for i, known in enumerate(names) if known == name]
+        found = found or [i for i, known in enumerate(names) if known.strip().lower() == name.strip().lower()]
+        if len(found) != 1:
+            much = "there twice" if found else f"not there; the columns are {self._names()}"
+            raise ValueError(f"columns.{what}: the column {name!r} is {much}")
+        return found[0]
+
+    def texts(self, position: int) -> tuple[Integers, list[str]]:
+        """The entries of a column: for each row the number of its text, -1 where it is missing; and the texts."""
+        import pandas as pd
+
+        codes, values = pd.factorize(self.frame.iloc[:, position].astype(object))
+        labels = [_text(value).strip() for value in values]
+        number = {label: i for i, label in enumerate(dict.fromkeys(labels)) if not is_missing(label)}
+        order = {label: i for i, label in enumerate(number)}
+        lookup = np.array([*(order.get(label, -1) for label in labels), -1], np.int64)
+        return lookup[codes], list(order)
+
+    def numbers(self, what: str, position: int, times: bool = False) -> NDArray[np.float64]:
+        """The numbers of a column, or its times in seconds; NaN where they are missing.
+
+        Raises:
+            ValueError: an entry is no finite number (or time).
+        """
+        import pandas as pd
+
+        column = self.frame.iloc[:, position]
+        if isinstance(column.dtype, np.dtype) and column.dtype.kind in "Mm":
+            return _seconds(column)
+        missing = column.isna() | column.map(lambda value: isinstance(value, str) and is_missing(value))
+        values = pd.to_numeric(column.where(~missing), errors="coerce")
+        if times and values[~missing].isna().any():
+            texts = column.where(~missing).astype(object)
+            for form, parse in ((CLOCK, pd.to_timedelta), (DATE, pd.to_datetime)):
+                if texts[~missing].astype(str).str.fullmatch(form).all():
+                    with contextlib.suppress(ValueError, TypeError), warnings.catch_warnings():
+                        warnings.simplefilter("ignore", UserWarning)  # of formats that differ from row to row
+                        values = pd.Series(_seconds(parse(texts)))
+        found: NDArray[np.float64] = values.to_numpy(np.float64, na_value=np.nan)
+        wrong = np.flatnonzero(~np.isfinite(found) & ~missing.to_numpy())
+        if wrong.size:
+            kind = "a number or a time" if times else "a finite number"
+            raise ValueError(f"{self.place(wrong[0])}: {what} {str(column.iloc[wrong[0]])!r} is not {kind}")
+        return found
+
+    def unused(self) -> list[str]:
+        """The names of the columns that hold nothing."""
+        used = {*self.at.values(), *self.context}
+        return [str(name) for i, name in enumerate(self.frame.columns) if i not in used]
+
+
+def _text(value: Any) -> str:
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+
+
+def _seconds(column: Any) -> NDArray[np.float64]:
+    """Times in seconds; dates from the first of them."""
+    since = column - column.min() if "datetime" in str(column.dtype) else column
+    found: NDArray[np.float64] = since.dt.total_seconds().to_numpy(np.float64)
+    return found
+
+
+def fields_of(
+    frame: Any,
+    columns: Columns | Mapping[str, Any] = Columns(),
+    *,
+    missing: str = "gap",
+    merge_repeats: bool = False,
+    max_gap: float | None = None,
+    num_actions: int | None = None,
+    action_names: Sequence[str] | None = None,
+    place: Callable[[int], str] = "row {}".format,
+    of: str = "table",
+) -> dict[str, Any]:
+    """What `Plans` are made of, by name; see `Plans.from_dataframe`.
+
+    Args:
+        frame, columns, missing, merge_repeats, max_gap, num_actions, action_names: see there.
+        place: what messages call a row, by its number.
+        of: the table itself in messages.
+
+    Raises:
+        ValueError: the table holds no plans, or an argument is wrong.
+    """
+    if missing not in MISSING:
+        raise ValueError(f"missing: one of {', '.join(MISSING)} is expected, not {missing!r}")
+    if max_gap is not None and not 0 <= max_gap < np.inf:
+        raise ValueError(f"max_gap: a time of at least 0 is expected, not {max_gap}")
+    names = check_names(num_actions, action_names)
+    table = Table(frame, columns, place, of)
+    if not len(frame):
+        raise ValueError(f"{of}: a header and no row below it")
+    plan, plan_names = _plans_of_rows(table)
+    start = table.numbers("start", table.at["start"], times=True) if "start" in table.at else None
+    order, notes = _order(table, plan, plan_names, start)
+    codes, labels = table.texts(table.at["action"])
+    notes += _alike(labels, "action")
+    without = codes < 0
+    if missing == "error" and without.any():
+        first_row = int(without.argmax())
+        raise ValueError(f"{place(first_row)}: action: no label; a number or a name is expected (missing='error')")
+    if missing == "label":
+        labels = labels if UNLABELLED in labels else [*labels, UNLABELLED]
+        codes = np.where(without, labels.index(UNLABELLED), codes)
+        without = codes < 0
+
+    # From here on everything is in the order of the plans, and `row` says where it stands in the table.
+    row = order
+    plan, codes, without = plan[row], codes[row], without[row]
+    begin = np.diff(plan, prepend=-1) != 0
+    seconds, ends = _durations(table, start, row, begin)
+    pause = np.zeros(len(row), bool)
+    if max_gap is not None:
+        if start is None or ends is None:
+            raise ValueError("max_gap: the columns start, and stop or duration, are expected with it")
+        latest = _running_maximum(ends, plan)
+        pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap)
+    if without.all():
+        raise ValueError(f"{of}: no row has an action")
+    # A gap is a run of rows without a label between actions of one plan, or a pause.
+    cut = begin | pause | np.concatenate([[False], without[:-1]])
+    piece = np.cumsum(cut)[~without]
+    row, plan, codes = row[~without], plan[~without], codes[~without]
+    seconds = None if seconds is None else seconds[~without]
+    gaps = int((np.diff(piece, prepend=-1) != 0).sum() - (np.diff(plan, prepend=-1) != 0).sum())
+    if without.any():
+        notes.append(f"{int(without.sum()):,} rows have no label")
+    if left_out := len(plan_names) - len(np.unique(plan)):
+        notes.append(f"{left_out:,} plans without any label are left out")
+    if gaps:
+        notes.append(f"{gaps:,} gaps end a plan, and the next begins after each")
+    if merge_repeats:
+        first = (np.diff(piece, prepend=-1) != 0) | (np.diff(codes, prepend=-1) != 0)
+        runs = np.cumsum(first) - 1
+        # What is known of the time of a run is the sum of its rows; without any times, the number of its rows.
+        weight = np.ones(len(row)) if seconds is None else seconds
+        seconds = np.bincount(runs, weight).astype(np.float64)
+        row, plan, codes, piece = row[first], plan[first], codes[first], piece[first]
+    starts = np.flatnonzero(np.diff(piece, prepend=-1))
+    lengths = np.diff(np.append(starts, len(piece)))
+
+    actions, action_found = _numbered("action", codes, labels, names, num_actions, lambda i: place(int(row[i])))
+    found: dict[str, Any] = {"action_names": action_found}
+    if num_actions is None and action_found is None:
+        num_actions = int(actions.max()) + 1
+        never = np.setdiff1d(np.arange(num_actions), actions) if num_actions < 10**6 else np.zeros(0)
+        if never.size:
+            notes.append(
+                f"actions are numbers from 0 to {num_actions - 1}, of which {_list(never)} never"
+                f" {'occurs' if never.size == 1 else 'occur'}"
+            )
+    found["num_actions"] = len(action_found) if action_found is not None else num_actions
+    found["actions"] = torch.from_numpy(padded(actions, lengths, of))
+    found["lengths"] = None if (lengths == lengths.max()).all() else torch.from_numpy(lengths)
+    if table.context:
+        found |= _context(table, row, lengths)
+    if seconds is not None:
+        found["durations"] = torch.from_numpy(padded(seconds.astype(np.float32), lengths, of))
+        if unknown := int(np.isnan(seconds).sum()):
+            notes.append(f"the durations of {unknown:,} of {len(seconds):,} actions are not known")
+    for what in ("group", "condition"):
+        if what in table.at:
+            texts, known = table.texts(table.at[what])
+            values = _of_plans(what, texts[row], plan, lambda i: place(int(row[i])))[starts]
+            notes += _alike(known, what)
+            number, kept = _numbered(what, values, known, None, None, lambda i: place(int(row[starts[i]])))
+            found |= _named(what, number, kept)
+    if gaps and "group" not in table.at:
+        # The parts of a plan are not independent of one another.
+        kept_plans, group = np.unique(plan[starts], return_inverse=True)
+        found |= _named("group", group, tuple(plan_names[i] for i in kept_plans))
+        notes.append("the parts of a plan form a group")
+    if unused := table.unused():
+        notes.append(f"columns that are not used: {_list(unused)}")
+    return found | {"notes": tuple(notes)}
+
+
+def _plans_of_rows(table: Table) -> tuple[Integers, list[str]]:
+    """For each row the number of its plan, in order of appearance, and the plans' names."""
+    parts, names = [], []
+    for what in ("group", "plan"):
+        if what not in table.at:
+            continue
+        codes, labels = table.texts(table.at[what])
+        if (codes < 0).any():
+            row = int((codes < 0).argmax())
+            raise ValueError(f"{table.place(row)}: {what}: an empty cell; the name or number of the {what} is expected")
+        parts.append(codes)
+        names.append(labels)
+    if not parts:
+        return np.zeros(len(table.frame), np.int64), ["table"]
+    both = np.stack(parts)
+    pairs, first, inverse = np.unique(both, axis=1, return_index=True, return_inverse=True)
+    order = first.argsort()
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    known_as = [
+        ", ".join(known[code] for known, code in zip(names, pair, strict=True)) for pair in pairs.T[order].tolist()
+    ]
+    return rank[inverse.reshape(-1)], known_as
+
+
+def _order(
+    table: Table, plan: Integers, names: list[str], start: NDArray[np.float64] | None
+) -> tuple[Integers, list[str]]:
+    """The rows in the order of plans and, where it is known, of time; and a note where that is another order."""
+    if start is None:
+        starts = np.flatnonzero(np.diff(plan, prepend=-1))
+        again = np.flatnonzero(plan[starts] != np.arange(len(starts)))
+        if again.size:
+            # Two pieces may be one plan in a file sorted by time, or two plans of subjects whose plans are each
+            # counted from 1: only the user can know.
+            row = int(starts[again[0]])
+            raise ValueError(
+                f"{table.place(row)}: plan {names[plan[row]]!r} goes on after another plan; sort the rows by plan, name"
+                " a column of times (start), or give each plan a name of its own"
+            )
+        return np.arange(len(plan)), []
+    if np.isnan(start).any():
+        row = int(np.isnan(start).argmax())
+        raise ValueError(f"{table.place(row)}: start: an empty cell; a time is expected")
+    order = np.lexsort((start, plan))
+    moved = bool((np.diff(order) < 0).any())
+    return order, ["rows are put in the order of their start"] * moved
+
+
+def _durations(
+    table: Table, start: NDArray[np.float64] | None, row: Integers, begin: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """The duration and the end of each action, in the order of `row`; NaN where not known, None where none is."""
+    when = None if start is None else start[row]
+    for what in ("duration", "stop"):
+        if what in table.at:
+            values = table.numbers(what, table.at[what], times=True)[row]
+            if what == "stop" and when is None:
+                raise ValueError("columns.stop: a column of the starts (columns.start) is expected with it")
+            since: Any = 0.0 if what == "duration" or when is None else when
+            taken = values - since
+            if (taken < 0).any():
+                wrong = int((taken < 0).argmax())
+                raise ValueError(
+                    f"{table.place(int(row[wrong]))}: {what}: the action takes {taken[wrong]:g}; 0 or more is expected"
+                )
+            return taken, None if when is None else when + taken
+    if when is None:
+        return None, None
+    # An action goes on until the next one begins; when the last one of a plan ended is not known.
+    until: NDArray[np.float64] = np.append(when[1:], np.nan).astype(np.float64)
+    until[np.append(begin[1:], True)] = np.nan
+    return until - when, until
+
+
+def _running_maximum(ends: NDArray[np.float64], plan: Integers) -> NDArray[np.float64]:
+    """The latest end so far in each plan."""
+    import pandas as pd
+
+    latest: NDArray[np.float64] = pd.Series(ends).groupby(plan).cummax().groupby(plan).ffill().to_numpy()
+    return latest
+
+
+def _numbered(
+    what: str,
+    codes: Integers,
+    labels: list[str],
+    names: Names | None,
+    count: int | None,
+    place: Callable[[int], str],
+) -> tuple[Integers, Names | None]:
+    """Numbers, and the names that they stand for: see `Column.finish`."""
+    column = Column(what, names, count, untyped=True)
+    occur = np.unique(codes)
+    try:
+        kept = column.look_up([labels[i] for i in occur])
+    except ValueError:
+        for i, code in enumerate(codes.tolist()):
+            try:
+                column.look_up([labels[code]])
+            except ValueError as error:
+                raise ValueError(f"{place(i)}: {error}") from None
+        raise
+    lookup = np.zeros(len(labels), np.int64)
+    lookup[occur] = kept
+    column.add_numbers(lookup[codes])
+    return column.finish(place)
+
+
+def _named(what: str, numbers: Integers, names: Names | None) -> dict[str, Any]:
+    found: dict[str, Any] = {what: torch.from_numpy(numbers.astype(np.int64))}
+    return found | {f"{what}_names": names}
+
+
+def _context(table: Table, row: Integers, lengths: Integers) -> dict[str, Any]:
+    """The context of each step: names or whole numbers of one column, or features."""
+    place = table.place
+    if len(table.context) == 1:
+        codes, labels = table.texts(table.context[0])
+        codes = codes[row]
+        if (codes < 0).any():
+            raise ValueError(f"{place(int(row[(codes < 0).argmax()]))}: context: an empty cell; a context is expected")
+        try:
+            numbers, names = _numbered("context", codes, labels, None, None, lambda i: place(int(row[i])))
+        except ValueError as error:
+            if "whole number" not in str(error):
+                raise
+        else:
+            return _named("context", padded(numbers, lengths, table.of), names)
+    columns = [table.numbers("context", at)[row] for at in table.context]
+    features: Floats = np.stack(columns, 1).astype(np.float32)
+    wrong = np.argwhere(~np.isfinite(features))
+    if wrong.size:
+        raise ValueError(f"{place(int(row[wrong[0, 0]]))}: context: a finite number is expected in each column")
+    return {"context": torch.from_numpy(padded(features, lengths, table.of))}
+
+
+def _of_plans(what: str, codes: Integers, plan: Integers, place: Callable[[int], str]) -> Integers:
+    """What plans have one of; ValueError where a row has another than the first row of its plan, or none."""
+    starts = np.flatnonzero(np.diff(plan, prepend=-1))
+    own = np.repeat(codes[starts], np.diff(np.append(starts, len(plan))))
+    wrong = np.flatnonzero((codes != own) | (codes < 0))
+    if wrong.size:
+        empty = codes[wrong[0]] < 0
+        kind = "an empty cell" if empty else f"another {what} than on the plan's first row"
+        raise ValueError(f"{place(int(wrong[0]))}: {what}: {kind}; a plan has one {what}")
+    return codes
+
+
+def _alike(labels: list[str], what: str) -> list[str]:
+    """A note for each set of names that differ in case, spaces, dashes or underscores only."""
+    alike: dict[str, list[str]] = {}
+    for label in labels:
+        if number_in(label) is None:
+            alike.setdefault(re.sub(r"[\s_-]", "", label.casefold()), []).append(label)
+    return [
+        f"{what}s {' and '.join(map(repr, names))} are nearly the same; rename them if they mean the same"
+        for key, names in alike.items()
+        if key and len(names) > 1
+    ]
+
+
+def _list(values: Sequence[Any] | NDArray[Any]) -> str:
+    return ", ".join(map(str, values[:SHOWN])) + (f" and {len(values) - SHOWN} more" if len(values) > SHOWN else "")

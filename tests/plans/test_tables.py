@@ -1,0 +1,200 @@
+"""Tables of events: from a frame, and from files as laboratories export them."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from neuroprior import Plans
+from neuroprior.plans import read_plans
+from tests.support.sources import refuses
+
+LAB = """animal,session,behaviour,t,seconds,drug,observer,arena
+m1,1,walk,0.0,1.5,saline,AB,A
+m1,1,Rear,1.5,0.5,saline,AB,A
+m1,1,,2.0,3.0,saline,AB,A
+m1,1,walk,5.0,1.0,saline,AB,B
+m1,2,rear,0.0,2.0,saline,AB,A
+m2,1,walk,3.0,1.0,drug,CD,A
+m2,1,groom,0.0,,drug,CD,B
+"""
+COLUMNS = {"action": "behaviour", "plan": "session", "group": "animal", "condition": "drug", "context": "arena"}
+
+
+def read(tmp_path, text, name="lab.csv", **options):
+    (tmp_path / name).write_text(text)
+    return read_plans(tmp_path / name, **options)
+
+
+def listed(plans):
+    """The actions of each plan, by name."""
+    lengths = plans.mask().sum(1).tolist()
+    names = plans.action_names or range(plans.num_actions)
+    return [[names[a] for a in row[:n]] for row, n in zip(plans.actions.tolist(), lengths, strict=True)]
+
+
+def test_a_table_of_a_laboratory(tmp_path):
+    plans = read(tmp_path, LAB, columns=COLUMNS | {"start": "t", "duration": "seconds"})
+    assert listed(plans) == [["walk", "Rear"], ["walk"], ["rear"], ["groom", "walk"]]
+    assert [plans.group_names[g] for g in plans.group] == ["m1", "m1", "m1", "m2"]
+    assert [plans.condition_names[c] for c in plans.condition] == ["saline"] * 3 + ["drug"]
+    assert [[plans.context_names[c] for c in row[:n]] for row, n in zip(plans.context, plans.lengths, strict=True)] == [
+        ["A", "A"],
+        ["B"],
+        ["A"],
+        ["B", "A"],
+    ]
+    known = torch.tensor([[1.5, 0.5], [1.0, 0], [2.0, 0], [torch.nan, 1.0]])
+    assert torch.equal(plans.durations.nan_to_num(-1), known.nan_to_num(-1))
+    assert list(plans.notes) == [
+        "rows are put in the order of their start",
+        "actions 'Rear' and 'rear' are nearly the same; rename them if they mean the same",
+        "1 rows have no label",
+        "1 gaps end a plan, and the next begins after each",
+        "the durations of 1 of 6 actions are not known",
+        "columns that are not used: observer",
+    ]
+
+
+def test_a_frame_is_read_as_its_file(tmp_path):
+    file = read(tmp_path, LAB, columns=COLUMNS | {"start": "t", "duration": "seconds"})
+    frame = Plans.from_dataframe(pd.read_csv(tmp_path / "lab.csv"), start="t", duration="seconds", **COLUMNS)
+    assert listed(frame) == listed(file)
+    for what in ("group", "condition", "context", "lengths"):
+        assert torch.equal(getattr(frame, what), getattr(file, what))
+    assert frame.notes == file.notes
+
+
+@pytest.mark.parametrize("word", ["", "NaN", "NA", "N/A", "null", "?", "-", " nan "])
+def test_a_missing_label_is_no_behaviour(tmp_path, word):
+    text = f"plan,action\n1,a\n1,{word}\n1,{word}\n1,b\n2,b\n2,{word}\n"
+    plans = read(tmp_path, text)
+    assert listed(plans) == [["a"], ["b"], ["b"]]
+    assert plans.group.tolist() == [0, 0, 1]  # what a gap parts is not independent
+    assert "1 gaps end a plan, and the next begins after each" in plans.notes
+    assert listed(read(tmp_path, text, missing="label")) == [["a", "missing", "missing", "b"], ["b", "missing"]]
+    with refuses("lab.csv, line 3", "no label"):
+        read(tmp_path, text, missing="error")
+
+
+def test_missing_values_of_pandas():
+    frame = pd.DataFrame({"action": ["a", None, "b", np.nan, pd.NA, "c"]})
+    plans = Plans.from_dataframe(frame)
+    assert listed(plans) == [["a"], ["b"], ["c"]]
+    categories = Plans.from_dataframe(frame.astype("category"))
+    assert listed(categories) == [["a"], ["b"], ["c"]]
+
+
+def test_a_pause_ends_a_plan(tmp_path):
+    text = "action,start,stop\na,0,5\nb,1,2\nc,6,7\nd,9,10\n"
+    assert listed(read(tmp_path, text, max_gap=1.5)) == [["a", "b", "c"], ["d"]]
+    assert listed(read(tmp_path, text, max_gap=2)) == [["a", "b", "c", "d"]]
+    with refuses("max_gap", "start"):
+        read(tmp_path, "plan,action\n1,a\n", max_gap=1)
+
+
+def test_durations_from_starts_alone(tmp_path):
+    plans = read(tmp_path, "plan,action,start\n1,a,0\n1,b,2\n1,,3\n1,a,7\n2,a,1\n")
+    assert listed(plans) == [["a", "b"], ["a"], ["a"]]
+    assert plans.durations.tolist()[0] == [2, 1]
+    assert plans.durations[1:, 0].isnan().all()
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ["0", "1.5", "61.5"],
+        ["00:00:00", "00:00:01.5", "00:01:01.5"],
+        ["2020-01-01 10:00:00.0", "2020-01-01 10:00:01.5", "2020-01-01 10:01:01.5"],
+    ],
+)
+def test_times_are_numbers_clocks_or_dates(times):
+    plans = Plans.from_dataframe(pd.DataFrame({"action": ["a", "b", "a"], "start": times}))
+    assert plans.durations[0, :2].tolist() == [1.5, 60]
+    if "-" in times[0]:
+        stamps = Plans.from_dataframe(pd.DataFrame({"action": ["a", "b", "a"], "start": pd.to_datetime(times)}))
+        assert stamps.durations[0, :2].tolist() == [1.5, 60]
+
+
+def test_frames_are_merged_to_actions():
+    frame = pd.DataFrame({"name": list("xxxxxxyy"), "syllable": [3, 3, 0, 0, 0, 3, 3, 3]})
+    plans = Plans.from_dataframe(frame, plan="name", action="syllable", merge_repeats=True)
+    assert listed(plans) == [[3, 0, 3], [3]]
+    assert plans.durations.tolist() == [[2, 3, 1], [2, 0, 0]]
+    assert "actions are numbers from 0 to 3, of which 1, 2 never occur" in plans.notes
+    timed = Plans.from_dataframe(frame.assign(duration=0.5), plan="name", action="syllable", merge_repeats=True)
+    assert timed.durations.tolist() == [[1, 1.5, 0.5], [1, 0, 0]]
+
+
+def test_features_of_several_columns():
+    frame = pd.DataFrame({"action": list("ab"), "speed": [1, 2.5], "turn": ["0", "-1"]})
+    plans = Plans.from_dataframe(frame, context=["speed", "turn"])
+    assert plans.context.tolist() == [[[1, 0], [2.5, -1]]]
+    assert Plans.from_dataframe(frame, context="speed").context.tolist() == [[[1], [2.5]]]
+
+
+def test_the_same_plan_name_in_two_groups_is_two_plans(tmp_path):
+    plans = read(tmp_path, "group,plan,action\nm1,1,a\nm2,1,b\n")
+    assert listed(plans) == [["a"], ["b"]]
+    assert listed(read(tmp_path, "group,action\nm1,a\nm1,b\nm2,b\n", columns={"action": "action"})) == [
+        ["a", "b"],
+        ["b"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"columns": {"action": "act"}}, ["columns.action", "'act'", "session, behaviour"]),
+        ({"columns": {"acts": "behaviour"}}, ["columns", "acts"]),
+        ({"columns": {"action": "behaviour", "plan": "behaviour"}}, ["'behaviour'", "action and plan"]),
+        ({"columns": {"plan": "session"}}, ["no column 'action'", "columns.action"]),
+        ({"columns": {"action": "behaviour", "plan": "animal", "condition": "session"}}, ["line 6", "condition"]),
+        ({"columns": {"action": "behaviour", "plan": "session"}}, ["line 7", "goes on after another plan"]),
+        ({"columns": {"action": "behaviour", "start": "drug"}}, ["line 2", "start 'saline'", "time"]),
+        ({"columns": {"action": "behaviour", "duration": "animal"}}, ["line 2", "'m1'"]),
+        ({"columns": {"action": "behaviour", "stop": "t"}}, ["columns.stop", "start"]),
+        ({"columns": {"action": "behaviour", "start": "seconds"}}, ["line 8", "start: an empty cell"]),
+        ({"columns": {"action": "behaviour", "start": "t", "stop": "seconds"}}, ["line 3", "stop", "-1"]),
+        ({"columns": {"action": "behaviour"}, "missing": "drop"}, ["missing", "gap, label, error"]),
+        ({"columns": {"action": "behaviour"}, "max_gap": -1}, ["max_gap", "-1"]),
+        ({"columns": {"action": "seconds"}}, ["line 2", "'1.5' is not a whole number"]),
+    ],
+)
+def test_bad_tables_are_one_line(tmp_path, options, words):
+    text = LAB.replace("m1,2,rear,0.0,2.0", "m1,1,rear,6.0,2.0") if "plan" not in options["columns"] else LAB
+    text = text + "m1,1,walk,9,1,saline,AB,A\n" if options["columns"].get("plan") == "session" else text
+    with refuses(*words):
+        read(tmp_path, text, **options)
+
+
+@pytest.mark.parametrize("name", ["a.jsonl", "a.npz"])
+def test_columns_are_for_tables(tmp_path, name):
+    with refuses("columns", "CSV"):
+        read(tmp_path, "x", name, columns={"action": "b"})
+
+
+def test_durations_and_conditions_stay_with_their_plans():
+    plans = Plans(
+        torch.tensor([[0, 1], [1, 0]]),
+        2,
+        torch.tensor([2, 1]),
+        durations=torch.tensor([[1.0, 2], [3, 9]]),
+        condition=torch.tensor([0, 1]),
+        condition_names=("wild", "mutant"),
+    )
+    assert plans.durations.tolist() == [[1, 2], [3, 0]]
+    assert plans[1:].durations.tolist() == [[3, 0]]
+    assert plans[torch.tensor([1])].condition.tolist() == [1]
+    closed = plans.with_end()
+    assert closed.durations.tolist() == [[1, 2, 0], [3, 0, 0]]
+    assert closed.without_end().durations.tolist() == [[1, 2], [3, 0]]
+    first, last = plans[:1].split(0.5)
+    assert (first.durations.tolist(), last.durations.tolist()) == ([[1]], [[2]])
+    for wrong in (torch.tensor([[1.0, -1], [1, 1]]), torch.tensor([[1.0, torch.inf], [1, 1]])):
+        with refuses("durations[0, 1]"):
+            Plans(plans.actions, 2, durations=wrong)
+    with refuses("durations: shape"):
+        Plans(plans.actions, 2, durations=torch.ones(2))
+    with refuses("condition"):
+        Plans(plans.actions, 2, condition=torch.tensor([0.5, 1]))
