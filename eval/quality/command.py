@@ -9,14 +9,13 @@ from typing import Any
 import pandas as pd
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt
-from rich.console import Console
 from torch import Tensor
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior
-from neuroprior._files import versions, write_json
 from neuroprior._jobs import Progress
 from neuroprior._random import draw_seed
-from neuroprior.report.document import Column, printed, records, table, write_frames
+from neuroprior.report.document import Column, Document, publish, table
+from neuroprior.report.page import Section, Table
 
 LENGTH = 32
 CONTEXTS = 8
@@ -121,8 +120,6 @@ def quality(
     """
     if num_plans < 100 or held_out < 100:
         raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
-    folder, console = Path(out), Console()
-    folder.mkdir(parents=True, exist_ok=True)
     generator, kinds = torch.Generator().manual_seed(seed), (MarkovPrior, GRUPrior, TransformerPrior)
     every, rows = sources(generator), []
     with Progress("quality", len(every) * len(kinds), len(every) * len(kinds)) as progress:
@@ -133,9 +130,11 @@ def quality(
                 rows.append(_fit(source, kind, training, test, true, seed))
                 progress.advance(f"{source.name}: {rows[-1]['model']} {rows[-1]['excess_percent']:+.2f} %")
     frame = pd.DataFrame(rows)
-    _print(console, frame, f"{num_plans:,} plans of {LENGTH} actions, {held_out:,} held out")
-    write_frames(folder, {"quality": frame})
-    write_json(folder / "results.json", {"rows": records(frame), "versions": versions()})
+    lead = f"{num_plans:,} plans of {LENGTH} actions to learn from, {held_out:,} held out."
+    sections = [Section("Bits more than the source, %", tables=[_table(frame)])]
+    settings = {"num_plans": num_plans, "held_out": held_out, "seed": seed}
+    frames, keys = {"quality": frame}, {"quality": "rows"}
+    publish(Document("Sources of known entropy", lead, sections, frames, settings, keys=keys), Path(out))
 
 
 def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
@@ -164,7 +163,7 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
     }
 
 
-def _print(console: Console, rows: pd.DataFrame, size: str) -> None:
+def _table(rows: pd.DataFrame) -> Table:
     """A row a source: the excess of each prior, and of the neural ones the seconds of training."""
     trained = rows.assign(text=[f"{row.excess_percent:+.2f} ({row.seconds:.0f})" for row in rows.itertuples()])
     neural = trained.pivot(index="source", columns="model", values="text")[["gru", "transformer"]]
@@ -180,6 +179,4 @@ def _print(console: Console, rows: pd.DataFrame, size: str) -> None:
         "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
         " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. (s): seconds of training."
     )
-    title = f"Bits more than the source, % ({size})"
-    shown = table(rows[rows.model == "markov"].join(neural, on="source"), columns, caption)
-    console.print(printed(title, shown))
+    return table(rows[rows.model == "markov"].join(neural, on="source"), columns, caption)
