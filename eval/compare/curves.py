@@ -53,6 +53,12 @@ class Starts:
         gained, most = (values.double() - self.reference for values in (score, self.best))
         return float(gained.mean() / most.mean())
 
+    def reached(self, score: Tensor) -> dict[str, float]:
+        """Of the scores of decisions, `[B, D]` or `[B]`: the normalised score, the share of optimal ones, and the mean."""
+        score = score.double().view(len(self.best), -1)
+        optimal = (score >= self.best[:, None] - CLOSE).double().mean()
+        return {"share": self.normalised(score.mean(1)), "at_oracle": float(optimal), "score": float(score.mean())}
+
 
 def starts_of(task: Task, world: World, number: int, length: int, generator: torch.Generator) -> Starts:
     """Random starts; if rewards are never negative, only those with an optimum above 0.
@@ -102,8 +108,7 @@ def curve(
     planner chooses by its own estimates; what counts are exact scores, which differ in stochastic worlds.
 
     Returns:
-        For each number, means over starts: `share`, the normalised score; `at_oracle`, the share of starts at which an
-        optimal plan was found; `score`.
+        See `Starts.reached`, a list for all numbers.
     """
     planner, estimates, scores = planner_of(starts, prior, max(budgets), temperature), [], []
     for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
@@ -113,16 +118,13 @@ def curve(
         estimates.append(score)
         scores.append(worth(starts.task, starts.world, state, plans) if starts.world.stochastic else score)
     estimated, exact = torch.cat(estimates), torch.cat(scores)
-    found: dict[str, list[float]] = {"share": [], "at_oracle": [], "score": []}
+    found = []
     for budget in budgets:
         blocks = estimated.shape[1] // budget
         shape = (len(estimated), blocks, budget)
         chosen = estimated[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
-        score = exact[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0].double()
-        found["share"].append(starts.normalised(score.mean(1)))
-        found["at_oracle"].append(float((score >= starts.best[:, None] - CLOSE).double().mean()))
-        found["score"].append(float(score.mean()))
-    return found
+        found.append(starts.reached(exact[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0]))
+    return {name: [one[name] for one in found] for name in found[0]}
 
 
 def seconds_per_decision(

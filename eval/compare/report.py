@@ -1,11 +1,11 @@
 """The report of `python -m eval compare`: one document of tables and figures."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from eval.compare import figures
 from eval.compare.figures import FORMER_NAMES, POINTS, Style
@@ -22,6 +22,37 @@ FRAMES |= {"growth": "curriculum"}
 HALF = "±: the longer side of the 95 % interval, over seeds."
 HOLM = "*: p < 0.05, corrected for all pairs of the world (Holm)."
 
+REASONS = (
+    "Every world in which the best neural prior is not significantly better. Where the best chain is near 100 %, little"
+    " is left to find. Where networks have no fewer bits than chains, they know no more of the plans' structure. Where"
+    " they have fewer, fewer samples are needed; but the best of many samples asks for many different ones, which"
+    " likelihood does not."
+)
+CURVES = (
+    "Bands: 95 % intervals over seeds. Thin lines: the other Markov chains. Dotted: the planner that tries all short"
+    " plans, at a cost of its own."
+)
+EFFICIENCY = "How many plans from a prior find as much as the most random ones. The numbers are in the tables below."
+CURRICULUM = (
+    "A prior learns from the best of all short plans, proposes longer ones, learns from the best of those, and so on."
+    " Below the axis: the round, and the number of actions in its plans; each is compared with the best plans of as"
+    " many actions. Temperatures are those that are best in the validation worlds. Bands: 95 % intervals over seeds;"
+    " thin lines: the other Markov chains."
+)
+BITS = (
+    "Bits per action of the held-out plans of the planner that tries all short ones: the fewer, the better a prior"
+    " predicts them. Hollow: without context; filled, below: with the initial or the per-step context. The numbers are"
+    " in the tables below."
+)
+DRAWN = (
+    "Candidate plans of some priors from one start, after the last round of the curriculum. Square: the start; dots:"
+    " where plans end; green: rewards; grey: walls."
+)
+TRANSITIONS = (
+    "How often each action follows each in plans sampled from a prior after the last round of the curriculum: means"
+    " over seeds."
+)
+
 
 def document(results: Results, settings: Mapping[str, Any], command: str) -> Document:
     """All that is printed and written of a comparison; the same results and settings give the same document.
@@ -35,21 +66,22 @@ def document(results: Results, settings: Mapping[str, Any], command: str) -> Doc
         ValueError: the runs do not belong together, or lack one of the numbers of plans.
     """
     style = figures.styles([*results.rows["prior"].dropna(), *results.curriculum["prior"]])
+    after = "after minus before the curriculum"
     sections = [
         headlines(results),
         reasons(results),
-        scores(results, style, False, "Normalised score against candidate plans"),
-        efficiency(results, style),
-        gains(results, style, "with minus without context", "What context adds"),
-        gains(results, style, "after minus before the curriculum", "What the horizon curriculum adds"),
-        scores(results, style, True, "Normalised score after the horizon curriculum"),
-        curriculum(results, style),
-        bits(results, style),
-        drawn_plans(results, style),
-        transitions(results),
+        _figures("Normalised score against candidate plans", CURVES, scores(results, style, False), beside=True),
+        _figures("Search efficiency", EFFICIENCY, efficiency(results, style)),
+        _figures("What context adds", "", gains(results, style, "with minus without context")),
+        _figures("What the horizon curriculum adds", "", gains(results, style, after)),
+        _figures("Normalised score after the horizon curriculum", CURVES, scores(results, style, True), beside=True),
+        _figures("The horizon curriculum, round by round", CURRICULUM, curriculum(results, style), beside=True),
+        _figures("Bits per action of held-out plans", BITS, bits(results, style), beside=True),
+        _figures("Plans drawn in the worlds", DRAWN, drawn_plans(results, style), beside=True),
+        _figures("Transition matrices", TRANSITIONS, transitions(results), beside=True),
         about_worlds(results),
         Section(
-            "Tables, world by world", tables=[one for world in results.worlds for one in tables_of(results, world)]
+            "Tables, world by world", tables=list(chain.from_iterable(tables_of(results, w) for w in results.worlds))
         ),
     ]
     named = ", ".join(results.worlds) if len(results.worlds) <= 3 else f"{len(results.worlds)} worlds"
@@ -62,6 +94,10 @@ def document(results: Results, settings: Mapping[str, Any], command: str) -> Doc
         command,
         former_names=FORMER_NAMES,
     )
+
+
+def _figures(title: str, text: str, boxes: Iterable[FigureBox], beside: bool = False) -> Section:
+    return Section(title, [text] if text else [], (), list(boxes), beside)
 
 
 def lead(results: Results) -> str:
@@ -128,12 +164,6 @@ def headlines(results: Results) -> Section:
 
 def reasons(results: Results) -> Section:
     """What may explain why networks are not better."""
-    text = (
-        "Every world in which the best neural prior is not significantly better. Where the best chain is near 100 %,"
-        " little is left to find. Where networks have no fewer bits than chains, they know no more of the plans'"
-        " structure. Where they have fewer, fewer samples are needed; but the best of many samples asks for many"
-        " different ones, which likelihood does not."
-    )
     columns: dict[str, Column] = {
         "world": lambda row: breakable(row["world"]),
         "context": _context,
@@ -148,120 +178,79 @@ def reasons(results: Results) -> Section:
         f" significantly better with {results.num_plans[0]:,} plans."
     )
     made = [table(results.reasons, columns, caption, align="llrrrr")] if len(results.reasons) else []
-    return Section("Where networks are not better", [text], made)
+    return Section("Where networks are not better", [REASONS], made)
 
 
-def scores(results: Results, style: Mapping[str, Style], after: bool, title: str) -> Section:
+def scores(results: Results, style: Mapping[str, Style], after: bool) -> Iterator[FigureBox]:
     """Normalised scores against the number of plans, a figure a world; before or after the horizon curriculum."""
-    boxes, about = [], {run["world"]: run["about"] for run in results.runs}
+    about = {run["world"]: run["about"] for run in results.runs}
     for (world,), rows in grouped(results.curves[results.curves["context"] == "none"], ["world"]):
         own = rows[((rows["rounds"] > 0) == after) | rows["prior"].isna() | (rows["prior"] == "uniform")]
         if own["prior"].notna().any() and (own["rounds"].any() or not after):
-            last = own[own["num_plans"] == results.shown]
-            drawn = figures.score_figure(own, _strong(last), style)
-            boxes.append(_box(drawn, world, last, 100, "" if after else f"{world}: {about[world]}."))
-    text = [
-        "Bands: 95 % intervals over seeds. Thin lines: the other Markov chains. Dotted: the planner that tries all"
-        " short plans, at a cost of its own."
-    ]
-    return Section(title, text, (), boxes, beside=True)
+            drawn = figures.score_figure(own, _strong(own[own["num_plans"] == results.shown]), style)
+            yield FigureBox(drawn, "" if after else f"{world}: {about[world]}.", f"normalised scores in {world}")
 
 
-def efficiency(results: Results, style: Mapping[str, Style]) -> Section:
+def efficiency(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """How many plans are needed."""
-    rows = results.efficiency
-    rows = rows[(rows["prior"] != "uniform") & (rows["context"] == "none") & (rows["rounds"] == 0)]
-    if rows.empty:
-        return Section("Search efficiency")
-    most = int(rows["most"].max())
-    high = rows["needed_high"].mask(rows["needed_high"].isna() & rows["needed_low"].notna(), rows["most"])
-    estimates = rows.assign(mean=rows["needed"].fillna(np.inf), low=rows["needed_low"], high=high)
-    drawn = figures.dots_figure(estimates, style, "candidate plans needed", most)
-    caption = f"Plans needed for what random search finds with {most:,}; arrow: more than that. Medians over seeds."
-    text = [f"How many plans from a prior find as much as {most:,} random ones. The numbers are in the tables below."]
-    return Section("Search efficiency", text, (), [FigureBox(drawn, caption, "plans needed by each prior, by world")])
+    rows = results.efficiency.query("prior != 'uniform' and context == 'none' and rounds == 0")
+    if len(rows):
+        most = int(rows["most"].max())
+        high = rows["needed_high"].mask(rows["needed_high"].isna() & rows["needed_low"].notna(), rows["most"])
+        estimates = rows.assign(mean=rows["needed"].fillna(np.inf), low=rows["needed_low"], high=high)
+        drawn = figures.dots_figure(estimates, style, "candidate plans needed", most)
+        caption = f"Plans needed for what random search finds with {most:,}; arrow: more than that. Medians over seeds."
+        yield FigureBox(drawn, caption, "plans needed by each prior, by world")
 
 
-def gains(results: Results, style: Mapping[str, Style], what: str, title: str) -> Section:
+def gains(results: Results, style: Mapping[str, Style], what: str) -> Iterator[FigureBox]:
     """What priors gain by context, or by the horizon curriculum: a figure for each context and curriculum."""
     rows = results.paired[(results.paired["what"] == what) & (results.paired["num_plans"] == results.shown)]
-    points = {"mean": 100 * rows["difference"], "low": 100 * rows["low"], "high": 100 * rows["high"]}
-    boxes = []
-    rows = rows.assign(prior=rows["first"], after=rows["rounds"] != "0", **points)
+    points = 100 * rows[["difference", "low", "high"]].rename(columns={"difference": "mean"})
+    rows = rows[["world", "context"]].assign(prior=rows["first"], after=rows["rounds"] != "0").join(points)
     for (context, after), own in grouped(rows, ["context", "after"]):
         how = f"{what.capitalize()} (context: {context}{', after' * bool(after and context.endswith(' - none'))})"
         caption = f"{how}, with {results.shown:,} plans. Intervals: 95 %, over seeds."
-        boxes.append(FigureBox(figures.dots_figure(own, style, POINTS), caption, how))
-    return Section(title, (), (), boxes)
+        yield FigureBox(figures.dots_figure(own, style, POINTS), caption, how)
 
 
-def curriculum(results: Results, style: Mapping[str, Style]) -> Section:
+def curriculum(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Curves against rounds of the horizon curriculum, a figure a world and context."""
-    boxes = []
     for (world, _), own in grouped(results.curriculum, ["world", "context"]):
-        last = own[own["round"] == own["round"].max()]
-        boxes.append(_box(figures.curriculum_figure(own, _strong(last), style), world, last, 100))
-    number = ", ".join(f"{one:,}" for one in sorted(results.curriculum["num_plans"].unique()))
-    text = [
-        "A prior learns from the best of all short plans, proposes longer ones, learns from the best of those, and so"
-        " on. Below the axis: the round, and the number of actions in its plans; each is compared with the best plans"
-        " of as many actions.",
-        f"{number} candidate plans, sampled at the temperature that is best in the validation worlds. Bands: 95 %"
-        " intervals over seeds; thin lines: the other Markov chains.",
-    ]
-    return Section("The horizon curriculum, round by round", text, (), boxes, beside=True)
+        drawn = figures.curriculum_figure(own, _strong(own[own["round"] == own["round"].max()]), style)
+        caption = f"{own['num_plans'].iloc[0]:,} candidate plans."
+        yield FigureBox(drawn, caption, f"normalised scores in {world} after each round")
 
 
-def bits(results: Results, style: Mapping[str, Style]) -> Section:
+def bits(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Bits of held-out plans, a figure a world."""
     rows = results.bits[(results.bits["rounds"] == 0) & (results.bits["prior"] != "uniform")]
-    boxes = [
-        _box(figures.bits_figure(own, style), world, _labelled(own).assign(prior=lambda frame: frame["label"]), 1)
-        for (world,), own in grouped(rows, ["world"])
-    ]
-    text = [
-        "Bits per action of the held-out plans of the planner that tries all short ones: the fewer, the better a prior"
-        " predicts them. Hollow: without context; filled, below: with the initial or the per-step context. The numbers"
-        " are in the tables below."
-    ]
-    return Section("Bits per action of held-out plans", text, (), boxes, beside=True)
+    for (world,), own in grouped(rows, ["world"]):
+        yield FigureBox(figures.bits_figure(own, style), "", f"bits per action in {world}")
 
 
-def drawn_plans(results: Results, style: Mapping[str, Style]) -> Section:
+def drawn_plans(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Plans drawn in the worlds."""
-    boxes = []
     for run in results.runs:
         for prior in (run.get("plans") or {"paths": ()})["paths"]:
             drawn = figures.plans_figure(run["plans"], prior, style[prior][0], f"{run['world']}: {prior}")
-            boxes.append(FigureBox(drawn, "", f"plans of {prior} in {run['world']}"))
-    text = [
-        "Candidate plans of some priors from one start, after the last round of the curriculum. Square: the start;"
-        " dots: where plans end; green: rewards; grey: walls."
-    ]
-    return Section("Plans drawn in the worlds", text, (), boxes, beside=True)
+            yield FigureBox(drawn, "", f"plans of {prior} in {run['world']}")
 
 
-def transitions(results: Results) -> Section:
+def transitions(results: Results) -> Iterator[FigureBox]:
     """Transition matrices of plans sampled from the priors: of the best chain, and of all priors that are no chains."""
-    boxes = []
     rows = results.rows[(results.rows["context"] == "none") & (results.rows["num_plans"] == results.shown)]
     for world in results.worlds:
         runs = [run for run in results.runs if run["world"] == world and run.get("transitions")]
-        strong = _strong(rows[rows["world"] == world])
-        for prior in runs[0]["transitions"] if runs else ():
-            if prior in strong and prior != "uniform":
-                matrices = np.array([run["transitions"][prior] for run in runs if prior in run["transitions"]])
-                # An action that never came has a row of zeros in its seed.
-                seeds = (matrices.sum(2, keepdims=True) > 0).sum(0)
-                mean = np.divide(matrices.sum(0), seeds, out=np.full(matrices.shape[1:], np.nan), where=seeds > 0)
-                names = runs[0]["action_names"] or [str(action) for action in range(len(mean))]
-                drawn = transition_figure(mean, names, f"{world}: {prior}", small=True)
-                boxes.append(FigureBox(drawn, "", f"transition matrix of {prior} in {world}"))
-    text = [
-        "How often each action follows each in plans sampled from a prior after the last round of the curriculum: means"
-        " over seeds."
-    ]
-    return Section("Transition matrices", text, (), boxes, beside=True)
+        strong = _strong(rows[(rows["world"] == world) & (rows["prior"] != "uniform")])
+        for prior in (prior for prior in (runs[0]["transitions"] if runs else ()) if prior in strong):
+            matrices = np.array([run["transitions"][prior] for run in runs if prior in run["transitions"]])
+            # An action that never came has a row of zeros in its seed.
+            seeds = (matrices.sum(2, keepdims=True) > 0).sum(0)
+            mean = np.divide(matrices.sum(0), seeds, out=np.full(matrices.shape[1:], np.nan), where=seeds > 0)
+            names = runs[0]["action_names"] or [str(action) for action in range(len(mean))]
+            drawn = transition_figure(mean, names, f"{world}: {prior}", small=True)
+            yield FigureBox(drawn, "", f"transition matrix of {prior} in {world}")
 
 
 def about_worlds(results: Results) -> Section:
@@ -319,14 +308,6 @@ def tables_of(results: Results, world: str) -> Iterator[Table]:
     caption = f"{world}: optimal in % of the starts, by candidate plans; ms: a decision with {results.shown:,} plans."
     shares = [f"{100 * one:.1f}" for one in rows["at_oracle"]]
     yield table_by(rows, {"prior": "label"}, "num_plans", shares, caption, world, timed=results.shown)
-
-
-def _box(drawn: Figure, world: str, rows: pd.DataFrame, factor: float, caption: str = "") -> FigureBox:
-    """A figure whose text for those who do not see it has the first number of each of `rows`."""
-    name = "oracle_share" if "oracle_share" in rows else "bits_per_action"
-    form = "{} {:.0f} %" if factor == 100 else "{} {:.3f}"
-    said = (form.format(row["prior"], factor * row[name]) for _, row in rows.iterrows())
-    return FigureBox(drawn, caption, f"{world}: {', '.join(said)}")
 
 
 def _gap(row: Any, significant: bool) -> str:

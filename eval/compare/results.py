@@ -158,15 +158,13 @@ class Results:
     def paired(self) -> pd.DataFrame:
         """Differences in the normalised score between priors with as many plans, over the seeds that have both.
 
-        What is compared: the best neural with the best Markov prior; each neural with each Markov prior; each saved or
-        macro prior with every other; after with before the horizon curriculum; with and without context. All else is
-        equal. The best are chosen on half of the seeds and compared on the other half, for both halves; their
-        intervals and p-values hold whichever are the best: see `best_difference`.
+        What is compared: the best neural with the best Markov prior (see `best_difference`); each neural with each
+        Markov prior; each saved or macro prior with every other; after with before the horizon curriculum; with and
+        without context. All else is equal.
 
-        A row a world, pair and number of plans: the scores of the two (`first_share`, `second_share`; of the best, as
-        they were chosen for each seed on the other half), their `difference` with Student's interval (`low`, `high`),
-        `p_value` of the two-sided paired t-test, and `p_holm`, corrected for all rows of the world. With a single seed
-        there are scores and a difference and nothing else; the best are not chosen then.
+        A row a world, pair and number of plans: the scores of the two (`first_share`, `second_share`), their
+        `difference` with Student's interval (`low`, `high`), `p_value` of the two-sided paired t-test, and `p_holm`,
+        corrected for all rows of the world. Of a single seed scores and difference alone; the best are not chosen then.
         """
         gaps = [
             {"world": world} | gap

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 
 from eval.compare.curves import (
-    CLOSE,
     ROLLOUTS,
     TEMPERATURES,
     Starts,
@@ -52,19 +51,10 @@ SHOWN = ("uniform", "markov-2", "gru")
 
 @dataclass(frozen=True)
 class Settings:
-    """All that decides the results of a run, beside its world and seed.
+    """All that decides the results of a run, beside its world and seed; see `eval.compare.command.compare`.
 
-    Attributes:
-        num_plans: numbers of candidate plans, powers of two.
-        kinds: of fitted priors: "markov", "macro", "gru", "transformer".
-        context: contexts of priors, see `CONTEXTS`; empty: those of the world (`Task`).
-        rounds: of the horizon curriculum, at most; a world has as many as it has lengths.
-        steps: of training of each neural prior in a round, at most.
-        starts: held-out starts to plan from.
-        training_starts: from so many starts, times `Task.start_factor`, training plans are collected.
-        seed: of everything random.
-        priors: folders of saved priors.
-        lengths: actions in a plan, round by round of the horizon curriculum; empty: those of the world.
+    `context` may be empty, for those of the world (`Task`), and so may `lengths`, the number of actions in a plan round
+    by round of the horizon curriculum.
     """
 
     num_plans: tuple[int, ...]
@@ -96,11 +86,6 @@ class Settings:
 
 def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
     """Collect plans, fit priors, extend their horizons and compare them, in the worlds of one seed.
-
-    Args:
-        run: the world, and the seed of its worlds and of everything that is drawn in them.
-        settings: how much is done.
-        tasks: the worlds by name.
 
     Returns:
         What `eval.compare.results` reads.
@@ -134,10 +119,7 @@ def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS)
 
 
 def curriculum_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
-    """Extend the horizons of all priors in the worlds of one seed; after every round, plan with plans of every length.
-
-    Args, raises: see `compare_run`.
-    """
+    """Extend the horizons of all priors in one seed's worlds; after every round, plan with plans of every length."""
     contest = Contest(tasks[run.world], run.seed, settings)
     growth = [
         contest.curriculum_entry(one, length)
@@ -299,22 +281,12 @@ class Contest:
             return []
         begin = perf_counter()
         decision = ExhaustivePlanner(self.task.depth, **self.task.scoring).plan(world, starts.state, self.generator)
-        seconds, score = perf_counter() - begin, decision.score.double()
-        entry = {
-            "planner": "exhaustive",
-            "prior": None,
-            "context": "none",
-            "rounds": 0,
-            "depth": self.task.depth,
-            "share": [starts.normalised(score)],
-            "at_oracle": [float((decision.score >= starts.best - CLOSE).double().mean())],
-            "score": [float(score.mean())],
-            "model_steps": [decision.model_steps],
-            "seconds": [seconds / self.settings.starts],
-            "bits": None,
-            "actions": 0,
-        }
-        return [entry]
+        seconds = (perf_counter() - begin) / self.settings.starts
+        named = {"planner": "exhaustive", "prior": None, "context": "none", "rounds": 0, "depth": self.task.depth}
+        reached = {name: [value] for name, value in starts.reached(decision.score).items()}
+        return [
+            named | reached | {"model_steps": [decision.model_steps], "seconds": [seconds], "bits": None, "actions": 0}
+        ]
 
 
 def transitions(prior: Prior, world: World, generator: torch.Generator) -> list[list[float]]:

@@ -9,7 +9,17 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from rich.console import Console
 
 from eval.mice import figures
-from eval.mice.experiment import NEURAL, PRIORS, SOURCES, UNIFORM, MiceSettings, PriorName, simulate
+from eval.mice.experiment import (
+    NEURAL,
+    PRIORS,
+    SOURCES,
+    UNIFORM,
+    MiceSettings,
+    PriorName,
+    paired_table,
+    reached_table,
+    simulate,
+)
 from eval.worlds.runs import check_distinct, plus_minus, table_by
 from neuroprior import read_plans
 from neuroprior._files import write_json
@@ -60,14 +70,14 @@ def mice(
     world, plans = labyrinth(absorbing=True), read_plans(DATA)
     parts = 2 + seeds * (len(NEURAL) + len(PRIORS))
     with Progress("mice", parts, parts) as progress:
-        result = simulate(settings, world, plans, progress.advance)
-    rows, paired = result.table(), result.paired()
-    tables = _learned(result.learned), _reached(rows, settings), _normalised(rows, settings), _differences(paired)
+        reached, priors, learned = simulate(settings, world, plans, progress.advance)
+    rows, paired = reached_table(reached), paired_table(reached)
+    tables = _learned(learned), _reached(rows, settings), _normalised(rows, settings), _differences(paired)
     document = Document(
         "Mice in a labyrinth",
         _finding(rows, settings),
         [Section("Tables", tables=tables)],
-        {"mice": rows, "paired": paired, "learned": result.learned},
+        {"mice": rows, "paired": paired, "learned": learned},
         asdict(settings),
         results={"seed": seed},
         keys={"mice": "rows"},
@@ -81,7 +91,7 @@ def mice(
         "the mice's Markov prior, no context": PriorName("markov", "mice", "moves"),
         "the mice's GRU, given the node": PriorName("gru", "mice", "node"),
     }
-    drawn = {title: result.priors[name] for title, name in examples.items()}
+    drawn = {title: priors[name] for title, name in examples.items()}
     pictures = {
         "mice_planner": figures.reached_against_candidates(rows),
         "maze": figures.maze(plans),

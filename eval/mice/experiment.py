@@ -55,7 +55,6 @@ class PriorName(NamedTuple):
         return ", ".join(filter(None, self))
 
 
-SIDES = ("first", "second")
 UNIFORM, ORACLE = PriorName("uniform", "", ""), PriorName("oracle", "", "")
 
 NEURAL = [
@@ -90,45 +89,27 @@ class MiceSettings:
     seed: int
 
 
-@dataclass(frozen=True, eq=False)
-class MiceResult:
-    """What was reached.
+def reached_table(reached: pd.DataFrame) -> pd.DataFrame:
+    """A row a prior, length and number of candidates, and one a length for the oracle; intervals over repeats."""
+    rows = seed_means(reached, [*PriorName._fields, "length", "num_plans"], "reached").drop(columns="seeds")
+    rows = rows.sort_values("length", kind="stable", ignore_index=True)
+    best = rows[rows["prior"] == "oracle"].set_index("length")["reached"]
+    share = (rows["reached"] / rows["length"].map(best)).mask(rows["prior"] == "oracle", 1.0)
+    rows = rows.assign(model_steps=rows["length"] * rows["num_plans"], oracle_share=share)
+    return rows.assign(low=rows["low"].clip(lower=0), high=rows["high"].clip(upper=1))
 
-    Attributes:
-        reached: a row a repeat, prior, length and number of candidates, and for the oracle a row a repeat and length:
-            the share of starts at which the water was reached.
-        priors: those of the last repeat.
-        learned: a row for each source: its size, and the orders that were chosen for the Markov priors.
-    """
 
-    reached: pd.DataFrame
-    priors: dict[PriorName, Prior]
-    learned: pd.DataFrame
-
-    def table(self) -> pd.DataFrame:
-        """A row a prior, length and number of candidates, and one a length for the oracle; intervals over repeats."""
-        rows = seed_means(self.reached, [*PriorName._fields, "length", "num_plans"], "reached")
-        rows = rows.sort_values("length", kind="stable", ignore_index=True).drop(columns="seeds")
-        best = rows[rows["prior"] == "oracle"].set_index("length")["reached"]
-        share = (rows["reached"] / rows["length"].map(best)).mask(rows["prior"] == "oracle", 1.0)
-        rows = rows.assign(model_steps=rows["length"] * rows["num_plans"], oracle_share=share)
-        return rows.assign(low=rows["low"].clip(lower=0), high=rows["high"].clip(upper=1))
-
-    def paired(self) -> pd.DataFrame:
-        """Paired differences over repeats, a row a pair of priors, length and number of candidates."""
-        own = dict(list(self.reached.groupby(list(PriorName._fields))))
-        parts = []
-        for what, *pair in _pairs():
-            first, second = (
-                own[name].rename(columns={"reached": side}) for name, side in zip(pair, SIDES, strict=True)
-            )
-            at = ["length", "num_plans", "seed"]
-            both = first[[*at, "first"]].merge(second[[*at, "second"]], on=at)
-            ends = zip(PriorName._fields, *pair, strict=True)
-            names: dict[str, str] = {field: " - ".join(dict.fromkeys(names)) for field, *names in ends}
-            parts.append(both.assign(**names, what=what, world="labyrinth"))
-        by = [*PriorName._fields, "what", "length", "num_plans"]
-        return paired_differences(pd.concat(parts), ["world", *by]).drop(columns="world")
+def paired_table(reached: pd.DataFrame) -> pd.DataFrame:
+    """Paired differences over repeats, a row a pair of priors, length and number of candidates."""
+    groups = reached.set_index(["length", "num_plans", "seed"]).groupby(list(PriorName._fields))["reached"]
+    own, parts = dict(list(groups)), []
+    for what, first, second in _pairs():
+        ends = zip(PriorName._fields, first, second, strict=True)
+        names: dict[str, str] = {field: " - ".join(dict.fromkeys(pair)) for field, *pair in ends}
+        both = pd.DataFrame({"first": own[first], "second": own[second]}).reset_index()
+        parts.append(both.assign(**names, what=what, world="labyrinth"))
+    by = ["world", *PriorName._fields, "what", "length", "num_plans"]
+    return paired_differences(pd.concat(parts), by).drop(columns="world")
 
 
 def _pairs() -> Iterator[tuple[str, PriorName, PriorName]]:
@@ -148,7 +129,7 @@ def _pairs() -> Iterator[tuple[str, PriorName, PriorName]]:
 
 def simulate(
     settings: MiceSettings, world: TabularWorld, mice_plans: Plans, finished: Callable[[str], None]
-) -> MiceResult:
+) -> tuple[pd.DataFrame, dict[PriorName, Prior], pd.DataFrame]:
     """Learn all priors and let a planner draw from each, `settings.seeds` times.
 
     Args:
@@ -156,6 +137,11 @@ def simulate(
         world: the maze; it ends at the water.
         mice_plans: what the mice did, with the node before each move as context.
         finished: is called twice, and in each repeat once for each neural prior trained and each prior planned with.
+
+    Returns:
+        The share of starts at which the water was reached, a row a repeat, prior, length and number of candidates, and
+        a row a repeat and length for the oracle; the priors of the last repeat; and a row for each source: its size,
+        and the orders that were chosen for the Markov priors.
     """
     generator = torch.Generator().manual_seed(settings.seed)
     dry = torch.tensor([node for node in range(world.num_states) if node != WATER])
@@ -184,7 +170,7 @@ def simulate(
         for length in settings.lengths:
             best = float(oracle(world, start, length, objective="return").mean())
             rows.append(ORACLE._asdict() | {"seed": repeat, "length": length, "reached": best})
-    return MiceResult(pd.DataFrame(rows).astype({"num_plans": "Int64"}), priors, learned)
+    return pd.DataFrame(rows).astype({"num_plans": "Int64"}), priors, learned
 
 
 def shares_reached(

@@ -75,17 +75,6 @@ class Source:
         """The number of contexts that a prior for this source is given."""
         return None if self.context is None else len(self.table)
 
-    def context_at(self, plans: Plans, t: int) -> Tensor | int:
-        """The context of `plans` at action t."""
-        if plans.context is None:
-            return 0
-        return plans.context[:, t] if self.context == "step" else plans.context
-
-    def make(self, kind: type[Prior]) -> Prior:
-        if kind is MarkovPrior:
-            return MarkovPrior(self.num_actions, self.order, num_contexts=self.contexts)
-        return kind(self.num_actions, num_contexts=self.contexts)
-
 
 def sources(generator: torch.Generator) -> list[Source]:
     """Sources with random tables (Dirichlet, 1/2), by which each kind of dependence is met."""
@@ -138,9 +127,10 @@ def quality(
 
 
 def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
-    prior, began = source.make(kind), time.perf_counter()
-    settings = {} if kind is MarkovPrior else {"progress": False}
-    prior.fit(training, generator=torch.Generator().manual_seed(seed), **settings)
+    chain, began = kind is MarkovPrior, time.perf_counter()
+    how: dict[str, Any] = {"order": source.order} if chain else {}
+    prior = kind(source.num_actions, num_contexts=source.contexts, **how)
+    prior.fit(training, generator=torch.Generator().manual_seed(seed), **({} if chain else {"progress": False}))
     seconds = time.perf_counter() - began
     with torch.no_grad():
         taken = prior.action_log_probs(test).double()
@@ -157,7 +147,7 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
         "excess_percent": 100 * excess / rate,
         # What maximum likelihood of so many free probabilities costs on new plans, for many plans.
         "expected_percent": 100 * free / (2 * log(2) * len(training) * (LENGTH - first)) / rate
-        if kind is MarkovPrior and not source.lag
+        if chain and not source.lag
         else None,
         "seconds": seconds,
     }
