@@ -54,7 +54,7 @@ class Starts:
         return float(gained.mean() / most.mean())
 
     def reached(self, score: Tensor) -> dict[str, float]:
-        """Of the scores of decisions, `[B, D]` or `[B]`: the normalised score, the share of optimal ones, and the mean."""
+        """Of scores of decisions, `[B, D]` or `[B]`: the normalised score, the share of optimal ones, and the mean."""
         score = score.double().view(len(self.best), -1)
         optimal = (score >= self.best[:, None] - CLOSE).double().mean()
         return {"share": self.normalised(score.mean(1)), "at_oracle": float(optimal), "score": float(score.mean())}
