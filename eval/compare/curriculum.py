@@ -7,7 +7,7 @@ import pandas as pd
 from jsonargparse.typing import PositiveInt
 
 from eval.compare.command import KINDS, Kind, TrainingStarts
-from eval.compare.figures import FORMER_NAMES, View, score_panels
+from eval.compare.figures import View, score_panels
 from eval.compare.run import Settings, curriculum_run
 from eval.worlds import runs
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
@@ -108,7 +108,7 @@ def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
         command,
         {"words": [lead]},
         keys={"grow": "rows"},
-        former_names=FORMER_NAMES,
+        former_names=runs.FORMER_NAMES,
     )
 
 

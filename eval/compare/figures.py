@@ -48,9 +48,6 @@ JITTER = 0.17
 
 POINTS = "difference in normalised score, percentage points"
 
-FORMER_NAMES = {"context": "sees"}
-"""Of columns in files, see `Document`."""
-
 Style = tuple[str, str]
 
 

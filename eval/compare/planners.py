@@ -11,7 +11,7 @@ import torch
 from matplotlib.figure import Figure
 
 from eval.compare.curves import ROLLOUTS, TEMPERATURES, Starts, worth
-from eval.compare.figures import FORMER_NAMES, View, score_panels
+from eval.compare.figures import View, score_panels
 from eval.compare.run import Contest, Contestant, Settings
 from eval.worlds import runs
 from eval.worlds.suite import TASKS
@@ -174,7 +174,7 @@ def planner_document(
     lead = runs.significance(gaps, f"Normalised scores against {baseline}")
     sections = [Section("Normalised score against model steps", figures=boxes), Section("Tables", tables=tables)]
     frames = {"rows": rows, "paired": gaps, "across": across}
-    return Document(title, lead, sections, frames, settings, command, {"words": [lead]}, former_names=FORMER_NAMES)
+    return Document(title, lead, sections, frames, settings, command, {"words": [lead]}, former_names=runs.FORMER_NAMES)
 
 
 def planner_pairs(frame: pd.DataFrame, baseline: str) -> pd.DataFrame:

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from eval.compare import figures
-from eval.compare.figures import FORMER_NAMES, POINTS, Style
+from eval.compare.figures import POINTS, Style
 from eval.compare.results import BEST, Results, grouped, kind_of
-from eval.worlds.runs import across_table, plus_minus, table_by
+from eval.worlds.runs import FORMER_NAMES, across_table, plus_minus, table_by
 from neuroprior.report.document import Column, Document, table
 from neuroprior.report.figures import transition_figure
 from neuroprior.report.page import FigureBox, Section, Table, breakable

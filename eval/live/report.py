@@ -57,7 +57,7 @@ def live_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, A
         settings,
         command,
         {"words": [lead]},
-        former_names={"context": "sees"},
+        former_names=runs.FORMER_NAMES,
     )
 
 

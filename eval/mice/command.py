@@ -20,7 +20,7 @@ from eval.mice.experiment import (
     reached_table,
     simulate,
 )
-from eval.worlds.runs import check_distinct, plus_minus, table_by
+from eval.worlds.runs import FORMER_NAMES, check_distinct, plus_minus, table_by
 from neuroprior import read_plans
 from neuroprior._files import write_json
 from neuroprior._jobs import Progress
@@ -81,7 +81,7 @@ def mice(
         asdict(settings),
         results={"seed": seed},
         keys={"mice": "rows"},
-        former_names={"context": "sees"},
+        former_names=FORMER_NAMES,
     )
     show(document, console)
     write_frames(folder, document.written)

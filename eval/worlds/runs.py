@@ -30,6 +30,9 @@ from neuroprior.report.page import Table
 MAKERS = ("gymnasium", "minigrid")
 """Packages of which another version may make other worlds."""
 
+FORMER_NAMES = {"context": "sees"}
+"""Of columns in files, see `Document`."""
+
 Seed = restricted_number_type("Seed", int, [(">=", 0), ("<", 2**40)], docstring="A seed of everything random.")
 
 
