@@ -75,7 +75,7 @@ def depth_run(run: runs.Run, settings: DepthSettings) -> dict[str, Any]:
     Returns, raises: see `eval.compare.planners.planner_run`.
     """
     task = replace(TASKS[run.world], any_prefix=True)
-    contest = Contest(task, run.seed, replace(settings, context=task.contexts[-1:]), ORDERS)
+    contest = Contest(run, task, replace(settings, context=task.contexts[-1:]), ORDERS)
     how: dict[str, Any] = {"objective": task.objective, "discount": task.discount}
     longest = settings.length
     starts = starts_of(task, contest.worlds.held_out, settings.starts, longest, contest.generator)

@@ -81,7 +81,7 @@ def planner_run(run: runs.Run, settings: PlannerSettings) -> dict[str, Any]:
         that were taken, and the `seconds` of a decision.
     """
     task = TASKS[run.world]
-    contest = Contest(task, run.seed, replace(settings, context=settings.context or task.contexts[-1:]), ORDERS)
+    contest = Contest(run, task, replace(settings, context=settings.context or task.contexts[-1:]), ORDERS)
     entries = [
         entry
         for one in contest.after_curriculum()

@@ -94,7 +94,7 @@ def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS)
         ValueError: too few plans or starts lead anywhere, or a saved prior does not fit the world.
     """
     begin, task = perf_counter(), tasks[run.world]
-    contest = Contest(task, run.seed, settings)
+    contest = Contest(run, task, settings)
     entries, growth, last = contest.exhaustive(), [], {}
     for one in contest.contestants():
         if one.length is not None:
@@ -120,7 +120,7 @@ def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS)
 
 def curriculum_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
     """Extend the horizons of all priors in one seed's worlds; after every round, plan with plans of every length."""
-    contest = Contest(tasks[run.world], run.seed, settings)
+    contest = Contest(run, tasks[run.world], settings)
     growth = [
         contest.curriculum_entry(one, length)
         for one in contest.contestants()
@@ -152,10 +152,10 @@ class Contestant(NamedTuple):
 class Contest:
     """The worlds of a seed, the plans that are collected there, and the starts from which priors are compared."""
 
-    def __init__(self, task: Task, seed: int, settings: Settings, orders: Sequence[int] = ORDERS) -> None:
-        self.task, self.settings, self.orders = task, settings, orders
-        self.generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
-        self.worlds = task.worlds(settings.seed * 10_000 + seed)
+    def __init__(self, run: Run, task: Task, settings: Settings, orders: Sequence[int] = ORDERS) -> None:
+        self.run, self.task, self.settings, self.orders = run, task, settings, orders
+        self.generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + run.seed)
+        self.worlds = task.worlds(settings.seed * 10_000 + run.seed)
         self.longer = (settings.lengths or task.lengths)[: settings.rounds]
         self.rounds, self.lengths = len(self.longer), tuple(sorted({task.depth, *self.longer}))
         self.training_starts = settings.training_starts * task.start_factor
@@ -176,7 +176,7 @@ class Contest:
         """All priors, each after every round of its curriculum; the object is the same, and goes on learning."""
         yield Contestant("uniform", "none", UniformPrior(self.worlds.training.num_actions), 0, None)
         for folder in self.settings.priors:
-            prior = load_for(folder, self.task.name, self.task.num_actions, self.task.action_names)
+            prior = load_for(folder, self.run.world, self.task.num_actions, self.task.action_names)
             context = next(name for name, per in CONTEXTS.items() if per == prior.context_per)
             yield Contestant(folder, context, prior, 0, None)
         for context in self.settings.context or self.task.contexts:

@@ -164,4 +164,5 @@ def _by_prior(rows: pd.DataFrame, by: str, cells: Sequence[str], title: str, cap
     """A row a prior (or a pair of them) and a column for each value of `by`."""
     context, prior = rows.context.str.replace("moves", "none"), rows.prior.str.replace("transformer", "transf.")
     names = {"learned from": "learned_from", "prior": "prior", "context": "context"}
+    cells = [cell.replace(" ", "") for cell in cells]  # that names fit beside them into 80 columns
     return table_by(rows.assign(context=context, prior=prior), names, by, cells, caption, title)

@@ -196,13 +196,14 @@ def table_by(
         caption, title: see `Table`.
         timed: a number in `by`: of its rows the milliseconds of a decision are shown in a last column.
     """
-    wide = rows.assign(cell=cells).pivot_table("cell", list(names.values()), by, aggfunc="first", sort=False)
-    wide = wide.sort_index(axis=1).rename(columns="{:,}".format)
+    labels = list(names.values())
+    wide = rows.assign(cell=cells).pivot_table("cell", labels, by, aggfunc="first").rename(columns="{:,}".format)
     columns = dict(names) | {number: number for number in wide.columns}
     if timed is not None:
-        times = rows[rows[by] == timed].set_index(list(names.values()))["seconds_per_decision"]
+        times = rows[rows[by] == timed].set_index(labels)["seconds_per_decision"]
         wide, columns = wide.assign(ms=1000 * times), columns | {"ms": "ms:.3g"}
-    return table(wide.reset_index(), columns, caption, title, "l" * len(names) + "r" * (len(columns) - len(names)))
+    in_order = rows[labels].drop_duplicates().merge(wide.reset_index(), on=labels)
+    return table(in_order, columns, caption, title, "l" * len(names) + "r" * (len(columns) - len(names)))
 
 
 def difference_table(

@@ -22,7 +22,6 @@ from tests.support.sources import refuses, seeded
 
 SMALL = Settings((4, 16), ("markov", "gru"), ("none", "per-step"), 1, 3, 4, 30, 0)
 TINY = Task(
-    "tiny",
     ("left", "right", "forward"),
     "a small maze",
     partial(from_seeds, make=maze, height=5, width=5, num_layouts=3, egocentric=True, view=1),
@@ -33,7 +32,7 @@ TINY = Task(
 
 
 def run_in(task: Task, seed: int, settings: Settings) -> dict:
-    return compare_run(Run(task.name, seed), settings, {task.name: task})
+    return compare_run(Run("tiny", seed), settings, {"tiny": task})
 
 
 def bandit(actions: int, probability: float | None = None) -> TabularWorld:
@@ -50,7 +49,7 @@ def bandit(actions: int, probability: float | None = None) -> TabularWorld:
 
 def one_step(world: TabularWorld) -> Task:
     names = tuple(str(action) for action in range(world.num_actions))
-    return Task("bandit", names, "one step", lambda seed: Worlds(world, world, world), 1, (1,), "return")
+    return Task(names, "one step", lambda seed: Worlds(world, world, world), 1, (1,), "return")
 
 
 def test_the_curve_of_a_lottery():
@@ -188,7 +187,7 @@ def test_numbers_of_states_are_no_initial_context():
     """Where other states to start from are held out, the number of a start says nothing."""
     settings = replace(SMALL, kinds=("markov",), context=("none", "initial", "per-step"), rounds=0)
     for task, contexts in ((TASKS["cliff"], {"none", "per-step"}), (TINY, {"none", "initial", "per-step"})):
-        assert {one.context for one in Contest(task, 0, settings, orders=(0,)).contestants()} == contexts
+        assert {one.context for one in Contest(Run("tiny", 0), task, settings, orders=(0,)).contestants()} == contexts
 
 
 def test_saved_priors_are_compared_as_they_are(tmp_path):
@@ -213,7 +212,6 @@ SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name
 def test_worlds_of_the_suite(name):
     """No two of the three worlds are the same, actions are named, and something can be reached."""
     task = TASKS[name]
-    assert task.name == name
     worlds = task.worlds(3)
     for world in worlds:
         assert world.num_actions == task.num_actions
@@ -252,7 +250,7 @@ def test_temperatures_are_chosen_where_priors_did_not_learn(monkeypatch):
 
 def test_the_documentation_describes_the_worlds():
     text = (Path(__file__).parents[3] / "docs" / "compare.md").read_text()
-    for task in TASKS.values():
+    for name, task in TASKS.items():
         lengths, contexts = ", ".join(map(str, task.lengths)), ", ".join(task.contexts)
-        row = (f"`{task.name}`", task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
+        row = (f"`{name}`", task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
         assert f"| {' | '.join(map(str, row))} |" in text
