@@ -74,7 +74,7 @@ def grow(
 
 def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
     """The tables and figures of the results of `curriculum_run`."""
-    frame = runs.frame_of(results, "growth").rename(columns={"share": "oracle_share"})
+    frame = runs.frame_of(results, "curriculum").rename(columns={"share": "oracle_share"})
     rows = runs.seed_means(frame, [*PRIOR, "round", "length", "num_plans"], "oracle_share")
     pairs = first_and_last(frame)
     gaps, across = runs.paired_differences(pairs, PRIOR), runs.across_worlds(pairs, PRIOR[1:])

@@ -245,7 +245,7 @@ class Results:
     def curriculum(self) -> pd.DataFrame:
         """The normalised score after each round of the horizon curriculum: a row a world, prior, round and length."""
         names = ["world", "prior", "context", "round", "length", "num_plans"]
-        entries = frame_of(self.runs, "growth").reindex(columns=[*names, "share"])
+        entries = frame_of(self.runs, "curriculum").reindex(columns=[*names, "share"])
         return seed_means(entries, names, "share").rename(columns={"share": "oracle_share"})
 
     @cached_property

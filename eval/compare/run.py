@@ -95,10 +95,10 @@ def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS)
     """
     begin, task = perf_counter(), tasks[run.world]
     contest = Contest(run, task, settings)
-    entries, growth, last = contest.exhaustive(), [], {}
+    entries, rounds, last = contest.exhaustive(), [], {}
     for one in contest.contestants():
         if one.length is not None:
-            growth.append(contest.curriculum_entry(one, one.length))
+            rounds.append(contest.curriculum_entry(one, one.length))
         if one.rounds in (0, contest.rounds):
             entries.append(contest.entry(one))
         if one.context == "none":
@@ -110,7 +110,7 @@ def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS)
         "num_starts": settings.starts,
         "budgets": settings.budgets,
         "entries": entries,
-        "growth": growth,
+        "curriculum": rounds,
         "action_names": task.action_names,
         "transitions": {label: transitions(prior, world, generator) for label, prior in last.items()},
         "plans": drawn_plans(last, contest.starts, generator) if run.seed == 0 else None,
@@ -121,12 +121,12 @@ def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS)
 def curriculum_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
     """Extend the horizons of all priors in one seed's worlds; after every round, plan with plans of every length."""
     contest = Contest(run, tasks[run.world], settings)
-    growth = [
+    curriculum = [
         contest.curriculum_entry(one, length)
         for one in contest.contestants()
         for length in (contest.lengths if one.length is not None else ())
     ]
-    return run._asdict() | {"about": contest.task.about, "growth": growth}
+    return run._asdict() | {"about": contest.task.about, "curriculum": curriculum}
 
 
 def with_context(plans: Plans, context: Context) -> Plans:

@@ -77,7 +77,7 @@ def live_frame(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 def live_rows(frame: pd.DataFrame) -> pd.DataFrame:
     """Rewards in 100 steps, a row a world and condition: `reward` with its interval over seeds, `after` and `late`.
 
-    `oracle_share`: the reward as a share of the oracle's.
+    `oracle_share`: the reward in shares of the oracle's reward.
     """
     rows = runs.seed_means(frame, ["world", *CONDITION], "reward", ["after", "late", "model_steps", "seconds"])
     best = rows[rows["prior"] == "oracle"].set_index("world")["reward"].clip(lower=1e-12)

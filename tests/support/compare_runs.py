@@ -27,7 +27,7 @@ def entry(prior: str | None, share: Sequence[float], context: str = "none", roun
 
 def run(world: str, seed: int, entries: Sequence[dict], **more: Any) -> dict[str, Any]:
     made = {"world": world, "seed": seed, "about": f"a made-up world called {world}", "length": 8, "num_starts": 32}
-    made |= {"seconds": 1.5, "budgets": list(BUDGETS), "entries": list(entries), "growth": []}
+    made |= {"seconds": 1.5, "budgets": list(BUDGETS), "entries": list(entries), "curriculum": []}
     return made | {"action_names": ACTIONS, "plans": None} | more
 
 
@@ -51,7 +51,7 @@ def worlds(
                         share = curve(worth * 2 ** ((way != "none") + (after > 0)), bumps[prior])
                         bits = 2.0 - math.log2(worth) / 8 - 0.1 * (way != "none") + bumps[prior]
                         entries.append(entry(prior, share, way, after, bits=bits, actions=4000))
-            growth = [
+            curriculum = [
                 {"prior": prior, "context": way, "round": one, "length": 4 + 2 * one, "num_plans": 256, "share": share}
                 for prior, worth in times.items()
                 for way in context
@@ -60,7 +60,7 @@ def worlds(
             pictures = {"transitions": {prior: rng.dirichlet(np.ones(4), 4).tolist() for prior in times}}
             if seed == 0:
                 pictures["plans"] = drawing(rng, list(times))
-            made.append(run(world, seed, entries, growth=growth if rounds else [], **pictures))
+            made.append(run(world, seed, entries, curriculum=curriculum if rounds else [], **pictures))
     return made
 
 

@@ -24,7 +24,7 @@ def made_up(run: Run, settings: Settings) -> dict[str, Any]:
         for prior in PRIORS
     ]
     lengths = settings.lengths or (4, 8, 12)
-    growth = [
+    curriculum = [
         {"prior": prior, "context": "none", "round": number, "length": length, "num_plans": 64, "share": draw()}
         for prior in PRIORS[1:]
         for number in range(settings.rounds + 1)
@@ -39,7 +39,7 @@ def made_up(run: Run, settings: Settings) -> dict[str, Any]:
         "seconds": 1.5,
         "budgets": budgets,
         "entries": entries,
-        "growth": growth,
+        "curriculum": curriculum,
         "action_names": None,
     }
 

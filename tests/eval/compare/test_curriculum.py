@@ -13,12 +13,12 @@ from tests.support.sources import refuses
 
 def result(seed: int, share, context="none", world="maze") -> dict:
     """A run with one prior, whose normalised score after each round at each length is `share(seed, round, length)`."""
-    growth = [
+    curriculum = [
         {"prior": "gru", "context": context, "round": turn, "length": n, "num_plans": 64, "share": share(seed, turn, n)}
         for turn in (0, 1, 2)
         for n in (4, 8)
     ]
-    return {"world": world, "seed": seed, "growth": growth}
+    return {"world": world, "seed": seed, "curriculum": curriculum}
 
 
 def document(results):

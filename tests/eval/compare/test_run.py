@@ -142,8 +142,8 @@ def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
         assert 0 < one["share"][0] <= one["share"][-1] <= 1 + 1e-12
         assert one["model_steps"] == [None, None, 20, None, 80]
         assert 0 < one["bits"] < 3
-    growth = [(one["prior"], one["context"], one["round"], one["length"]) for one in run["growth"]]
-    assert growth == [(p, s, r, (3, 5)[r]) for s in ("none", "per-step") for p in fitted for r in (0, 1)]
+    curriculum = [(one["prior"], one["context"], one["round"], one["length"]) for one in run["curriculum"]]
+    assert curriculum == [(p, s, r, (3, 5)[r]) for s in ("none", "per-step") for p in fitted for r in (0, 1)]
     for matrix in run["transitions"].values():
         assert torch.allclose(torch.tensor(matrix).sum(1), torch.ones(3))
     assert set(run["plans"]["paths"]) == {"uniform", "markov-2", "gru"}
@@ -195,14 +195,16 @@ def test_saved_priors_are_compared_as_they_are(tmp_path):
     folder = str(save(MarkovPrior(3, 1).fit(plans), tmp_path / "mine"))
     found = run_in(TINY, 0, replace(SMALL, kinds=(), priors=(folder,)))
     assert [one["prior"] for one in found["entries"]] == [None, "uniform", folder]
-    assert found["growth"] == []
+    assert found["curriculum"] == []
 
 
 def test_the_curriculum_alone_with_lengths_of_its_own():
     settings = replace(SMALL, kinds=("markov",), context=("none",), rounds=2, lengths=(4, 6), num_plans=(8,))
     found = curriculum_run(Run("tiny", 0), settings, {"tiny": TINY})
-    assert {(one["round"], one["length"]) for one in found["growth"]} == {(r, n) for r in range(3) for n in (3, 4, 6)}
-    assert {one["num_plans"] for one in found["growth"]} == {8}
+    assert {(one["round"], one["length"]) for one in found["curriculum"]} == {
+        (r, n) for r in range(3) for n in (3, 4, 6)
+    }
+    assert {one["num_plans"] for one in found["curriculum"]} == {8}
 
 
 SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name.startswith("minigrid")]
