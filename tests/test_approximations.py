@@ -40,7 +40,7 @@ def test_more_tilings_and_smaller_tiles_come_closer(peak):
     assert by_tilings[0] > by_tilings[1] > by_tilings[2] > 0
     by_size = [rms(tile_approximation(values, coordinates, size), values) for size in (8, 4, 2)]
     assert by_size[0] > by_size[1] > by_size[2] > 0
-    # Tilings that no cell can tell from those before, and are linearly dependent on them, change nothing.
+    # Tilings that are linear combinations of earlier ones change nothing.
     dependent = tile_approximation(values, coordinates, 4, 8)
     torch.testing.assert_close(dependent, tile_approximation(values, coordinates, 4, 4))
 

@@ -80,36 +80,28 @@ def bench(
     for each in tables(found, settings):
         console.print(printed(each.title, each))
     figures = {"peers": peers_figure, "sizes": sizes_figure}
-    write_figures(folder, {part: draw(found[part]) for part, draw in figures.items() if part in found})
+    write_figures(folder, {part: draw(pd.DataFrame(found[part])) for part, draw in figures.items() if part in found})
     console.print(f"written to {folder}")
 
 
 def tables(found: dict[str, Rows], settings: dict[str, Any]) -> list[Table]:
     """The tables of what was measured: rows by part."""
-    shown: dict[str, Callable[[pd.DataFrame], Table]] = {
-        "peers": partial(_peers, settings),
-        "sizes": _sizes,
-        "limits": _limits,
-        "gpu": _gpu,
-        "imports": _imports,
-    }
+    shown: dict[str, Callable[[pd.DataFrame], Table]]
+    shown = {"peers": partial(_peers, settings), "sizes": _sizes, "limits": _limits, "gpu": _gpu, "imports": _imports}
     return [make(pd.DataFrame(found[part])) for part, make in shown.items() if part in found]
 
 
 def _peers(settings: dict[str, Any], rows: pd.DataFrame) -> Table:
     met = "" if settings["scale"] < 1 else (rows.ratio >= rows.goal).map({True: "yes", False: "no"})
-    columns: dict[str, Column] = {"job: peer": "name", "seconds": "seconds:.3g"}
-    columns |= {heading: _short(name) for heading, name in RATIO.items()} | {"goal": _short("goal"), "met": "met"}
+    columns: dict[str, Column] = {"job: peer": "name", "seconds": "seconds:.3g", "ratio": _short("ratio")}
+    columns |= {"min": _short("low"), "max": _short("high"), "goal": _short("goal"), "met": "met"}
     title = f"Speed with {settings['threads']} threads of torch (ratio: peer's time / ours)"
     return table(rows.assign(name=rows.job + ": " + rows.peer, met=met), columns, "Medians; least and most.", title)
 
 
-RATIO = {"ratio": "ratio", "min": "low", "max": "high"}
-
-
 def _imports(rows: pd.DataFrame) -> Table:
-    columns: dict[str, Column] = {"": "what", "seconds": "seconds:.2f", "torch, s": "torch_seconds:.2f"}
-    columns |= {heading: f"{name}:.3f" for heading, name in RATIO.items()} | {"goal": "goal"}
+    columns = {"": "what", "seconds": "seconds:.2f", "torch, s": "torch_seconds:.2f", "ratio": "ratio:.3f"}
+    columns |= {"min": "low:.3f", "max": "high:.3f", "goal": "goal"}
     return table(rows.assign(what="import neuroprior:"), columns, title="Time to import (ratio: to that of torch)")
 
 
@@ -117,7 +109,7 @@ def _sizes(rows: pd.DataFrame) -> Table:
     """The smallest and the largest of each kind."""
     kinds = rows.groupby("growing", sort=False)
     ends = kinds.first().add_suffix("_first").join(kinds.last().add_suffix("_last")).reset_index()
-    ends["slope"] = [sizes.slope(rows[rows.growing == kind].to_dict("records")) for kind in ends.growing]
+    ends["slope"] = [sizes.slope(own) for _, own in kinds]
     columns: dict[str, Column] = {
         "size": "growing",
         "from": "size_first:,",
@@ -128,26 +120,20 @@ def _sizes(rows: pd.DataFrame) -> Table:
         "peak\nMiB": _mebi("peak_bytes_last"),
         "result\nMiB": _mebi("result_bytes_last"),
     }
-    caption = " ".join(f"{end.growing}: {end.about_first}." for end in ends.itertuples())
+    caption = " ".join(ends.growing + ": " + ends.about_first + ".")
     caption += " peak: of the process at the largest size, beyond what it held before."
     title = "Cost against size: time increases as size to the power of `slope` over the last decades"
     return table(ends, columns, caption, title)
 
 
 def _limits(rows: pd.DataFrame) -> Table:
-    rates = {name: rows[name] / rows.seconds / 1e9 for name in ("moved", "operations")}
-    columns: dict[str, Column] = {
-        "work": "work",
-        "seconds": "seconds:.3g",
-        "GB/s": _rate("moved"),
-        "Gop/s": _rate("operations"),
-        "share": "share:.1%",
-        "limit": "bound",
-    }
+    rates = {name: (rows[name] / rows.seconds / 1e9).map(_two_digits) for name in ("moved", "operations")}
+    columns = {"work": "work", "seconds": "seconds:.3g", "GB/s": "moved", "Gop/s": "operations"}
     caption = (
         "GB/s: bytes that have to be moved to or from memory at the least; Gop/s: operations of matrix products."
         " copy and product: what the machine does at its best, and so the limit."
     )
+    columns |= {"share": "share:.1%", "limit": "bound"}
     return table(rows.assign(**rates), columns, caption, "Share of the machine's limit")
 
 
@@ -160,8 +146,8 @@ def _mebi(name: str) -> Column:
     return lambda row: "" if pd.isna(row[name]) else f"{row[name] / 2**20:,.0f}"
 
 
-def _rate(name: str) -> Column:
-    return lambda row: f"{row[name]:.2g}" if row[name] < 10 else f"{row[name]:.0f}"
+def _two_digits(rate: float) -> str:
+    return f"{rate:.2g}" if rate < 10 else f"{rate:.0f}"
 
 
 def _short(name: str) -> Column:

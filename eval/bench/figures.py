@@ -1,11 +1,11 @@
 """The figures of `python -m eval bench`."""
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from eval.bench.sizes import slope
-from eval.bench.timing import Rows
-from neuroprior.report.drawing import FEWER, MORE, at_edges, names_down, panels
+from neuroprior.report.drawing import FEWER, MORE, at_edges, dot, names_down, panels
 
 ACROSS = 4
 """Panels beside each other."""
@@ -14,15 +14,15 @@ MEBI = 2**20
 """Bytes; no less is drawn."""
 
 
-def peers_figure(rows: Rows) -> Figure:
+def peers_figure(rows: pd.DataFrame) -> Figure:
     """How many times as long each peer takes, minimum to maximum; a line across marks the goal."""
     figure, (axes,) = panels(1, 1, (8, 1 + 0.3 * len(rows)))
-    for at, row in enumerate(reversed(rows)):
-        color = FEWER if row["ratio"] >= row["goal"] else MORE
-        axes.plot([row["low"], row["high"]], [at, at], color=color, lw=2.2, solid_capstyle="butt")
-        axes.plot(row["ratio"], at, "o", color=color)
-        axes.plot([row["goal"]] * 2, [at - 0.35, at + 0.35], color="black", lw=1.2)
-    names_down(axes, [f"{row['job']}: {row['peer']}" for row in reversed(rows)])
+    rows = rows[::-1]
+    estimates = rows[["ratio", "low", "high"]].to_numpy()
+    for at, (estimate, goal) in enumerate(zip(estimates, rows.goal, strict=True)):
+        dot(axes, at, estimate, FEWER if estimate[0] >= goal else MORE)
+        axes.plot([goal] * 2, [at - 0.35, at + 0.35], color="black", lw=1.2)
+    names_down(axes, list(rows.job + ": " + rows.peer))
     axes.axvline(1, color="black", lw=0.6, ls=":")
     axes.set_xscale("log")
     axes.spines[["top", "right"]].set_visible(False)
@@ -30,31 +30,28 @@ def peers_figure(rows: Rows) -> Figure:
     return figure
 
 
-def sizes_figure(rows: Rows) -> Figure:
+def sizes_figure(rows: pd.DataFrame) -> Figure:
     """Seconds and memory against size, a panel for each size that increases."""
-    kinds = list(dict.fromkeys(row["growing"] for row in rows))
-    figure, cells = panels(-(-len(kinds) // ACROSS), ACROSS, (11, 2.7 * -(-len(kinds) // ACROSS)))
-    seconds = _decades([row["seconds"] for row in rows])
-    memory = _decades([max(row["peak_bytes"] or 0, MEBI) for row in rows])
-    for axes, growing in zip(cells, kinds, strict=False):
-        own = [row for row in rows if row["growing"] == growing]
-        size = np.array([row["size"] for row in own])
-        axes.loglog(size, [row["seconds"] for row in own], "o-", color=FEWER, ms=4)
-        axes.set_ylim(seconds)
+    kinds = rows.growing.nunique()
+    figure, cells = panels(-(-kinds // ACROSS), ACROSS, (11, 2.7 * -(-kinds // ACROSS)))
+    rows = rows.assign(peak=rows.peak_bytes.clip(lower=MEBI))
+    for axes, (growing, own) in zip(cells, rows.groupby("growing", sort=False), strict=False):
+        axes.loglog(own["size"], own.seconds, "o-", color=FEWER, ms=4)
+        axes.set_ylim(_decades(rows.seconds))
         power = slope(own)
-        axes.set_title(growing if power is None else f"{growing}, slope {power:.2f}", fontsize=10)
-        if own[0]["peak_bytes"] is not None:
+        axes.set_title(f"{growing}" if power is None else f"{growing}, slope {power:.2f}", fontsize=10)
+        if own.peak.notna().all():
             right = axes.twinx()
-            right.loglog(size, [max(row["peak_bytes"], MEBI) for row in own], "s--", color=MORE, ms=3, lw=1)
-            right.set_ylim(memory)
+            right.loglog(own["size"], own.peak, "s--", color=MORE, ms=3, lw=1)
+            right.set_ylim(_decades(rows.peak))
             right.tick_params(axis="y", colors=MORE)
-            if axes is cells[min(len(kinds), ACROSS) - 1]:
+            if axes is cells[min(kinds, ACROSS) - 1]:
                 right.set_ylabel("peak memory, bytes", color=MORE)
-    at_edges(cells, len(kinds), ACROSS, "size", "seconds")
+    at_edges(cells, kinds, ACROSS, "size", "seconds")
     return figure
 
 
-def _decades(values: list[float]) -> tuple[float, float]:
+def _decades(values: pd.Series) -> tuple[float, float]:
     """Powers of ten around them."""
     low, high = np.log10([min(values), max(values)])
     return 10 ** np.floor(low), 10 ** np.ceil(high)

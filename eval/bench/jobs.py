@@ -9,6 +9,7 @@ from itertools import product
 from statistics import median
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -34,38 +35,23 @@ FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 
 @dataclass(frozen=True)
 class Peer:
-    """What a user would take in place of the library.
+    """What a user would take in place of the library."""
 
-    Attributes:
-        name: as in the tables.
-        make: prepares it; what it returns is timed.
-        goal: how many times as long it should take as the library.
-        share: of the job's work that it does, for peers that would take minutes for all of it.
-        needs: the package without which it is left out; None: it is always there.
-    """
-
-    name: str
-    make: Callable[[], Run]
-    goal: float
-    share: float = 1.0
-    needs: str | None = None
+    name: str  # as in the tables
+    make: Callable[[], Run]  # prepares it; what it returns is timed
+    goal: float  # how many times as long it should take as the library
+    share: float = 1.0  # of the job's work that it does, for peers that would take minutes for all of it
+    needs: str | None = None  # the package without which it is left out
 
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work that is timed.
+    """A piece of work that is timed."""
 
-    Attributes:
-        about: as in the tables.
-        make: prepares it on a device; what it returns is timed.
-        peers: the baselines in the same run, which run on the CPU alone.
-        needs: the package without which it is left out; None: it is always there.
-    """
-
-    about: str
-    make: Callable[[torch.device], Run]
-    peers: tuple[Peer, ...]
-    needs: str | None = None
+    about: str  # as in the tables
+    make: Callable[[torch.device], Run]  # prepares it on a device; what it returns is timed
+    peers: tuple[Peer, ...]  # the baselines in the same run, which run on the CPU alone
+    needs: str | None = None  # the package without which it is left out
 
 
 def missing(package: str | None) -> bool:
@@ -80,14 +66,9 @@ def against_peers(
     say: Callable[[str], Any],
     missing: Callable[[str | None], bool] = missing,
 ) -> Iterator[dict[str, Any]]:
-    """A row for each peer of a job: how many times as long it takes.
+    """A row for each peer of a job: how many times as long it takes, timed in turn with it.
 
-    Args:
-        name: of the job, in `JOBS`.
-        scale: share of the job that is done.
-        repetitions: how often it is timed, in turn with its peers.
-        say: is called with what is left out, and why.
-        missing: whether a package is not installed.
+    `say` is called with what is left out, because a package is missing.
     """
     job = JOBS[name](scale)
     if missing(job.needs):
@@ -105,17 +86,9 @@ def against_peers(
         torch.set_num_threads(threads)  # packages change it when they are loaded
         times = [(seconds(ours), seconds(theirs) / peer.share) for _ in range(repetitions)]
         own, other = map(list, zip(*times, strict=True))
-        yield {
-            "job": name,
-            "about": job.about,
-            "setup_seconds": setup,
-            "seconds": median(own),
-            "peer": peer.name,
-            "peer_seconds": median(other),
-            "share": peer.share,
-            **compared(own, other),
-            "goal": peer.goal,
-        }
+        row = {"job": name, "about": job.about, "setup_seconds": setup, "seconds": median(own)}
+        row |= {"peer": peer.name, "peer_seconds": median(other), "share": peer.share}
+        yield row | compared(own, other) | {"goal": peer.goal}
 
 
 def on_device(name: str, device: torch.device, scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
@@ -131,13 +104,10 @@ def on_device(name: str, device: torch.device, scale: float, repetitions: int) -
 
     if cuda:
         torch.cuda.reset_peak_memory_stats(device)
-    yield {
-        "job": name,
-        "about": job.about,
-        "device": torch.cuda.get_device_name(device) if cuda else device.type,
-        "seconds": median_seconds(finished, repetitions),
-        "peak_bytes": torch.cuda.max_memory_allocated(device) if cuda else None,
-    }
+    row: dict[str, Any] = {"job": name, "about": job.about}
+    row |= {"device": torch.cuda.get_device_name(device) if cuda else device.type}
+    row |= {"seconds": median_seconds(finished, repetitions)}
+    yield row | {"peak_bytes": torch.cuda.max_memory_allocated(device) if cuda else None}
 
 
 def sample_short(scale: float) -> Job:
@@ -185,7 +155,7 @@ def sample_markov(scale: float) -> Job:
         f"sample {number:,} plans of length 8, Markov-2",
         lambda device: partial(prior.to(device).sample, number, 8),
         (
-            Peer("numpy", lambda: partial(peers.numpy_sample, *tables, number, 8), 20),
+            Peer("numpy", lambda: partial(peers.numpy_sample, *tables, number, 8, np.random.default_rng(0)), 20),
             Peer("pomegranate", pomegranate, 20, few / number, "pomegranate"),
         ),
     )
@@ -296,16 +266,7 @@ def quickest(
     close: Callable[[nn.Module], bool],
     clock: Callable[[], float] = time.perf_counter,
 ) -> Run:
-    """The training that comes close enough in the least time.
-
-    Args:
-        train: trains a model; takes batch size, learning rate and number of gradient steps.
-        close: whether a model is close enough.
-        clock: the time in seconds.
-
-    Raises:
-        ValueError: none is.
-    """
+    """The training, by batch size, learning rate and number of steps, that comes close enough in the least time."""
     settings, numbers = list(product((64, 256, 1024), (1e-3, 3e-3, 1e-2))), (25, 50, 100, 200, 400, 800)
     train(*settings[0], numbers[0])  # the first run is slow
     enough: dict[tuple[int, float, int], float] = {}
@@ -369,17 +330,11 @@ def decide(scale: float) -> Job:
 
 
 JOBS: dict[str, Callable[[float], Job]] = {
-    "sample_short": sample_short,
-    "sample_long": sample_long,
-    "sample_gru": sample_gru,
-    "sample_markov": sample_markov,
-    "fit_markov": fit_markov,
-    "fit_tree": fit_tree,
-    "evaluate": evaluate,
-    "table_1": table_1,
-    "train": train,
-    "shoot": shoot,
-    "decide": decide,
+    make.__name__: make
+    for make in (
+        *(sample_short, sample_long, sample_gru, sample_markov, fit_markov, fit_tree),
+        *(evaluate, table_1, train, shoot, decide),
+    )
 }
 """By name; each makes its job at a scale: 1 is the size of the goals."""
 

@@ -20,27 +20,36 @@ FLOAT, INTEGER, ACTION = 4, 8, 1
 
 @dataclass(frozen=True)
 class Work:
-    """What is timed, with the least that it has to do.
+    """What is timed, with the least that it has to do."""
 
-    Attributes:
-        about: as in the tables.
-        run: does it.
-        moved: bytes that have to be read from memory or written there, once each; what fits a cache is not counted.
-        operations: multiplications and additions of matrices.
-    """
-
-    about: str
+    about: str  # as in the tables
     run: Run
-    moved: int
-    operations: int = 0
+    moved: int  # bytes that have to be read or written in memory, once each; what fits a cache is not counted
+    operations: int = 0  # multiplications and additions of matrices
 
 
 def works(scale: float) -> Iterator[Work]:
     """Trying plans, and sampling by prefix tree and plan by plan; each is made when its turn comes."""
-    yield _evaluate(scale)
-    yield _tree_markov(scaled(2_560_000, scale))
-    yield _tree_transformer(scaled(2_560_000, scale))
-    yield _plan_by_plan(scaled(8192, scale))
+    job, plans = JOBS["evaluate"](scale), scaled(10_000, scale) * 256
+    # Plans are read, rewards and final states written; the tables of a small world fit any cache.
+    yield Work(job.about, job.make(torch.device("cpu")), plans * (8 * (ACTION + FLOAT) + INTEGER))
+    number = scaled(2_560_000, scale)
+    about = f"sample {number:,} plans of length 8 by prefix tree"
+    chain = MarkovPrior(4, 2).fit(torch.randint(4, (1000, 16), generator=torch.Generator().manual_seed(0)))
+    yield Work(f"{about}, Markov-2", partial(chain.sample, number, 8, method="tree"), number * 8 * ACTION)
+    prior = TransformerPrior(4)
+    products = sum(layer.weight.numel() for layer in prior.modules() if isinstance(layer, torch.nn.Linear))
+    # One token for each prefix, at most.
+    attention = 2 * prior.num_layers * prior.width
+    operations = sum(2 * min(4**t, number) * (products + attention * (t + 1)) for t in range(8))
+    run = partial(prior.sample, number, 8, method="tree")
+    yield Work(f"{about}, transformer", run, number * 8 * ACTION, operations)
+    gru, number, length = GRUPrior(4, lags=1), scaled(8192, scale), 64
+    width, steps = gru.hidden_size, number * length
+    # The hidden state of each plan is read and written at each step, and multiplied; an input is a row of a table.
+    moved, operations = steps * (2 * width * FLOAT + ACTION), 2 * steps * width * (3 * width + gru.num_actions)
+    about = f"sample {number:,} plans of length {length} plan by plan, GRU"
+    yield Work(about, partial(gru.sample, number, length, method="ancestral"), moved, operations)
 
 
 def measured(
@@ -50,11 +59,6 @@ def measured(
 
     The limit is the time that the bytes, or the operations, would take at the machine's measured rates, whichever is
     longer (the roofline: Williams, Waterman and Patterson 2009).
-
-    Args:
-        works: what is measured.
-        repetitions: how often each is timed.
-        timed: how long work takes.
     """
     copied, factor = torch.zeros(COPIED // FLOAT), torch.randn(SIDE, SIDE)
     target, product = torch.empty_like(copied), torch.empty_like(factor)
@@ -70,38 +74,3 @@ def measured(
         bound = max(least, key=lambda what: least[what])
         row = {"work": work.about, "seconds": seconds, "moved": work.moved, "operations": work.operations}
         yield row | {"share": least[bound] / seconds, "bound": bound}
-
-
-def _evaluate(scale: float) -> Work:
-    """Plans are read, rewards and final states written; the tables of a small world fit any cache."""
-    job, plans = JOBS["evaluate"](scale), scaled(10_000, scale) * 256
-    return Work(job.about, job.make(torch.device("cpu")), plans * (8 * (ACTION + FLOAT) + INTEGER))
-
-
-def _tree_markov(number: int) -> Work:
-    """Plans are written."""
-    prior = MarkovPrior(4, 2).fit(torch.randint(4, (1000, 16), generator=torch.Generator().manual_seed(0)))
-    about = f"sample {number:,} plans of length 8 by prefix tree, Markov-2"
-    return Work(about, partial(prior.sample, number, 8, method="tree"), number * 8 * ACTION)
-
-
-def _tree_transformer(number: int) -> Work:
-    """One token for each prefix, at most; plans are written."""
-    prior = TransformerPrior(4)
-    products = sum(layer.weight.numel() for layer in prior.modules() if isinstance(layer, torch.nn.Linear))
-    operations = 0
-    for before in range(8):
-        attention = 2 * prior.num_layers * prior.width * (before + 1)
-        operations += 2 * min(4**before, number) * (products + attention)
-    about = f"sample {number:,} plans of length 8 by prefix tree, transformer"
-    return Work(about, partial(prior.sample, number, 8, method="tree"), number * 8 * ACTION, operations)
-
-
-def _plan_by_plan(number: int) -> Work:
-    """The hidden state of each plan is read and written at each step, and multiplied; an input is a row of a table."""
-    prior, length = GRUPrior(4, lags=1), 64
-    width = prior.hidden_size
-    moved = number * length * (2 * width * FLOAT + ACTION)
-    about = f"sample {number:,} plans of length {length} plan by plan, GRU"
-    run = partial(prior.sample, number, length, method="ancestral")
-    return Work(about, run, moved, 2 * number * length * width * (3 * width + prior.num_actions))

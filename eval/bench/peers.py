@@ -18,18 +18,16 @@ from eval.bench.timing import Run
 Array = NDArray[Any]
 
 
-def numpy_sample(probs: Array, follow: Array, start: int, num_plans: int, length: int, seed: int = 0) -> Array:
+def numpy_sample(
+    probs: Array, follow: Array, start: int | Array, num_plans: int, length: int, generator: np.random.Generator
+) -> Array:
     """Plans `[N, L]` of a Markov chain, vectorised over plans, by inverse CDF a step.
 
-    Args:
-        probs: `[H, A]`: of each action after each history.
-        follow: `[H, A]`: the history after an action.
-        start: the history of no action.
-        num_plans, length, seed: N, L, and of numpy's generator.
+    `probs [H, A]` are those of each action after each history, `follow [H, A]` the history after an action; `start` is
+    the history of no action, or one for each plan.
     """
-    generator = np.random.default_rng(seed)
     edges = probs.cumsum(1)[:, :-1]
-    node = np.full(num_plans, start)
+    node = np.broadcast_to(start, num_plans)
     plans = np.empty((num_plans, length), np.uint8)
     for t in range(length):
         action = (generator.random((num_plans, 1)) > edges[node]).sum(1)
@@ -54,11 +52,7 @@ def numpy_add_at(plans: Array, num_actions: int, order: int) -> Array:
 
 
 def torch_rollout(next_state: Tensor, reward: Tensor, state: Tensor, plans: Tensor) -> tuple[Tensor, Tensor]:
-    """What one writes first: index two tables at every step.
-
-    Returns:
-        The last cells `[B, P]` and the rewards `[B, P, L]`.
-    """
+    """What one writes first: index two tables at every step; the last cells `[B, P]`, the rewards `[B, P, L]`."""
     cell, world = state % len(next_state), state // len(next_state)
     cell = cell[:, None].expand(plans.shape[:2])
     world = world[:, None].expand(plans.shape[:2])
@@ -119,18 +113,10 @@ def plain_training(plans: Tensor, num_actions: int, steps: int, batch_size: int,
 def numpy_table_1(
     reward: Array, start: Array, num_plans: int, length: int, depth: int, orders: tuple[int, ...]
 ) -> dict[str, Array]:
-    """Hyvärinen's first simulation in numpy, on a square torus: what each planner scores from each start.
+    """Hyvärinen's first simulation in numpy, on a square torus: each planner's scores `[n]` from cells `start [n]`.
 
     The deterministic planner tries all plans of `depth` moves, chains of some `orders` learn from what it chose at as
-    many other starts, and planners choose the best of plans drawn from them.
-
-    Args:
-        reward: `[S]`, of the cells.
-        start: `[n]`, cells.
-        num_plans, length, depth, orders: see above.
-
-    Returns:
-        Scores `[n]` by planner.
+    many other starts, and planners choose the best of plans drawn from them. `reward [S]` is of the cells.
     """
     generator, size = np.random.default_rng(0), round(len(reward) ** 0.5)
     row, column = np.divmod(np.arange(len(reward)), size)
@@ -163,16 +149,11 @@ def _chain(learned: Array, order: int, number: int, length: int) -> Array:
     """`[number, L]`: plans of a chain that counted `learned`, which open as those did."""
     counts = numpy_counts(learned, 4, order) + 1e-3
     probs = counts / counts.sum(1, keepdims=True)
+    follow = (np.arange(4**order)[:, None] * 4 + np.arange(4)) % 4**order
     generator = np.random.default_rng(order)
-    plans = np.empty((number, length), np.uint8)
-    plans[:, :order] = learned[generator.integers(len(learned), size=number), :order]
-    edges = probs.cumsum(1)[:, :-1]
-    for t in range(order, length):
-        code = np.zeros(number, np.int64)
-        for back in range(order):
-            code = code * 4 + plans[:, t - order + back]
-        plans[:, t] = (generator.random((number, 1)) > edges[code]).sum(1)
-    return plans
+    opening = learned[generator.integers(len(learned), size=number), :order]
+    start = opening @ 4 ** np.arange(order)[::-1]
+    return np.hstack([opening, numpy_sample(probs, follow, start, number, length - order, generator)])
 
 
 def transformers_generate(num_actions: int, length: int, batch_size: int, width: int = 64, layers: int = 2) -> Run:

@@ -11,10 +11,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import pandas as pd
 import torch
 from torch import Tensor
 
-from eval.bench.timing import Rows, Run, seconds
+from eval.bench.timing import Run, seconds
 from neuroprior import MarkovPrior, SamplingPlanner, UniformPrior, gridworld
 
 REPETITIONS = 3
@@ -26,17 +27,11 @@ LAST = 2
 
 @dataclass(frozen=True)
 class Sweep:
-    """A piece of work whose cost is measured as one size increases.
+    """A piece of work whose cost is measured as one size increases."""
 
-    Attributes:
-        about: what is done, and what is fixed.
-        sizes: how large, at most.
-        make: prepares the work of a size; what it returns is timed.
-    """
-
-    about: str
-    sizes: tuple[int, ...]
-    make: Callable[[int], Run]
+    about: str  # what is done, and what is fixed
+    sizes: tuple[int, ...]  # how large, at most
+    make: Callable[[int], Run]  # prepares the work of a size; what it returns is timed
 
 
 def decades(first: int, last: int) -> tuple[int, ...]:
@@ -113,22 +108,18 @@ def measured(name: str, sweep: Sweep, most: float) -> Iterator[dict[str, Any]]:
         before = _memory("VmRSS", set_back=True)
         held = _bytes(run())
         most_held = _memory("VmHWM")
-        yield {
-            "growing": name,
-            "about": sweep.about,
-            "size": size,
-            "seconds": median(seconds(run) for _ in range(REPETITIONS)),
-            "result_bytes": held,
-            "peak_bytes": None if before is None or most_held is None else max(most_held - before, 0),
-        }
+        row = {"growing": name, "about": sweep.about, "size": size}
+        row |= {"seconds": median(seconds(run) for _ in range(REPETITIONS)), "result_bytes": held}
+        yield row | {"peak_bytes": None if before is None or most_held is None else max(most_held - before, 0)}
 
 
-def slope(rows: Rows) -> float | None:
+def slope(rows: pd.DataFrame) -> float | None:
     """By what power of the size the time increases, over the largest sizes; None for fewer than two of them."""
-    last = [row for row in rows if row["size"] >= rows[-1]["size"] / 10**LAST]
+    last = rows[rows["size"] >= rows["size"].iloc[-1] / 10**LAST][["size", "seconds"]].map(math.log)
     if len(last) < 2:
         return None
-    return math.log(last[-1]["seconds"] / last[0]["seconds"]) / math.log(last[-1]["size"] / last[0]["size"])
+    size, seconds = last.iloc[-1] - last.iloc[0]
+    return float(seconds / size)
 
 
 def _bytes(result: Any) -> int:
@@ -150,9 +141,7 @@ def _release() -> None:
 def _memory(what: str, set_back: bool = False) -> int | None:
     """A line of Linux's status of this process, in bytes; None on other systems.
 
-    Args:
-        what: VmRSS: what it has; VmHWM: the most that it had.
-        set_back: set the most back to what it has.
+    VmRSS is what it has, VmHWM the most that it had, which is set back to what it has if `set_back`.
     """
     try:
         if set_back:

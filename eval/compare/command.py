@@ -1,20 +1,19 @@
 """`python -m eval compare`: do neural priors help a planner more than Markov chains, in many worlds at equal budget?"""
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt, restricted_number_type
 
-from eval.compare.planners import PlannerName, PlannerSettings, compare_planners
+from eval.compare.planners import PlannerName, PlannerSettings, check_planners, planner_document, planner_run
 from eval.compare.priors import NEURAL, load_for
 from eval.compare.report import document
 from eval.compare.results import Results
 from eval.compare.run import Settings, compare_run
-from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, command_line, finished
+from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, run_experiment
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
-from neuroprior.report.document import publish
+from neuroprior.report.document import Document
 
 KINDS = ("markov", "macro", *NEURAL)
 """Kinds of priors that can be fitted."""
@@ -80,11 +79,18 @@ def compare(
     check_contexts(worlds, context or ())
     check_saved(saved, worlds)
     how = (tuple(num_plans), fitted, tuple(context or ()), rounds, steps, starts, training_starts, seed, saved)
-    if planners is not None:
-        compare_planners(PlannerSettings(*how, planners=tuple(planners)), worlds, seeds, out, processes, dask)
-        return
-    found, shown = finished("compare", compare_run, Settings(*how), worlds, seeds, out, processes, dask)
-    publish(document(Results(found, num_plans), shown, command_line("compare")), Path(out))
+    where = (worlds, seeds, out, processes, dask)
+    if planners is None:
+        run_experiment("compare", compare_run, report, Settings(*how), *where)
+    else:
+        check_planners(planners, worlds)
+        settings = PlannerSettings(*how, planners=tuple(planners))
+        run_experiment("compare --planners", planner_run, planner_document, settings, *where)
+
+
+def report(runs: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], line: str) -> Document:
+    """The document of a comparison of priors."""
+    return document(Results(runs, settings["num_plans"]), settings, line)
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:

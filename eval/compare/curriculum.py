@@ -1,29 +1,24 @@
 """`python -m eval grow`: what priors gain from the horizon curriculum, in which they learn from ever longer plans."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from jsonargparse.typing import PositiveInt
-from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from eval.compare.command import KINDS, Kind, TrainingStarts
+from eval.compare.figures import View, score_panels
 from eval.compare.run import Settings, curriculum_run
 from eval.worlds import runs
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
-from neuroprior.analysis.statistics import mean_intervals
-from neuroprior.report.document import Document, publish, records, table, write_frames
-from neuroprior.report.drawing import WIDTH, band, drawn, expect_some, legend, lines, panels
+from neuroprior.report.document import Document
 from neuroprior.report.page import FigureBox, Section, Table
 
 ROUNDS = 4
 """Rounds at most, where no lengths are given."""
 
-PRIOR = ["world", "prior", "sees"]
-NAMES = {"prior": "prior", "context": "sees"}
-ACROSS = {"round": "rounds of the curriculum", "length": "actions in a plan"}
+PRIOR = ["world", "prior", "context"]
+NAMES = {"prior": "prior", "context": "context"}
 
 
 def grow(
@@ -72,20 +67,18 @@ def grow(
         if longer and longer[0] <= TASKS[world].depth:
             depth = TASKS[world].depth
             raise ValueError(f"lengths: more than {depth} is expected first: in {world} all plans of {depth} are tried")
-    rounds = len(longer) or ROUNDS
-    how = (tuple(kinds), tuple(context), rounds, steps, starts, training_starts, seed)
+    how = (tuple(kinds), tuple(context), len(longer) or ROUNDS, steps, starts, training_starts, seed)
     settings = Settings((num_plans,), *how, lengths=longer)
-    found = runs.finished("grow", curriculum_run, settings, worlds, seeds, out, processes, dask)
-    document = curriculum_document(*found, runs.command_line("grow"))
-    publish(document, Path(out))
-    write_frames(Path(out), {"grow": pd.DataFrame(document.results["rows"])})
+    runs.run_experiment("grow", curriculum_run, curriculum_document, settings, worlds, seeds, out, processes, dask)
 
 
 def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
     """The tables and figures of the results of `curriculum_run`."""
-    frame = runs.frame_of(results, "growth")
-    rows, pairs = curriculum_rows(frame), first_and_last(frame)
+    frame = runs.frame_of(results, "curriculum").rename(columns={"share": "oracle_share"})
+    rows = runs.seed_means(frame, [*PRIOR, "round", "length", "num_plans"], "oracle_share")
+    pairs = first_and_last(frame)
     gaps, across = runs.paired_differences(pairs, PRIOR), runs.across_worlds(pairs, PRIOR[1:])
+    gains = runs.seed_means(pairs.assign(gain=pairs["first"] - pairs["second"]), [*PRIOR, "length", "rounds"], "gain")
     tables: list[Table] = []
     boxes = []
     for world, own in rows.groupby("world", sort=False):
@@ -95,88 +88,53 @@ def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
             tables.append(runs.difference_table(here, above, NAMES, "normalised score, % of the optimum", 100))
         caption = f"{world}: {own['num_plans'].iloc[0]:,} candidates for each start; bands: 95 % intervals over seeds."
         alt = f"Normalised score in {world} against rounds and actions in a plan; the numbers are in the tables."
-        boxes.append(FigureBox(curriculum_figure(own), caption, alt))
+        boxes.append(FigureBox(score_panels(list(views(own)), 3.4), caption, alt))
     if len(across):
         unit = "the normalised score of the longest plans, % of the optimum"
         tables.append(runs.across_table(across, NAMES, "after", "before", unit, 100))
     lead = runs.significance(gaps, "Normalised scores after the last round of the curriculum against before the first")
     sections = [
-        Section("Normalised score against rounds and length of plans", [], figures=boxes),
-        Section("Tables", [], tables),
+        Section("Normalised score against rounds and length of plans", figures=boxes),
+        Section("Tables", tables=tables),
     ]
-    frames = {"gains": gain_rows(pairs, gaps), "across": across}
-    more = {"rows": records(rows), "words": [lead]}
-    return Document("Horizon curriculum", lead, sections, frames, settings, command, more)
-
-
-def curriculum_rows(frame: pd.DataFrame) -> pd.DataFrame:
-    """The normalised score with its interval over seeds, a row a world, prior, round and length of plans."""
-    found: pd.DataFrame = mean_intervals(frame, [*PRIOR, "round", "length", "num_plans"], "share")
-    return found.rename(columns={"mean": "oracle_share", "n": "seeds"})
+    gains = gains.merge(gaps[[*PRIOR, "p_value", "p_holm"]], "left", PRIOR)
+    frames = {"grow": rows, "gains": gains, "across": across}
+    return Document(
+        "Horizon curriculum",
+        lead,
+        sections,
+        frames,
+        settings,
+        command,
+        {"words": [lead]},
+        keys={"grow": "rows"},
+        former_names=runs.FORMER_NAMES,
+    )
 
 
 def first_and_last(frame: pd.DataFrame) -> pd.DataFrame:
-    """A row a world, prior and seed: its score with the longest plans after the last round, `first`, and before the
-    first round, `second`.
-    """
+    """A row a world, prior and seed: its score with the longest plans after the last round (`first`) and before."""
     longest = frame[frame["length"] == frame.groupby("world")["length"].transform("max")]
     ends = longest.sort_values("round", kind="stable").groupby([*PRIOR, "seed"], sort=False)
-    last = ends.last().rename(columns={"share": "first", "round": "rounds"})
-    return last.assign(second=ends["share"].first()).reset_index()
+    last = ends.last().rename(columns={"oracle_share": "first", "round": "rounds"})
+    return last.assign(second=ends["oracle_share"].first()).reset_index()
 
 
-def gain_rows(pairs: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
-    """The mean gain of `first_and_last` with its interval over seeds, a row a world and prior."""
-    gains = pairs.assign(gain=pairs["first"] - pairs["second"])
-    found: pd.DataFrame = mean_intervals(gains, [*PRIOR, "length", "rounds"], "gain")
-    found = found.rename(columns={"mean": "gain", "n": "seeds"})
-    return found.merge(gaps[[*PRIOR, "p_value", "p_holm"]], "left", PRIOR)
-
-
-def views(rows: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
-    """The rows of a world by round with the longest plans, and by length after the last round.
-
-    Yields:
-        The column that varies, what does not, in words, and the rows.
-    """
-    longest, last = rows["length"].max(), rows["round"].max()
-    yield "round", f"plans of {longest} actions", rows[rows["length"] == longest]
-    yield "length", f"after {last} rounds", rows[rows["round"] == last]
+def views(rows: pd.DataFrame) -> Iterator[View]:
+    """Of one world's rows those with the longest plans, by round, and those after the last round, by length."""
+    names = [f"{prior}, {context}".removesuffix(", none") for prior, context in rows[PRIOR[1:]].to_numpy()]
+    rows, longest, last = rows.assign(name=names), rows["length"].max(), rows["round"].max()
+    for title, own, across, label in (
+        (f"plans of {longest} actions", rows[rows["length"] == longest], "round", "rounds of the curriculum"),
+        (f"after {last} rounds", rows[rows["round"] == last], "length", "actions in a plan"),
+    ):
+        yield View(title, own, across, label, sorted(set(own[across])))
 
 
 def curriculum_tables(rows: pd.DataFrame) -> Iterator[Table]:
     """The normalised scores in one world, a table a view."""
-    world, number, seeds = (rows[name].iloc[0] for name in ("world", "num_plans", "seeds"))
-    over = f"; ±: half of Student's 95 % interval over {seeds} seeds." if seeds > 1 else "; a single seed."
-    for by, fixed, own in views(rows):
-        own = own.assign(score=[runs.plus_minus(row, "oracle_share", 100) for _, row in own.iterrows()])
-        cells = own.pivot_table("score", ["prior", "sees"], by, aggfunc="first", sort=False).sort_index(axis=1)
-        cells = cells.rename(columns=str)
-        caption = f"Normalised score, % of the optimum, by {ACROSS[by]}; {number:,} candidates{over}"
-        columns = NAMES | {name: name for name in cells.columns}
-        yield table(cells.reset_index(), columns, caption, f"{world}, {fixed}", "ll" + "r" * len(cells.columns))
-
-
-@drawn
-def curriculum_figure(rows: pd.DataFrame) -> Figure:
-    """Normalised score of one world's priors, a panel a view, a line a prior.
-
-    Raises:
-        ValueError: there are no rows.
-    """
-    expect_some("rows", rows)
-    figure, axes = panels(1, 2, (WIDTH, 3.4), sharey=True)
-    for panel, (by, fixed, own) in zip(axes, views(rows), strict=True):
-        own = own.assign(name=own["prior"] + own["sees"].map(lambda sees: "" if sees == "none" else f", {sees}"))
-        names = list(dict.fromkeys(own["name"]))
-        for name, (color, line) in zip(names, lines(names), strict=True):
-            points = own[own["name"] == name][[by, "oracle_share", "low", "high"]].sort_values(by)
-            band(panel, list(points.itertuples(index=False, name=None)), color, name, line)
-        panel.set_xticks(sorted(set(own[by])))
-        panel.set_xlabel(ACROSS[by])
-        panel.set_title(fixed)
-        panel.grid(axis="y")
-    axes[0].set_ylabel("normalised score,\n% of the optimum")
-    axes[0].yaxis.set_major_formatter(PercentFormatter(1, symbol=""))
-    legend(figure, axes[0].get_legend_handles_labels()[0])
-    return figure
+    world, number = rows["world"].iloc[0], rows["num_plans"].iloc[0]
+    for view in views(rows):
+        caption = f"Normalised score, % of the optimum, by {view.label}; {number:,} candidates. {runs.over_seeds(rows)}"
+        cells = [runs.plus_minus(row, "oracle_share", 100) for _, row in view.rows.iterrows()]
+        yield runs.table_by(view.rows, NAMES, view.across, cells, caption, f"{world}, {view.title}")

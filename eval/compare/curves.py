@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -54,6 +53,12 @@ class Starts:
         gained, most = (values.double() - self.reference for values in (score, self.best))
         return float(gained.mean() / most.mean())
 
+    def reached(self, score: Tensor) -> dict[str, float]:
+        """Of scores of decisions, `[B, D]` or `[B]`: the normalised score, the share of optimal ones, and the mean."""
+        score = score.double().view(len(self.best), -1)
+        optimal = (score >= self.best[:, None] - CLOSE).double().mean()
+        return {"share": self.normalised(score.mean(1)), "at_oracle": float(optimal), "score": float(score.mean())}
+
 
 def starts_of(task: Task, world: World, number: int, length: int, generator: torch.Generator) -> Starts:
     """Random starts; if rewards are never negative, only those with an optimum above 0.
@@ -88,66 +93,49 @@ def planner_of(starts: Starts, prior: Prior, num_plans: int, temperature: float)
     return SamplingPlanner(prior, starts.length, num_plans, **how)
 
 
-def candidate_scores(starts: Starts, planner: SamplingPlanner, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The scores of a planner's P candidates: as the planner estimates them, and exactly.
-
-    Returns:
-        Twice `[B, P]`; the two differ in stochastic worlds.
-    """
-    estimated, exact = [], []
-    for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
-        plans, score, _ = planner.candidates(starts.world, state, generator)
-        if score.dim() == 3:  # any prefix may win
-            score = score.amax(-1)
-        estimated.append(score)
-        exact.append(worth(starts.task, starts.world, state, plans) if starts.world.stochastic else score)
-    return torch.cat(estimated), torch.cat(exact)
-
-
-def best_temperature(starts: Starts, prior: Prior, budget: int, generator: torch.Generator) -> float:
+def best_temperature(starts: Starts, prior: Prior, num_plans: int, generator: torch.Generator) -> float:
     """The one of `TEMPERATURES` at which a prior's plans reach the most from these starts."""
-    shares = {t: curve(starts, prior, [budget], generator, t)["share"][0] for t in TEMPERATURES}
+    shares = {t: curve(starts, prior, generator, t, [num_plans])["share"][0] for t in TEMPERATURES}
     return max(shares, key=lambda t: shares[t])
 
 
 def curve(
-    starts: Starts, prior: Prior, budgets: list[int], generator: torch.Generator, temperature: float = 1.0
+    starts: Starts, prior: Prior, generator: torch.Generator, temperature: float, budgets: Sequence[int]
 ) -> dict[str, list[float]]:
     """What a sampling planner reaches with each number of candidates.
 
-    The largest number is drawn once from each start. Smaller numbers are blocks of it, each block a decision.
+    The largest number is drawn once from each start. Smaller numbers are blocks of it, each block a decision. The
+    planner chooses by its own estimates; what counts are exact scores, which differ in stochastic worlds.
 
     Returns:
-        For each number, means over starts: `share`, the normalised score; `at_oracle`, the share of starts at which an
-        optimal plan was found; `score`.
+        See `Starts.reached`, a list for all numbers.
     """
-    estimated, exact = candidate_scores(starts, planner_of(starts, prior, max(budgets), temperature), generator)
-    found: dict[str, list[float]] = {"share": [], "at_oracle": [], "score": []}
+    planner, estimates, scores = planner_of(starts, prior, max(budgets), temperature), [], []
+    for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
+        plans, score, _ = planner.candidates(starts.world, state, generator)
+        if score.dim() == 3:  # any prefix may win
+            score = score.amax(-1)
+        estimates.append(score)
+        scores.append(worth(starts.task, starts.world, state, plans) if starts.world.stochastic else score)
+    estimated, exact = torch.cat(estimates), torch.cat(scores)
+    found = []
     for budget in budgets:
         blocks = estimated.shape[1] // budget
         shape = (len(estimated), blocks, budget)
         chosen = estimated[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
-        score = exact[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0].double()
-        found["share"].append(starts.normalised(score.mean(1)))
-        found["at_oracle"].append(float((score >= starts.best[:, None] - CLOSE).double().mean()))
-        found["score"].append(float(score.mean()))
-    return found
+        found.append(starts.reached(exact[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0]))
+    return {name: [one[name] for one in found] for name in found[0]}
 
 
 def seconds_per_decision(
-    starts: Starts, prior: Prior, budgets: Sequence[int], number: int, generator: torch.Generator, temperature: float
+    starts: Starts, prior: Prior, generator: torch.Generator, temperature: float, budgets: Sequence[int], number: int
 ) -> dict[int, tuple[float, int]]:
-    """How long a sampling planner takes, planning from `number` starts together.
-
-    Returns:
-        By number of candidates: seconds, and model steps, for each start.
-    """
+    """By number of candidates the seconds and model steps that a decision takes, at `number` starts together."""
     state, taken = starts.state[:number], {}
     planners = [planner_of(starts, prior, budget, temperature) for budget in budgets]
     # The first call is slower than those that follow, and the largest makes room for all.
-    max(planners, key=lambda planner: planner.num_plans).plan(
-        starts.world, state, torch.Generator(generator.device).manual_seed(0)
-    )
+    largest = max(planners, key=lambda planner: planner.num_plans)
+    largest.plan(starts.world, state, torch.Generator(generator.device).manual_seed(0))
     for planner in planners:
         begin = perf_counter()
         decision = planner.plan(starts.world, state, generator)
@@ -158,5 +146,4 @@ def seconds_per_decision(
 def worth(task: Task, world: World, state: Tensor, plans: Tensor) -> Tensor:
     """The exact mean scores `[B, P]` of plans in a table."""
     assert isinstance(world, TabularWorld)
-    how: dict[str, Any] = {"objective": task.objective, "discount": task.discount}
-    return expected_score(world, state, plans, **how)
+    return expected_score(world, state, plans, objective=task.objective, discount=task.discount)

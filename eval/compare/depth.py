@@ -2,19 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from jsonargparse.typing import PositiveInt
 
 from eval.compare.curves import starts_of
-from eval.compare.planner_report import planner_document
-from eval.compare.planners import ORDERS, planned
+from eval.compare.planners import ORDERS, planned, planner_document
 from eval.compare.run import Contest, Settings
 from eval.worlds import runs
 from eval.worlds.suite import TASKS, WorldName
 from neuroprior.planners import HorizonPlanner, Planner, SamplingPlanner
-from neuroprior.report.document import publish
 
 WORLDS = ("grid", "four_rooms", "egocentric", "goal_maze", "taxi", "frozen_lake")
 
@@ -67,8 +65,8 @@ def depth(
         if TASKS[world].worlds(0).held_out.stochastic:
             raise ValueError(f"worlds: deterministic ones are expected, not {world}")
     settings = DepthSettings(tuple(num_plans), ("markov",), (), 9, 1, starts, training_starts, seed, length=length)
-    found = runs.finished("depth", depth_run, settings, worlds, seeds, out, processes, dask)
-    publish(planner_document(*found, runs.command_line("depth"), CHOSEN, "How deep to plan"), Path(out))
+    report = partial(planner_document, baseline=CHOSEN, title="How deep to plan")
+    runs.run_experiment("depth", depth_run, report, settings, worlds, seeds, out, processes, dask)
 
 
 def depth_run(run: runs.Run, settings: DepthSettings) -> dict[str, Any]:
@@ -77,20 +75,19 @@ def depth_run(run: runs.Run, settings: DepthSettings) -> dict[str, Any]:
     Returns, raises: see `eval.compare.planners.planner_run`.
     """
     task = replace(TASKS[run.world], any_prefix=True)
-    contest = Contest(task, run.seed, replace(settings, context=task.contexts[-1:]), ORDERS)
+    contest = Contest(run, task, replace(settings, context=task.contexts[-1:]), ORDERS)
     how: dict[str, Any] = {"objective": task.objective, "discount": task.discount}
     longest = settings.length
     starts = starts_of(task, contest.worlds.held_out, settings.starts, longest, contest.generator)
-    horizons = [2**k for k in range(1, longest.bit_length())]
     entries: list[dict[str, Any]] = []
     for one in contest.after_curriculum():
-        for horizon in [*horizons, None]:
-            name = f"{horizon} actions" if horizon else CHOSEN
+        for horizon in [*(2**k for k in range(1, longest.bit_length())), None]:
             for number in settings.num_plans:
                 planner: Planner = HorizonPlanner(one.prior, longest, number, **how)
                 if horizon:
                     more = longest // horizon
                     planner = SamplingPlanner(one.prior, horizon, number * more, any_prefix=True, **how)
-                entry = {"planner": name, "prior": one.label, "sees": one.sees, "num_plans": number}
+                name = f"{horizon} actions" if horizon else CHOSEN
+                entry = {"planner": name, "prior": one.label, "context": one.context, "num_plans": number}
                 entries.append(entry | planned(starts, planner, contest.generator))
-    return {"world": run.world, "seed": run.seed, "about": task.about, "entries": entries}
+    return run._asdict() | {"about": task.about, "entries": entries}

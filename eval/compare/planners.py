@@ -1,16 +1,17 @@
 """`python -m eval compare --planners`: several planners with the same priors and as many model steps."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, TypeAlias
 
+import pandas as pd
 import torch
+from matplotlib.figure import Figure
 
 from eval.compare.curves import ROLLOUTS, TEMPERATURES, Starts, worth
-from eval.compare.planner_report import planner_document
+from eval.compare.figures import View, score_panels
 from eval.compare.run import Contest, Contestant, Settings
 from eval.worlds import runs
 from eval.worlds.suite import TASKS
@@ -23,7 +24,8 @@ from neuroprior.planners import (
     SamplingPlanner,
     execute,
 )
-from neuroprior.report.document import publish
+from neuroprior.report.document import Document
+from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.worlds import World
 
 ORDERS = (3,)
@@ -48,6 +50,9 @@ STOCHASTIC, ONLY_STOCHASTIC = {"sampling", "cross-entropy", "halving", "replanni
 TRAJECTORIES = 8
 """From each start with "replanning", whose score is no single plan's and so cannot be computed."""
 
+PLACE = ["world", "planner", "prior", "context", "num_plans"]
+NAMES = {"prior": "prior", "context": "context", "planner": "planner"}
+
 
 @dataclass(frozen=True)
 class PlannerSettings(Settings):
@@ -56,30 +61,16 @@ class PlannerSettings(Settings):
     planners: tuple[str, ...] = ()
 
 
-def compare_planners(
-    settings: PlannerSettings,
-    worlds: Sequence[str],
-    seeds: int,
-    out: str,
-    processes: int | None = None,
-    dask: str | None = None,
-) -> None:
-    """Compare planners and publish the report; see `eval.compare.command.compare`.
-
-    Raises:
-        ValueError: a planner is given twice, or no planner suits one of the worlds.
-    """
-    runs.check_distinct(planners=settings.planners)
-    given = set(settings.planners)
+def check_planners(planners: Sequence[str], worlds: Sequence[str]) -> None:
+    """Raise ValueError where a planner is given twice, or none suits one of the worlds."""
+    runs.check_distinct(planners=planners)
+    if set(planners) & STOCHASTIC and set(planners) - ONLY_STOCHASTIC:
+        return  # whatever the worlds are: some take long to make
     for world in worlds:
-        if given & STOCHASTIC and given - ONLY_STOCHASTIC:
-            continue  # whatever the world is: some take long to make
         held_out = TASKS[world].worlds(0).held_out
-        if not any(suits(name, held_out) for name in settings.planners):
-            names = " ".join(settings.planners)
+        if not any(suits(name, held_out) for name in planners):
+            names = " ".join(planners)
             raise ValueError(f"planners: none of {names} is for {world}; leave it out, or add sampling")
-    found = runs.finished("compare --planners", planner_run, settings, worlds, seeds, out, processes, dask)
-    publish(planner_document(*found, runs.command_line("compare")), Path(out))
 
 
 def planner_run(run: runs.Run, settings: PlannerSettings) -> dict[str, Any]:
@@ -88,18 +79,17 @@ def planner_run(run: runs.Run, settings: PlannerSettings) -> dict[str, Any]:
     Returns:
         `entries`, one of each planner, prior and number of plans: `share` (the normalised score), the `model_steps`
         that were taken, and the `seconds` of a decision.
-
-    Raises:
-        ValueError: see `eval.compare.run.compare_priors`.
     """
     task = TASKS[run.world]
-    contest = Contest(task, run.seed, replace(settings, context=settings.context or task.contexts[-1:]), ORDERS)
-    entries = []
-    for one in contest.after_curriculum():
-        for name in settings.planners:
-            if suits(name, contest.worlds.held_out):
-                entries += _entries(contest, one, name)
-    return {"world": run.world, "seed": run.seed, "about": task.about, "entries": entries}
+    contest = Contest(run, task, replace(settings, context=settings.context or task.contexts[-1:]), ORDERS)
+    entries = [
+        entry
+        for one in contest.after_curriculum()
+        for name in settings.planners
+        if suits(name, contest.worlds.held_out)
+        for entry in _entries(contest, one, name)
+    ]
+    return run._asdict() | {"about": task.about, "entries": entries}
 
 
 def suits(name: str, world: World) -> bool:
@@ -109,27 +99,24 @@ def suits(name: str, world: World) -> bool:
 
 def _entries(contest: Contest, one: Contestant, name: str) -> list[dict[str, Any]]:
     """What a planner reaches with a prior; the temperature is chosen for both, in the validation worlds."""
-    length, generator = contest.task.length, contest.generator
+    numbers = contest.settings.num_plans
 
     def reached(starts: Starts, number: int, temperature: float) -> dict[str, Any]:
         how: dict[str, Any] = starts.task.scoring | {"temperature": temperature}
         if starts.world.stochastic:
             how["num_rollouts"] = ROLLOUTS
-        if name != "replanning":
-            return planned(starts, PLANNERS[name](one.prior, starts.length, number, **how), generator)
-        # All decisions together take no more steps than one of the others, but for at least one plan each.
-        planner = PLANNERS[name](one.prior, starts.length, max(number // starts.length, 1), **how)
-        return replanned(starts, planner, generator)
+        # All decisions of "replanning" take no more steps together than one of the others, but for one plan each.
+        number = max(number // starts.length, 1) if name == "replanning" else number
+        planner = PLANNERS[name](one.prior, starts.length, number, **how)
+        return (replanned if name == "replanning" else planned)(starts, planner, contest.generator)
 
     best = 1.0
     if one.label != "uniform":
-        most = max(contest.settings.num_plans)
-        shares = {t: reached(contest.validation_at[length], most, t)["share"] for t in TEMPERATURES}
+        validation = contest.validation_at[contest.task.length]
+        shares = {t: reached(validation, max(numbers), t)["share"] for t in TEMPERATURES}
         best = max(shares, key=lambda t: shares[t])
-    label = {"planner": name, "prior": one.label, "sees": one.sees, "temperature": best}
-    return [
-        label | {"num_plans": number} | reached(contest.starts, number, best) for number in contest.settings.num_plans
-    ]
+    label = {"planner": name, "prior": one.label, "context": one.context, "temperature": best}
+    return [label | {"num_plans": number} | reached(contest.starts, number, best) for number in numbers]
 
 
 def planned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:
@@ -151,3 +138,81 @@ def replanned(starts: Starts, planner: Planner, generator: torch.Generator) -> d
     seconds = (perf_counter() - begin) / len(state)
     score = planner.score(done.rewards.double(), done.states[:, -1]).view(-1, TRAJECTORIES).mean(1)
     return {"share": starts.normalised(score), "model_steps": done.model_steps, "seconds": seconds}
+
+
+def planner_document(
+    results: Sequence[Mapping[str, Any]],
+    settings: Mapping[str, Any],
+    command: str,
+    baseline: str = "sampling",
+    title: str = "Planners compared",
+) -> Document:
+    """The tables and figures of the results of `planner_run`; `baseline`: the planner that others are compared with."""
+    frame = runs.frame_of(results).rename(columns={"share": "oracle_share", "seconds": "seconds_per_decision"})
+    rows = runs.seed_means(frame, PLACE, "oracle_share", ["model_steps", "seconds_per_decision"])
+    pairs = planner_pairs(frame, baseline)
+    gaps = runs.paired_differences(pairs, PLACE)
+    # Worlds offer unlike contexts: of each, the last counts.
+    last = pairs.drop_duplicates(["world", "planner", "prior", "num_plans", "seed"], keep="last")
+    across = runs.across_worlds(last, ["prior", "planner", "num_plans"])
+    most = frame["num_plans"].max()
+    score = "normalised score, % of the optimum"
+    tables, boxes = [], []
+    for world, about in {one["world"]: one["about"] for one in results}.items():
+        here = rows[rows["world"] == world].merge(gaps[[*PLACE, "p_holm"]], "left", PLACE)
+        tables.append(planner_table(here, baseline))
+        shown = gaps[(gaps["world"] == world) & (gaps["prior"] != "uniform") & (gaps["num_plans"] == most)]
+        if len(shown):
+            above = f"{world}, {most:,} plans: differences to {baseline}"
+            tables.append(runs.difference_table(shown, above, NAMES, score, 100))
+        alt = f"Normalised score in {world} against model steps, a line a planner; the numbers are in the tables."
+        caption = f"{world}: {about}. Bands: Student's 95 % intervals over seeds."
+        boxes.append(FigureBox(planner_figure(here), caption, alt))
+    if len(shown := across[across["num_plans"] == most]):
+        names = {"prior": "prior", "planner": "planner"}
+        tables.append(runs.across_table(shown, names, "score", baseline, f"the {score}, {most:,} plans", 100))
+    lead = runs.significance(gaps, f"Normalised scores against {baseline}")
+    sections = [Section("Normalised score against model steps", figures=boxes), Section("Tables", tables=tables)]
+    frames = {"rows": rows, "paired": gaps, "across": across}
+    return Document(title, lead, sections, frames, settings, command, {"words": [lead]}, former_names=runs.FORMER_NAMES)
+
+
+def planner_pairs(frame: pd.DataFrame, baseline: str) -> pd.DataFrame:
+    """A row a world, planner, prior, number of plans and seed: its score `first`, and `second` that of the baseline."""
+    same = [name for name in [*PLACE, "seed"] if name != "planner"]
+    base = frame.loc[frame["planner"] == baseline, [*same, "oracle_share"]].rename(columns={"oracle_share": "second"})
+    others = frame[frame["planner"] != baseline].rename(columns={"oracle_share": "first"})
+    return others.merge(base, on=same)
+
+
+def planner_table(rows: pd.DataFrame, baseline: str) -> Table:
+    """Normalised scores in one world, a row a prior and planner; stars mark significant differences (`p_holm`)."""
+    clear = rows["p_holm"] < 0.05
+    scores = [runs.plus_minus(row, "oracle_share", 100) for _, row in rows.iterrows()]
+    length = round((rows["model_steps"] / rows["num_plans"]).max())
+    star = f" *: p < 0.05 against {baseline} with the same prior, corrected for all tests in this world (Holm)."
+    caption = (
+        f"Normalised score, % of the optimum, by number of plans of {length} model steps each, or as many steps"
+        f" otherwise spent; ms: of a decision with the most. {runs.over_seeds(rows)}{star * bool(clear.any())}"
+    )
+    cells = [score + "*" * star for score, star in zip(scores, clear, strict=True)]
+    return runs.table_by(rows, NAMES, "num_plans", cells, caption, rows["world"].iloc[0], timed=rows["num_plans"].max())
+
+
+def planner_figure(rows: pd.DataFrame) -> Figure:
+    """Normalised score against model steps in one world, a panel a prior, a line a planner."""
+    # Most planners spend all steps that they may.
+    ticks = rows.groupby("num_plans")["model_steps"].max().astype(int).tolist()
+    return score_panels(
+        [
+            View(
+                str(prior) if context == "none" else f"{prior}, context: {context}",
+                own.assign(name=own["planner"]),
+                "model_steps",
+                "model steps per start",
+                ticks,
+            )
+            for (prior, context), own in rows.groupby(["prior", "context"], sort=False)
+        ],
+        log=True,
+    )

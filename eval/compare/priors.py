@@ -1,7 +1,7 @@
 """The priors of `python -m eval compare`: Markov chains with and without context, networks, and saved priors."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -33,7 +33,7 @@ class UnlimitedGRU(GRUPrior):
         return plans
 
 
-NEURAL: dict[str, Any] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
+NEURAL: dict[str, Callable[..., Prior]] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
 
 RECIPE: dict[str, dict[str, Any]] = {"gru": {"lags": 1, "dropout": 0.2}, "transformer": {"dropout": 0.2}}
 """Arguments of networks. In plans this short a GRU does not need its last inputs shown again, and is far quicker."""
@@ -71,9 +71,7 @@ def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:
     """A network, one of `NEURAL`, for plans like these, with their context if they have one."""
     sizes = context_sizes(world, plans)
     wide = WIDE[kind] if sizes.get("context_size", 0) >= MANY else {}
-    prior = NEURAL[kind](plans.num_actions, seed=seed, **sizes, **RECIPE[kind], **wide)
-    assert isinstance(prior, Prior)
-    return prior
+    return NEURAL[kind](plans.num_actions, seed=seed, **sizes, **RECIPE[kind], **wide)
 
 
 def context_sizes(world: World, plans: Plans) -> dict[str, Any]:
@@ -145,25 +143,20 @@ class ContextMarkov(Prior):
         self.index = ContextIndex(torch.zeros(1, dtype=torch.long))
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
-        """Choose the features, number the contexts, and count; returns self.
-
-        Raises:
-            ValueError: plans that a Markov prior cannot learn from, or without the context that this prior takes.
-        """
+        """Choose the features, number the contexts, and count; returns self."""
         plans = self.training_plans(plans)
         best: Sequence[int] | None = None
         if self.feature_sets:
             training, validation = plans.split(VALIDATION, torch.Generator().manual_seed(0))
-            self.fallback.fit(training, **settings)
             bits = {
                 features: score("", self._count(training, features, settings), validation).bits_per_action().mean
                 for features in (None, *self.feature_sets)
             }
             best = min(bits, key=lambda features: bits[features])
-        self.fallback.fit(plans, **settings)
         return self._count(plans, best, settings)
 
     def _count(self, plans: Plans, features: Sequence[int] | None, settings: dict[str, Any]) -> Self:
+        self.fallback.fit(plans, **settings)
         context = plans.context
         assert context is not None
         flat = context.flatten(0, -2) if context.is_floating_point() else context.flatten()
@@ -195,12 +188,9 @@ class ContextMarkov(Prior):
 
 
 class Renumbered(Prior):
-    """A saved prior whose actions have other numbers in a world.
+    """A saved prior whose actions have other numbers in a world: `number [A]`, of the world's action 0, 1, ..."""
 
-    Args:
-        prior: any prior.
-        number: `[A]`, int64: the prior's number of the world's action 0, 1, ...; a permutation.
-    """
+    number: Tensor
 
     def __init__(self, prior: Prior, number: Tensor) -> None:
         super().__init__(prior.num_actions, prior.num_contexts, prior.context_size)
@@ -211,39 +201,22 @@ class Renumbered(Prior):
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         logits, state = self.prior.start(batch_size, context)
-        return logits[:, self._number], state
+        return logits[:, self.number], state
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        logits, state = self.prior.step(self._number[action], state, context)
-        return logits[:, self._number], state
+        logits, state = self.prior.step(self.number[action], state, context)
+        return logits[:, self.number], state
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
-        logits = self.prior(self._number[plans.long()], context)
-        assert isinstance(logits, Tensor)
-        return logits[..., self._number]
+        return self.prior.forward(self.number[plans.long()], context)[..., self.number]
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
-        """Not possible: a saved prior is compared as it is.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Not possible: a saved prior is compared as it is."""
         raise NotImplementedError("a renumbered prior is not trained")
-
-    @property
-    def _number(self) -> Tensor:
-        assert isinstance(self.number, Tensor)
-        return self.number
 
 
 def load_for(folder: str, world: str, num_actions: int, action_names: Sequence[str] | None) -> Prior:
     """The prior saved in a folder, with its actions numbered as in a world: by name if both have names.
-
-    Args:
-        folder: as `neuroprior.save` and `neuroprior fit` write it.
-        world: its name, for messages.
-        num_actions: of the world.
-        action_names: of the world; None: actions are matched by number.
 
     Raises:
         ValueError: the prior has other actions than the world, or samples an end symbol; or a file is damaged.

@@ -1,28 +1,57 @@
 """The report of `python -m eval compare`: one document of tables and figures."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from eval.compare import figures
 from eval.compare.figures import POINTS, Style
-from eval.compare.results import BEST, Key, Results, grouped, kind_of
-from eval.worlds.runs import across_table
+from eval.compare.results import BEST, Results, grouped, kind_of
+from eval.worlds.runs import FORMER_NAMES, across_table, plus_minus, table_by
 from neuroprior.report.document import Column, Document, table
 from neuroprior.report.figures import transition_figure
 from neuroprior.report.page import FigureBox, Section, Table, breakable
 
-Row = Any
-Columns = dict[str, Column]
-
-FRAMES = ("rows", "paired", "efficiency", "bits", "words", "growth", "reasons", "across")
-"""The tables of `Results` that are written to files."""
+FRAMES = {name: name for name in ("rows", "paired", "efficiency", "bits", "words", "reasons", "across")}
+FRAMES |= {"growth": "curriculum"}
+"""The tables of `Results` that are written to files, by the names of the files."""
 
 HALF = "±: the longer side of the 95 % interval, over seeds."
 HOLM = "*: p < 0.05, corrected for all pairs of the world (Holm)."
+
+REASONS = (
+    "Every world in which the best neural prior is not significantly better. Where the best chain is near 100 %, little"
+    " is left to find. Where networks have no fewer bits than chains, they know no more of the plans' structure. Where"
+    " they have fewer, fewer samples are needed; but the best of many samples asks for many different ones, which"
+    " likelihood does not."
+)
+CURVES = (
+    "Bands: 95 % intervals over seeds. Thin lines: the other Markov chains. Dotted: the planner that tries all short"
+    " plans, at a cost of its own."
+)
+EFFICIENCY = "How many plans from a prior find as much as the most random ones. The numbers are in the tables below."
+CURRICULUM = (
+    "A prior learns from the best of all short plans, proposes longer ones, learns from the best of those, and so on."
+    " Below the axis: the round, and the number of actions in its plans; each is compared with the best plans of as"
+    " many actions. Temperatures are those that are best in the validation worlds. Bands: 95 % intervals over seeds;"
+    " thin lines: the other Markov chains."
+)
+BITS = (
+    "Bits per action of the held-out plans of the planner that tries all short ones: the fewer, the better a prior"
+    " predicts them. Hollow: without context; filled, below: with the initial or the per-step context. The numbers are"
+    " in the tables below."
+)
+DRAWN = (
+    "Candidate plans of some priors from one start, after the last round of the curriculum. Square: the start; dots:"
+    " where plans end; green: rewards; grey: walls."
+)
+TRANSITIONS = (
+    "How often each action follows each in plans sampled from a prior after the last round of the curriculum: means"
+    " over seeds."
+)
 
 
 def document(results: Results, settings: Mapping[str, Any], command: str) -> Document:
@@ -36,22 +65,23 @@ def document(results: Results, settings: Mapping[str, Any], command: str) -> Doc
     Raises:
         ValueError: the runs do not belong together, or lack one of the numbers of plans.
     """
-    style = figures.styles([*results.rows["prior"].dropna(), *results.growth["prior"]])
+    style = figures.styles([*results.rows["prior"].dropna(), *results.curriculum["prior"]])
+    after = "after minus before the curriculum"
     sections = [
         headlines(results),
         reasons(results),
-        scores(results, style, False, "Normalised score against candidate plans"),
-        efficiency(results, style),
-        gains(results, style, "with minus without context", "What context adds"),
-        gains(results, style, "after minus before the curriculum", "What the horizon curriculum adds"),
-        scores(results, style, True, "Normalised score after the horizon curriculum"),
-        curriculum(results, style),
-        bits(results, style),
-        drawn_plans(results, style),
-        transitions(results),
+        _figures("Normalised score against candidate plans", CURVES, scores(results, style, False), beside=True),
+        _figures("Search efficiency", EFFICIENCY, efficiency(results, style)),
+        _figures("What context adds", "", gains(results, style, "with minus without context")),
+        _figures("What the horizon curriculum adds", "", gains(results, style, after)),
+        _figures("Normalised score after the horizon curriculum", CURVES, scores(results, style, True), beside=True),
+        _figures("The horizon curriculum, round by round", CURRICULUM, curriculum(results, style), beside=True),
+        _figures("Bits per action of held-out plans", BITS, bits(results, style), beside=True),
+        _figures("Plans drawn in the worlds", DRAWN, drawn_plans(results, style), beside=True),
+        _figures("Transition matrices", TRANSITIONS, transitions(results), beside=True),
         about_worlds(results),
         Section(
-            "Tables, world by world", tables=[one for world in results.worlds for one in tables_of(results, world)]
+            "Tables, world by world", tables=list(chain.from_iterable(tables_of(results, w) for w in results.worlds))
         ),
     ]
     named = ", ".join(results.worlds) if len(results.worlds) <= 3 else f"{len(results.worlds)} worlds"
@@ -59,16 +89,21 @@ def document(results: Results, settings: Mapping[str, Any], command: str) -> Doc
         f"Priors compared in {named}",
         lead(results),
         [section for section in sections if section.tables or section.figures],
-        {name: getattr(results, name) for name in FRAMES},
+        {file: getattr(results, name) for file, name in FRAMES.items()},
         settings,
         command,
+        former_names=FORMER_NAMES,
     )
+
+
+def _figures(title: str, text: str, boxes: Iterable[FigureBox], beside: bool = False) -> Section:
+    return Section(title, [text] if text else [], (), list(boxes), beside)
 
 
 def lead(results: Results) -> str:
     """In how many worlds the best neural prior is better than the best chain, without context and curriculum."""
     words = results.words
-    best = words[(words["what"] == BEST) & (words["sees"] == "none") & (words["rounds"] == 0)]
+    best = words[(words["what"] == BEST) & (words["context"] == "none") & (words["rounds"] == 0)]
     seeds = f"Seeds: {len({run['seed'] for run in results.runs})}."
     if best.empty:
         return f"Neural priors and Markov chains were not compared. {seeds}"
@@ -86,7 +121,8 @@ def headlines(results: Results) -> Section:
     best = words["what"] == BEST
     if len(words):
         pairs = " (" + words["first"] + " - " + words["second"] + ")"
-        columns: Columns = {
+        labels = words["world"].map(breakable) + pairs.where(~best, "")
+        columns: dict[str, Column] = {
             "world": "label",
             "context": _context,
             "Markov" if best.all() else "second": lambda row: f"{100 * row['second_share']:.1f}",
@@ -100,15 +136,14 @@ def headlines(results: Results) -> Section:
             f" and the difference in percentage points. after: after the horizon curriculum. {HALF} Holm p: corrected"
             " for the number of worlds; *: below 0.05."
         )
-        labels = words["world"].map(breakable) + pairs.where(~best, "")
         tables.append(table(words.assign(label=labels), columns, caption, align="llrrrrr"))
-    plain = results.paired[(results.paired["sees"] == "none") & (results.paired["rounds"] == "0")]
-    plain = plain[plain["what"] == BEST]
+    plain = results.paired.query("what == @BEST and context == 'none' and rounds == '0'")
     if len(plain):
         caption = f"Best neural minus best Markov prior, percentage points, by candidate plans. {HALF} {HOLM}"
-        tables.append(_by_number(plain, plain["world"].map(breakable), plain.apply(_gap, axis=1), "world", caption))
-    for (sees, after), rows in grouped(words[best].assign(after=words["rounds"] > 0), ["sees", "after"]):
-        how = f"{sees.replace('none', 'no')} context, {'after' if after else 'before'} the horizon curriculum"
+        labels = plain["world"].map(breakable)
+        tables.append(table_by(plain.assign(world=labels), {"world": "world"}, "num_plans", _gaps(plain), caption))
+    for (context, after), rows in grouped(words[best].assign(after=words["rounds"] > 0), ["context", "after"]):
+        how = f"{context.replace('none', 'no')} context, {'after' if after else 'before'} the horizon curriculum"
         caption = f"Best neural minus best Markov prior with {results.shown:,} plans, {how}. Hollow: not significant."
         alt = "; ".join(f"{row['world']} {100 * row['difference']:+.1f}" for _, row in rows.iterrows())
         drawn = figures.gap_figure(rows, ("Markov better", "neural better"))
@@ -123,19 +158,13 @@ def headlines(results: Results) -> Section:
     if len(across := results.across):
         unit = f"the normalised score, % of the optimum, with {results.shown:,} candidate plans"
         names = {"prior": "label", "baseline": "baseline"}
-        tables.append(across_table(across.assign(label=_labels(across)), names, "score", "baseline's", unit, 100))
+        tables.append(across_table(_labelled(across), names, "score", "baseline's", unit, 100))
     return Section("Neural priors against Markov chains", text, tables, boxes)
 
 
 def reasons(results: Results) -> Section:
     """What may explain why networks are not better."""
-    text = (
-        "Every world in which the best neural prior is not significantly better. Where the best chain is near 100 %,"
-        " little is left to find. Where networks have no fewer bits than chains, they know no more of the plans'"
-        " structure. Where they have fewer, fewer samples are needed; but the best of many samples asks for many"
-        " different ones, which likelihood does not."
-    )
-    columns: Columns = {
+    columns: dict[str, Column] = {
         "world": lambda row: breakable(row["world"]),
         "context": _context,
         "Markov": lambda row: f"{100 * row['markov_share']:.1f}",
@@ -149,127 +178,86 @@ def reasons(results: Results) -> Section:
         f" significantly better with {results.num_plans[0]:,} plans."
     )
     made = [table(results.reasons, columns, caption, align="llrrrr")] if len(results.reasons) else []
-    return Section("Where networks are not better", [text], made)
+    return Section("Where networks are not better", [REASONS], made)
 
 
-def scores(results: Results, style: Mapping[str, Style], after: bool, title: str) -> Section:
+def scores(results: Results, style: Mapping[str, Style], after: bool) -> Iterator[FigureBox]:
     """Normalised scores against the number of plans, a figure a world; before or after the horizon curriculum."""
-    boxes, about = [], {run["world"]: run["about"] for run in results.runs}
-    for (world,), rows in grouped(results.curves[results.curves["sees"] == "none"], ["world"]):
+    about = {run["world"]: run["about"] for run in results.runs}
+    for (world,), rows in grouped(results.curves[results.curves["context"] == "none"], ["world"]):
         own = rows[((rows["rounds"] > 0) == after) | rows["prior"].isna() | (rows["prior"] == "uniform")]
         if own["prior"].notna().any() and (own["rounds"].any() or not after):
-            last = own[own["num_plans"] == results.shown]
-            drawn = figures.score_figure(own, _strong(last), style)
-            boxes.append(_box(drawn, world, last, 100, "" if after else f"{world}: {about[world]}."))
-    text = [
-        "Bands: 95 % intervals over seeds. Thin lines: the other Markov chains. Dotted: the planner that tries all"
-        " short plans, at a cost of its own."
-    ]
-    return Section(title, text, (), boxes, beside=True)
+            drawn = figures.score_figure(own, _strong(own[own["num_plans"] == results.shown]), style)
+            yield FigureBox(drawn, "" if after else f"{world}: {about[world]}.", f"normalised scores in {world}")
 
 
-def efficiency(results: Results, style: Mapping[str, Style]) -> Section:
+def efficiency(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """How many plans are needed."""
-    rows = results.efficiency
-    rows = rows[(rows["prior"] != "uniform") & (rows["sees"] == "none") & (rows["rounds"] == 0)]
-    if rows.empty:
-        return Section("Search efficiency")
-    most = int(rows["most"].max())
-    high = rows["needed_high"].mask(rows["needed_high"].isna() & rows["needed_low"].notna(), rows["most"])
-    estimates = rows.assign(mean=rows["needed"].fillna(np.inf), low=rows["needed_low"], high=high)
-    drawn = figures.dots_figure(estimates, style, "candidate plans needed", most)
-    caption = f"Plans needed for what random search finds with {most:,}; arrow: more than that. Medians over seeds."
-    text = [f"How many plans from a prior find as much as {most:,} random ones. The numbers are in the tables below."]
-    return Section("Search efficiency", text, (), [FigureBox(drawn, caption, "plans needed by each prior, by world")])
+    rows = results.efficiency.query("prior != 'uniform' and context == 'none' and rounds == 0")
+    if len(rows):
+        most = int(rows["most"].max())
+        high = rows["needed_high"].mask(rows["needed_high"].isna() & rows["needed_low"].notna(), rows["most"])
+        estimates = rows.assign(mean=rows["needed"].fillna(np.inf), low=rows["needed_low"], high=high)
+        drawn = figures.dots_figure(estimates, style, "candidate plans needed", most)
+        caption = f"Plans needed for what random search finds with {most:,}; arrow: more than that. Medians over seeds."
+        yield FigureBox(drawn, caption, "plans needed by each prior, by world")
 
 
-def gains(results: Results, style: Mapping[str, Style], what: str, title: str) -> Section:
+def gains(results: Results, style: Mapping[str, Style], what: str) -> Iterator[FigureBox]:
     """What priors gain by context, or by the horizon curriculum: a figure for each context and curriculum."""
     rows = results.paired[(results.paired["what"] == what) & (results.paired["num_plans"] == results.shown)]
-    points = {"mean": 100 * rows["difference"], "low": 100 * rows["low"], "high": 100 * rows["high"]}
-    boxes = []
-    rows = rows.assign(prior=rows["first"], after=rows["rounds"] != "0", **points)
-    for (sees, after), own in grouped(rows, ["sees", "after"]):
-        how = f"{what.capitalize()} (context: {sees}{', after' * bool(after and sees.endswith(' - none'))})"
+    points = 100 * rows[["difference", "low", "high"]].rename(columns={"difference": "mean"})
+    rows = rows[["world", "context"]].assign(prior=rows["first"], after=rows["rounds"] != "0").join(points)
+    for (context, after), own in grouped(rows, ["context", "after"]):
+        how = f"{what.capitalize()} (context: {context}{', after' * bool(after and context.endswith(' - none'))})"
         caption = f"{how}, with {results.shown:,} plans. Intervals: 95 %, over seeds."
-        boxes.append(FigureBox(figures.dots_figure(own, style, POINTS), caption, how))
-    return Section(title, (), (), boxes)
+        yield FigureBox(figures.dots_figure(own, style, POINTS), caption, how)
 
 
-def curriculum(results: Results, style: Mapping[str, Style]) -> Section:
+def curriculum(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Curves against rounds of the horizon curriculum, a figure a world and context."""
-    boxes = []
-    for (world, _), own in grouped(results.growth, ["world", "sees"]):
-        last = own[own["round"] == own["round"].max()]
-        boxes.append(_box(figures.curriculum_figure(own, _strong(last), style), world, last, 100))
-    number = ", ".join(f"{one:,}" for one in sorted(results.growth["num_plans"].unique()))
-    text = [
-        "A prior learns from the best of all short plans, proposes longer ones, learns from the best of those, and so"
-        " on. Below the axis: the round, and the number of actions in its plans; each is compared with the best plans"
-        " of as many actions.",
-        f"{number} candidate plans, sampled at the temperature that is best in the validation worlds. Bands: 95 %"
-        " intervals over seeds; thin lines: the other Markov chains.",
-    ]
-    return Section("The horizon curriculum, round by round", text, (), boxes, beside=True)
+    for (world, _), own in grouped(results.curriculum, ["world", "context"]):
+        drawn = figures.curriculum_figure(own, _strong(own[own["round"] == own["round"].max()]), style)
+        caption = f"{own['num_plans'].iloc[0]:,} candidate plans."
+        yield FigureBox(drawn, caption, f"normalised scores in {world} after each round")
 
 
-def bits(results: Results, style: Mapping[str, Style]) -> Section:
+def bits(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Bits of held-out plans, a figure a world."""
     rows = results.bits[(results.bits["rounds"] == 0) & (results.bits["prior"] != "uniform")]
-    boxes = [
-        _box(figures.bits_figure(own, style), world, own.assign(prior=_labels(own)), 1)
-        for (world,), own in grouped(rows, ["world"])
-    ]
-    text = [
-        "Bits per action of the held-out plans of the planner that tries all short ones: the fewer, the better a prior"
-        " predicts them. Hollow: without context; filled, below: with the initial or the per-step context. The numbers"
-        " are in the tables below."
-    ]
-    return Section("Bits per action of held-out plans", text, (), boxes, beside=True)
+    for (world,), own in grouped(rows, ["world"]):
+        yield FigureBox(figures.bits_figure(own, style), "", f"bits per action in {world}")
 
 
-def drawn_plans(results: Results, style: Mapping[str, Style]) -> Section:
+def drawn_plans(results: Results, style: Mapping[str, Style]) -> Iterator[FigureBox]:
     """Plans drawn in the worlds."""
-    boxes = []
     for run in results.runs:
         for prior in (run.get("plans") or {"paths": ()})["paths"]:
             drawn = figures.plans_figure(run["plans"], prior, style[prior][0], f"{run['world']}: {prior}")
-            boxes.append(FigureBox(drawn, "", f"plans of {prior} in {run['world']}"))
-    text = [
-        "Candidate plans of some priors from one start, after the last round of the curriculum. Square: the start;"
-        " dots: where plans end; green: rewards; grey: walls."
-    ]
-    return Section("Plans drawn in the worlds", text, (), boxes, beside=True)
+            yield FigureBox(drawn, "", f"plans of {prior} in {run['world']}")
 
 
-def transitions(results: Results) -> Section:
+def transitions(results: Results) -> Iterator[FigureBox]:
     """Transition matrices of plans sampled from the priors: of the best chain, and of all priors that are no chains."""
-    boxes = []
-    rows = results.rows[(results.rows["sees"] == "none") & (results.rows["num_plans"] == results.shown)]
+    rows = results.rows[(results.rows["context"] == "none") & (results.rows["num_plans"] == results.shown)]
     for world in results.worlds:
         runs = [run for run in results.runs if run["world"] == world and run.get("transitions")]
-        strong = _strong(rows[rows["world"] == world])
-        for prior in runs[0]["transitions"] if runs else ():
-            if prior in strong and prior != "uniform":
-                matrices = np.array([run["transitions"][prior] for run in runs if prior in run["transitions"]])
-                # An action that never came has a row of zeros in its seed.
-                seeds = (matrices.sum(2, keepdims=True) > 0).sum(0)
-                mean = np.divide(matrices.sum(0), seeds, out=np.full(matrices.shape[1:], np.nan), where=seeds > 0)
-                names = runs[0]["action_names"] or [str(action) for action in range(len(mean))]
-                drawn = transition_figure(mean, names, f"{world}: {prior}", small=True)
-                boxes.append(FigureBox(drawn, "", f"transition matrix of {prior} in {world}"))
-    text = [
-        "How often each action follows each in plans sampled from a prior after the last round of the curriculum: means"
-        " over seeds."
-    ]
-    return Section("Transition matrices", text, (), boxes, beside=True)
+        strong = _strong(rows[(rows["world"] == world) & (rows["prior"] != "uniform")])
+        for prior in (prior for prior in (runs[0]["transitions"] if runs else ()) if prior in strong):
+            matrices = np.array([run["transitions"][prior] for run in runs if prior in run["transitions"]])
+            # An action that never came has a row of zeros in its seed.
+            seeds = (matrices.sum(2, keepdims=True) > 0).sum(0)
+            mean = np.divide(matrices.sum(0), seeds, out=np.full(matrices.shape[1:], np.nan), where=seeds > 0)
+            names = runs[0]["action_names"] or [str(action) for action in range(len(mean))]
+            drawn = transition_figure(mean, names, f"{world}: {prior}", small=True)
+            yield FigureBox(drawn, "", f"transition matrix of {prior} in {world}")
 
 
 def about_worlds(results: Results) -> Section:
     """What the worlds are."""
     names = ["world", "length", "num_starts"]
     runs = pd.DataFrame([{name: run[name] for name in names} for run in results.runs])
-    frame = runs.groupby("world", sort=False).agg("first").assign(seeds=runs["world"].value_counts()).reset_index()
+    frame = runs.groupby(names, sort=False).size().reset_index(name="seeds")
     columns = {"world": "world", "actions": "length", "starts": "num_starts:,", "seeds": "seeds"}
     text = [
         "Plans are learned from in training worlds and searched for in held-out ones. The normalised score is that of a"
@@ -281,23 +269,23 @@ def about_worlds(results: Results) -> Section:
 
 def tables_of(results: Results, world: str) -> Iterator[Table]:
     """Of a world: normalised scores and their differences, plans needed, bits, optimal starts and times."""
-    rows = results.rows[results.rows["world"] == world]
+    rows, needed, bits = (
+        _labelled(frame[frame["world"] == world]) for frame in (results.rows, results.efficiency, results.bits)
+    )
     caption = f"{world}: normalised score, % of the optimum, by candidate plans. {HALF}"
     for _, row in rows[rows["num_plans"].isna()].iterrows():
         score = plus_minus(row, "oracle_share", 100)
         caption += f" {row['planner'].capitalize()}, {row['model_steps']:,} model steps: {score}."
     rows = rows[rows["num_plans"].notna()]
-    cells = [plus_minus(row, "oracle_share", 100) for _, row in rows.iterrows()]
-    yield _by_number(rows, _labels(rows), cells, "prior", caption, world)
-    paired = results.paired[results.paired["world"] == world]
-    if len(paired):
+    scores = [plus_minus(row, "oracle_share", 100) for _, row in rows.iterrows()]
+    yield table_by(rows, {"prior": "label"}, "num_plans", scores, caption, world)
+    if len(paired := results.paired[results.paired["world"] == world]):
         caption = f"{world}: differences between priors, percentage points, by candidate plans, paired. {HALF} {HOLM}"
-        pairs, gaps = paired.apply(_pair, axis=1), paired.apply(_gap, axis=1)
-        yield _by_number(paired, pairs, gaps, "first - second", caption, world)
-    needed = results.efficiency[results.efficiency["world"] == world]
+        pairs = paired.assign(label=paired.apply(_pair, axis=1))
+        yield table_by(pairs, {"first - second": "label"}, "num_plans", _gaps(pairs), caption, world)
     if (needed["prior"] != "uniform").any():
         most = f"{needed['most'].iloc[0]:,}"
-        columns: Columns = {
+        columns: dict[str, Column] = {
             "prior": "label",
             "plans needed": lambda row: _median(row, "needed", f"> {most}"),
             "times fewer": lambda row: _median(row, "factor", "< 1"),
@@ -308,80 +296,49 @@ def tables_of(results: Results, world: str) -> Iterator[Table]:
             " test). times fewer: than random search needs, which is less where it gains nothing by more. reached:"
             f" seeds in which the prior did with {most} plans."
         )
-        yield table(needed.assign(label=_labels(needed)), columns, caption, world)
-    bits = results.bits[(results.bits["world"] == world) & (results.bits["rounds"] == 0)]
-    if len(bits):
+        yield table(needed, columns, caption, world)
+    if len(bits := bits[bits["rounds"] == 0]):
         columns = {
             "prior": "label",
-            "bits per action": lambda row: plus_minus(row, "bits_per_action", 1, 3),
-            "more": lambda row: plus_minus(row, "more", 1, 3, "+", ("more_low", "more_high")),
+            "bits per action": lambda row: plus_minus(row, "bits_per_action", digits=3),
+            "more": lambda row: plus_minus(row, "more", digits=3, sign="+", ends="more_"),
         }
         caption = f"{world}: bits per held-out action; more: than the best Markov chain of equal context, paired."
-        yield table(bits.assign(label=_labels(bits)), columns, caption, world)
-    last = rows[rows["num_plans"] == results.shown]
-    times = [f"{1000 * one:.3g}" if one == one else "" for one in last["seconds_per_decision"]]
+        yield table(bits, columns, caption, world)
     caption = f"{world}: optimal in % of the starts, by candidate plans; ms: a decision with {results.shown:,} plans."
-    cells = [f"{100 * one:.1f}" for one in rows["at_oracle"]]
-    made = _by_number(rows, _labels(rows), cells, "prior", caption)
-    body = [[*row, time] for row, time in zip(made.rows, times, strict=True)]
-    yield Table([*made.headings, "ms"], body, caption, title=world)
+    shares = [f"{100 * one:.1f}" for one in rows["at_oracle"]]
+    yield table_by(rows, {"prior": "label"}, "num_plans", shares, caption, world, timed=results.shown)
 
 
-def _by_number(
-    rows: pd.DataFrame, labels: Iterable[str], cells: Iterable[str], heading: str, caption: str, title: str = ""
-) -> Table:
-    """A table with a row a label and a column a number of plans, of a label and a cell for each of `rows`."""
-    labels = list(labels)
-    found = dict(zip(zip(labels, rows["num_plans"], strict=True), cells, strict=True))
-    numbers = sorted(rows["num_plans"].unique())
-    body = [[label, *(found.get((label, number), "") for number in numbers)] for label in dict.fromkeys(labels)]
-    return Table([heading, *(f"{number:,}" for number in numbers)], body, caption, title=title)
-
-
-def _box(drawn: Figure, world: str, rows: pd.DataFrame, factor: float, caption: str = "") -> FigureBox:
-    """A figure whose text for those who do not see it has the first number of each of `rows`."""
-    name = "oracle_share" if "oracle_share" in rows else "bits_per_action"
-    form = "{} {:.0f} %" if factor == 100 else "{} {:.3f}"
-    said = (form.format(row["prior"], factor * row[name]) for _, row in rows.iterrows())
-    return FigureBox(drawn, caption, f"{world}: {', '.join(said)}")
-
-
-def plus_minus(
-    row: Row, name: str, factor: float, digits: int = 1, sign: str = "", ends: tuple[str, str] = ("low", "high")
-) -> str:
-    """A mean with the longer side of its interval."""
-    mean, low, high = (row[one] for one in (name, *ends))
-    if pd.isna(mean):
-        return ""
-    text = f"{round(factor * mean, digits) + 0:{sign}.{digits}f}"  # no minus before 0.0
-    return text if pd.isna(low) else f"{text} ±{factor * max(high - mean, mean - low):.{digits}f}"
-
-
-def _gap(row: Row, significant: bool | None = None) -> str:
+def _gap(row: Any, significant: bool) -> str:
     """A difference in percentage points, with a star where it is significant."""
-    star = row["p_holm"] < 0.05 if significant is None else significant
-    return plus_minus(row, "difference", 100, 1, "+") + ("*" if star else " " if row["seeds"] > 1 else "")
+    return plus_minus(row, "difference", 100, sign="+") + ("*" if significant else " " if row["seeds"] > 1 else "")
 
 
-def _labels(rows: pd.DataFrame) -> list[str]:
-    """Names of priors in tables."""
-    return [Key(*one).label for one in zip(rows["prior"], rows["sees"], rows["rounds"], strict=True)]
+def _gaps(rows: pd.DataFrame) -> list[str]:
+    return [_gap(row, row["p_holm"] < 0.05) for _, row in rows.iterrows()]
 
 
-def _context(row: Row) -> str:
-    return f"{row['sees']}{', after' if row['rounds'] else ''}"
+def _labelled(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows with the names of their priors in tables."""
+    context = (", " + rows["context"] + " context").replace(", none context", "")
+    return rows.assign(label=rows["prior"] + context + np.where(rows["rounds"] > 0, ", after curriculum", ""))
 
 
-def _pair(row: Row) -> str:
+def _context(row: Any) -> str:
+    return f"{row['context']}{', after' if row['rounds'] else ''}"
+
+
+def _pair(row: Any) -> str:
     # Which priors are the best may differ with the number of plans.
     pair = "best neural - best Markov" if row["what"] == BEST else f"{row['first']} - {row['second']}"
     pair = str(row["first"]) if row["first"] == row["second"] else pair
-    context = "" if row["sees"] == "none" else f", context {row['sees']}"
+    context = "" if row["context"] == "none" else f", context {row['context']}"
     after = f", rounds {row['rounds']}" if "-" in row["rounds"] else ", after curriculum"
     return f"{pair}{context}{'' if row['rounds'] == '0' else after}"
 
 
-def _median(row: Row, name: str, beyond: str) -> str:
+def _median(row: Any, name: str, beyond: str) -> str:
     """A median with its interval; `beyond` stands for what is missing."""
     median, *ends = [
         beyond if pd.isna(value) else f"{value:,.0f}" if value >= 10 else f"{value:.2g}"

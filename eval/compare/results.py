@@ -1,8 +1,7 @@
 """From runs to tables of results: normalised scores, differences between priors, plans needed, bits, curriculum.
 
-A run is one world and one seed: worlds to learn in, worlds held out, and priors of its own. Runs are independent, so
-all intervals and tests are over the seeds of a world. Intervals are Student's, 95 %; those of medians (of numbers of
-plans, some of which are infinite) are those of the sign test.
+Intervals and tests are over the seeds of a world, since these are what is independent. Intervals are Student's, 95 %;
+those of medians (of numbers of plans, some of which are infinite) are those of the sign test.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,17 +15,16 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from eval.compare.priors import NEURAL
-from eval.worlds.runs import across_worlds
-from neuroprior.analysis.statistics import Difference, holm, mean_intervals
+from eval.worlds.runs import across_worlds, frame_of, seed_means
+from neuroprior.analysis.statistics import Difference, holm
 
 Array = NDArray[np.float64]
-Runs = Sequence[Mapping[str, Any]]
 
 BEST = "best neural minus best Markov"
 LEARNED = ("neural", "markov", "other")
 """Kinds of priors that have learned something."""
 
-PRIOR = ["prior", "sees", "rounds"]
+PRIOR = ["prior", "context", "rounds"]
 """Columns that name a prior: its label, its context, and its rounds of the horizon curriculum."""
 
 CLOSE = 1e-9
@@ -37,19 +35,13 @@ class Key(NamedTuple):
     """The columns `PRIOR` of a row."""
 
     prior: str
-    sees: str
+    context: str
     rounds: int
 
     @property
     def kind(self) -> str:
-        """One of uniform, markov, neural, and other: macro, or the folder of a saved prior."""
+        """See `kind_of`."""
         return kind_of(self.prior)
-
-    @property
-    def label(self) -> str:
-        """Its name in tables."""
-        context = "" if self.sees == "none" else f", {self.sees} context"
-        return self.prior + context + (", after curriculum" if self.rounds else "")
 
 
 UNIFORM = Key("uniform", "none", 0)
@@ -57,7 +49,7 @@ UNIFORM = Key("uniform", "none", 0)
 
 
 def kind_of(prior: str) -> str:
-    """The kind of a prior by its label, see `Key.kind`."""
+    """The kind of a prior by its label: uniform, markov, neural, or other (macro, or the folder of a saved prior)."""
     if prior == "uniform":
         return prior
     if prior in NEURAL:
@@ -65,12 +57,8 @@ def kind_of(prior: str) -> str:
     return "markov" if prior.removeprefix("markov-").isdecimal() else "other"
 
 
-class Pair(NamedTuple):
-    """Two sets of priors to be compared; of a set of several, the best."""
-
-    what: str
-    first: Sequence[Key]
-    second: Sequence[Key]
+Pair = tuple[str, Sequence[Key], Sequence[Key]]
+"""What is compared, in words, and two sets of priors; of a set of several, the best."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +73,7 @@ class Results:
         ValueError: there are no runs, or (from the tables) they do not belong together.
     """
 
-    runs: Runs
+    runs: Sequence[Mapping[str, Any]]
     num_plans: Sequence[int]
 
     def __post_init__(self) -> None:
@@ -115,20 +103,22 @@ class Results:
             ValueError: a world has an entry twice, or runs with different numbers of plans.
         """
         budgets: dict[str, list[int]] = {}
-        lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds"]
-        entries, found = [], set()
         for run in self.runs:
-            world, seed, numbers = run["world"], run["seed"], list(run["budgets"])
+            world, numbers = run["world"], list(run["budgets"])
             if budgets.setdefault(world, numbers) != numbers:
-                raise ValueError(f"{world}, seed {seed}: the numbers of plans are {numbers}, not {budgets[world]}")
-            for entry in run["entries"]:
-                named = {"world": world, "seed": seed} | {name: entry[name] for name in ("planner", *PRIOR)}
-                if (place := tuple(named.values())) in found:
-                    raise ValueError(f"{world}, seed {seed}: {entry['prior'] or entry['planner']} is there twice")
-                found.add(place)
-                named["num_plans"] = numbers if entry["prior"] else [None]
-                entries.append(named | {name: entry[name] for name in lists[1:]})
-        frame = pd.DataFrame(entries, columns=["world", "seed", "planner", *PRIOR, *lists]).explode(lists, True)
+                raise ValueError(
+                    f"{world}, seed {run['seed']}: the numbers of plans are {numbers}, not {budgets[world]}"
+                )
+        frame, place = frame_of(self.runs), ["world", "seed", "planner", *PRIOR]
+        for _, twice in frame[frame.duplicated(place)].iterrows():
+            name = twice["planner"] if pd.isna(twice["prior"]) else twice["prior"]
+            raise ValueError(f"{twice['world']}, seed {twice['seed']}: {name} is there twice")
+        frame["num_plans"] = [
+            [None] if pd.isna(prior) else budgets[world]
+            for world, prior in zip(frame["world"], frame["prior"], strict=True)
+        ]
+        lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds"]
+        frame = frame[[*place, *lists]].explode(lists, ignore_index=True)
         return frame.astype(dict.fromkeys(lists, "float64") | {"num_plans": "Int64"})
 
     @cached_property
@@ -146,14 +136,9 @@ class Results:
     def curves(self) -> pd.DataFrame:
         """The normalised score: a row a world, planner, prior and number of plans, with its interval over seeds."""
         by = ["world", "planner", *PRIOR, "num_plans"]
-        found: pd.DataFrame = mean_intervals(self.scores, by, "share").rename(
-            columns={"mean": "oracle_share", "n": "seeds"}
-        )
-        others = self.scores.groupby(by, sort=False, dropna=False)[["model_steps", "at_oracle", "seconds"]].mean()
-        found = found.join(others.reset_index(drop=True).rename(columns={"seconds": "seconds_per_decision"}))
+        found = seed_means(self.scores, by, "share", ["model_steps", "at_oracle", "seconds"])
         found["model_steps"] = found["model_steps"].convert_dtypes()
-        columns = ["model_steps", "oracle_share", "low", "high", "at_oracle", "seconds_per_decision", "seeds"]
-        return found[[*by, *columns]]
+        return found.rename(columns={"share": "oracle_share", "seconds": "seconds_per_decision"})
 
     @cached_property
     def rows(self) -> pd.DataFrame:
@@ -173,31 +158,29 @@ class Results:
     def paired(self) -> pd.DataFrame:
         """Differences in the normalised score between priors with as many plans, over the seeds that have both.
 
-        What is compared: the best neural with the best Markov prior; each neural with each Markov prior; each saved or
-        macro prior with every other; after with before the horizon curriculum; with and without context. All else is
-        equal. The best are chosen on half of the seeds and compared on the other half, for both halves; their
-        intervals and p-values hold whichever are the best: see `best_difference`.
+        What is compared: the best neural with the best Markov prior (see `best_difference`); each neural with each
+        Markov prior; each saved or macro prior with every other; after with before the horizon curriculum; with and
+        without context. All else is equal.
 
-        A row a world, pair and number of plans: the scores of the two (`first_share`, `second_share`; of the best, as
-        they were chosen for each seed on the other half), their `difference` with Student's interval (`low`, `high`),
-        `p_value` of the two-sided paired t-test, and `p_holm`, corrected for all rows of the world. With a single seed
-        there are scores and a difference and nothing else; the best are not chosen then.
+        A row a world, pair and number of plans: the scores of the two (`first_share`, `second_share`), their
+        `difference` with Student's interval (`low`, `high`), `p_value` of the two-sided paired t-test, and `p_holm`,
+        corrected for all rows of the world. Of a single seed scores and difference alone; the best are not chosen then.
         """
-        gaps = (
-            (world, difference(tables, pair, number))
+        gaps = [
+            {"world": world} | gap
             for world, tables in self._by_prior.items()
             for pair in _pairs(tables)
             for number in self.num_plans
-        )
-        found = pd.DataFrame([{"world": world} | gap for world, gap in gaps if gap], columns=["world", *GAP])
-        return found.assign(p_holm=corrected(found, ["world"]))
+            if (gap := difference(tables, pair, number))
+        ]
+        return corrected(pd.DataFrame(gaps, columns=["world", *GAP]), ["world"])
 
     @cached_property
     def words(self) -> pd.DataFrame:
         """The answer in each world: the best neural against the best Markov prior of equal context and curriculum.
 
         Where a world lacks one of the kinds, its two learned priors, or the best of them against random plans. A row a
-        world, context (`sees`) and number of rounds: that of the difference, with `p_holm` corrected for the number of
+        world, context and number of rounds: that of the difference, with `p_holm` corrected for the number of
         worlds in which the same was asked, and `better`, the name of the better prior where `p_holm` is below 0.05.
         """
         rows = []
@@ -205,9 +188,9 @@ class Results:
             for like in dict.fromkeys(key[1:] for key in tables if key.kind in LEARNED):
                 gaps = (difference(tables, pair, self.shown) for pair in _headlines(tables, like))
                 if gap := next(filter(None, gaps), None):  # the first pair that can be compared
-                    rows.append({"world": world} | gap | {"sees": like[0], "rounds": like[1]})
+                    rows.append({"world": world} | gap | {"context": like[0], "rounds": like[1]})
         found = pd.DataFrame(rows, columns=["world", *GAP])
-        found["p_holm"] = corrected(found.assign(after=found["rounds"] > 0), ["sees", "after"])
+        found = corrected(found.assign(after=found["rounds"] > 0), ["context", "after"]).drop(columns="after")
         better = found["first"].where(found["difference"] > 0, found["second"])
         return found.assign(better=better.where(found["p_holm"] < 0.05))
 
@@ -245,12 +228,9 @@ class Results:
         The best chain of equal context, before the horizon curriculum: see `best_difference` for `more`, its interval
         and its p-value, which is not corrected for the number of priors.
         """
-        entries = [{"world": run["world"], "seed": run["seed"], **one} for run in self.runs for one in run["entries"]]
-        frame = pd.DataFrame(entries, columns=["world", "seed", *PRIOR, "bits"]).astype({"bits": "float64"})
-        frame, by = frame[frame["bits"].notna()], ["world", *PRIOR]
-        found: pd.DataFrame = mean_intervals(frame, by, "bits").rename(
-            columns={"mean": "bits_per_action", "n": "seeds"}
-        )
+        frame, by = frame_of(self.runs).astype({"bits": "float64"}), ["world", *PRIOR]
+        frame = frame[frame["bits"].notna()]
+        found = seed_means(frame, by, "bits").rename(columns={"bits": "bits_per_action"})
         bits = {place: own.set_index("seed")["bits"] for place, own in grouped(frame, by)}
         more = []
         for place, mine in bits.items():
@@ -262,12 +242,11 @@ class Results:
         return found.join(pd.DataFrame(more, columns=["more", "more_low", "more_high", "p_value"]))
 
     @cached_property
-    def growth(self) -> pd.DataFrame:
+    def curriculum(self) -> pd.DataFrame:
         """The normalised score after each round of the horizon curriculum: a row a world, prior, round and length."""
-        names = ["world", "prior", "sees", "round", "length", "num_plans"]
-        entries = [{"world": run["world"], **one} for run in self.runs for one in run["growth"]]
-        found: pd.DataFrame = mean_intervals(pd.DataFrame(entries, columns=[*names, "share"]), names, "share")
-        return found.rename(columns={"mean": "oracle_share", "n": "seeds"})
+        names = ["world", "prior", "context", "round", "length", "num_plans"]
+        entries = frame_of(self.runs, "curriculum").reindex(columns=[*names, "share"])
+        return seed_means(entries, names, "share").rename(columns={"share": "oracle_share"})
 
     @cached_property
     def reasons(self) -> pd.DataFrame:
@@ -278,13 +257,13 @@ class Results:
         held-out ones (`neural_bits`, `markov_bits`), and by how much networks are significantly ahead with the fewest
         plans (`early`).
         """
-        at = ["world", "sees", "rounds"]
+        at = ["world", "context", "rounds"]
         best = self.words[(self.words["what"] == BEST) & (self.words["better"] != self.words["first"])]
         found = best[[*at, "second_share"]].rename(columns={"second_share": "markov_share"})
         for kind in ("neural", "markov"):
             own = self.bits[(self.bits["rounds"] == 0) & (self.bits["prior"].map(kind_of) == kind)]
-            fewest = own.groupby(["world", "sees"])["bits_per_action"].min().rename(f"{kind}_bits")
-            found = found.merge(fewest.reset_index(), "left", on=["world", "sees"])
+            fewest = own.groupby(["world", "context"])["bits_per_action"].min().rename(f"{kind}_bits")
+            found = found.merge(fewest.reset_index(), "left", on=["world", "context"])
         early = self.paired[(self.paired["what"] == BEST) & (self.paired["num_plans"] == self.num_plans[0])]
         early = early[(early["difference"] > 0) & (early["p_holm"] < 0.05) & (self.num_plans[0] < self.shown)]
         early = early.astype({"rounds": "int64"}).rename(columns={"difference": "early"})
@@ -300,11 +279,11 @@ class Results:
         own = self.scores[(self.scores["num_plans"] == self.shown) & self.scores["prior"].notna()]
         own = own.assign(rounds=(own["rounds"] > 0).astype("int64"), kind=own["prior"].map(kind_of))
         own = own[["world", "seed", *PRIOR, "kind", "share"]]
-        chains, random = own[own["kind"] == "markov"], own[own["kind"] == "uniform"].drop(columns=["sees", "rounds"])
-        others = own[own["kind"].isin(["neural", "other"])].merge(chains, on=["world", "seed", "sees", "rounds"])
+        chains, random = own[own["kind"] == "markov"], own[own["kind"] == "uniform"].drop(columns=["context", "rounds"])
+        others = own[own["kind"].isin(["neural", "other"])].merge(chains, on=["world", "seed", "context", "rounds"])
         pairs = pd.concat([others, own[own["kind"] != "uniform"].merge(random, on=["world", "seed"])])
         names = {"prior_x": "prior", "prior_y": "baseline", "share_x": "first", "share_y": "second"}
-        return across_worlds(pairs.rename(columns=names), ["prior", "sees", "rounds", "baseline"])
+        return across_worlds(pairs.rename(columns=names), ["prior", "context", "rounds", "baseline"])
 
 
 def grouped(frame: pd.DataFrame, by: Sequence[str]) -> Iterator[tuple[Any, pd.DataFrame]]:
@@ -313,59 +292,24 @@ def grouped(frame: pd.DataFrame, by: Sequence[str]) -> Iterator[tuple[Any, pd.Da
 
 
 def _pairs(tables: Mapping[Key, pd.DataFrame]) -> Iterator[Pair]:
+    """All pairs of priors with something to compare, see `Results.paired`."""
     keys = [key for key in tables if key.kind in LEARNED]
     for like in dict.fromkeys(key[1:] for key in keys):
         neural, markov = ([k for k in keys if (k.kind, k[1:]) == (kind, like)] for kind in ("neural", "markov"))
         if neural and markov:
-            yield Pair(BEST, neural, markov)
-        yield from (Pair("neural minus Markov", [one], [other]) for one in neural for other in markov)
+            yield BEST, neural, markov
+        yield from (("neural minus Markov", [one], [other]) for one in neural for other in markov)
     for place, key in enumerate(keys):
         for later, other in enumerate(keys):
             alike = other != key and other[1:] == key[1:]
             if key.kind == "other" and alike and (other.kind != "other" or place < later):
-                yield Pair("other minus any", [key], [other])
+                yield "other minus any", [key], [other]
     for key in keys:
         if key.rounds and (before := key._replace(rounds=0)) in keys:
-            yield Pair("after minus before the curriculum", [key], [before])
+            yield "after minus before the curriculum", [key], [before]
     for key in keys:
-        if key.sees != "none" and (without := key._replace(sees="none")) in keys:
-            yield Pair("with minus without context", [key], [without])
-
-
-SIDES = ["first", "second", "first_share", "second_share"]
-GAP = ["what", *SIDES, "sees", "rounds", "num_plans", "difference", "low", "high", "p_value", "seeds"]
-
-
-def difference(tables: Mapping[Key, pd.DataFrame], pair: Pair, num_plans: int) -> dict[str, Any] | None:
-    """The columns `GAP` of a pair; None where the best would have to be chosen from a single seed."""
-    keys = [*pair.first, *pair.second]
-    values = pd.concat([tables[key][num_plans] for key in keys], axis=1, join="inner").to_numpy().T
-    first, second = values[: len(pair.first)], values[len(pair.first) :]
-    seeds, choice = values.shape[1], max(len(first), len(second)) > 1
-    if seeds < 1 + choice:
-        return None
-    best = [chosen(side) for side in (first, second)]
-    names = [
-        " / ".join(dict.fromkeys(some[place].prior for place in own))
-        for some, own in zip((pair.first, pair.second), best, strict=True)
-    ]
-    means = [float(side[own, np.arange(seeds)].mean()) for side, own in zip((first, second), best, strict=True)]
-    gap = best_difference(first, second) if seeds > 1 else (float((first - second).mean()), *[np.nan] * 3)
-    about = [
-        " - ".join(dict.fromkeys(str(key[place]) for key in (pair.first[0], pair.second[0])))
-        for place in (Key._fields.index("sees"), Key._fields.index("rounds"))
-    ]
-    return dict(zip(GAP, (pair.what, *names, *means, *about, num_plans, *gap, seeds), strict=True))
-
-
-def corrected(rows: pd.DataFrame, by: Sequence[str]) -> pd.Series:
-    """P-values corrected for the number of rows that agree in columns `by` (Holm's procedure); missing ones stay so."""
-
-    def correct(p_values: pd.Series) -> pd.Series:
-        known = p_values.dropna()
-        return pd.Series(holm(known.to_numpy(np.float64)), known.index).reindex(p_values.index)
-
-    return rows["p_value"].astype("float64").groupby([rows[name] for name in by]).transform(correct)
+        if key.context != "none" and (without := key._replace(context="none")) in keys:
+            yield "with minus without context", [key], [without]
 
 
 def _headlines(tables: Mapping[Key, pd.DataFrame], like: tuple[str, int]) -> Iterator[Pair]:
@@ -373,13 +317,41 @@ def _headlines(tables: Mapping[Key, pd.DataFrame], like: tuple[str, int]) -> Ite
     keys = [key for key in tables if key.kind in LEARNED and key[1:] == like]
     neural, markov = ([key for key in keys if key.kind == kind] for kind in ("neural", "markov"))
     if neural and markov:
-        yield Pair(BEST, neural, markov)
-        yield Pair("neural minus Markov", neural[:1], markov[-1:])
+        yield BEST, neural, markov
+        yield "neural minus Markov", neural[:1], markov[-1:]
     elif len(keys) == 2:
-        yield Pair("learned minus other", keys[:1], keys[1:])
+        yield "learned minus other", keys[:1], keys[1:]
     if UNIFORM in tables:
-        yield Pair("best learned minus random", keys, [UNIFORM])
-        yield Pair("learned minus random", keys[:1], [UNIFORM])
+        yield "best learned minus random", keys, [UNIFORM]
+        yield "learned minus random", keys[:1], [UNIFORM]
+
+
+GAP = ["what", "first", "second", "first_share", "second_share", "context", "rounds", "num_plans"]
+GAP += ["difference", "low", "high", "p_value", "seeds"]
+
+
+def difference(tables: Mapping[Key, pd.DataFrame], pair: Pair, num_plans: int) -> dict[str, Any] | None:
+    """The columns `GAP` of a pair; None where the best would have to be chosen from a single seed."""
+    what, *sides = pair
+    values = pd.concat([tables[key][num_plans] for side in sides for key in side], axis=1, join="inner").to_numpy().T
+    first, second = np.split(values, [len(sides[0])])
+    seeds = np.arange(values.shape[1])
+    if len(seeds) < 1 + (max(map(len, sides)) > 1):
+        return None
+    best = [chosen(own) for own in (first, second)]
+    names = [
+        " / ".join(dict.fromkeys(side[place].prior for place in own)) for side, own in zip(sides, best, strict=True)
+    ]
+    means = [float(own[which, seeds].mean()) for own, which in zip((first, second), best, strict=True)]
+    about = [" - ".join(dict.fromkeys(map(str, ends))) for ends in zip(sides[0][0][1:], sides[1][0][1:], strict=True)]
+    gap = best_difference(first, second) if len(seeds) > 1 else (float((first - second).mean()), *[np.nan] * 3)
+    return dict(zip(GAP, (what, *names, *means, *about, num_plans, *gap, len(seeds)), strict=True))
+
+
+def corrected(rows: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
+    """Rows with `p_holm`: their p-values corrected for the number of rows that agree in `by`; missing ones stay so."""
+    known = rows[rows["p_value"].notna()].astype({"p_value": "float64"})
+    return rows.assign(p_holm=known.groupby(list(by))["p_value"].transform(holm).astype("float64"))
 
 
 def best_difference(first: Array, second: Array, level: float = 0.95) -> Difference:
@@ -456,8 +428,8 @@ def _median(logs: Array) -> tuple[float, ...]:
     """The median of what has these base-2 logarithms, and the order statistics that hold the true one between them."""
     ordered = np.sort(logs)
     out = int(stats.binom.ppf(0.025, len(logs), 0.5)) - 1
-    # Of two in the middle of which one is infinite, the median is on the safe side.
-    middle = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
-    median = sum(middle) / 2 if np.isfinite(middle).all() else middle[int(np.isfinite(middle[0]))]
+    # Of two of which one is infinite, the median is on the safe side.
+    two = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    median = sum(two) / 2 if np.isfinite(two).all() else two[int(np.isfinite(two[0]))]
     ends = (ordered[out], ordered[-1 - out]) if out >= 0 else (np.nan, np.nan)
     return tuple(2.0**value if np.isfinite(value) else np.nan for value in (median, *ends))

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import torch
 
 from eval.compare.curves import (
-    CLOSE,
     ROLLOUTS,
     TEMPERATURES,
     Starts,
@@ -52,19 +51,10 @@ SHOWN = ("uniform", "markov-2", "gru")
 
 @dataclass(frozen=True)
 class Settings:
-    """All that decides the results of a run, beside its world and seed.
+    """All that decides the results of a run, beside its world and seed; see `eval.compare.command.compare`.
 
-    Attributes:
-        num_plans: numbers of candidate plans, powers of two.
-        kinds: of fitted priors: "markov", "macro", "gru", "transformer".
-        context: contexts of priors, see `CONTEXTS`; empty: those of the world (`Task`).
-        rounds: of the horizon curriculum, at most; a world has as many as it has lengths.
-        steps: of training of each neural prior in a round, at most.
-        starts: held-out starts to plan from.
-        training_starts: from so many starts, times `Task.start_factor`, training plans are collected.
-        seed: of everything random.
-        priors: folders of saved priors.
-        lengths: actions in a plan, round by round of the horizon curriculum; empty: those of the world.
+    `context` may be empty, for those of the world (`Task`), and so may `lengths`, the number of actions in a plan round
+    by round of the horizon curriculum.
     """
 
     num_plans: tuple[int, ...]
@@ -97,11 +87,6 @@ class Settings:
 def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
     """Collect plans, fit priors, extend their horizons and compare them, in the worlds of one seed.
 
-    Args:
-        run: the world, and the seed of its worlds and of everything that is drawn in them.
-        settings: how much is done.
-        tasks: the worlds by name.
-
     Returns:
         What `eval.compare.results` reads.
 
@@ -109,40 +94,39 @@ def compare_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS)
         ValueError: too few plans or starts lead anywhere, or a saved prior does not fit the world.
     """
     begin, task = perf_counter(), tasks[run.world]
-    contest = Contest(task, run.seed, settings)
-    entries, growth, last = [], [], {}
-    if (tried_all := contest.exhaustive()) is not None:
-        entries.append(tried_all)
+    contest = Contest(run, task, settings)
+    entries, rounds, last = contest.exhaustive(), [], {}
     for one in contest.contestants():
         if one.length is not None:
-            growth.append(contest.curriculum_entry(one, one.length))
+            rounds.append(contest.curriculum_entry(one, one.length))
         if one.rounds in (0, contest.rounds):
             entries.append(contest.entry(one))
-        if one.sees == "none":
+        if one.context == "none":
             last[one.label] = one.prior  # the object goes on learning until all rounds are done
-    found: dict[str, Any] = {"world": run.world, "seed": run.seed, "about": task.about, "length": task.length}
-    found |= {"num_starts": settings.starts, "budgets": settings.budgets, "entries": entries, "growth": growth}
-    found |= {"action_names": task.action_names}
-    world = contest.worlds.held_out
-    found |= {"transitions": {label: transitions(prior, world, contest.generator) for label, prior in last.items()}}
-    found |= {"plans": drawn_plans(last, contest.starts, contest.generator) if run.seed == 0 else None}
-    return found | {"seconds": perf_counter() - begin}
+    world, generator = contest.worlds.held_out, contest.generator
+    return run._asdict() | {
+        "about": task.about,
+        "length": task.length,
+        "num_starts": settings.starts,
+        "budgets": settings.budgets,
+        "entries": entries,
+        "curriculum": rounds,
+        "action_names": task.action_names,
+        "transitions": {label: transitions(prior, world, generator) for label, prior in last.items()},
+        "plans": drawn_plans(last, contest.starts, generator) if run.seed == 0 else None,
+        "seconds": perf_counter() - begin,
+    }
 
 
 def curriculum_run(run: Run, settings: Settings, tasks: Mapping[str, Task] = TASKS) -> dict[str, Any]:
-    """Extend the horizons of all priors in the worlds of one seed; after every round, plan with plans of every length.
-
-    Args, raises: see `compare_run`.
-    """
-    begin, task = perf_counter(), tasks[run.world]
-    contest = Contest(task, run.seed, settings)
-    growth = [
+    """Extend the horizons of all priors in one seed's worlds; after every round, plan with plans of every length."""
+    contest = Contest(run, tasks[run.world], settings)
+    curriculum = [
         contest.curriculum_entry(one, length)
         for one in contest.contestants()
         for length in (contest.lengths if one.length is not None else ())
     ]
-    found: dict[str, Any] = {"world": run.world, "seed": run.seed, "about": task.about, "growth": growth}
-    return found | {"seconds": perf_counter() - begin}
+    return run._asdict() | {"about": contest.task.about, "curriculum": curriculum}
 
 
 def with_context(plans: Plans, context: Context) -> Plans:
@@ -155,11 +139,11 @@ def with_context(plans: Plans, context: Context) -> Plans:
 class Contestant(NamedTuple):
     """A prior after some rounds of the horizon curriculum, the last of which had plans of `length` actions.
 
-    `sees` is the name of its context; `length` is None for priors that do not take part in the curriculum.
+    `length` is None for priors that do not take part in the curriculum.
     """
 
     label: str
-    sees: Context
+    context: Context
     prior: Prior
     rounds: int
     length: int | None
@@ -168,10 +152,10 @@ class Contestant(NamedTuple):
 class Contest:
     """The worlds of a seed, the plans that are collected there, and the starts from which priors are compared."""
 
-    def __init__(self, task: Task, seed: int, settings: Settings, orders: Sequence[int] = ORDERS) -> None:
-        self.task, self.settings, self.orders = task, settings, orders
-        self.generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
-        self.worlds = task.worlds(settings.seed * 10_000 + seed)
+    def __init__(self, run: Run, task: Task, settings: Settings, orders: Sequence[int] = ORDERS) -> None:
+        self.run, self.task, self.settings, self.orders = run, task, settings, orders
+        self.generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + run.seed)
+        self.worlds = task.worlds(settings.seed * 10_000 + run.seed)
         self.longer = (settings.lengths or task.lengths)[: settings.rounds]
         self.rounds, self.lengths = len(self.longer), tuple(sorted({task.depth, *self.longer}))
         self.training_starts = settings.training_starts * task.start_factor
@@ -192,32 +176,35 @@ class Contest:
         """All priors, each after every round of its curriculum; the object is the same, and goes on learning."""
         yield Contestant("uniform", "none", UniformPrior(self.worlds.training.num_actions), 0, None)
         for folder in self.settings.priors:
-            prior = load_for(folder, self.task.name, self.task.num_actions, self.task.action_names)
-            sees = next(name for name, per in CONTEXTS.items() if per == prior.context_per)
-            yield Contestant(folder, sees, prior, 0, None)
-        for sees in self.settings.context or self.task.contexts:
-            if self.task.offers(sees):
-                yield from self._learners(sees)
+            prior = load_for(folder, self.run.world, self.task.num_actions, self.task.action_names)
+            context = next(name for name, per in CONTEXTS.items() if per == prior.context_per)
+            yield Contestant(folder, context, prior, 0, None)
+        for context in self.settings.context or self.task.contexts:
+            if self.task.offers(context):
+                yield from self._learners(context)
 
     def after_curriculum(self) -> Iterator[Contestant]:
         """Each prior after its last round alone; saved priors and the uniform prior have none."""
         return (one for one in self.contestants() if one.rounds == (0 if one.length is None else self.rounds))
 
-    def _learners(self, sees: Context) -> Iterator[Contestant]:
-        first = with_context(self.first, sees)
-        if "markov" in self.settings.kinds:
+    def _learners(self, context: Context) -> Iterator[Contestant]:
+        """The fitted priors with a context, after every round."""
+        kinds, first, world = self.settings.kinds, with_context(self.first, context), self.worlds.training
+        if "markov" in kinds:
             for order in self.orders:
-                prior = chain(order, self.worlds.training, first, self.task.feature_sets)
-                yield from self._curriculum(f"markov-{order}", sees, prior, first, {})
-        for kind in (kind for kind in NEURAL if kind in self.settings.kinds):
-            prior = network(kind, self.worlds.training, first, draw_seed(self.generator))
-            yield from self._curriculum(kind, sees, prior, first, TRAINING | {"max_steps": self.settings.steps})
-        if "macro" in self.settings.kinds and sees == "none":
-            yield from self._curriculum("macro", sees, macro(first), first, {})
+                prior = chain(order, world, first, self.task.feature_sets)
+                yield from self._curriculum(f"markov-{order}", context, prior, first)
+        for kind in (kind for kind in NEURAL if kind in kinds):
+            prior = network(kind, world, first, draw_seed(self.generator))
+            training = TRAINING | {"max_steps": self.settings.steps}
+            yield from self._curriculum(kind, context, prior, first, **training)
+        if "macro" in kinds and context == "none":
+            yield from self._curriculum("macro", context, macro(first), first)
 
     def _curriculum(
-        self, label: str, sees: Context, prior: Prior, first: Plans, training: dict[str, Any]
+        self, label: str, context: Context, prior: Prior, first: Plans, **training: Any
     ) -> Iterator[Contestant]:
+        """A prior after every round of its curriculum."""
         rounds = extend_horizon(
             prior,
             first,
@@ -233,7 +220,7 @@ class Contest:
             **training,
         )
         for number, _ in enumerate(rounds):
-            yield Contestant(label, sees, prior, number, (self.task.depth, *self.longer)[number])
+            yield Contestant(label, context, prior, number, (self.task.depth, *self.longer)[number])
 
     @cached_property
     def first(self) -> Plans:
@@ -251,48 +238,55 @@ class Contest:
 
     def entry(self, one: Contestant) -> dict[str, Any]:
         """What a prior's plans reach in the held-out worlds, and how well it predicts those that were chosen there."""
-        starts, temperature = self.starts, self._temperature(one, self.task.length)
-        entry: dict[str, Any] = {"planner": "sampling", "prior": one.label, "sees": one.sees, "rounds": one.rounds}
-        entry |= {"temperature": temperature}
-        entry |= curve(starts, one.prior, self.settings.budgets, self.generator, temperature)
-        asked = self.settings.num_plans
-        timed = seconds_per_decision(starts, one.prior, asked, TIMED_STARTS, self.generator, temperature)
-        seconds, steps = ([timed[b][k] if b in timed else None for b in self.settings.budgets] for k in (0, 1))
-        entry |= {"seconds": seconds, "model_steps": steps}
-        scored = score(one.label, one.prior, with_context(self.held_out_plans, one.sees))
-        return entry | {"bits": scored.bits_per_action().mean, "actions": int(self.held_out_plans.mask().sum())}
+        temperature = self._temperature(one, self.task.length)
+        how = self.starts, one.prior, self.generator, temperature
+        reached, budgets = curve(*how, self.settings.budgets), self.settings.budgets
+        timed = seconds_per_decision(*how, self.settings.num_plans, TIMED_STARTS)
+        held_out = with_context(self.held_out_plans, one.context)
+        return {
+            "planner": "sampling",
+            "prior": one.label,
+            "context": one.context,
+            "rounds": one.rounds,
+            "temperature": temperature,
+            **reached,
+            "seconds": [timed[number][0] if number in timed else None for number in budgets],
+            "model_steps": [timed[number][1] if number in timed else None for number in budgets],
+            "bits": score(one.label, one.prior, held_out).bits_per_action().mean,
+            "actions": int(held_out.mask().sum()),
+        }
 
     def curriculum_entry(self, one: Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""
-        budget = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else VALIDATION_PLANS
+        number = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else VALIDATION_PLANS
         temperature = self._temperature(one, length)
-        share = curve(self.starts_at[length], one.prior, [budget], self.generator, temperature)["share"][0]
-        named = {"prior": one.label, "sees": one.sees, "round": one.rounds}
-        return named | {"length": length, "num_plans": budget, "share": share}
+        share = curve(self.starts_at[length], one.prior, self.generator, temperature, [number])["share"][0]
+        named = {"prior": one.label, "context": one.context, "round": one.rounds}
+        return named | {"length": length, "num_plans": number, "share": share}
 
     def _temperature(self, one: Contestant, length: int) -> float:
         """The temperature to sample plans of `length` actions at, chosen once; uniform plans are the same at all."""
         if one.label == "uniform":
             return 1.0
-        key = one.label, one.sees, one.rounds, length
+        key = one.label, one.context, one.rounds, length
         if key not in self._temperatures:
             starts = self.validation_at[length]
             self._temperatures[key] = best_temperature(starts, one.prior, VALIDATION_PLANS, self.generator)
         return self._temperatures[key]
 
-    def exhaustive(self) -> dict[str, Any] | None:
-        """What all short plans reach; None where longer ones cost more, which would favour the short."""
-        if self.starts.reference < 0 or self.worlds.held_out.stochastic:
-            return None
-        planner = ExhaustivePlanner(self.task.depth, **self.task.scoring)
+    def exhaustive(self) -> list[dict[str, Any]]:
+        """What all short plans reach, one entry; none where longer plans cost more, which would favour the short."""
+        starts, world = self.starts, self.worlds.held_out
+        if starts.reference < 0 or world.stochastic:
+            return []
         begin = perf_counter()
-        decision = planner.plan(self.worlds.held_out, self.starts.state, self.generator)
+        decision = ExhaustivePlanner(self.task.depth, **self.task.scoring).plan(world, starts.state, self.generator)
         seconds = (perf_counter() - begin) / self.settings.starts
-        reached = float((decision.score >= self.starts.best - CLOSE).double().mean())
-        entry: dict[str, Any] = {"planner": "exhaustive", "prior": None, "sees": "none", "rounds": 0}
-        entry |= {"depth": self.task.depth, "share": [self.starts.normalised(decision.score.double())]}
-        entry |= {"at_oracle": [reached], "score": [float(decision.score.double().mean())]}
-        return entry | {"model_steps": [decision.model_steps], "seconds": [seconds], "bits": None, "actions": 0}
+        named = {"planner": "exhaustive", "prior": None, "context": "none", "rounds": 0, "depth": self.task.depth}
+        reached = {name: [value] for name, value in starts.reached(decision.score).items()}
+        return [
+            named | reached | {"model_steps": [decision.model_steps], "seconds": [seconds], "bits": None, "actions": 0}
+        ]
 
 
 def transitions(prior: Prior, world: World, generator: torch.Generator) -> list[list[float]]:
@@ -313,16 +307,18 @@ def drawn_plans(priors: dict[str, Prior], starts: Starts, generator: torch.Gener
     start = starts.state[:1]
     layout, squares = int(world.layout(start)), world.height * world.width
     rewards = world.reward[int(world.reward_map(start)), :: 4 if world.egocentric else 1]
-    found: dict[str, Any] = {"height": world.height, "width": world.width, "walls": world.walls[layout].tolist()}
-    found["reward"] = rewards[layout * squares : (layout + 1) * squares].view(world.height, world.width).tolist()
-    found["start"] = world.coordinates(start)[0].tolist()
-    found["paths"] = {}
-    for label in SHOWN:
-        if label in priors:
-            _, rollout = sample_in_world(
-                priors[label], world, start, DRAWN, starts.length, generator=generator, keep_states=True
-            )
-            assert rollout.states is not None
-            states = torch.cat([start.expand(DRAWN)[:, None], rollout.states[0]], 1)
-            found["paths"][label] = world.coordinates(states).tolist()
-    return found
+    paths = {}
+    for label in (label for label in SHOWN if label in priors):
+        how: dict[str, Any] = {"generator": generator, "keep_states": True}
+        rollout = sample_in_world(priors[label], world, start, DRAWN, starts.length, **how)[1]
+        assert rollout.states is not None
+        states = torch.cat([start.expand(DRAWN)[:, None], rollout.states[0]], 1)
+        paths[label] = world.coordinates(states).tolist()
+    return {
+        "height": world.height,
+        "width": world.width,
+        "walls": world.walls[layout].tolist(),
+        "reward": rewards[layout * squares : (layout + 1) * squares].view(world.height, world.width).tolist(),
+        "start": world.coordinates(start)[0].tolist(),
+        "paths": paths,
+    }

@@ -10,8 +10,7 @@ from eval.live.report import live_document
 from eval.live.run import LEARN_EVERY, PARTS, REPLAN_EVERY, LiveSettings, run_live
 from eval.worlds import runs
 from eval.worlds.foraging import FORAGING_WORLDS, ForagingWorldName
-from neuroprior._files import written_whole
-from neuroprior.report.document import publish
+from neuroprior.report.document import write_figures
 
 Kind: TypeAlias = Literal[tuple(LEARN_EVERY)]  # type: ignore[valid-type]
 Items: TypeAlias = restricted_number_type("Items", int, [(">=", 1), ("<=", 8)], docstring="More takes the oracle long.")  # type: ignore[valid-type]
@@ -60,9 +59,5 @@ def live(
     if period % whole:
         raise ValueError(f"period: a multiple of {whole} is expected, not {period}")
     settings = LiveSettings(tuple(kinds), period, seasons, agents, items, num_plans, length, seed)
-    found = runs.finished("live", run_live, settings, worlds, seeds, out, processes, dask)
-    document, pictures = live_document(*found, runs.command_line("live"))
-    publish(document, Path(out))
-    for world, figure in pictures.items():
-        with written_whole(Path(out) / f"{world}.png", "wb") as file:
-            figure.savefig(file, format="png", dpi=150, bbox_inches="tight", facecolor="white")
+    document = runs.run_experiment("live", run_live, live_document, settings, worlds, seeds, out, processes, dask)
+    write_figures(Path(out), {box.name: box.figure for box in document.sections[0].figures})

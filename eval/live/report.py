@@ -11,50 +11,54 @@ from eval.live.run import FORESIGHT, ORACLE, PARTS, RANDOM
 from eval.worlds import runs
 from neuroprior.analysis.statistics import mean_intervals
 from neuroprior.report.document import Column, Document, table
-from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, expect_some, legend, panels
+from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
 from neuroprior.report.page import FigureBox, Section, Table
 
-CONDITION = ["prior", "sees", "learns", "warm_start"]
-NAMES = {"prior": "prior", "context": "sees", "learns": "learns"}
+CONDITION = ["prior", "context", "learns", "warm_start"]
+NAMES = {"prior": "prior", "context": "context", "learns": "learns"}
 
 COLORS = {"never": "#7d838c", "before": "#d9731a", "online": "#3079d8", "oracle": "#2e9e5b"}
 """Of lines, by when the prior learned."""
 
 
-def live_document(
-    results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str
-) -> tuple[Document, dict[str, Figure]]:
-    """The tables and figures of the results of `run_live`, and the figures by world."""
+def live_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
+    """The tables of the results of `run_live`, and a figure named after each world."""
     frame = live_frame(results)
     rows, pairs = live_rows(frame), live_pairs(frame)
     gaps = runs.paired_differences(pairs, ["world", *CONDITION[:3], "against"])
-    best = frame[frame["prior"] == "oracle"].set_index(["world", "seed"])["reward"].clip(lower=1e-12)
-    pairs = pairs[pairs["against"] == "random"].set_index(["world", "seed"])
-    shares = pairs.assign(**{side: pairs[side] / best.loc[pairs.index] for side in ("first", "second")}).reset_index()
+    best = frame.loc[frame["prior"] == "oracle", ["world", "seed", "reward"]].rename(columns={"reward": "best"})
+    shares = pairs[pairs["against"] == "random"].merge(best, on=["world", "seed"])
+    for side in ("first", "second"):
+        shares[side] /= shares["best"].clip(lower=1e-12)
     across = runs.across_worlds(shares, CONDITION[:3])
-    about = {result["world"]: result for result in results}
-    pictures = {world: live_figure(frame, world, one["period"]) for world, one in about.items()}
-    boxes = []
-    for world, one in about.items():
+    tables, boxes = [], []
+    for world, one in {result["world"]: result for result in results}.items():
         places = np.mean([result["places"] for result in results if result["world"] == world])
         caption = (
             f"{world}: {one['about']}; food grows in a patch of about {places:.0f} places, which moves with every"
             " season. Bands: Student's 95 % intervals over seeds."
         )
         alt = f"Food eaten in 100 steps in {world} against time, a line a prior; the numbers are in the tables."
-        boxes.append(FigureBox(pictures[world], caption, alt))
-    lead = runs.significance(gaps, "Food eaten in 100 steps")
-    tables = []
-    for world in about:
-        tables.append(live_table(rows, gaps, world))
-        if len(own := gaps[gaps["world"] == world]):
+        boxes.append(FigureBox(live_figure(frame, world, one["period"]), caption, alt, world))
+        own = gaps[gaps["world"] == world]
+        tables.append(live_table(rows[rows["world"] == world], own))
+        if len(own):
             names = NAMES | {"against": "against"}
             tables.append(runs.difference_table(own, f"{world}: differences", names, "food eaten in 100 steps"))
     if len(across):
         tables.append(runs.across_table(across, NAMES, "agent", "random", "food eaten, % of the oracle's", 100))
-    sections = [Section("Food eaten against time", [], figures=boxes), Section("Tables", [], tables)]
-    frames = {"rows": rows, "paired": gaps, "across": across}
-    return Document("Online learning", lead, sections, frames, settings, command, {"words": [lead]}), pictures
+    lead = runs.significance(gaps, "Food eaten in 100 steps")
+    sections = [Section("Food eaten against time", figures=boxes), Section("Tables", tables=tables)]
+    return Document(
+        "Online learning",
+        lead,
+        sections,
+        {"rows": rows, "paired": gaps, "across": across},
+        settings,
+        command,
+        {"words": [lead]},
+        former_names=runs.FORMER_NAMES,
+    )
 
 
 def live_frame(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -73,15 +77,11 @@ def live_frame(results: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 def live_rows(frame: pd.DataFrame) -> pd.DataFrame:
     """Rewards in 100 steps, a row a world and condition: `reward` with its interval over seeds, `after` and `late`.
 
-    `oracle_share`: the reward as a share of the oracle's.
+    `oracle_share`: the reward in shares of the oracle's reward.
     """
-    by = ["world", *CONDITION]
-    found: pd.DataFrame = mean_intervals(frame, by, "reward")
-    means = frame.groupby(by, sort=False)[["after", "late", "model_steps", "seconds"]].mean().reset_index(drop=True)
-    best = found[found["prior"] == "oracle"].set_index("world")["mean"].clip(lower=1e-12)
-    rows = found.rename(columns={"mean": "reward", "n": "seeds"}).join(means)
-    rows.insert(len(rows.columns) - 2, "oracle_share", rows["reward"] / rows["world"].map(best))
-    return rows
+    rows = runs.seed_means(frame, ["world", *CONDITION], "reward", ["after", "late", "model_steps", "seconds"])
+    best = rows[rows["prior"] == "oracle"].set_index("world")["reward"].clip(lower=1e-12)
+    return rows.assign(oracle_share=rows["reward"] / rows["world"].map(best))
 
 
 def live_pairs(frame: pd.DataFrame) -> pd.DataFrame:
@@ -105,10 +105,10 @@ def live_pairs(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts).dropna(subset="second").sort_index(kind="stable")
 
 
-def live_table(rows: pd.DataFrame, gaps: pd.DataFrame, world: str) -> Table:
+def live_table(rows: pd.DataFrame, gaps: pd.DataFrame) -> Table:
     """Rewards in one world, a row a condition."""
     against_random = gaps[gaps["against"] == "random"].assign(warm_start=True)
-    own = rows[rows["world"] == world].merge(against_random[["world", *CONDITION, "p_holm"]], "left")
+    own = rows.merge(against_random[["world", *CONDITION, "p_holm"]], "left")
     columns: dict[str, Column] = {
         **NAMES,
         "learns": lambda row: row["learns"] + ("" if row["warm_start"] else ", cold"),
@@ -118,42 +118,35 @@ def live_table(rows: pd.DataFrame, gaps: pd.DataFrame, world: str) -> Table:
         "last": "late:,.1f",
         "µs": lambda row: f"{1e6 * row['seconds']:,.0f}",
     }
-    seeds = own["seeds"].max()
-    over = f" ±: half of Student's 95 % interval over {seeds} seeds." if seeds > 1 else " A single seed."
     caption = (
         f"Food eaten in 100 steps; in % of the oracle's; in the first and the last quarter of the seasons after the"
         f" first; microseconds a step and agent. Cold: without a warm start, but with one plan more. The oracle knows"
-        f" where all food lies, and plans {FORESIGHT} times as far; where food will grow it does not know.{over}"
-        " *: p < 0.05 against random plans (tested: priors that learned, with a warm start), corrected for all tests in"
-        " this world."
+        f" where all food lies, and plans {FORESIGHT} times as far; where food will grow it does not know."
+        f" {runs.over_seeds(own)} *: p < 0.05 against random plans (tested: priors that learned, with a warm start),"
+        " corrected for all tests in this world."
     )
-    return table(own, columns, caption, world, "lllrrrrr")
+    return table(own, columns, caption, own["world"].iloc[0], "lllrrrrr")
 
 
 @drawn
 def live_figure(frame: pd.DataFrame, world: str, period: int) -> Figure:
-    """Food eaten in 100 steps against time in one world, a panel a kind of prior and its context.
-
-    Raises:
-        ValueError: there are no results of this world.
-    """
+    """Food eaten in 100 steps against time in one world, a panel a kind of prior and its context."""
     frame = frame[(frame["world"] == world) & frame["warm_start"]]
-    expect_some("results", frame)
-    learned = frame[frame["learns"] != "never"]
-    shown = list(dict.fromkeys(zip(learned["prior"], learned["sees"], strict=True))) or [("", "")]
+    learned = frame.loc[frame["learns"] != "never", ["prior", "context"]]
+    shown = list(learned.drop_duplicates().itertuples(index=False, name=None))
     across = min(len(shown), 2)
     down = -(-len(shown) // across)
     figure, axes = panels(down, across, (WIDTH, 2.8 * down), sharey=True)
     for panel, (prior, context) in zip(axes, shown, strict=False):
-        own = frame[(frame["learns"] == "never") | (frame["prior"] == prior) & (frame["sees"] == context)]
+        own = frame[(frame["learns"] == "never") | (frame["prior"] == prior) & (frame["context"] == context)]
         for (name, learns), lines in own.groupby(["prior", "learns"], sort=False):
             label = {RANDOM.prior: "random", ORACLE.prior: "oracle"}.get(name, f"learned {learns}")
             parts = 100 * pd.DataFrame(lines["rewards"].tolist())
             found = mean_intervals(parts.melt(var_name="part"), "part", "value")
             found["part"] = (found["part"].astype(float) + 0.5) * period / PARTS
-            points = found[["part", "mean", "low", "high"]].itertuples(index=False, name=None)
-            band(panel, list(points), COLORS.get(name, COLORS[learns]), label, "-")
-        panel.set_title(f"{prior}, context: {context}" if prior else "")
+            points = found[["part", "mean", "low", "high"]].to_numpy()
+            band(panel, points, COLORS.get(name, COLORS[learns]), label, "-")
+        panel.set_title(f"{prior}, context: {context}")
         panel.set_xticks(np.arange(0, len(parts.columns) // PARTS + 1) * period)
         panel.grid(axis="both")
     at_edges(axes, len(shown), across, "steps; the food moves at each line", "food in 100 steps")

@@ -58,13 +58,13 @@ class Condition(NamedTuple):
 
     Attributes:
         prior: "uniform", or the kind of a prior that learns; "oracle": none.
-        sees: the context of the prior: "none" or "per-step"; "full" for the oracle, which knows the state.
+        context: the context of the prior: "none" or "per-step"; "full" for the oracle, which knows the state.
         learns: "never"; "before": in a season before the run; "online": during the run.
         warm: whether the rest of the last plan is a candidate.
     """
 
     prior: str
-    sees: str
+    context: str
     learns: str
     warm: bool = True
 
@@ -77,11 +77,11 @@ def conditions(kinds: Sequence[str]) -> Iterator[Condition]:
     yield RANDOM._replace(warm=False)
     yield RANDOM
     for kind in kinds:
-        for sees in ORDERS:
-            yield Condition(kind, sees, "before")
-            yield Condition(kind, sees, "online")
-            if sees == "per-step":
-                yield Condition(kind, sees, "online", warm=False)
+        for context in ORDERS:
+            yield Condition(kind, context, "before")
+            yield Condition(kind, context, "online")
+            if context == "per-step":
+                yield Condition(kind, context, "online", warm=False)
     yield ORACLE
 
 
@@ -96,8 +96,8 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + run.seed)
     table = task.table(settings.seed * 10_000 + run.seed)
     # There is one season more than those of the run: priors that learn before the run learn in it.
-    growth = patches(table, settings.seasons + 1, task.radius, generator)
-    world = ForagingWorld(table, growth, settings.period, settings.items)
+    food = patches(table, settings.seasons + 1, task.radius, generator)
+    world = ForagingWorld(table, food, settings.period, settings.items)
     state, own = world.reset(settings.agents, generator), draw_seed(generator)
     steps = settings.period * settings.seasons
 
@@ -107,11 +107,22 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
             # The rest of the last plan is one more candidate: without it there is one more plan.
             number = settings.num_plans + (not condition.warm)
             planner = SamplingPlanner(prior, settings.length, number, objective="return", discount=DISCOUNT)
-        often = LEARN_EVERY.get(condition.prior)
-        how: dict[str, Any] = {"replan_every": REPLAN_EVERY, "change": world.regrow, "warm_start": condition.warm}
-        how |= {"learn_every": often if learns else None, "retention": 0.5 ** ((often or 1) / HALF_LIFE)}
-        how |= {"plan_length": settings.length, "min_score": 0.0, "training": TRAINING.get(condition.prior)}
-        return Agent(world, planner, prior, state, generator=drawn, **how)
+        often = LEARN_EVERY.get(condition.prior, 1)
+        return Agent(
+            world,
+            planner,
+            prior,
+            state,
+            generator=drawn,
+            replan_every=REPLAN_EVERY,
+            change=world.regrow,
+            warm_start=condition.warm,
+            learn_every=often if learns else None,
+            retention=0.5 ** (often / HALF_LIFE),
+            plan_length=settings.length,
+            min_score=0.0,
+            training=TRAINING.get(condition.prior),
+        )
 
     entries = []
     for condition in conditions(settings.kinds):
@@ -125,17 +136,20 @@ def run_live(run: Run, settings: LiveSettings) -> dict[str, Any]:
         done = agent(condition, prior, state, drawn, condition.learns == "online").run(steps)
         rewards = done.rewards.double().mean(0).view(-1, settings.period // PARTS).mean(1)
         entry: dict[str, Any] = condition._asdict() | {"rewards": rewards.tolist()}
-        entry |= {"seconds": (perf_counter() - begin) / steps / settings.agents}
-        entries.append(entry | {"model_steps": done.model_steps / steps})
-    found: dict[str, Any] = {"world": run.world, "seed": run.seed, "about": task.about, "period": settings.period}
-    return found | {"places": float((growth > 0).sum(1).double().mean()), "entries": entries}
+        entry |= {
+            "seconds": (perf_counter() - begin) / steps / settings.agents,
+            "model_steps": done.model_steps / steps,
+        }
+        entries.append(entry)
+    places = float((food > 0).sum(1).double().mean())
+    return run._asdict() | {"about": task.about, "period": settings.period, "places": places, "entries": entries}
 
 
 def untrained(condition: Condition, table: TabularWorld, seed: int) -> Prior:
     """The prior of a condition, which has learned nothing yet."""
-    context: dict[str, Any] = {"num_contexts": table.num_states} if condition.sees == "per-step" else {}
+    num_contexts = table.num_states if condition.context == "per-step" else None
     if condition.prior == "markov":
-        return MarkovPrior(table.num_actions, ORDERS[condition.sees], **context)
+        return MarkovPrior(table.num_actions, ORDERS[condition.context], num_contexts=num_contexts)
     if condition.prior == "gru":
-        return GRUPrior(table.num_actions, lags=1, dropout=0.2, seed=seed, **context)
+        return GRUPrior(table.num_actions, lags=1, dropout=0.2, seed=seed, num_contexts=num_contexts)
     return UniformPrior(table.num_actions)

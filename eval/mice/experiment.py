@@ -8,6 +8,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from eval.worlds.runs import paired_differences, seed_means
 from neuroprior import (
     ExhaustivePlanner,
     GRUPrior,
@@ -24,7 +25,6 @@ from neuroprior import (
 )
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
-from neuroprior.analysis.statistics import mean_interval, paired_difference
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds.labyrinth import WATER
 
@@ -49,7 +49,7 @@ class PriorName(NamedTuple):
 
     prior: str
     learned_from: str
-    sees: str
+    context: str
 
     def __str__(self) -> str:
         return ", ".join(filter(None, self))
@@ -58,10 +58,10 @@ class PriorName(NamedTuple):
 UNIFORM, ORACLE = PriorName("uniform", "", ""), PriorName("oracle", "", "")
 
 NEURAL = [
-    PriorName(kind, source, sees)
+    PriorName(kind, source, context)
     for source in SOURCES
     for kind in ("gru", "transformer")
-    for sees in CONTEXTS
+    for context in CONTEXTS
     if kind == "gru" or source == "mice"
 ]
 """Neural priors, in the order of training: from the mice both kinds, from planners the GRU."""
@@ -69,8 +69,8 @@ NEURAL = [
 PRIORS = [UNIFORM] + [
     name
     for source in SOURCES
-    for sees in CONTEXTS
-    for name in (PriorName(kind, source, sees) for kind in ("markov", "gru", "transformer"))
+    for context in CONTEXTS
+    for name in (PriorName(kind, source, context) for kind in ("markov", "gru", "transformer"))
     if name.prior == "markov" or name in NEURAL
 ]
 """All priors, in the order of the tables."""
@@ -89,58 +89,27 @@ class MiceSettings:
     seed: int
 
 
-@dataclass(frozen=True, eq=False)
-class MiceResult:
-    """What was reached.
+def reached_table(reached: pd.DataFrame) -> pd.DataFrame:
+    """A row a prior, length and number of candidates, and one a length for the oracle; intervals over repeats."""
+    rows = seed_means(reached, [*PriorName._fields, "length", "num_plans"], "reached").drop(columns="seeds")
+    rows = rows.sort_values("length", kind="stable", ignore_index=True)
+    best = rows[rows["prior"] == "oracle"].set_index("length")["reached"]
+    share = (rows["reached"] / rows["length"].map(best)).mask(rows["prior"] == "oracle", 1.0)
+    rows = rows.assign(model_steps=rows["length"] * rows["num_plans"], oracle_share=share)
+    return rows.assign(low=rows["low"].clip(lower=0), high=rows["high"].clip(upper=1))
 
-    Attributes:
-        settings: how much was done.
-        reached: of each prior `[R, T, P]`: the share of starts at which the water was reached, in R repeats, with plans
-            of T lengths and P numbers of candidates.
-        oracle: `[R, T]`: the share of starts from which plans of these lengths can reach it.
-        priors: those of the last repeat.
-        learned: a row for each source: its size, and the orders that were chosen for the Markov priors.
-    """
 
-    settings: MiceSettings
-    reached: dict[PriorName, Tensor]
-    oracle: Tensor
-    priors: dict[PriorName, Prior]
-    learned: pd.DataFrame
-
-    def table(self) -> pd.DataFrame:
-        """A row a prior, length and number of candidates, and one a length for the oracle; intervals over repeats."""
-        rows = []
-        for t, length in enumerate(self.settings.lengths):
-            best = mean_interval(self.oracle[:, t]).mean
-            cells = [
-                (name, number, shares[:, t, p])
-                for name, shares in self.reached.items()
-                for p, number in enumerate(self.settings.num_plans)
-            ]
-            for name, number, shares in [*cells, (ORACLE, None, self.oracle[:, t])]:
-                mean, low, high = mean_interval(shares)
-                normalised = 1.0 if name == ORACLE else mean / best if best else None
-                steps = None if number is None else length * number
-                row = name._asdict() | {"length": length, "num_plans": number, "model_steps": steps}
-                row |= {"reached": mean, "low": max(low, 0.0), "high": min(high, 1.0), "oracle_share": normalised}
-                rows.append(row)
-        return pd.DataFrame(rows).astype({"num_plans": "Int64", "model_steps": "Int64"})
-
-    def paired(self) -> pd.DataFrame:
-        """Paired differences over repeats, a row a pair of priors, length and number of candidates."""
-        rows = []
-        for what, first, second in _pairs():
-            for t, length in enumerate(self.settings.lengths):
-                for p, number in enumerate(self.settings.num_plans):
-                    # Rounded, so that equal differences have no spread.
-                    gaps = (self.reached[first] - self.reached[second])[:, t, p].round(decimals=9)
-                    gap = paired_difference(gaps, torch.zeros_like(gaps))
-                    ends = zip(PriorName._fields, first, second, strict=True)
-                    row: dict[str, Any] = {name: " - ".join(dict.fromkeys(pair)) for name, *pair in ends}
-                    row |= {"what": what, "length": length, "num_plans": number, "difference": gap.mean}
-                    rows.append(row | {"low": gap.low, "high": gap.high, "p_value": gap.p_value})
-        return pd.DataFrame(rows)
+def paired_table(reached: pd.DataFrame) -> pd.DataFrame:
+    """Paired differences over repeats, a row a pair of priors, length and number of candidates."""
+    groups = reached.set_index(["length", "num_plans", "seed"]).groupby(list(PriorName._fields))["reached"]
+    own, parts = dict(list(groups)), []
+    for what, first, second in _pairs():
+        ends = zip(PriorName._fields, first, second, strict=True)
+        names: dict[str, str] = {field: " - ".join(dict.fromkeys(pair)) for field, *pair in ends}
+        both = pd.DataFrame({"first": own[first], "second": own[second]}).reset_index()
+        parts.append(both.assign(**names, what=what, world="labyrinth"))
+    by = ["world", *PriorName._fields, "what", "length", "num_plans"]
+    return paired_differences(pd.concat(parts), by).drop(columns="world")
 
 
 def _pairs() -> Iterator[tuple[str, PriorName, PriorName]]:
@@ -154,13 +123,13 @@ def _pairs() -> Iterator[tuple[str, PriorName, PriorName]]:
             if other in PRIORS:
                 yield "mice's minus a planner's", name, other
     for name in PRIORS:
-        if name.sees == "node":
-            yield "node as context minus none", name, name._replace(sees="moves")
+        if name.context == "node":
+            yield "node as context minus none", name, name._replace(context="moves")
 
 
 def simulate(
     settings: MiceSettings, world: TabularWorld, mice_plans: Plans, finished: Callable[[str], None]
-) -> MiceResult:
+) -> tuple[pd.DataFrame, dict[PriorName, Prior], pd.DataFrame]:
     """Learn all priors and let a planner draw from each, `settings.seeds` times.
 
     Args:
@@ -168,6 +137,11 @@ def simulate(
         world: the maze; it ends at the water.
         mice_plans: what the mice did, with the node before each move as context.
         finished: is called twice, and in each repeat once for each neural prior trained and each prior planned with.
+
+    Returns:
+        The share of starts at which the water was reached, a row a repeat, prior, length and number of candidates, and
+        a row a repeat and length for the oracle; the priors of the last repeat; and a row for each source: its size,
+        and the orders that were chosen for the Markov priors.
     """
     generator = torch.Generator().manual_seed(settings.seed)
     dry = torch.tensor([node for node in range(world.num_states) if node != WATER])
@@ -175,24 +149,28 @@ def simulate(
     finished("collecting plans")
     priors, learned = _count_based(sources, generator)
     finished("counting")
-    reached: dict[PriorName, list[Tensor]] = {name: [] for name in PRIORS}
-    best = []
+    rows: list[dict[str, Any]] = []
     for repeat in range(1, settings.seeds + 1):
         drawn = torch.Generator().manual_seed(draw_seed(generator))
         start = dry[torch.randperm(len(dry), generator=drawn)[: settings.starts]].sort().values
-        best.append(torch.stack([oracle(world, start, n, objective="return").mean() for n in settings.lengths]))
         for name in NEURAL:
             make = GRUPrior if name.prior == "gru" else TransformerPrior
-            prior = make(4, num_contexts=CONTEXTS[name.sees], seed=draw_seed(drawn))
+            prior = make(4, num_contexts=CONTEXTS[name.context], seed=draw_seed(drawn))
             plans = sources[name.learned_from]
             priors[name] = prior.fit(plans, generator=drawn, progress=False, max_steps=settings.steps)
             finished(f"training {name}, repeat {repeat}")
         for name in PRIORS:
             shares = shares_reached(priors[name], world, start, settings.lengths, settings.num_plans, drawn)
-            reached[name].append(shares)
+            rows += [
+                name._asdict() | {"seed": repeat, "length": length, "num_plans": number, "reached": share}
+                for length, some in zip(settings.lengths, shares.tolist(), strict=True)
+                for number, share in zip(settings.num_plans, some, strict=True)
+            ]
             finished(f"planning with {name}, repeat {repeat}")
-    stacked = {name: torch.stack(found) for name, found in reached.items()}
-    return MiceResult(settings, stacked, torch.stack(best), priors, learned)
+        for length in settings.lengths:
+            best = float(oracle(world, start, length, objective="return").mean())
+            rows.append(ORACLE._asdict() | {"seed": repeat, "length": length, "reached": best})
+    return pd.DataFrame(rows).astype({"num_plans": "Int64"}), priors, learned
 
 
 def shares_reached(
@@ -266,11 +244,11 @@ def _count_based(sources: dict[str, Plans], generator: torch.Generator) -> tuple
     for source, plans in sources.items():
         row: dict[str, Any] = {"source": source, "plans": len(plans), "moves": int(plans.mask().sum())}
         training, validation = plans.split(0.1, generator)
-        for sees, contexts in CONTEXTS.items():
+        for context, contexts in CONTEXTS.items():
             tried = {order: MarkovPrior(4, order, num_contexts=contexts).fit(training) for order in ORDERS}
             bits = {order: score("", prior, validation).bits_per_action().mean for order, prior in tried.items()}
             best = min(bits, key=lambda order: bits[order])
-            priors[PriorName("markov", source, sees)] = MarkovPrior(4, best, num_contexts=contexts).fit(plans)
-            row |= {f"markov_order_{sees}": best, f"bits_{sees}": bits[best]}
+            priors[PriorName("markov", source, context)] = MarkovPrior(4, best, num_contexts=contexts).fit(plans)
+            row |= {f"markov_order_{context}": best, f"bits_{context}": bits[best]}
         learned.append(row)
     return priors, pd.DataFrame(learned)

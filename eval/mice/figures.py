@@ -8,7 +8,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
@@ -79,7 +79,7 @@ def maze(plans: Plans) -> Figure:
     visits, turns = figure.subplots(1, 2)
     walked = passages(plans)
     scale = LogNorm(int(walked.min().clamp(min=1)), int(walked.max()))
-    _corridors(visits, place, 8.5, walked, "YlOrBr", scale)
+    _corridors(visits, place, 8.5, walked, cmap="YlOrBr", norm=scale)
     visits.set_title(f"how often mice walked through each corridor\n({len(plans)} x {plans.max_length} moves)")
     figure.colorbar(ScalarMappable(scale, "YlOrBr"), ax=visits, label="passages, in or out", shrink=0.75, pad=0.02)
     share, number = left_turns(plans)
@@ -129,26 +129,16 @@ def far_from_water(world: TabularWorld) -> Tensor:
     return torch.where(moves == moves.max(), apart, -1).argmax()[None]
 
 
-def _corridors(
-    axes: Axes,
-    place: Tensor,
-    width: float,
-    value: Tensor | None = None,
-    colors: str | Colormap = "Greys",
-    scale: Normalize | None = None,
-) -> None:
+def _corridors(axes: Axes, place: Tensor, width: float, value: Tensor | None = None, **colors: Any) -> None:
     """The corridors as wide lines, light grey or coloured by `value [127]`."""
     parent = (torch.arange(len(place)) - 1).div(2, rounding_mode="floor")
     ends = torch.stack([place[parent.clamp(min=0)], place], 1).numpy()
     ends[0, 0] = ENTRANCE
     order = np.arange(len(place))[::-1]  # wide corridors meet at junctions: the inner ones last, on top
-    edges = LineCollection(list(ends), colors="#9a9a9a", linewidths=width + 1.6, capstyle="projecting", zorder=1)
-    axes.add_collection(edges)
-    paint: dict[str, Any] = {"colors": "#efefef"}
-    if value is not None:
-        paint = {"array": value.numpy()[order].clip(1), "cmap": colors, "norm": scale}
-    lines = LineCollection(list(ends[order]), linewidths=width, capstyle="projecting", zorder=2, **paint)
-    axes.add_collection(lines)
+    paint = {"colors": "#efefef"} if value is None else {"array": value.numpy()[order].clip(1), **colors}
+    line: dict[str, Any] = {"capstyle": "projecting"}
+    axes.add_collection(LineCollection(list(ends), colors="#9a9a9a", linewidths=width + 1.6, zorder=1, **line))
+    axes.add_collection(LineCollection(list(ends[order]), linewidths=width, zorder=2, **line, **paint))
     axes.set(xlim=(-9.6, 8.1), ylim=(-8.1, 8.1), aspect="equal", xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
 
@@ -192,8 +182,8 @@ def _panel(axes: Axes, rows: pd.DataFrame) -> None:
     best = rows[rows.prior == "oracle"].reached.iloc[0]
     axes.axhline(100 * best, color=COLORS["oracle"], linestyle=":", linewidth=1.4)
     tried = rows[rows.prior != "oracle"].astype({"num_plans": int}).sort_values("num_plans", kind="stable")
-    for _, some in tried.groupby(["prior", "sees"], sort=False):
-        color, style = COLORS[some.prior.iloc[0]], STYLES[some.sees.iloc[0]]
+    for _, some in tried.groupby(["prior", "context"], sort=False):
+        color, style = COLORS[some.prior.iloc[0]], STYLES[some.context.iloc[0]]
         axes.plot(some.num_plans, 100 * some.reached, color=color, linestyle=style, linewidth=1.8)
         axes.fill_between(some.num_plans, 100 * some.low, 100 * some.high, color=color, alpha=0.18, linewidth=0)
     axes.set_xscale("log", base=2)

@@ -10,13 +10,12 @@ from jsonargparse.typing import NonNegativeFloat, NonNegativeInt, PositiveInt
 from rich.console import Console
 
 from eval.paper import figures, first_simulation, second_simulation, value_quality
-from eval.paper.first_simulation import PAPER_BEST, PAPER_MATRIX, PAPER_STRUCTURE
-from eval.paper.planners import ANY_PREFIX, PaperSettings
-from eval.paper.second_simulation import PAPER_REACHED
+from eval.paper.first_simulation import PAPER_BEST, PAPER_MATRIX, PROTOCOLS
+from eval.paper.planners import ANY_PREFIX, PaperSettings, under_each
+from eval.paper.second_simulation import PAPER_REACHED, SCALES
 from neuroprior._files import versions, write_json
 from neuroprior._jobs import Progress
 from neuroprior.report.document import Column, printed, records, table, write_figures, write_frames
-from neuroprior.report.page import Table
 
 SHORT = {"deterministic": "det.", "random": "rand.", "markov-1": "m-1", "markov-2": "m-2", "markov-3": "m-3"}
 SHORT |= {"transformer": "trans."}
@@ -84,7 +83,7 @@ def paper(
     folder, console = Path(out), Console()
     folder.mkdir(parents=True, exist_ok=True)
     results = {"settings": settings, "versions": versions(), "seed": seed}
-    for part in (_all_protocols, _all_scales) if protocols == "all" else (_first, _second):
+    for part in (_all_settings,) if protocols == "all" else (_first, _second):
         results |= part(own, console, folder)
         write_json(folder / "results.json", results)  # an error in the second part does not lose the first
     console.print(f"written to {folder}")
@@ -111,12 +110,12 @@ def _first(settings: PaperSettings, console: Console, folder: Path) -> dict[str,
     title = f"Table 1 ({settings.protocol}; {_amount(settings)})"
     console.print(printed(title, table(rows, columns, caption)))
     if len(paired):
-        console.print(printed("Table 1, paired over worlds: optimal, points", _paired_table(paired)))
-    moves = list(dict.fromkeys(matrix["next"]))
+        console.print(_paired("Table 1, paired over worlds: optimal, points", paired))
     both = matrix.assign(shown=[f"{a:.3f} ({b:.2f})" for a, b in zip(matrix.learned, matrix.paper, strict=True)])
+    moves = list(matrix["next"].unique())
     both = both.pivot(index="after", columns="next", values="shown").loc[moves].reset_index()
     title = "Transition matrix, markov-1 (in brackets: the paper's, about)"
-    console.print(printed(title, table(both, {"after": "after"} | {move: move for move in moves})))
+    console.print(printed(title, table(both, {name: name for name in ("after", *moves)})))
     write_frames(folder, {"table_1": rows, "paired_1": paired, "transition_matrix": matrix})
     learned = result.transition_matrix
     pictures = {
@@ -125,7 +124,7 @@ def _first(settings: PaperSettings, console: Console, folder: Path) -> dict[str,
         "world": figures.plans_in_world(result),
     }
     write_figures(folder, pictures)
-    protocol = {"edges": settings.edges, "ties": settings.ties, "learn_from": settings.learn_from}
+    protocol = {name: getattr(settings, name) for name in PROTOCOLS}
     found = {"protocol": protocol, "rows": records(rows), "paired": records(paired)}
     return {"simulation_1": found | {"transition_matrix": learned.tolist()}}
 
@@ -150,8 +149,7 @@ def _second(settings: PaperSettings, console: Console, folder: Path) -> dict[str
     size = f"{settings.value_functions} value functions x {settings.starts:,} starts"
     title = f"Table 2 ({settings.edges}; {size}, up to {settings.max_plans} plans)"
     console.print(printed(title, table(pd.concat([rows, pd.DataFrame(shown)]), columns, caption)))
-    title = "Table 2, paired over value functions: goal reached, points"
-    console.print(printed(title, _paired_table(paired)))
+    console.print(_paired("Table 2, paired over value functions: goal reached, points", paired))
     names = [str(name) for name in quality if f"{name} low" in quality]
     columns = {"values": "kind", "level": "level", "qual.": "quality:.2f"}
     columns |= {SHORT.get(name, name): _percent(name) for name in names} | {"ceil.": _percent("ceiling")}
@@ -170,13 +168,18 @@ def _second(settings: PaperSettings, console: Console, folder: Path) -> dict[str
     return {"simulation_2": found | {"value_quality": records(quality)}}
 
 
-def _all_protocols(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
-    with Progress("protocols", 8, 8) as progress:
-        rows = first_simulation.all_protocols(settings, progress.advance)
-    repeat, turn, reverse, _ = PAPER_STRUCTURE
-    own = {"edges": "paper", **PAPER_BEST, "repeat": repeat, "turn": turn, "reverse": reverse}
+def _all_settings(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
+    """Both tables under every protocol and scale, with the Markov priors alone."""
+    with Progress("protocols and initial values", 16, 16) as progress:
+        protocols = under_each(
+            PROTOCOLS, settings, lambda own: first_simulation.simulate(own, neural=False).summary(), progress.advance
+        )
+        scales = under_each(
+            SCALES, settings, lambda own: second_simulation.simulate(own, full=False)[0].summary(), progress.advance
+        )
+    own = {"edges": "paper", **PAPER_BEST, **first_simulation.structure(PAPER_MATRIX)}
     columns: dict[str, Column] = {
-        "edges, ties,\nlearn from": lambda row: " ".join(row[["edges", "ties", "learn_from"]].dropna()),
+        "edges, ties,\nlearn from": lambda row: " ".join(row[list(PROTOCOLS)].dropna()),
         **{SHORT[name]: _percent(name) for name in PAPER_BEST},
         "re-\npeat": "repeat:.2f",
         "turn": "turn:.2f",
@@ -185,32 +188,26 @@ def _all_protocols(settings: PaperSettings, console: Console, folder: Path) -> d
         "off\nm.": "matrix_distance:.3f",
     }
     caption = "off: root mean square difference from the paper's table, points; off m.: from its matrix."
-    shown = table(pd.concat([rows, pd.DataFrame([own])]), columns, caption)
+    shown = table(pd.concat([protocols, pd.DataFrame([own])]), columns, caption)
     console.print(printed(f"Table 1 under every protocol, % of starts ({_amount(settings)})", shown))
-    nearest = {}
-    for what in ("table", "matrix"):
-        best = records(rows.nsmallest(1, f"{what}_distance")[["edges", "ties", "learn_from"]])[0]
-        nearest[what] = best
+    nearest = {
+        what: records(protocols.nsmallest(1, f"{what}_distance")[list(PROTOCOLS)])[0] for what in ("table", "matrix")
+    }
+    for what, best in nearest.items():
         console.print(f"nearest to the paper's {what}: [bold]{replace(settings, **best).protocol}[/bold]")
-    write_frames(folder, {"protocols": rows})
-    return {"protocols": records(rows), "nearest": nearest}
-
-
-def _all_scales(settings: PaperSettings, console: Console, folder: Path) -> dict[str, Any]:
-    with Progress("initial values", 8, 8) as progress:
-        rows = second_simulation.all_scales(settings, progress.advance)
-    columns: dict[str, Column] = {"edges": "edges", "initial\nvalues": "initial_scale:g"}
+    columns = {"edges": "edges", "initial\nvalues": "initial_scale:g"}
     columns |= {SHORT[name]: _percent(name) for name in PAPER_REACHED}
     columns |= {"ceiling": _percent("ceiling"), "off": _percent("table_distance"), "95 %": _interval()}
     caption = "off: root mean square difference from the paper's table, points (interval over value functions)."
-    shown = table(pd.concat([rows, pd.DataFrame([{"edges": "paper", **PAPER_REACHED}])]), columns, caption)
+    shown = table(pd.concat([scales, pd.DataFrame([{"edges": "paper", **PAPER_REACHED}])]), columns, caption)
     console.print(printed("Table 2 under every setting: goal reached, % of starts", shown))
-    best = records(rows.nsmallest(1, "table_distance")[["edges", "initial_scale"]])[0]
+    scale = records(scales.nsmallest(1, "table_distance")[list(SCALES)])[0]
     console.print(
-        f"nearest to the paper's Table 2: [bold]{best['edges']}, values up to {best['initial_scale']:g}[/bold]"
+        f"nearest to the paper's Table 2: [bold]{scale['edges']}, values up to {scale['initial_scale']:g}[/bold]"
     )
-    write_frames(folder, {"scales": rows})
-    return {"scales": records(rows), "nearest_scale": best}
+    write_frames(folder, {"protocols": protocols, "scales": scales})
+    found = {"protocols": records(protocols), "nearest": nearest}
+    return found | {"scales": records(scales), "nearest_scale": scale}
 
 
 def _amount(settings: PaperSettings) -> str:
@@ -218,11 +215,11 @@ def _amount(settings: PaperSettings) -> str:
     return f"{worlds} x {settings.starts:,} starts, {settings.num_plans} plans of {settings.length} moves"
 
 
-def _paired_table(paired: pd.DataFrame) -> Table:
+def _paired(title: str, paired: pd.DataFrame) -> Any:
     short = {end: paired[end].str.replace(ANY_PREFIX, ", any", regex=False) for end in ("first", "second")}
     columns: dict[str, Column] = {"planner": "first", "minus": "second", "gain": _percent("mean", "+.1f")}
     columns |= {"95 % interval": _interval("+.1f", " to "), "p": "p_value:.1g"}
-    return table(paired.assign(**short), columns, align="llrrr")
+    return printed(title, table(paired.assign(**short), columns, align="llrrr"))
 
 
 def _percent(name: str, form: str = ".1f") -> Callable[[Any], str]:

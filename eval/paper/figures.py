@@ -1,5 +1,6 @@
 """Figures of the paper's simulations."""
 
+import numpy as np
 import pandas as pd
 import torch
 from matplotlib.axes import Axes
@@ -9,6 +10,7 @@ from torch import Tensor
 from eval.paper.first_simulation import FirstResult
 from eval.paper.planners import ANY_PREFIX, PaperSettings
 from eval.paper.second_simulation import SecondResult
+from neuroprior.report.drawing import band, panels
 from neuroprior.worlds import GridWorld
 from neuroprior.worlds.grid import MOVES
 
@@ -28,8 +30,7 @@ def best_bars(rows: pd.DataFrame) -> Figure:
     """How often each planner was best, with intervals, and the paper's figures; `rows` as of `FirstResult.table`."""
     rows = rows[rows.planner != "oracle"].reset_index(drop=True)
     best, low, high = (100 * rows[name].astype(float) for name in ("best", "low", "high"))
-    figure = Figure(figsize=(7, 3.6))
-    axes = figure.subplots()
+    figure, (axes,) = panels(1, 1, (7, 3.6))
     colors = [COLORS[name] for name in rows.planner]
     axes.bar(rows.planner, best, yerr=[best - low, high - best], color=colors, capsize=4, width=0.65)
     paper = 100 * rows.paper.astype(float).dropna()
@@ -45,21 +46,16 @@ def best_bars(rows: pd.DataFrame) -> Figure:
 
 def matrices(named: dict[str, Tensor]) -> Figure:
     """Transition matrices side by side as heat maps."""
-    figure = Figure(figsize=(3.6 * len(named), 3.4))
-    for axes, (name, matrix) in zip(figure.subplots(1, len(named), squeeze=False)[0], named.items(), strict=True):
+    figure, cells = panels(1, len(named), (3.6 * len(named), 3.4))
+    for axes, (name, matrix) in zip(cells, named.items(), strict=True):
         axes.imshow(matrix.numpy(), cmap="Blues", vmin=0, vmax=1)
-        for a in range(len(matrix)):
-            for b in range(len(matrix)):
-                value = float(matrix[a, b])
-                axes.text(b, a, f"{value:.2f}", ha="center", va="center", color="white" if value > 0.55 else "black")
+        for (a, b), value in np.ndenumerate(matrix.numpy()):
+            axes.text(b, a, f"{value:.2f}", ha="center", va="center", color="white" if value > 0.55 else "black")
         axes.set_xticks(range(4), MOVES)
         axes.set_yticks(range(4), MOVES)
-        axes.set_xlabel("next move")
-        axes.set_ylabel("last move")
-        axes.set_title(name)
+        axes.set(xlabel="next move", ylabel="last move", title=name)
         axes.spines[:].set_visible(False)
         axes.tick_params(length=0)
-    figure.tight_layout()
     return figure
 
 
@@ -68,8 +64,7 @@ def plans_in_world(result: FirstResult) -> Figure:
     world = result.world
     chosen = _dividing_start(result)
     start = result.states.flatten()[chosen]
-    figure = Figure(figsize=(7.4, 5.2))
-    axes = figure.subplots()
+    figure, (axes,) = panels(1, 1, (7.4, 5.2))
     rewards = world.reward[int(world.reward_map(start))].view(world.height, world.width)
     picture = axes.imshow(rewards.numpy(), cmap="Greys_r", vmin=0, vmax=1)
     figure.colorbar(picture, ax=axes, label="reward", shrink=0.8)
@@ -118,43 +113,40 @@ def values_and_stuck(result: SecondResult, settings: PaperSettings) -> Figure:
     Only starts count that can end on the goal with whole plans.
     """
     whole = {name: done for name, done in result.pursuits.items() if not name.endswith(ANY_PREFIX)}
-    figure = Figure(figsize=(11, 7.6))
-    panels = figure.subplots(3, 3).flatten()
+    figure, cells = panels(3, 3, (11, 7.6))
     size, exact, able = settings.size, result.exact, result.ceiling[0]
     maps = {"approximate values": result.values[0], "exact values": exact}
-    for axes, (title, values) in zip(panels, maps.items(), strict=False):
+    for axes, (title, values) in zip(cells, maps.items(), strict=False):
         values = values.clone()
         values[settings.goal] = exact[exact < exact[settings.goal]].max()
         axes.imshow(values.view(size, size).numpy(), cmap="Greys_r", vmin=0)
         axes.set_title(title)
-    for axes, (name, done) in zip(panels[len(maps) :], whole.items(), strict=True):
+    for axes, (name, done) in zip(cells[len(maps) :], whole.items(), strict=True):
         stuck = able & ~done.reached[: len(able)]
-        cells = result.world.cell(done.final_state[: len(able)][stuck]).bincount(minlength=size**2)
-        axes.imshow((cells / able.sum()).sqrt().view(size, size).numpy(), cmap="Reds", vmin=0, vmax=0.5)
+        ends = result.world.cell(done.final_state[: len(able)][stuck]).bincount(minlength=size**2)
+        axes.imshow((ends / able.sum()).sqrt().view(size, size).numpy(), cmap="Reds", vmin=0, vmax=0.5)
         axes.set_title(f"{name}: {100 * int(stuck.sum()) / max(int(able.sum()), 1):.0f} % stuck")
-    for axes in panels:
+    for axes in cells:
         axes.plot(size // 2, size // 2, "*", color="gold", markeredgecolor="black", markersize=12)
         axes.set(xticks=[], yticks=[])
-    figure.tight_layout()
     return figure
 
 
 def success_against_quality(rows: pd.DataFrame) -> Figure:
     """How often each planner reached the goal against the quality of the values, a panel for each way to be wrong."""
-    kinds = rows.groupby("kind", sort=False)
-    figure = Figure(figsize=(2.6 * len(kinds) + 1, 3.4))
-    for axes, (kind, some) in zip(figure.subplots(1, len(kinds), sharey=True), kinds, strict=True):
-        some = some.sort_values("quality", kind="stable")
+    kinds = rows.sort_values("quality", kind="stable").groupby("kind", sort=False)
+    order = list(rows["kind"].unique())
+    figure, cells = panels(1, len(order), (2.6 * len(order) + 1, 3.4), sharey=True)
+    for axes, kind in zip(cells, order, strict=True):
+        some = kinds.get_group(kind)
         axes.plot(some.quality, 100 * some.ceiling, color="black", linestyle=":", label="ceiling")
         for name, color in COLORS.items():
-            axes.plot(some.quality, 100 * some[name], "o-", color=color, markersize=4, label=name)
-            low, high = (100 * some[f"{name} {end}"] for end in ("low", "high"))
-            axes.fill_between(some.quality, low, high, color=color, alpha=0.12, linewidth=0)
-        axes.set_title({"sweeps": "value iteration cut short"}.get(str(kind), str(kind)), fontsize=10)
+            shares = 100 * some[[name, f"{name} low", f"{name} high"]]
+            band(axes, np.column_stack([some.quality, shares]), color, name, "-")
+        axes.set_title({"sweeps": "value iteration cut short"}.get(kind, kind), fontsize=10)
         axes.set_xlabel("quality of the values")
         axes.spines[["top", "right"]].set_visible(False)
-    first, last = figure.axes[0], figure.axes[-1]
-    first.set_ylabel("goal reached, % of starts")
-    first.set_ylim(0, None)
-    last.legend(frameon=False, loc="center left", bbox_to_anchor=(1.02, 0.5))
+    cells[0].set_ylabel("goal reached, % of starts")
+    cells[0].set_ylim(0, None)
+    cells[-1].legend(frameon=False, loc="center left", bbox_to_anchor=(1.02, 0.5))
     return figure

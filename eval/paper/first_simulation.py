@@ -1,16 +1,23 @@
 """The paper's first simulation: planners on a grid of random rewards, with and without behavioural priors."""
 
-from dataclasses import replace
-from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 import torch
 from torch import Tensor
 
-from eval.paper.planners import Finished, PaperSettings, fit_priors, groups, make_planners, over_groups
+from eval.paper.planners import (
+    Finished,
+    PaperSettings,
+    best_markov,
+    fit_priors,
+    groups,
+    make_planners,
+    paired_table,
+    share_table,
+)
 from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, gridworld, oracle
-from neuroprior.analysis.statistics import best_of, paired_difference
+from neuroprior.analysis.statistics import best_of
 from neuroprior.planners import Decision
 from neuroprior.plans import all_plans
 from neuroprior.worlds import GridWorld
@@ -18,47 +25,37 @@ from neuroprior.worlds import GridWorld
 PAPER_BEST = {"deterministic": 0.321, "random": 0.537, "markov-1": 0.841, "markov-2": 0.844}
 """Hyvärinen, Table 1: in what share of the starts each planner was best, of these four."""
 
-PAPER_STRUCTURE = (0.60, 0.20, 0.0, 0.20)
+PAPER_MATRIX = torch.tensor([[(0.60, 0.20, 0.0, 0.20)[(b - a) % 4] for b in range(4)] for a in range(4)])
 """Hyvärinen's transition matrix, about: repeat the last move, turn, reverse it, turn the other way."""
 
-PAPER_MATRIX = torch.tensor([[PAPER_STRUCTURE[(b - a) % 4] for b in range(4)] for a in range(4)])
+PROTOCOLS = {"edges": ("torus", "wall"), "ties": ("uniform", "first"), "learn_from": ("all", "shortest")}
+"""What the paper leaves open."""
 
 
 class FirstResult(NamedTuple):
-    """The first simulation under one protocol, in W worlds with n starts in each.
-
-    Attributes:
-        world: in which the planners were compared.
-        states: `[W, n]`: the starts.
-        decisions: of each planner, for the starts flattened.
-        oracle: `[W, n]`: the best of any plan.
-        transition_matrix: `[A, A]` of the Markov prior of order 1.
-    """
+    """The first simulation under one protocol, in W worlds with n starts in each."""
 
     world: GridWorld
-    states: Tensor
-    decisions: dict[str, Decision]
-    oracle: Tensor
-    transition_matrix: Tensor
+    states: Tensor  # [W, n]: the starts
+    decisions: dict[str, Decision]  # of each planner, for the starts flattened
+    oracle: Tensor  # [W, n]: the best of any plan
+    transition_matrix: Tensor  # [A, A], of the Markov prior of order 1
+
+    def scores(self) -> dict[str, Tensor]:
+        """Of each planner: `[W, n]`."""
+        return {name: decision.score.view(self.states.shape) for name, decision in self.decisions.items()}
 
     def table(self) -> pd.DataFrame:
         """Table 1: in what share of the starts each planner was best of the paper's four, and its rewards."""
-        scores = {name: decision.score.view(self.states.shape) for name, decision in self.decisions.items()}
-        scores["oracle"] = self.oracle
+        scores = self.scores() | {"oracle": self.oracle}
         best = best_of(torch.stack(list(scores.values())), [list(scores).index(name) for name in PAPER_BEST])
-        rows = []
-        for (name, own), hits in zip(scores.items(), best, strict=True):
-            share = over_groups(hits)
-            row = {"planner": name, "best": share.mean, "low": share.low, "high": share.high}
-            row |= {
-                "paper": PAPER_BEST.get(name),
-                "mean_reward": float(own.double().mean()),
-                "oracle_share": float(own.double().sum() / self.oracle.double().sum()),
-                "at_oracle": float((own >= self.oracle).double().mean()),
-                "model_steps": None if name == "oracle" else self.decisions[name].model_steps,
-            }
-            rows.append(row)
-        return pd.DataFrame(rows, dtype=object)
+        steps = [decision.model_steps for decision in self.decisions.values()]
+        return share_table("best", dict(zip(scores, best, strict=True)), PAPER_BEST).assign(
+            mean_reward=[float(own.double().mean()) for own in scores.values()],
+            oracle_share=[float(own.double().sum() / self.oracle.double().sum()) for own in scores.values()],
+            at_oracle=[float((own >= self.oracle).double().mean()) for own in scores.values()],
+            model_steps=pd.array([*steps, None], dtype="Int64"),
+        )
 
     def paired(self) -> pd.DataFrame:
         """Neural priors minus the best Markov prior: in how many more starts they found the best plan of all.
@@ -67,15 +64,8 @@ class FirstResult(NamedTuple):
         """
         if len(self.oracle) < 2:
             return pd.DataFrame()
-        optimal = {
-            name: (decision.score.view(self.states.shape) >= self.oracle).double().mean(1)
-            for name, decision in self.decisions.items()
-        }
-        markov = max((name for name in optimal if "markov" in name), key=lambda name: float(optimal[name].mean()))
-        pairs = [(name, markov) for name in ("gru", "transformer")]
-        return pd.DataFrame(
-            {"first": a, "second": b, **paired_difference(optimal[a], optimal[b])._asdict()} for a, b in pairs
-        )
+        optimal = {name: (score >= self.oracle).double().mean(1) for name, score in self.scores().items()}
+        return paired_table(optimal, [(name, best_markov(optimal)) for name in ("gru", "transformer")])
 
     def matrix(self) -> pd.DataFrame:
         """The transition matrix of the Markov prior of order 1, a row for each pair of moves."""
@@ -87,32 +77,32 @@ class FirstResult(NamedTuple):
         )
 
     def summary(self) -> dict[str, float]:
-        """The paper's four shares, the matrix as repeat, turn and reverse, and how far both are from the paper's.
+        """The paper's four shares, the structure of the matrix, and how far both are from the paper's.
 
         Distances are root mean squares.
         """
-        table, matrix = self.table().set_index("planner"), self.transition_matrix
-        shares = {name: float(table.best[name]) for name in PAPER_BEST}
+        best = self.table().set_index("planner").best
+        shares = {name: float(best[name]) for name in PAPER_BEST}
         gaps = torch.tensor([shares[name] - PAPER_BEST[name] for name in PAPER_BEST])
-        shifted = [float(torch.stack([matrix[a, (a + d) % 4] for a in range(4)]).mean()) for d in range(4)]
-        structure = {"repeat": shifted[0], "turn": (shifted[1] + shifted[3]) / 2, "reverse": shifted[2]}
         return {
             **shares,
-            **structure,
+            **structure(self.transition_matrix),
             "table_distance": float(gaps.square().mean().sqrt()),
-            "matrix_distance": float((matrix - PAPER_MATRIX).square().mean().sqrt()),
+            "matrix_distance": float((self.transition_matrix - PAPER_MATRIX).square().mean().sqrt()),
         }
 
 
-def simulate(settings: PaperSettings, neural: bool, finished: Finished) -> FirstResult:
-    """Collect plans, fit the priors, and let all planners plan from the same starts.
+def structure(matrix: Tensor) -> dict[str, float]:
+    """How often the last move is repeated, turned from (to either side), and reversed."""
+    repeat, left, reverse, right = (torch.stack([matrix[a, (a + d) % 4] for a in range(4)]).mean() for d in range(4))
+    return {"repeat": float(repeat), "turn": (float(left) + float(right)) / 2, "reverse": float(reverse)}
 
-    With one world the priors learn in the world where they are used; with more, in as many other ones.
 
-    Args:
-        settings: see `paper`.
-        neural: also fit a GRU and a transformer.
-        finished: is called 11 times, without neural priors 7 times.
+def simulate(settings: PaperSettings, neural: bool, finished: Finished = lambda _: None) -> FirstResult:
+    """Collect plans, fit the priors (neural ones too, or not), and let all planners plan from the same starts.
+
+    With one world the priors learn in the world where they are used; with more, in as many other ones. `finished` is
+    called 11 times, without neural priors 7 times.
     """
     worlds, starts = settings.worlds, settings.starts
     generator = torch.Generator().manual_seed(settings.seed)
@@ -133,17 +123,6 @@ def simulate(settings: PaperSettings, neural: bool, finished: Finished) -> First
     best = oracle(world, states.flatten(), settings.length).view(states.shape)
     finished("planning: oracle")
     return FirstResult(world, states, decisions, best, MarkovPrior(4, 1).fit(plans).transition_matrix())
-
-
-def all_protocols(settings: PaperSettings, finished: Finished) -> pd.DataFrame:
-    """Table 1 under every protocol, with the Markov priors alone; `finished` is called 8 times."""
-    rows: list[dict[str, Any]] = []
-    for choice in product(("torus", "wall"), ("uniform", "first"), ("all", "shortest")):
-        protocol: dict[str, Any] = dict(zip(("edges", "ties", "learn_from"), choice, strict=True))
-        changed = replace(settings, **protocol)
-        rows.append(protocol | simulate(changed, neural=False, finished=lambda _: None).summary())
-        finished(changed.protocol)
-    return pd.DataFrame(rows)
 
 
 def training_plans(world: GridWorld, states: Tensor, settings: PaperSettings, generator: torch.Generator) -> Plans:

@@ -1,9 +1,11 @@
-"""What both simulations of the paper share: settings, the priors that learn, the planners that are compared."""
+"""What both simulations of the paper share: settings, the priors that learn, planners, and tables."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Literal
 
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -18,7 +20,7 @@ from neuroprior import (
     TransformerPrior,
     UniformPrior,
 )
-from neuroprior.analysis.statistics import Interval, mean_interval, share_interval
+from neuroprior.analysis.statistics import Interval, mean_interval, paired_difference, share_interval
 from neuroprior.worlds import GridWorld
 
 ANY_PREFIX = " (any prefix)"
@@ -57,7 +59,7 @@ class PaperSettings:
 
     @property
     def goal(self) -> int:
-        """The goal's cell of the second simulation, in the middle."""
+        """The goal's cell of the second simulation, at the centre."""
         return self.size // 2 * self.size + self.size // 2
 
 
@@ -109,3 +111,38 @@ def over_groups(hits: Tensor) -> Interval:
         return share_interval(int(hits.sum()), hits.numel())
     share, low, high = mean_interval(hits.double().mean(1))
     return Interval(share, max(low, 0.0), min(high, 1.0))
+
+
+def share_table(what: str, hits: Mapping[str, Tensor], paper: Mapping[str, float]) -> pd.DataFrame:
+    """A row a planner: the share of True in its `hits [G, n]`, with an interval, and the paper's."""
+    shares = pd.DataFrame([over_groups(own) for own in hits.values()]).set_axis([what, "low", "high"], axis=1)
+    shares.insert(0, "planner", list(hits))
+    return shares.assign(paper=shares.planner.map(paper))
+
+
+def paired_table(shares: Mapping[str, Tensor], pairs: Iterable[tuple[str, str]]) -> pd.DataFrame:
+    """The first of each pair of planners minus the second: means of `shares [G]`, paired over worlds or values."""
+    return pd.DataFrame(
+        {"first": one, "second": other, **paired_difference(shares[one], shares[other])._asdict()}
+        for one, other in pairs
+    )
+
+
+def best_markov(shares: Mapping[str, Tensor], suffix: str = "") -> str:
+    """The Markov prior with the highest mean share."""
+    return max((f"markov-{order}{suffix}" for order in (1, 2, 3)), key=lambda name: float(shares[name].mean()))
+
+
+def under_each(
+    choices: Mapping[str, Sequence[Any]],
+    settings: PaperSettings,
+    summary: Callable[[PaperSettings], dict[str, Any]],
+    finished: Finished,
+) -> pd.DataFrame:
+    """A row with the summary of a simulation for each combination of `choices`, which replace settings."""
+    rows = []
+    for values in product(*choices.values()):
+        chosen: dict[str, Any] = dict(zip(choices, values, strict=True))
+        rows.append(chosen | summary(replace(settings, **chosen)))
+        finished(", ".join(map(str, values)))
+    return pd.DataFrame(rows)

@@ -1,5 +1,6 @@
 """How the gain of the priors depends on how wrong the values are: every way to be wrong that the paper names."""
 
+from dataclasses import replace
 from typing import Any
 
 import pandas as pd
@@ -8,9 +9,9 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from eval.paper.planners import Finished, PaperSettings, make_planners, over_groups
-from eval.paper.second_simulation import ceiling, empty_world, objective, pursue, random_starts
+from eval.paper.second_simulation import ceiling, empty_world, learned_values, objective, pursue, random_starts
 from neuroprior import Prior
-from neuroprior.values import network_approximation, q_learning, tile_approximation, value_iteration
+from neuroprior.values import network_approximation, tile_approximation, value_iteration
 
 STARTS = 600
 """Starts for each level, at the most."""
@@ -26,14 +27,7 @@ def families(settings: PaperSettings, generator: torch.Generator) -> dict[str, d
     places = world.coordinates(torch.arange(world.num_states)).double()
 
     def learned(steps: int) -> Tensor:
-        return q_learning(
-            world,
-            settings.goal,
-            num_agents=AGENTS,
-            steps=steps,
-            initial_scale=settings.initial_scale,
-            generator=generator,
-        ).amax(-1)
+        return learned_values(replace(settings, q_steps=steps), AGENTS, generator)
 
     def network(steps: int) -> Tensor:
         return network_approximation(exact.expand(AGENTS, -1), places, steps=steps, generator=generator)

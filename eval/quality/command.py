@@ -9,14 +9,13 @@ from typing import Any
 import pandas as pd
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt
-from rich.console import Console
 from torch import Tensor
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior
-from neuroprior._files import versions, write_json
 from neuroprior._jobs import Progress
 from neuroprior._random import draw_seed
-from neuroprior.report.document import Column, printed, records, table, write_frames
+from neuroprior.report.document import Column, Document, publish, table
+from neuroprior.report.page import Section, Table
 
 LENGTH = 32
 CONTEXTS = 8
@@ -76,17 +75,6 @@ class Source:
         """The number of contexts that a prior for this source is given."""
         return None if self.context is None else len(self.table)
 
-    def context_at(self, plans: Plans, t: int) -> Tensor | int:
-        """The context of `plans` at action t."""
-        if plans.context is None:
-            return 0
-        return plans.context[:, t] if self.context == "step" else plans.context
-
-    def make(self, kind: type[Prior]) -> Prior:
-        if kind is MarkovPrior:
-            return MarkovPrior(self.num_actions, self.order, num_contexts=self.contexts)
-        return kind(self.num_actions, num_contexts=self.contexts)
-
 
 def sources(generator: torch.Generator) -> list[Source]:
     """Sources with random tables (Dirichlet, 1/2), by which each kind of dependence is met."""
@@ -121,8 +109,6 @@ def quality(
     """
     if num_plans < 100 or held_out < 100:
         raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
-    folder, console = Path(out), Console()
-    folder.mkdir(parents=True, exist_ok=True)
     generator, kinds = torch.Generator().manual_seed(seed), (MarkovPrior, GRUPrior, TransformerPrior)
     every, rows = sources(generator), []
     with Progress("quality", len(every) * len(kinds), len(every) * len(kinds)) as progress:
@@ -133,15 +119,18 @@ def quality(
                 rows.append(_fit(source, kind, training, test, true, seed))
                 progress.advance(f"{source.name}: {rows[-1]['model']} {rows[-1]['excess_percent']:+.2f} %")
     frame = pd.DataFrame(rows)
-    _print(console, frame, f"{num_plans:,} plans of {LENGTH} actions, {held_out:,} held out")
-    write_frames(folder, {"quality": frame})
-    write_json(folder / "results.json", {"rows": records(frame), "versions": versions()})
+    lead = f"{num_plans:,} plans of {LENGTH} actions to learn from, {held_out:,} held out."
+    sections = [Section("Bits more than the source, %", tables=[_table(frame)])]
+    settings = {"num_plans": num_plans, "held_out": held_out, "seed": seed}
+    frames, keys = {"quality": frame}, {"quality": "rows"}
+    publish(Document("Sources of known entropy", lead, sections, frames, settings, keys=keys), Path(out))
 
 
 def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
-    prior, began = source.make(kind), time.perf_counter()
-    settings = {} if kind is MarkovPrior else {"progress": False}
-    prior.fit(training, generator=torch.Generator().manual_seed(seed), **settings)
+    chain, began = kind is MarkovPrior, time.perf_counter()
+    how: dict[str, Any] = {"order": source.order} if chain else {}
+    prior = kind(source.num_actions, num_contexts=source.contexts, **how)
+    prior.fit(training, generator=torch.Generator().manual_seed(seed), **({} if chain else {"progress": False}))
     seconds = time.perf_counter() - began
     with torch.no_grad():
         taken = prior.action_log_probs(test).double()
@@ -158,13 +147,13 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
         "excess_percent": 100 * excess / rate,
         # What maximum likelihood of so many free probabilities costs on new plans, for many plans.
         "expected_percent": 100 * free / (2 * log(2) * len(training) * (LENGTH - first)) / rate
-        if kind is MarkovPrior and not source.lag
+        if chain and not source.lag
         else None,
         "seconds": seconds,
     }
 
 
-def _print(console: Console, rows: pd.DataFrame, size: str) -> None:
+def _table(rows: pd.DataFrame) -> Table:
     """A row a source: the excess of each prior, and of the neural ones the seconds of training."""
     trained = rows.assign(text=[f"{row.excess_percent:+.2f} ({row.seconds:.0f})" for row in rows.itertuples()])
     neural = trained.pivot(index="source", columns="model", values="text")[["gru", "transformer"]]
@@ -180,6 +169,4 @@ def _print(console: Console, rows: pd.DataFrame, size: str) -> None:
         "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
         " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. (s): seconds of training."
     )
-    title = f"Bits more than the source, % ({size})"
-    shown = table(rows[rows.model == "markov"].join(neural, on="source"), columns, caption)
-    console.print(printed(title, shown))
+    return table(rows[rows.model == "markov"].join(neural, on="source"), columns, caption)

@@ -17,12 +17,21 @@ import pandas as pd
 from jsonargparse.typing import extend_base_type, restricted_number_type
 
 from neuroprior._jobs import JobRun
-from neuroprior.analysis.statistics import holm, interquartile_mean, paired_difference, probability_of_improvement
-from neuroprior.report.document import Column, table
+from neuroprior.analysis.statistics import (
+    holm,
+    interquartile_mean,
+    mean_intervals,
+    paired_difference,
+    probability_of_improvement,
+)
+from neuroprior.report.document import Column, Document, publish, table
 from neuroprior.report.page import Table
 
 MAKERS = ("gymnasium", "minigrid")
 """Packages of which another version may make other worlds."""
+
+FORMER_NAMES = {"context": "sees"}
+"""Of columns in files, see `Document`."""
 
 Seed = restricted_number_type("Seed", int, [(">=", 0), ("<", 2**40)], docstring="A seed of everything random.")
 
@@ -52,34 +61,38 @@ def runs_of(worlds: Sequence[str], seeds: int) -> list[Run]:
     return [Run(world, seed) for world in worlds for seed in range(seeds)]
 
 
-def finished(
-    command: str,
+def run_experiment(
+    name: str,
     work: Callable[..., dict[str, Any]],
+    report: Callable[[list[dict[str, Any]], dict[str, Any], str], Document],
     settings: Any,
     worlds: Sequence[str],
     seeds: int,
     out: str,
-    processes: int | None = None,
-    dask: str | None = None,
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Do the runs of an experiment that are not finished yet; see `neuroprior._jobs.JobRun`.
+    processes: int | None,
+    dask: str | None,
+) -> Document:
+    """Do the runs of an experiment that are not finished yet, then print and write its report.
 
     Args:
-        command: the name of the experiment.
+        name: of the experiment.
         work: does a run, `work(run, settings=settings)`.
+        report: makes the document, of the results in the order of `runs_of`, what was asked, and the command line.
         settings: a dataclass; its property `asked`, if it has one, says what distinguishes finished runs.
         worlds, seeds: see `runs_of`.
         out: the folder of the experiment; finished runs are kept in `runs` below it.
-        processes, dask: see `JobRun.do`.
-
-    Returns:
-        The results in the order of `runs_of`; and what was asked, as a report shows it.
+        processes, dask: see `neuroprior._jobs.JobRun.do`.
     """
-    asked = {"command": command, **(settings.asked if hasattr(settings, "asked") else asdict(settings))}
+    asked = {"command": name, **(settings.asked if hasattr(settings, "asked") else asdict(settings))}
     run = partial(work, settings=settings)
     jobs = JobRun(run, Path(out) / "runs", asked, name=attrgetter("name"), packages=MAKERS)
-    results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title=command)
-    return results, {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
+    results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title=name)
+    command = name.split()[0]
+    given = sys.argv[1:] if sys.argv[1:2] == [command] else [command]
+    shown = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
+    document = report(results, shown, "python -m eval " + shlex.join(given))
+    publish(document, Path(out))
+    return document
 
 
 def check_distinct(**options: Sequence[Any]) -> None:
@@ -91,15 +104,20 @@ def check_distinct(**options: Sequence[Any]) -> None:
             raise ValueError(f"{name}: each may be given once, not {' '.join(map(str, given))}")
 
 
-def command_line(name: str) -> str:
-    """The command line that this program was started with, or that of the command with its defaults."""
-    given = sys.argv[1:] if sys.argv[1:2] == [name] else [name]
-    return "python -m eval " + shlex.join(given)
-
-
 def frame_of(results: Sequence[Mapping[str, Any]], key: str = "entries") -> pd.DataFrame:
     """The rows that the results of runs hold under `key`, each with the world and the seed of its run."""
     return pd.DataFrame([{"world": one["world"], "seed": one["seed"], **row} for one in results for row in one[key]])
+
+
+def seed_means(frame: pd.DataFrame, by: Sequence[str], value: str, others: Sequence[str] = ()) -> pd.DataFrame:
+    """Means over the rows of each group, one for each seed.
+
+    Returns:
+        A row for each group: columns `by`, `value` with its interval (`low`, `high`), the number of `seeds`, `others`.
+    """
+    found: pd.DataFrame = mean_intervals(frame, by, value).rename(columns={"mean": value, "n": "seeds"})
+    means = frame.groupby(list(by), sort=False, dropna=False)[list(others)].mean()
+    return found.join(means.reset_index(drop=True))
 
 
 def paired_differences(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
@@ -152,12 +170,40 @@ def significance(gaps: pd.DataFrame, what: str) -> str:
     """How many of `paired_differences` are significant, in one line."""
     if gaps.empty:
         return f"{what}: differences need at least two seeds."
-    clear = gaps[gaps["p_holm"] < 0.05]
-    more = int((clear["difference"] > 0).sum())
+    clear = gaps.loc[gaps["p_holm"] < 0.05, "difference"]
     return (
         f"{what}: {len(clear)} of {len(gaps)} differences are significant (p < 0.05, Holm's correction for all tests in"
-        f" a world): {more} positive, {len(clear) - more} negative."
+        f" a world): {(clear > 0).sum()} positive, {(clear <= 0).sum()} negative."
     )
+
+
+def table_by(
+    rows: pd.DataFrame,
+    names: Mapping[str, str],
+    by: str,
+    cells: Sequence[str],
+    caption: str = "",
+    title: str = "",
+    timed: int | None = None,
+) -> Table:
+    """A table with a row for each value of the columns `names`, by heading, and a column for each number in `by`.
+
+    Args:
+        rows: those that are shown.
+        names: the columns that name a row of the table, by heading.
+        by: the column of the numbers.
+        cells: the text of each of `rows`.
+        caption, title: see `Table`.
+        timed: a number in `by`: of its rows the milliseconds of a decision are shown in a last column.
+    """
+    labels = list(names.values())
+    wide = rows.assign(cell=cells).pivot_table("cell", labels, by, aggfunc="first").rename(columns="{:,}".format)
+    columns = dict(names) | {number: number for number in wide.columns}
+    if timed is not None:
+        times = rows[rows[by] == timed].set_index(labels)["seconds_per_decision"]
+        wide, columns = wide.assign(ms=1000 * times), columns | {"ms": "ms:.3g"}
+    in_order = rows[labels].drop_duplicates().merge(wide.reset_index(), on=labels)
+    return table(in_order, columns, caption, title, "l" * len(names) + "r" * (len(columns) - len(names)))
 
 
 def difference_table(
@@ -179,8 +225,8 @@ def across_table(
     """`across_worlds` as a table; `names`: the columns that name a row, by heading; `first`, `second`: headings."""
     columns = dict(names) | {
         "worlds": "worlds",
-        first: lambda row: plus_minus(row, "first", factor, low="first_low"),
-        second: lambda row: plus_minus(row, "second", factor, low="second_low"),
+        first: lambda row: plus_minus(row, "first", factor, ends="first_"),
+        second: lambda row: plus_minus(row, "second", factor, ends="second_"),
         "P(better)": lambda row: "{improvement:.2f} ({improvement_low:.2f} to {improvement_high:.2f})".format(**row),
     }
     caption = (
@@ -190,7 +236,16 @@ def across_table(
     return table(found, columns, caption, "Over worlds", "l" * len(names) + "rrrr")
 
 
-def plus_minus(row: Any, name: str, factor: float = 1, digits: int = 1, low: str = "low") -> str:
-    """A mean with half of its interval, which is symmetric; the mean alone of a single seed."""
-    mean = f"{factor * row[name]:.{digits}f}"
-    return mean if pd.isna(row[low]) else f"{mean} ±{factor * (row[name] - row[low]):.{digits}f}"
+def over_seeds(rows: pd.DataFrame) -> str:
+    """What the intervals of rows are, for a caption."""
+    seeds = rows["seeds"].max()
+    return f"±: half of Student's 95 % interval over {seeds} seeds." if seeds > 1 else "A single seed."
+
+
+def plus_minus(row: Any, name: str, factor: float = 1, digits: int = 1, sign: str = "", ends: str = "") -> str:
+    """A mean with the longer side of its interval, the columns `low` and `high` after `ends`, where it has one."""
+    mean, low, high = (factor * row[one] for one in (name, f"{ends}low", f"{ends}high"))
+    if pd.isna(mean):
+        return ""
+    text = f"{round(mean, digits) + 0:{sign}.{digits}f}"  # no minus before 0.0
+    return text if pd.isna(low) else f"{text} ±{max(high - mean, mean - low):.{digits}f}"

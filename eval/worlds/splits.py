@@ -117,8 +117,8 @@ def goal_mazes(seed: int) -> Worlds:
 def mid_plan(seed: int) -> Worlds:
     """The egocentric mazes after the first moves of the best of all plans of `LAST` moves."""
 
-    def middle(world: World) -> MidPlanWorld:
+    def replanned(world: World) -> MidPlanWorld:
         assert isinstance(world, TabularWorld)
         return MidPlanWorld(world, ExhaustivePlanner(LAST), TAKEN)
 
-    return Worlds(*map(middle, grid_layouts(seed, maze, egocentric=True)))
+    return Worlds(*map(replanned, grid_layouts(seed, maze, egocentric=True)))

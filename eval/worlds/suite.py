@@ -1,6 +1,6 @@
 """The worlds of `python -m eval compare`, `depth` and `grow`: what is optimised, observed and learned from in each.
 
-To add a world, add a `Task` to `_tasks` below. Its `worlds` makes three worlds for a seed, mostly with a function of
+To add a world, add a `Task` to `TASKS` below. Its `worlds` makes three worlds for a seed, mostly with a function of
 `eval.worlds.splits`. A world that is no `TabularWorld` also needs its optimum in `best_score`.
 """
 
@@ -28,7 +28,6 @@ class Task:
     """A world of the comparison.
 
     Attributes:
-        name: as in `TASKS`.
         action_names: of its actions, in the order of their numbers.
         about: what it is, what is optimised, and what differs between the worlds of a seed.
         worlds: makes the worlds of a seed.
@@ -46,7 +45,6 @@ class Task:
         start_factor: plans are collected from so many times as many starts, where most starts lead nowhere.
     """
 
-    name: str
     action_names: tuple[str, ...]
     about: str
     worlds: Callable[[int], splits.Worlds]
@@ -105,9 +103,8 @@ _states: dict[str, Any] = {"state_number": True, "contexts": ("none", "per-step"
 _lake: dict[str, Any] = {"action_names": ("left", "down", "right", "up"), "depth": 5, "lengths": (9, 14)}
 
 
-def _minigrid(name: str, about: str, environment: str) -> Task:
+def _minigrid(about: str, environment: str) -> Task:
     return Task(
-        name,
         minigrid.MOVES,
         f"MiniGrid {about}; reaching it; new layouts held out",
         partial(splits.minigrid_layouts, environment=environment),
@@ -121,29 +118,25 @@ def _minigrid(name: str, about: str, environment: str) -> Task:
     )
 
 
-_tasks = (
-    Task(
-        "grid",
+TASKS = {
+    "grid": Task(
         MOVES,
         "the paper's grid: 20 x 20, a torus, independent rewards; the reward where a plan ends; new rewards held out",
         partial(splits.from_seeds, make=gridworld, edges="torus", num_worlds=splits.MAPS),
         4,
         (6, 8),
     ),
-    Task(
-        "four_rooms",
+    "four_rooms": Task(
         about=f"four rooms, 13 x 13, doors at random places, four moves; {_ENDS}",
         worlds=partial(splits.grid_layouts, make=four_rooms),
         **_moving,
     ),
-    Task(
-        "maze",
+    "maze": Task(
         about=f"mazes with some loops, 15 x 15, four moves; {_ENDS}",
         worlds=partial(splits.grid_layouts, make=maze),
         **_moving,
     ),
-    Task(
-        "egocentric",
+    "egocentric": Task(
         about=f"the same mazes for an agent that turns left, turns right or goes forward; {_ENDS}",
         worlds=partial(splits.grid_layouts, make=maze, egocentric=True),
         observation=f"{_SQUARES}, as it is turned",
@@ -151,8 +144,7 @@ _tasks = (
         contexts=("none", "initial", "per-step"),
         **_turning,
     ),
-    Task(
-        "goal_maze",
+    "goal_maze": Task(
         about="the same mazes with a goal whose direction is observed; reaching it; new walls and goals held out",
         worlds=splits.goal_mazes,
         observation=f"{_SQUARES}, and how far ahead and aside the goal is",
@@ -161,8 +153,7 @@ _tasks = (
         contexts=("none", "per-step"),
         **_turning | _goal | {"start_factor": 8},
     ),
-    Task(
-        "mid_plan",
+    "mid_plan": Task(
         about=f"the egocentric mazes, planning anew after the first {splits.TAKEN} of {splits.LAST} moves; {_ENDS}",
         worlds=splits.mid_plan,
         observation="what is left of the last plan",
@@ -170,8 +161,7 @@ _tasks = (
         contexts=("none", "initial"),
         **_turning,
     ),
-    Task(
-        "taxi",
+    "taxi": Task(
         ("south", "north", "east", "west", "pickup", "dropoff"),
         "Taxi: fetch a passenger and bring it; the sum of rewards; a quarter of all states to start from held out",
         partial(splits.split_starts, name="Taxi-v4"),
@@ -181,8 +171,7 @@ _tasks = (
         observation="the whole state",
         **_states,
     ),
-    Task(
-        "cliff",
+    "cliff": Task(
         MOVES,
         "CliffWalking: go around a cliff; the sum of rewards; a quarter of all squares to start from held out",
         partial(splits.split_starts, name="CliffWalking-v1"),
@@ -192,31 +181,27 @@ _tasks = (
         observation="the square",
         **_states,
     ),
-    Task(
-        "frozen_lake",
+    "frozen_lake": Task(
         about="FrozenLake, 8 x 8, not slippery: to the goal, between holes; reaching it; new lakes held out",
         worlds=partial(splits.frozen_lakes, slippery=False),
         **_lake | _goal,
     ),
-    Task(
-        "slippery",
+    "slippery": Task(
         about="FrozenLake, 8 x 8, slippery: a third of the moves go where they should; how likely a plan reaches the"
         " goal; new lakes held out",
         worlds=partial(splits.frozen_lakes, slippery=True),
         objective="return",
         **_lake,
     ),
-    _minigrid("minigrid_four_rooms", "FourRooms: to a goal square, seven actions", "MiniGrid-FourRooms-v0"),
-    _minigrid(
-        "minigrid_multi_room",
+    "minigrid_four_rooms": _minigrid("FourRooms: to a goal square, seven actions", "MiniGrid-FourRooms-v0"),
+    "minigrid_multi_room": _minigrid(
         "MultiRoom: through the doors of four rooms to a goal square",
         "MiniGrid-MultiRoom-N4-S5-v1",
     ),
-    _minigrid(
-        "minigrid_door_key", "DoorKey, 6 x 6: fetch a key, open a door, go to a goal square", "MiniGrid-DoorKey-6x6-v0"
+    "minigrid_door_key": _minigrid(
+        "DoorKey, 6 x 6: fetch a key, open a door, go to a goal square", "MiniGrid-DoorKey-6x6-v0"
     ),
-    Task(
-        "cube",
+    "cube": Task(
         tuple(face + turn for face in FACES for turn in ("", "2", "'")),
         "the 2 x 2 x 2 cube after nine random moves, half turns too; passing the solved state; a quarter held out",
         splits.scrambled_cubes,
@@ -227,8 +212,7 @@ _tasks = (
         start_factor=8,
         **_goal,
     ),
-)
-TASKS = {task.name: task for task in _tasks}
+}
 """By name."""
 
 WorldName: TypeAlias = Literal[tuple(TASKS)]  # type: ignore[valid-type]

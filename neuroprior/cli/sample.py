@@ -58,14 +58,13 @@ def _context(prior: Prior, name: str | None, folder: str, num_plans: int) -> Ten
     if prior.num_contexts is None:
         raise ValueError(f"{folder}: its context are features; sample it from Python, with Prior.sample")
     names = prior.context_names or ()
+    some = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
     if name is None:
-        some = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
         raise ValueError(f"context: the prior in {folder} takes one; give --context and a name or number ({some})")
     if name in names:
         index = names.index(name)
     elif name.isdecimal() and int(name) < prior.num_contexts and not names:
         index = int(name)
     else:
-        some = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
         raise ValueError(f"context: {name!r} is not known to the prior in {folder}; it knows {some}")
     return torch.full((num_plans,), index, dtype=torch.long)

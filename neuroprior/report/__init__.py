@@ -20,12 +20,11 @@ from neuroprior.report.figures import (
     transition_figure,
 )
 from neuroprior.report.page import FigureBox, Section, Table
-from neuroprior.report.plan_report import Report, report
+from neuroprior.report.plan_report import report
 
 __all__ = [
     "Document",
     "FigureBox",
-    "Report",
     "Section",
     "Table",
     "calibration_figure",

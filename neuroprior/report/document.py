@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from neuroprior._files import versions, write_json, written_whole
-from neuroprior.report.page import Page, Section, Table, write_page
+from neuroprior.report.page import Section, Table, write_page
 
 Column = str | Callable[[Any], str]
 
@@ -26,27 +26,29 @@ Column = str | Callable[[Any], str]
 class Document:
     """Results with all that it takes to show them.
 
-    Attributes:
-        title: of the page.
-        lead: the finding in one or two plain sentences.
-        sections: in order; their tables are printed too.
-        frames: the tables of results, each written as `NAME.csv` and as a list of rows under `NAME` in `results.json`.
-        settings: how the results were made, by name.
-        command: the command line that makes them again.
-        results: further JSON values for `results.json`.
-        keys: the keys of frames in `results.json` where they are not the names of the CSV files.
-        former_names: of columns, by their present name: files hold these columns under both names.
+    Each of `frames`, the tables of results, is written as `NAME.csv`, and as a list of rows in `results.json` under
+    `NAME`, or under what `keys` has for it.
     """
 
-    title: str
-    lead: str
-    sections: Sequence[Section]
+    title: str  # of the page
+    lead: str  # the finding in one or two plain sentences
+    sections: Sequence[Section]  # in order; their tables are printed too
     frames: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    command: str = ""
-    results: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)  # how the results were made, by name
+    command: str = ""  # the command line that makes them again
+    results: Mapping[str, Any] = field(default_factory=dict)  # further JSON values for `results.json`
     keys: Mapping[str, str] = field(default_factory=dict)
-    former_names: Mapping[str, str] = field(default_factory=dict)
+    former_names: Mapping[str, str] = field(default_factory=dict)  # of columns, which files hold under both names
+
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """The frames that have rows, by name."""
+        return {name: frame for name, frame in self.frames.items() if len(frame)}
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """The figures by name."""
+        return {box.name: box.figure for section in self.sections for box in section.figures}
 
     @property
     def written(self) -> dict[str, pd.DataFrame]:
@@ -93,7 +95,7 @@ def write_document(document: Document, folder: Path) -> None:
     write_frames(folder, document.written)
     write_json(folder / "results.json", results_of(document))
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
-    write_page(folder / "report.html", Page(document.title, document.lead, document.command, shown, document.sections))
+    write_page(folder / "report.html", document.title, document.lead, document.sections, shown, document.command)
 
 
 def results_of(document: Document) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""The figures of a report on plans. Each takes a table of the report, as pandas frame, or arrays, and stands alone."""
+"""The figures of a report on plans. Each takes a table of the report, as pandas frame, or arrays, and stands alone.
+
+Where there is nothing to draw, it is a ValueError.
+"""
 
 from collections.abc import Mapping, Sequence
 from textwrap import wrap
@@ -73,8 +76,8 @@ GAMMA = 0.7
 
 
 def model_names(frame: pd.DataFrame) -> pd.Series:
-    """The names of models with their input, from the columns `model` and `sees`."""
-    return frame["model"] + frame["sees"].map(lambda sees: ", with context" if "context" in sees else "")
+    """The names of models with their input, from the columns `model` and `context`."""
+    return frame["model"] + frame["context"].str.contains("context").map({True: ", with context", False: ""})
 
 
 def lag_names(lags: pd.DataFrame) -> pd.Series:
@@ -90,14 +93,11 @@ def score_figure(scores: pd.DataFrame) -> Figure:
     at the right.
 
     Args:
-        scores: the table `plans` of a report: `model`, `sees` (its input: "actions" or "actions and context"),
+        scores: the table `plans` of a report: `model`, `context` (its input: "actions" or "actions and context"),
             `bits_per_action`, `low`, `high`; a model may have a row for each input.
-
-    Raises:
-        ValueError: there are none.
     """
     expect_some("scores", scores)
-    scores = scores.assign(with_context=scores["sees"].str.contains("context"))
+    scores = scores.assign(with_context=scores["context"].str.contains("context"))
     best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
     models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
@@ -136,11 +136,8 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
     Where the values span decades the axis is logarithmic above, and linear around 0, where estimates are negative too.
 
     Args:
-        lags: the table `lags` of a report: `what` ("mutual information" or "gain"), `model`, `sees`, `lag`, `bits`,
+        lags: the table `lags` of a report: `what` ("mutual information" or "gain"), `model`, `context`, `lag`, `bits`,
             `low`, `high`, and `chance`, the 95 % quantile of what independent actions would give, or missing.
-
-    Raises:
-        ValueError: there are none.
     """
     expect_some("lags", lags)
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
@@ -169,18 +166,18 @@ def order_figure(orders: pd.DataFrame, scores: pd.DataFrame) -> Figure:
     """Information criteria and held-out bits against the order of the chain; the least of each is ringed.
 
     Args:
-        orders: the table `orders` of a report: `order`, `sees`, `bic_bits` and `aic_bits`: half the criterion in bits
+        orders: the table `orders` of a report: `order`, `context`, `bic_bits`, `aic_bits`: half the criterion in bits
             per action, on the scale of the held-out bits.
         scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
     """
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     styles = iter(("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1))))
-    for sees, own in orders.groupby("sees", sort=False):
+    for inputs, own in orders.groupby("context", sort=False):
         for criterion in ("BIC", "AIC"):
             rows = own.assign(none=None)[["order", f"{criterion.lower()}_bits", "none", "none"]]
-            band(axes, rows.to_numpy(), INK, criterion + ", with context" * ("context" in str(sees)), next(styles))
+            band(axes, rows.to_numpy(), INK, criterion + ", with context" * ("context" in str(inputs)), next(styles))
     chains = chain_scores(scores)
-    curves = {f"held out, {sees}": own for sees, own in chains.groupby("sees", sort=False)}
+    curves = {f"held out, {inputs}": own for inputs, own in chains.groupby("context", sort=False)}
     for (name, own), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
         band(axes, own[["order", "bits_per_action", "low", "high"]].to_numpy(), color, name, line)
     lows, tops = [], []
@@ -210,11 +207,8 @@ def calibration_figure(calibration: pd.DataFrame) -> Figure:
     """The share of actions that were taken against the forecast probability, a panel a model; the diagonal is right.
 
     Args:
-        calibration: the table of a report: `model`, `sees`, `forecast` (the mean of a bin), `taken` (the share),
+        calibration: the table of a report: `model`, `context`, `forecast` (the mean of a bin), `taken` (the share),
             `low`, `high`, and `number` of forecasts; larger points hold more.
-
-    Raises:
-        ValueError: there are none.
     """
     expect_some("calibration", calibration)
     curves = dict(iter(calibration.groupby(model_names(calibration), sort=False)))
@@ -278,9 +272,6 @@ def group_transition_figure(
         names: A of them.
         group_names: G of them.
         significant: `[G, A, A]` bool.
-
-    Raises:
-        ValueError: there are no groups.
     """
     expect_some("group_names", group_names)
     gaps = np.asarray(matrices, dtype=np.float64) - np.asarray(pooled, dtype=np.float64)
@@ -315,9 +306,6 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
     Args:
         motifs: rows of the table of a report: `sequence` (text), `ratio` (observed by expected), `low`, `high`,
             `count`; drawn from the top down.
-
-    Raises:
-        ValueError: there are none.
     """
     expect_some("motifs", motifs)
     names = ["\n".join(wrap(clean(name), 36, max_lines=4, placeholder=" …")) for name in motifs["sequence"]][::-1]
@@ -388,9 +376,6 @@ def distribution_figure(distributions: Mapping[str, tuple[Sequence[Number], Sequ
     Args:
         distributions: by what the length is of, such as "run length, actions": the shares of the lengths 1, 2, 3 and
             so on, real and generated. Lengths that never occur are left out.
-
-    Raises:
-        ValueError: there are none.
     """
     expect_some("distributions", distributions)
     figure, cells = panels(1, len(distributions), (WIDTH if len(distributions) > 1 else 5, 3.2))

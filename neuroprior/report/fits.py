@@ -57,27 +57,22 @@ MOST_GENERATED = 1000
 
 @dataclass(frozen=True)
 class Design:
-    """All that decides the results of a cross-validation, beside the plans.
+    """All that decides the results of a cross-validation, beside the plans."""
 
-    Attributes:
-        folds: how many; 1: learn from some plans and score on others.
-        seed: draws the folds, and everything in training.
-        skip: actions at the beginning of each plan that are left out of the score.
-        max_steps: gradient steps of neural priors.
-        patience: share of them without improvement after which training stops.
-        reach: the most past actions whose information is measured.
-        cut: whether the plans are consecutive parts of a single one.
-        version: of the library.
-    """
+    folds: int  # how many; 1: learn from some plans and score on others
+    seed: int = 0  # draws the folds, and everything in training
+    skip: int = 0  # actions at the beginning of each plan that are left out of the score
+    max_steps: int = 1000  # gradient steps of neural priors
+    patience: float = 0.25  # share of them without improvement after which training stops
+    reach: int = 16  # the most past actions whose information is measured
+    cut: bool = False  # whether the plans are consecutive parts of a single one
+    version: str = __version__  # of the library
 
-    folds: int
-    seed: int = 0
-    skip: int = 0
-    max_steps: int = 1000
-    patience: float = 0.25
-    reach: int = 16
-    cut: bool = False
-    version: str = __version__
+    @property
+    def training(self) -> dict[str, Any]:
+        """How neural priors are trained."""
+        patience = max(ceil(self.patience * self.max_steps), 1)
+        return {"max_steps": self.max_steps, "patience": patience, "progress": False}
 
 
 @dataclass(frozen=True)
@@ -111,22 +106,13 @@ def split(plans: Plans, test: Plans | None, design: Design, fold: int) -> tuple[
 
 
 def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) -> Arrays:
-    """Fit the models of a job and score them on held-out plans.
-
-    Args:
-        plans: to learn from; all of them, where there are other plans to score.
-        test: plans to score in place of cross-validation, or None.
-        design: of the cross-validation.
-        job: which fold, models and input.
+    """Fit the models of a job and score them on held-out plans, or on `test`.
 
     Returns:
         Arrays by the name of the model and what they are, such as "gru/bits". "how": its settings. "bits" `[n, L]`,
         float32: those of each held-out action. "calibration": the sums of a `Reliability`. In the first fold,
         "generated" `[g, L]`: plans sampled from it. Or, of the job "lags", "bits" and "actions" `[J, U]`: those of the
         same actions with 0, 1, ... J - 1 past ones known, by independent unit.
-
-    Raises:
-        ValueError: plans that cannot be learned from.
     """
     learned, index = split(plans, test, design, job.fold)
     whole = plans if test is None else test
@@ -182,7 +168,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
                 # Chosen on the validation plans; then these are learned from as well.
                 yield baseline.model, baseline.how, baseline.prior.fit(learned)
         return
-    how = _training(design) | NEURAL[MIXED[0] if kind == "mixture" else kind][1]
+    how = design.training | NEURAL[MIXED[0] if kind == "mixture" else kind][1]
     prior = _made(kind, learned.num_actions, seed=seed, **sizes)
     yield kind, "", prior.fit(learned, generator=generator, **how)
 
@@ -192,12 +178,6 @@ def _made(kind: str, num_actions: int, **how: Any) -> Any:
     if kind == "mixture":
         return MixturePrior(num_actions, [_made(expert, num_actions, **how) for expert in MIXED])
     return NEURAL[kind][0](num_actions, **how)
-
-
-def _training(design: Design) -> dict[str, Any]:
-    """How neural priors are trained."""
-    patience = max(ceil(design.patience * design.max_steps), 1)
-    return {"max_steps": design.max_steps, "patience": patience, "progress": False}
 
 
 def _sizes(*some: Plans) -> dict[str, int]:
@@ -228,7 +208,7 @@ def _by_lag(learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
     if held_out.group is None or len(held_out.group.unique()) < FEWEST_UNITS:
         return {}
     neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
-    neural.fit(divisible(short), generator=generator, batch_size=PIECES_A_STEP, **_training(design))
+    neural.fit(divisible(short), generator=generator, batch_size=PIECES_A_STEP, **design.training)
     found = {"gru": [_of_last(neural, held_out, known) for known in range(reach + 1)]}
     if "context_size" not in sizes:
         found[COUNTED] = _chains(learned, held_out, reach, sizes.get("num_contexts"))

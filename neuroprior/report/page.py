@@ -65,24 +65,17 @@ def breakable(name: str) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text.
-
-    Attributes:
-        headings: K of them.
-        rows: of K cells each; the first cell names its row.
-        caption: what the numbers are, and what their intervals go over.
-        align: K letters, "l" (left) or "r" (right, for numbers); None: the first column left, the others right.
-        title: above it in the terminal; by default that of its section.
+    """A table of text, with K columns.
 
     Raises:
         ValueError: a row, or `align`, does not have as many columns as there are headings.
     """
 
     headings: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    caption: str = ""
-    align: str | None = None
-    title: str = ""
+    rows: Sequence[Sequence[str]]  # the first cell of each names its row
+    caption: str = ""  # what the numbers are, and what their intervals go over
+    align: str | None = None  # K letters, "l" or "r" (right, for numbers); None: the first column left, others right
+    title: str = ""  # above it in the terminal; by default that of its section
 
     def __post_init__(self) -> None:
         wide = len(self.headings)
@@ -97,19 +90,12 @@ class Table:
 
 @dataclass(frozen=True)
 class FigureBox:
-    """A figure with its words.
+    """A figure with its words."""
 
-    Attributes:
-        figure: made with matplotlib's settings `STYLE`.
-        caption: below the figure: what it shows, in which units, and what intervals go over.
-        alt: what the figure says, for readers who cannot see it.
-        name: by which programs find it.
-    """
-
-    figure: Figure
-    caption: str
-    alt: str
-    name: str = ""
+    figure: Figure  # made with matplotlib's settings `STYLE`
+    caption: str  # below it: what it shows, in which units, and what intervals go over
+    alt: str  # what it says, for readers who cannot see it
+    name: str = ""  # by which programs find it
 
 
 @dataclass(frozen=True)
@@ -126,29 +112,12 @@ class Section:
     beside: bool = False
 
 
-@dataclass(frozen=True)
-class Page:
-    """A page of results.
-
-    Attributes:
-        title: of the page.
-        lead: the findings in a few sentences, before everything else.
-        command: the command line that made the page.
-        settings: all settings under which it was made, by name; shown with the command at the end.
-        sections: in the order of the contents.
-    """
-
-    title: str
-    lead: str
-    command: str
-    settings: Mapping[str, Any]
-    sections: Sequence[Section]
-
-
-def write_page(path: Path, page: Page) -> None:
+def write_page(
+    path: Path, title: str, lead: str, sections: Sequence[Section], settings: Mapping[str, Any], command: str = ""
+) -> None:
     """Write a page as one HTML file, whole or not at all; the same page gives the same bytes.
 
-    All text is escaped: names in a user's file may hold anything.
+    All text is escaped: names in a user's file may hold anything. What it shows is explained at `Document`.
 
     Raises:
         ValueError: the place is a directory.
@@ -165,8 +134,9 @@ def write_page(path: Path, page: Page) -> None:
     )
     drawings = [
         [_drawing(box, f"figure-{s}-{number}-") for number, box in enumerate(section.figures, 1)]
-        for s, section in enumerate(page.sections, 1)
+        for s, section in enumerate(sections, 1)
     ]
+    page = {"title": title, "lead": lead, "sections": sections, "settings": settings, "command": command}
     text = environment.get_template("page.html.j2").render(page=page, drawings=drawings)
     write_whole(path, text.encode())
 
@@ -190,12 +160,12 @@ def svg(figure: Figure) -> str:
 
 def clean(text: str) -> str:
     """Text in one line without characters that HTML and XML cannot hold; each becomes U+FFFD."""
-    one_line = " ".join(text.split())
-    return "".join("\N{REPLACEMENT CHARACTER}" if _forbidden(letter) else letter for letter in one_line)
-
-
-def _forbidden(letter: str) -> bool:
-    return unicodedata.category(letter) in ("Cc", "Cs") or ord(letter) & 0xFFFE == 0xFFFE
+    return "".join(
+        "\N{REPLACEMENT CHARACTER}"
+        if unicodedata.category(letter) in ("Cc", "Cs") or ord(letter) & 0xFFFE == 0xFFFE
+        else letter
+        for letter in " ".join(text.split())
+    )
 
 
 def _printable(value: Any) -> Any:

@@ -1,14 +1,12 @@
 """The report on plans: which models predict them best, how far back they reach, what is typical of them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-import pandas as pd
 import torch
-from matplotlib.figure import Figure
 
 from neuroprior._jobs import Progress
 from neuroprior.plans import Plans, read_plans
@@ -17,13 +15,7 @@ from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.report.document import Document, write_document
 from neuroprior.report.fits import ACTIONS, CONTEXT, Design, counted
-from neuroprior.report.scores import (
-    Evaluation,
-    cross_validation,
-    evaluate,
-    evaluate_saved,
-    jobs,
-)
+from neuroprior.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.report.sections import SECTIONS, describe
 
 ModelName = Literal["counts", "gru", "transformer", "stacked", "gru-large", "mixture"]
@@ -40,27 +32,6 @@ CSV = (".csv", ".tsv")
 
 FOLDS = 5
 """Where they are not given; fewer where there are fewer groups."""
-
-
-@dataclass(frozen=True)
-class Report:
-    """A report on plans.
-
-    Attributes:
-        document: all that is printed and written.
-    """
-
-    document: Document
-
-    @property
-    def tables(self) -> dict[str, pd.DataFrame]:
-        """The tables of results by name: that of models is "plans"; those without rows are left out."""
-        return {name: frame for name, frame in self.document.frames.items() if len(frame)}
-
-    @property
-    def figures(self) -> dict[str, Figure]:
-        """The figures by name, such as "scores", "lags" and "transitions"."""
-        return {box.name: box.figure for section in self.document.sections for box in section.figures}
 
 
 def report(
@@ -82,11 +53,11 @@ def report(
     dask: str | None = None,
     sections: Sequence[str] = tuple(SECTIONS),
     command: str = "",
-) -> Report:
+) -> Document:
     """Report on plans: which models predict them best, how far back they reach, what is typical of them.
 
     Args:
-        plans: the plans, or their file: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
+        plans: executed plans, or their file: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
         out: folder for `report.html`, `results.json`, tables as CSV, and the finished fits of a cross-validation, with
             which an interrupted one goes on; None: nothing is written.
         priors: score these fitted priors only, given by name or by their folders; the first is the reference.
@@ -106,6 +77,10 @@ def report(
         dask: address of a Dask scheduler whose workers fit the models; None: this machine.
         sections: which to make, of `neuroprior.report.sections.SECTIONS`; all by default.
         command: the command line that makes the report again, for the page.
+
+    Returns:
+        All that is printed and written; its `tables`, of which that of models is "plans", and its `figures`, such as
+        "scores", "lags" and "transitions".
 
     Raises:
         ValueError: an argument is out of range, or the plans cannot be learned from or scored.
@@ -160,20 +135,20 @@ def report(
         settings |= {"plans without actions, left out": empty} if empty else {}
         settings |= {} if test is None else {"test": str(test) if not isinstance(test, Plans) else "plans"}
         found = replace(found, plans=whole, settings=settings)
-    made = Report(_document(found, sections, file, command))
+    document = _document(found, sections, file, command)
     if out is not None:
-        write_document(made.document, Path(out))
-    return made
+        write_document(document, Path(out))
+    return document
 
 
 def _document(found: Evaluation, sections: Sequence[str], file: str, command: str) -> Document:
-    parts = []
+    made = []
     with Progress("report", len(sections), len(sections)) as progress:
-        for section in SECTIONS:
-            if section in sections:
-                parts.append(SECTIONS[section](found))
-                progress.advance(section)
-    made = [part for part in parts if part is not None]
+        for name in [name for name in SECTIONS if name in sections]:
+            part = SECTIONS[name](found)
+            made += [] if part is None else [part]
+            progress.advance(name)
+    facts = describe(found.plans)
     bits, low, high, _ = found.best.score.bits_per_action()
     return Document(
         title=f"Plans in {Path(file).name}" if file else "Plans",
@@ -186,9 +161,10 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
         results={
             "reference": found.reference[1],
             "unit": found.unit,
-            "file": {"name": file} | describe(found.plans),
+            "file": {"name": file, **facts, "sees": facts["context"]},
         },
         keys={"plans": "rows"},
+        former_names={"context": "sees"},
     )
 
 

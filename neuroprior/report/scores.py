@@ -31,25 +31,15 @@ ORDERED += ["context tree", "gru", "transformer", "gru-large", "stacked", "mixtu
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A model that was scored on held-out plans.
+    """A model that was scored on held-out plans."""
 
-    Attributes:
-        name: such as "markov-3".
-        inputs: `ACTIONS` or `CONTEXT`.
-        how: its settings in each fold, the distinct ones.
-        bits: `[N, L]`, float32: those of each held-out action (and of the ends, where it predicts these too).
-        score: their sums by independent unit.
-        calibration: its forecasts against what happened; None where nothing was scored.
-        generated: `[g, L]`: plans sampled from it in the place of held-out plans; None where it has none.
-    """
-
-    name: str
-    inputs: str
-    how: str
-    bits: Tensor
-    score: Score
-    calibration: Reliability | None
-    generated: Tensor | None = None
+    name: str  # such as "markov-3"
+    inputs: str  # `ACTIONS` or `CONTEXT`
+    how: str  # its settings in each fold, the distinct ones
+    bits: Tensor  # [N, L]: those of each held-out action (and of the ends, where it predicts these too)
+    score: Score  # their sums by independent unit
+    calibration: Reliability | None  # its forecasts against what happened; None where nothing was scored
+    generated: Tensor | None = None  # [g, L]: plans sampled in the place of held-out plans; None where it has none
 
     @property
     def label(self) -> str:
@@ -64,27 +54,16 @@ class Model:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """All that a report is made of.
+    """All that a report is made of."""
 
-    Attributes:
-        plans: those that are described.
-        scored: those on which models were scored, N of them.
-        mask: `[N, L]` bool: their actions that count.
-        models: in the order of the main table.
-        reference: the model that the others are compared with, and its name in the report.
-        sampled: the plans in whose place plans were sampled.
-        gains: the information by lag that models give.
-        settings: how it was made.
-    """
-
-    plans: Plans
-    scored: Plans
-    mask: Tensor
-    models: Sequence[Model]
-    reference: tuple[Model, str]
-    sampled: Plans
-    gains: pd.DataFrame
-    settings: dict[str, Any]
+    plans: Plans  # those that are described
+    scored: Plans  # those on which models were scored, N of them
+    mask: Tensor  # [N, L] bool: their actions that count
+    models: Sequence[Model]  # in the order of the main table
+    reference: tuple[Model, str]  # the model that the others are compared with, and its name in the report
+    sampled: Plans  # the plans in whose place plans were sampled
+    gains: pd.DataFrame  # the information by lag that models give
+    settings: dict[str, Any]  # how it was made
 
     @property
     def unit(self) -> str:
@@ -108,7 +87,7 @@ class Evaluation:
         rows = []
         for model in self.models:
             bits, low, high, _ = model.score.bits_per_action()
-            row = {"model": model.name, "sees": model.inputs, "bits_per_action": bits, "low": low, "high": high}
+            row = {"model": model.name, "context": model.inputs, "bits_per_action": bits, "low": low, "high": high}
             for end, value in (("_per_action", bits), ("_low", low), ("_high", high)):
                 row["nats" + end] = value * log(2)
             for end, value in (("", bits), ("_low", low), ("_high", high)):
@@ -154,31 +133,29 @@ def evaluate(plans: Plans, test: Plans | None, design: Design, todo: Sequence[Jo
             gains += _gains(by_fold[0], inputs)
             continue
         for name in [key.removesuffix("/how") for key in by_fold[0] if key.endswith("/how")]:
+            parts = [{key.removeprefix(f"{name}/"): array for key, array in arrays.items()} for arrays in by_fold]
             # A chain may be too large for its tables in some folds.
-            if not all(f"{name}/how" in arrays for arrays in by_fold):
-                continue
-            how = dict.fromkeys(str(arrays[f"{name}/how"]) for arrays in by_fold)
-            bits = torch.zeros(scored.actions.shape)
-            for index, arrays in zip(held_out, by_fold, strict=True):
-                bits[index] = torch.from_numpy(arrays[f"{name}/bits"])
-            sums = [arrays[f"{name}/calibration"] for arrays in by_fold if f"{name}/calibration" in arrays]
-            generated = by_fold[0].get(f"{name}/generated")
-            models.append(
-                Model(
-                    name,
-                    inputs,
-                    ", ".join(filter(None, how)),
-                    bits,
-                    score_bits(name, inputs, bits, scored, mask),
-                    Reliability(torch.from_numpy(sum(sums[1:], start=sums[0]))) if sums else None,
-                    None if generated is None else torch.from_numpy(generated),
-                )
-            )
+            if all("how" in part for part in parts):
+                how = ", ".join(filter(None, dict.fromkeys(str(part["how"]) for part in parts)))
+                models.append(_model(name, inputs, how, parts, held_out, scored, mask))
     models.sort(key=lambda model: (model.inputs == CONTEXT, ORDERED.index(model.name)))
     best = min(models, key=lambda model: model.cost)
-    table = pd.DataFrame(gains).sort_values("sees", kind="stable") if gains else pd.DataFrame()
+    table = pd.DataFrame(gains).sort_values("context", kind="stable") if gains else pd.DataFrame()
     reference = best, f"{best.name} ({best.inputs})"
     return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design))
+
+
+def _model(
+    name: str, inputs: str, how: str, parts: Sequence[Arrays], held_out: Sequence[Tensor], scored: Plans, mask: Tensor
+) -> Model:
+    """A model from its results on each part of the plans, given by the numbers of the plans."""
+    bits = torch.zeros(scored.actions.shape)
+    for index, part in zip(held_out, parts, strict=True):
+        bits[index] = torch.from_numpy(part["bits"])
+    sums = [part["calibration"] for part in parts if "calibration" in part]
+    calibration = Reliability(torch.from_numpy(sum(sums[1:], start=sums[0]))) if sums else None
+    generated = torch.from_numpy(parts[0]["generated"]) if "generated" in parts[0] else None
+    return Model(name, inputs, how, bits, score_bits(name, inputs, bits, scored, mask), calibration, generated)
 
 
 def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
@@ -191,7 +168,7 @@ def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
         scores = [Score(name, inputs, bits, actions) for bits, actions in pairs]
         for lag in range(1, len(scores)):
             bits, low, high, _ = scores[lag - 1].minus(scores[lag])
-            row = {"what": "gain", "model": name, "sees": inputs, "lag": lag, "bits": bits, "low": low, "high": high}
+            row = {"what": "gain", "model": name, "context": inputs, "lag": lag, "bits": bits, "low": low, "high": high}
             rows.append(row | {"chance": None, "units": len(scores[lag].actions)})
     return rows
 
@@ -202,25 +179,18 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Eval
     Raises:
         ValueError: a prior does not know these actions or contexts; the message has its name.
     """
-    models = [_saved(name, prior, plans, skip) for name, prior in priors.items()]
+    models = []
+    for name, prior in priors.items():
+        own = match_plans(plans, prior, name)
+        mask, inputs = counted(own, skip), CONTEXT if prior.takes_context else ACTIONS
+        try:
+            arrays = fits.score_arrays(prior, own, mask, units(own, mask))
+            models.append(_model(name, inputs, type(prior).__name__, [arrays], [torch.arange(len(own))], own, mask))
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
     mask = counted(plans, skip)
     settings = {"priors": ", ".join(priors), "skip": skip, "unit": unit_name(plans, mask)}
     return Evaluation(plans, plans, mask, models, (models[0], models[0].name), plans, pd.DataFrame(), settings)
-
-
-def _saved(name: str, prior: Prior, plans: Plans, skip: int) -> Model:
-    plans = match_plans(plans, prior, name)
-    inputs = CONTEXT if prior.takes_context else ACTIONS
-    mask = counted(plans, skip)
-    try:
-        arrays = fits.score_arrays(prior, plans, mask, units(plans, mask))
-        bits = torch.from_numpy(arrays["bits"])
-        score = score_bits(name, inputs, bits, plans, mask)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    sums = arrays.get("calibration")
-    calibration = None if sums is None else Reliability(torch.from_numpy(sums))
-    return Model(name, inputs, type(prior).__name__, bits, score, calibration)
 
 
 def _digest(plans: Plans) -> str:
@@ -228,9 +198,8 @@ def _digest(plans: Plans) -> str:
     digest = hashlib.sha256()
     for name, value in vars(plans).items():
         if isinstance(value, Tensor):
-            digest.update(
-                f"{name} {value.dtype} {[*value.shape]}".encode() + value.cpu().contiguous().numpy().tobytes()
-            )
+            digest.update(f"{name} {value.dtype} {[*value.shape]}".encode())
+            digest.update(value.cpu().contiguous().numpy().tobytes())
         else:
             digest.update(f"{name} {value!r}".encode())
     return digest.hexdigest()

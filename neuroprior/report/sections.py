@@ -49,7 +49,7 @@ class Part(NamedTuple):
 def file_section(found: Evaluation) -> Part:
     """What is in the file."""
     columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
-    columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "sees"}
+    columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "context"}
     shown = table(pd.DataFrame([describe(found.plans)]), columns, align="rrrrrrl")
     return Part(Section("Plans", tables=[shown]), {})
 
@@ -68,7 +68,7 @@ def describe(plans: Plans) -> dict[str, Any]:
         "longest": int(lengths.max()),
         "kinds of actions": plans.num_actions,
         "groups": 0 if plans.group is None else len(plans.group.unique()),
-        "sees": context,
+        "context": context,
     }
 
 
@@ -113,9 +113,9 @@ def lag_section(found: Evaluation) -> Part | None:
         information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles())).rename(
             columns={"critical_value": "chance"}
         )
-        information = information.assign(what="mutual information", model="counts", sees=ACTIONS, units=None)
+        information = information.assign(what="mutual information", model="counts", context=ACTIONS, units=None)
         lags = pd.concat([information, lags], ignore_index=True) if len(lags) else information
-        lags = lags[["what", "model", "sees", "lag", "bits", "low", "high", "chance", "units"]]
+        lags = lags[["what", "model", "context", "lag", "bits", "low", "high", "chance", "units"]]
     if not len(lags):
         return None
     lags = lags.assign(units=lags["units"].astype("Int64"))
@@ -155,17 +155,17 @@ def order_section(found: Evaluation) -> Part | None:
     fitted = {ACTIONS: order_selection(plans, most)}
     if number is not None:
         fitted[CONTEXT] = order_selection(plans, most, number)
-    orders = pd.concat([pd.DataFrame(own).assign(sees=sees) for sees, own in fitted.items()], ignore_index=True)
-    orders = orders[["sees", *orders.columns.drop("sees")]]
+    orders = pd.concat([pd.DataFrame(own).assign(context=inputs) for inputs, own in fitted.items()], ignore_index=True)
+    orders = orders[["context", *orders.columns.drop("context")]]
     scale = 2 * log(2) * orders["num_actions_scored"].clip(lower=1)
     orders = orders.assign(bic_bits=orders["bic"] / scale, aic_bits=orders["aic"] / scale)
     scores = found.table()
-    held_out = figures.chain_scores(scores)[["order", "sees", "bits_per_action"]]
-    both = orders.merge(held_out, how="left", on=["order", "sees"])
+    held_out = figures.chain_scores(scores)[["order", "context", "bits_per_action"]]
+    both = orders.merge(held_out, how="left", on=["order", "context"])
     criteria = {"BIC": "bic_bits", "AIC": "aic_bits", "held out": "bits_per_action"}
     columns: dict[str, Column] = {"order": "order", "input": _input, "parameters": "num_parameters:,"}
     for heading, name in criteria.items():
-        least = both[name] == both.groupby("sees")[name].transform("min")
+        least = both[name] == both.groupby("context")[name].transform("min")
         both[heading] = both[name].map("{:.4f}".format, na_action="ignore") + least.map({True: "*", False: " "})
         columns[heading] = heading
     caption = (
@@ -184,18 +184,14 @@ def order_section(found: Evaluation) -> Part | None:
 
 def calibration_section(found: Evaluation) -> Part | None:
     """Whether forecast probabilities are the shares of actions taken."""
-    rows, errors = [], []
-    for model in found.leading(found.best.inputs) or found.models:
-        if model.calibration is None:
-            continue
-        errors.append({"model": model.label, "error": 100 * model.calibration.expected_calibration_error})
-        for one in model.calibration.bins:
-            taken = {"taken": one.taken.mean, "low": one.taken.low, "high": one.taken.high}
-            row = {"model": model.name, "sees": model.inputs, "forecast": one.forecast}
-            rows.append(row | taken | {"number": one.number})
+    models = found.leading(found.best.inputs) or found.models
+    known = [(model, model.calibration) for model in models if model.calibration is not None]
+    rows = [(own.name, own.inputs, one.forecast, *one.taken, one.number) for own, sums in known for one in sums.bins]
     if not rows:
         return None
-    calibration = pd.DataFrame(rows)
+    names = ["model", "context", "forecast", "taken", "low", "high", "number"]
+    calibration = pd.DataFrame(rows, columns=names)
+    errors = [{"model": own.label, "error": 100 * sums.expected_calibration_error} for own, sums in known]
     columns = {"model": "model", "expected calibration error, %": "error:.2f"}
     shown = table(pd.DataFrame(errors), columns, "Mean distance of forecast probability and share taken.")
     text = ["Of the actions with a forecast probability of about 0.3, were 0.3 taken? Points on the diagonal: yes."]
@@ -295,18 +291,11 @@ def macro_section(found: Evaluation) -> Part | None:
     macros, _ = learn_macros(plans, MOST_MACROS, "compression")
     if not macros:
         return None
-    rows = [
-        {
-            "macro": " ".join(names[action] for action in macro.actions),
-            "actions": len(macro.actions),
-            "count": macro.count,
-            "gain_bits": macro.gain,
-        }
-        for macro in macros
-    ]
+    spelled = [" ".join(names[action] for action in macro.actions) for macro in macros]
     counts = plans.actions[plans.mask()].long().bincount().double()
     before = float(-torch.special.xlogy(counts, counts / counts.sum()).sum()) / log(2)
-    frame = pd.DataFrame(rows)
+    rows = [(name, len(one.actions), one.count, one.gain) for name, one in zip(spelled, macros, strict=True)]
+    frame = pd.DataFrame(rows, columns=["macro", "actions", "count", "gain_bits"])
     frame["bits_per_action"] = (before - frame["gain_bits"].cumsum()) / float(counts.sum())
     text = [
         "Sequences that could be taken as one action. Repeatedly, the two successive actions (or macro-actions) are"
@@ -315,12 +304,8 @@ def macro_section(found: Evaluation) -> Part | None:
     ]
     none = pd.DataFrame([{"macro": "none", "bits_per_action": before / float(counts.sum())}])
     shown = pd.concat([none, frame]).astype({"count": "Int64"})
-    columns = {
-        "macro-action": "macro",
-        "count": "count:,",
-        "gain": "gain_bits:,.0f",
-        "bits per action": "bits_per_action:.3f",
-    }
+    columns = {"macro-action": "macro", "count": "count:,", "gain": "gain_bits:,.0f"}
+    columns |= {"bits per action": "bits_per_action:.3f"}
     caption = (
         "In the order in which they were found. count: how often each was put in then; gain: bits saved then; bits per"
         " action: of the code with all macro-actions up to that one."
@@ -344,7 +329,7 @@ def likeness_section(found: Evaluation) -> Part | None:
         if results and shown is None:
             shown = model, real, results
         rows += [
-            {"model": model.name, "sees": model.inputs, "statistic": one.statistic}
+            {"model": model.name, "context": model.inputs, "statistic": one.statistic}
             | {"distance": one.distance, "chance": one.null_distance}
             | {"p_value": one.p_value if tested else None, "corrected": one.corrected if tested else None}
             for one in results
@@ -356,10 +341,10 @@ def likeness_section(found: Evaluation) -> Part | None:
     stars = (frame["corrected"] < SIGNIFICANT).map({True: "*", False: ""})
     cells = frame.assign(cell=frame["distance"].map("{:.3f}".format) + stars)
     statistics = [one.statistic for one in results]
-    order = frame[["model", "sees"]].drop_duplicates()
-    wide = cells.pivot(index=["model", "sees"], columns="statistic", values="cell").reset_index()
-    wide = order.merge(wide, on=["model", "sees"])
-    wide.loc[len(wide)] = {"model": "same source", "sees": ""} | {
+    order = frame[["model", "context"]].drop_duplicates()
+    wide = cells.pivot(index=["model", "context"], columns="statistic", values="cell").reset_index()
+    wide = order.merge(wide, on=["model", "context"])
+    wide.loc[len(wide)] = {"model": "same source", "context": ""} | {
         one.statistic: f"{one.null_distance:.3f}" for one in results
     }
     test = (
@@ -463,11 +448,12 @@ def _action_drift(plans: Plans) -> pd.DataFrame:
         return pd.DataFrame()  # too few plans with two halves
     names = action_names(plans)
     rows = [
-        {"action": names[one.action], "first_half": one.first, "second_half": one.second, "change": one.change.mean}
-        | {"low": one.change.low, "high": one.change.high, "p_value": one.change.p_value, "corrected": one.corrected}
+        {"action": names[one.action], "first_half": one.first, "second_half": one.second}
+        | one.change._asdict()
+        | {"corrected": one.corrected}
         for one in found
     ]
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows).rename(columns={"mean": "change"})
 
 
 SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
@@ -509,7 +495,7 @@ def _shuffles() -> torch.Generator:
 
 def _input(row: Any) -> str:
     """The input of a model, short enough for a terminal."""
-    return str(row["sees"]).replace(" and ", ", ")
+    return str(row["context"]).replace(" and ", ", ")
 
 
 def _p(value: float) -> str:

@@ -173,11 +173,11 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_results(tiny_run):
     results = json.loads((tiny_run / "results.json").read_text())
     rows = results["rows"]
-    names = {(row["prior"], row["learned_from"], row["sees"]) for row in rows}
+    names = {(row["prior"], row["learned_from"], row["context"]) for row in rows}
     contexts = ("moves", "node")
-    learned = [(prior, "mice", sees) for prior in ("markov", "gru", "transformer") for sees in contexts]
+    learned = [(prior, "mice", context) for prior in ("markov", "gru", "transformer") for context in contexts]
     learned += [
-        (prior, own, sees) for prior in ("markov", "gru") for own in ("planner", "reached") for sees in contexts
+        (prior, own, context) for prior in ("markov", "gru") for own in ("planner", "reached") for context in contexts
     ]
     assert names == {*learned, ("uniform", "", ""), ("oracle", "", "")}
     assert len(rows) == 2 * (2 * (len(names) - 1) + 1)
@@ -195,7 +195,7 @@ def test_results(tiny_run):
 
 def test_differences_are_those_of_the_rows(tiny_run):
     results = json.loads((tiny_run / "results.json").read_text())
-    columns = ("prior", "learned_from", "sees", "length", "num_plans")
+    columns = ("prior", "learned_from", "context", "length", "num_plans")
     at = {tuple(row[name] for name in columns): row for row in results["rows"]}
     assert len(results["paired"]) == (8 + 8 + 7) * 4
     for row in results["paired"]:

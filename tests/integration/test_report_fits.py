@@ -69,6 +69,7 @@ def test_the_entropy_rate_is_reached(second_order):
         "longest": 30,
         "kinds of actions": 3,
         "groups": 0,
+        "context": "none",
         "sees": "none",
     }
 

@@ -119,7 +119,7 @@ def test_each_kind_of_file(name, tmp_path):
     assert main([*small(kind, tmp_path / "run"), "--data.file", str(tmp_path / name)]) == 0
     report = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert report["unit"] == ("plans" if plans.group is None else "groups")
-    assert ("context" in report["rows"][-1]["sees"]) == (takes == "context")
+    assert ("context" in report["rows"][-1]["context"]) == (takes == "context")
     assert read_plans(tmp_path / "run" / "plans.npz").actions.shape == plans.actions.shape
 
 

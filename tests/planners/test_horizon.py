@@ -44,7 +44,7 @@ def gathered(scores):
 
 
 def test_what_promises_most():
-    """Scores spread at once: many short plans. Only the last action tells: few long ones. Nothing tells: long ones."""
+    """Scores spread at once: many short plans. Only the last action matters: few long ones. None does: long ones."""
     planner = HorizonPlanner(UniformPrior(100), 3, 60)
     short = [[[0.0] * 3, [1.0] * 3, [0.5] * 3, [0.2] * 3]]
     long = [[[0.0, 0.0, 0.1], [0.0, 0.0, 1.0], [0.0, 0.0, 0.6], [0.0, 0.0, 0.3]]]
@@ -54,14 +54,14 @@ def test_what_promises_most():
 
 
 def test_of_few_actions_there_are_few_plans():
-    """Two actions: of one step there are two plans, of which sixty tries tell no more."""
+    """Two actions: of one step there are two plans, to which sixty tries add nothing."""
     scores = [[[0.0] * 3, [1.0] * 3, [0.5] * 3, [0.2] * 3]]
     assert HorizonPlanner(UniformPrior(100), 3, 60)._best_horizon(gathered(scores), 60).tolist() == [1]
     assert HorizonPlanner(UniformPrior(2), 3, 60)._best_horizon(gathered(scores), 60).tolist() == [3]
 
 
 def test_deep_horizons_count():
-    """Only the last of 64 actions tells; so many plans of four actions there are that their number overflows."""
+    """Only the last of 64 actions matters; so many plans of four actions there are that their number overflows."""
     scores = torch.zeros(1, 8, 64, dtype=torch.float64)
     scores[0, :, -1] = torch.arange(8) / 8
     found = gathered(scores.tolist())

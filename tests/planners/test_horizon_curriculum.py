@@ -67,8 +67,8 @@ def test_the_prior_is_as_it_was_after_each_round():
     first = MarkovPrior(2, 1).fit(plans)
     every = torch.cartesian_prod(*[torch.arange(2)] * 4)
     assert torch.allclose(prior.log_prob(every), first.log_prob(every))
-    grown = next(rounds)
-    assert torch.allclose(prior.log_prob(every), MarkovPrior(2, 1).fit(grown.plans).log_prob(every))
+    first = next(rounds)
+    assert torch.allclose(prior.log_prob(every), MarkovPrior(2, 1).fit(first.plans).log_prob(every))
     assert next(rounds, None) is None
 
 
@@ -111,15 +111,15 @@ def test_neural_priors_see_what_their_plans_recorded(per):
 
 
 def test_same_seed_same_plans():
-    def grown(seed: int) -> torch.Tensor:
+    def extended(seed: int) -> torch.Tensor:
         world, generator = gridworld(6, 6), seeded(seed)
         plans = collect(ExhaustivePlanner(2), world, 40, generator=generator)
         how = {"num_starts": 20, "num_plans": 8, "generator": generator, "max_steps": 2, "progress": False}
         *_, last = extend_horizon(GRUPrior(4, 8), plans, world, (4,), **how)
         return last.plans.actions
 
-    assert torch.equal(grown(3), grown(3))
-    assert not torch.equal(grown(3), grown(4))
+    assert torch.equal(extended(3), extended(3))
+    assert not torch.equal(extended(3), extended(4))
 
 
 def test_only_plans_that_led_somewhere():
@@ -161,7 +161,7 @@ def slippery() -> TabularWorld:
 
 
 def test_in_a_stochastic_world_a_plan_is_executed_once():
-    """What is recorded as seen before its last executed action is not the end."""
+    """What is observed before the last executed action is not the end."""
     world, planner = slippery(), SamplingPlanner(UniformPrior(1), 12, 2, objective="return")
     plans = collect(planner, world, state=torch.zeros(400, dtype=torch.long), context="step", generator=seeded(0))
     assert plans.context is not None

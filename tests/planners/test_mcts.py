@@ -60,7 +60,7 @@ def test_nor_does_an_overconfident_wrong_prior_stop_it(temperature):
 
 
 def test_scores_guide_it_better_than_random_search():
-    """Rewards on the way tell where more are: with as many steps it finds more than samples do."""
+    """Early rewards lead to later ones: with as many steps it finds more than samples do."""
     world = gridworld(15, 15, "torus", num_worlds=5, reward_power=4)
     state = world.reset(300, seeded(0))
     how = {"objective": "return"}

@@ -2,6 +2,7 @@
 
 import re
 from html.parser import HTMLParser
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib as mpl
@@ -30,7 +31,7 @@ from neuroprior.report.figures import (
     score_figure,
     transition_figure,
 )
-from neuroprior.report.page import INK, PAPER, FigureBox, Page, Section, Table, clean, svg, write_page
+from neuroprior.report.page import INK, PAPER, FigureBox, Section, Table, clean, svg, write_page
 from tests.support.browser import check_in_browser
 
 HOSTILE = ["<b>\"&'", "</svg><script>alert(1)</script>", "$x$ $\\frac{$", "\x00\x1b\ud800", "http://evil.org", "_x"]
@@ -58,15 +59,16 @@ class Reader(HTMLParser):
         return [attributes[name] for _, attributes in self.tags if name in attributes]
 
 
-def page_of(name: str, boxes: list[FigureBox] = ()) -> Page:
-    """A page in which `name` stands wherever a text can."""
+def page_of(name: str, boxes: list[FigureBox] = ()) -> dict[str, Any]:
+    """The arguments of a page in which `name` stands wherever a text can."""
     table = Table([name, "bits"], [[name, "1.5"], ["other", name]], name)
     section = Section(name, [name, name], [table], [FigureBox(box.figure, name, name) for box in boxes])
-    return Page(name, name, name, {name: name, "names": [name]}, [section, Section("last")])
+    settings = {name: name, "names": [name]}
+    return {"title": name, "lead": name, "sections": [section, Section("last")], "settings": settings, "command": name}
 
 
-def written(folder, page: Page) -> str:
-    write_page(folder / "page.html", page)
+def written(folder, page: dict[str, Any]) -> str:
+    write_page(folder / "page.html", **page)
     return (folder / "page.html").read_text(encoding="utf-8")
 
 
@@ -76,28 +78,28 @@ def estimate(mean: float, half: float = 0.05) -> tuple[float, float, float]:
 
 def scores(models: list[str], context: bool) -> pd.DataFrame:
     rows = [
-        (model, sees, 1 + n / 10, 0.9 + n / 10, 1.1 + n / 10)
+        (model, inputs, 1 + n / 10, 0.9 + n / 10, 1.1 + n / 10)
         for n, model in enumerate(models)
-        for sees in ("actions", "actions and context")[: 1 + context]
+        for inputs in ("actions", "actions and context")[: 1 + context]
     ]
-    return pd.DataFrame(rows, columns=["model", "sees", "bits_per_action", "low", "high"])
+    return pd.DataFrame(rows, columns=["model", "context", "bits_per_action", "low", "high"])
 
 
 def of_chains(*estimates: tuple) -> pd.DataFrame:
     """Held-out scores of Markov chains of order 0, 1 and so on."""
     rows = [(f"markov-{order}", "actions", *one) for order, one in enumerate(estimates)]
-    return pd.DataFrame(rows, columns=["model", "sees", "bits_per_action", "low", "high"])
+    return pd.DataFrame(rows, columns=["model", "context", "bits_per_action", "low", "high"])
 
 
-def criteria(*bits: float | None, sees: str = "actions") -> pd.DataFrame:
+def criteria(*bits: float | None, context: str = "actions") -> pd.DataFrame:
     """Both criteria of chains of order 0, 1 and so on."""
-    return pd.DataFrame({"order": range(len(bits)), "sees": sees, "bic_bits": bits, "aic_bits": None})
+    return pd.DataFrame({"order": range(len(bits)), "context": context, "bic_bits": bits, "aic_bits": None})
 
 
 def lags(curves: dict[str, list[tuple]], floor: dict[int, float] | None = None) -> pd.DataFrame:
     rows = [("gain", model, "actions", *row, None) for model, rows in curves.items() for row in rows]
     rows += [("mutual information", "counts", "actions", lag, None, None, None, b) for lag, b in (floor or {}).items()]
-    return pd.DataFrame(rows, columns=["what", "model", "sees", "lag", "bits", "low", "high", "chance"])
+    return pd.DataFrame(rows, columns=["what", "model", "context", "lag", "bits", "low", "high", "chance"])
 
 
 def matrix(names: list[str], seed: int = 0) -> np.ndarray:
@@ -117,7 +119,7 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
     by_group = np.stack([matrix(names, seed) for seed in range(len(groups))])
     ranked = scores(models, context)
     if len(models) > 1:
-        ranked.loc[len(ranked)] = {"model": "not scored", "sees": "actions"}
+        ranked.loc[len(ranked)] = {"model": "not scored", "context": "actions"}
     motifs = pd.DataFrame({"ratio": (8.0, 0.5, 0.0, None, float("inf")), "low": (None, None, 0, None, None), "high": 4})
     curve = [(0.1, 0.12, 0.1, 0.14, 900), (0.9, 0.85, None, None, 20), (None, None, None, None, 0)]
     plans = [(n, None if n == 3 else 1 + n / 100) for _ in groups for n in range(20)]
@@ -130,7 +132,7 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
         "lag": lag_figure(lags(dict.fromkeys(models, steps), {1: 0.01})),
         "one lag": lag_figure(lags({models[0]: [(1, 0.0, -0.1, 0.1)]})),
         "order": order_figure(criteria(1.5, 1.3, 1.4, 40.0, None), of_chains(estimate(1.5), estimate(1.2), [None] * 3)),
-        "calibration": calibration_figure(bins.assign(model=np.repeat(models, 3), sees="actions")),
+        "calibration": calibration_figure(bins.assign(model=np.repeat(models, 3), context="actions")),
         "motif": motif_figure(motifs.assign(sequence=" > ".join(names[:6]), count=1200)),
         "distribution": distribution_figure({"run length": ([0.5, None, 0.0, 0.1], [0.6, 0.4])}),
         "drift": drift_figure(
@@ -244,15 +246,14 @@ def test_tables():
 
 
 def test_contents_settings_and_places(tmp_path):
-    page = Page(
-        "t", "lead", "eval x --y", {"seed": 3}, [Section("one"), Section("two", tables=[Table(["a"], [["1"]])])]
-    )
+    sections = [Section("one"), Section("two", tables=[Table(["a"], [["1"]])])]
+    page = {"title": "t", "lead": "lead", "sections": sections, "settings": {"seed": 3}, "command": "eval x --y"}
     text = written(tmp_path, page)
     assert re.findall(r'<a href="#(.*?)">(.*?)</a>', text) == [("section-1", "one"), ("section-2", "two")]
     assert re.findall(r'<h2 id="(.*?)">', text) == ["section-1", "section-2"]
     assert re.search(r"<details.*eval x --y.*<dt>seed</dt><dd>3</dd>.*</details>", text, re.DOTALL)
     with pytest.raises(ValueError, match="a directory; the name of a file is expected"):
-        write_page(tmp_path, page)
+        write_page(tmp_path, **page)
 
 
 def luminance(color: str) -> float:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from neuroprior.plans import Plans
 from neuroprior.priors import MarkovPrior, UniformPrior, learn_macros
-from neuroprior.report import FigureBox, Report, report
+from neuroprior.report import Document, FigureBox, report
 from neuroprior.report.fits import counted
 from neuroprior.report.scores import evaluate_saved
 from neuroprior.report.sections import SECTIONS, macro_section
@@ -50,7 +50,7 @@ def test_where_nothing_repeats_there_is_no_section():
 
 
 @pytest.fixture(scope="module")
-def made() -> Report:
+def made() -> Document:
     plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 3)
     return report(plans, folds=2, **QUICK)
 
@@ -64,14 +64,14 @@ def test_a_report_has_its_tables_and_figures(made):
     names = {"scores", "lags", "orders", "calibration", "transitions", "group_transitions", "raster", "distributions"}
     assert {*names, "drift"} <= set(made.figures)
     assert all(isinstance(figure, Figure) for figure in made.figures.values())
-    boxes = [box for section in made.document.sections for box in section.figures]
+    boxes = [box for section in made.sections for box in section.figures]
     assert all(isinstance(box, FigureBox) and box.caption and box.alt and box.name for box in boxes)
-    assert len(made.document.sections) >= len(SECTIONS) - 2
+    assert len(made.sections) >= len(SECTIONS) - 2
 
 
 def test_the_lead_names_the_best_model(made):
     best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
-    assert made.document.lead == (
+    assert made.lead == (
         f"The best model, {best.model}, takes {best.bits_per_action:.3f} bits per action"
         f" (95 % interval {best.low:.3f} to {best.high:.3f} over groups)."
     )

@@ -108,7 +108,7 @@ def test_nor_at_the_ends_of_the_uniform_distribution(never, uniform, monkeypatch
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("num", [60_000, 90])
 def test_each_plan_has_the_distribution_of_its_context(method, num):
-    """In any order of the contexts, one of them seen rarely, one never."""
+    """In any order of the contexts, one of them rare, one absent."""
     prior, generator = TablePrior.random(A, 3, num_contexts=4, seed=2), seeded(3)
     context = torch.tensor([0, 2, 2, 0, 2, 3] * (num // 6))
     context = context[torch.randperm(num, generator=generator)]
@@ -132,9 +132,9 @@ def test_contexts_known_beforehand(kind, per, features):
         table = torch.nn.functional.one_hot(table, 3).float()
     arguments = {"context_size": 3} if features else {"num_contexts": 3}
     if kind == "markov":
-        seen = torch.randint(3, (90, 3) if per == "step" else (90,), generator=generator)
+        contexts = torch.randint(3, (90, 3) if per == "step" else (90,), generator=generator)
         prior = MarkovPrior(A, 1, **arguments).fit(
-            Plans(torch.randint(A, (90, 3), generator=generator), A, context=seen)
+            Plans(torch.randint(A, (90, 3), generator=generator), A, context=contexts)
         )
     else:
         size = {"hidden_size": 8} if kind == "gru" else {"width": 8, "num_heads": 2}
@@ -207,11 +207,11 @@ def test_parts_that_fit_a_cache_draw_the_same_plans(prior):
 
 
 def test_a_tree_evaluates_each_prefix_once():
-    prior, seen = UniformPrior(A), []
+    prior, sizes = UniformPrior(A), []
     step = prior.step
-    prior.step = lambda action, state, context=None: seen.append(len(action)) or step(action, state, context)
+    prior.step = lambda action, state, context=None: sizes.append(len(action)) or step(action, state, context)
     sample(prior, 1_000_000, 4, generator=seeded(0))
-    assert seen == [3, 9, 27]
+    assert sizes == [3, 9, 27]
 
 
 @settings(max_examples=60, deadline=None)
@@ -238,9 +238,9 @@ def world_prior(per):
     if per is None:
         return PRIORS["markov"]
     generator = seeded(11)
-    seen = torch.randint(6, (80, 4) if per == "step" else (80,), generator=generator)
+    contexts = torch.randint(6, (80, 4) if per == "step" else (80,), generator=generator)
     return MarkovPrior(A, 1, num_contexts=6, smoothing=0.5).fit(
-        Plans(torch.randint(A, (80, 4), generator=generator), A, context=seen)
+        Plans(torch.randint(A, (80, 4), generator=generator), A, context=contexts)
     )
 
 

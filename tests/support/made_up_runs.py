@@ -18,14 +18,14 @@ def made_up(run: Run, settings: Settings) -> dict[str, Any]:
     draw = random.Random(f"{run.world} {run.seed} {settings}").random
     budgets = [2**k for k in range(max(settings.num_plans).bit_length())]
     entries = [
-        {"planner": "sampling", "prior": prior, "sees": "none", "rounds": 0, "bits": 1 + draw(), "actions": 100}
+        {"planner": "sampling", "prior": prior, "context": "none", "rounds": 0, "bits": 1 + draw(), "actions": 100}
         | {name: [draw() for _ in budgets] for name in ("share", "at_oracle", "score", "seconds")}
         | {"model_steps": [8 * number for number in budgets]}
         for prior in PRIORS
     ]
     lengths = settings.lengths or (4, 8, 12)
-    growth = [
-        {"prior": prior, "sees": "none", "round": number, "length": length, "num_plans": 64, "share": draw()}
+    curriculum = [
+        {"prior": prior, "context": "none", "round": number, "length": length, "num_plans": 64, "share": draw()}
         for prior in PRIORS[1:]
         for number in range(settings.rounds + 1)
         for length in lengths
@@ -39,7 +39,7 @@ def made_up(run: Run, settings: Settings) -> dict[str, Any]:
         "seconds": 1.5,
         "budgets": budgets,
         "entries": entries,
-        "growth": growth,
+        "curriculum": curriculum,
         "action_names": None,
     }
 

@@ -25,18 +25,19 @@ FROM_ELSEWHERE = r"<(script|img|iframe)|<link (?!rel=.icon. href=.data:,.)|(src|
 def report(plans: Plans, folder: Path, **options: Any) -> dict[str, Any]:
     """What `results.json` of a report on a file of plans would hold; every report must have the same shape."""
     write_plans(plans, folder / "new.npz")
-    results = json.loads(json.dumps(results_of(report_on(folder / "new.npz", **(QUICK | options)).document)))
+    results = json.loads(json.dumps(results_of(report_on(folder / "new.npz", **(QUICK | options)))))
     for row in results["rows"]:
         assert row["nats_per_action"] == pytest.approx(row["bits_per_action"] * math.log(2))
         assert row["perplexity"] == pytest.approx(2 ** row["bits_per_action"])
         assert row["low"] <= row["bits_per_action"] <= row["high"]
-        assert row["sees"] in ("actions", "actions and context")
+        assert row["context"] == row["sees"]
+        assert row["context"] in ("actions", "actions and context")
     assert min(row["more"] for row in results["rows"]) == 0
     return results
 
 
 def bits(results: dict[str, Any], inputs: str = "actions") -> dict[str, float]:
-    return {row["model"]: row["bits_per_action"] for row in results["rows"] if row["sees"] == inputs}
+    return {row["model"]: row["bits_per_action"] for row in results["rows"] if row["context"] == inputs}
 
 
 def fails(arguments: list[str], capsys: Any, *words: str) -> None:

@@ -45,11 +45,11 @@ def p_value(numbers: Tensor, probs: Tensor) -> float:
         return 0.0
     expected = probs * observed.sum()
     rare = expected < 5
-    seen, due = (torch.cat([v[~rare], v[rare].sum()[None]]) for v in (observed, expected))
-    seen, due = seen[due > 0], due[due > 0]
+    counts, due = (torch.cat([v[~rare], v[rare].sum()[None]]) for v in (observed, expected))
+    counts, due = counts[due > 0], due[due > 0]
     if len(due) < 2:
         raise AssertionError("too few draws for a test")
-    return float(stats.chi2.sf(float(((seen - due) ** 2 / due).sum()), len(due) - 1))
+    return float(stats.chi2.sf(float(((counts - due) ** 2 / due).sum()), len(due) - 1))
 
 
 def fits(plans: Tensor, probs: Tensor, num_actions: int) -> bool:
@@ -132,7 +132,7 @@ def trajectories(
 class TablePrior(Prior):
     """A prior written down: `logits[t]` of shape `[contexts, A**t, A]` are those of action t after each prefix.
 
-    The state is the number of the prefix, the number of actions in it, and the context seen first.
+    The state is the number of the prefix, the number of actions in it, and the first context.
     """
 
     def __init__(self, logits: list[Tensor], num_contexts: int | None = None) -> None:

@@ -59,9 +59,9 @@ def test_food_regrows_at_the_places_of_the_season():
     world = ForagingWorld(corridor(), growth, 10, 2)
     for time, season in ((3, 0), (13, 1), (20, 0), (30, 1)):
         state = torch.tensor([[0, time, 4, 4]]).repeat(10_000, 1)
-        grown = world.regrow(state, seeded(time))
-        assert torch.equal(grown[:, :2], state[:, :2])
-        assert p_value(grown[:, 2:], growth[season].double()) > FALSE_ALARM
+        renewed = world.regrow(state, seeded(time))
+        assert torch.equal(renewed[:, :2], state[:, :2])
+        assert p_value(renewed[:, 2:], growth[season].double()) > FALSE_ALARM
         assert (world.season(state) == season).all()
 
 

@@ -158,13 +158,13 @@ def test_minigrid(name, limit):
     for _ in range(800):
         env.step_count = 0  # so that rewards are those of a first step, and time never runs out
         action = int(env.action_space.sample())
-        seen, reward, ended, _, _ = env.step(action)
+        observed, reward, ended, _, _ = env.step(action)
         state, gained = world.step(state, torch.tensor([action]))
         assert float(gained) == pytest.approx(reward)
         assert bool(world.ended[state]) == ended
         features = world.observe(state)[0]
-        assert features[:4].argmax() == seen["direction"]
-        assert features[4:].equal(torch.as_tensor(seen["image"]).float().flatten())
+        assert features[:4].argmax() == observed["direction"]
+        assert features[4:].equal(torch.as_tensor(observed["image"]).float().flatten())
         if ended:
             env.reset(seed=5)
             state, ends = world.reset(1), ends + 1

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -68,7 +69,7 @@ def test_peers_that_sample_a_chain():
     every = all_plans(2, 4)
     want = prior.log_prob(every).double().exp()
     tables = prior.log_probs.exp().double().numpy(), prior.next_node.numpy(), int(prior.start_node)
-    drawn = peers.numpy_sample(*tables, 20_000, 4)
+    drawn = peers.numpy_sample(*tables, 20_000, 4, np.random.default_rng(0))
     assert p_value(torch.from_numpy(drawn @ np.array([8, 4, 2, 1])), want) > FALSE_ALARM
     pytest.importorskip("pomegranate")
     plans = peers.pomegranate_sample(torch.from_numpy(drawn), 2, 30, 6)()
@@ -201,8 +202,8 @@ def test_sizes_increase_and_memory_is_measured():
 
 def test_the_slope_is_that_of_the_last_decades():
     rows = [{"size": 10**k, "seconds": 1.0 if k < 3 else 10.0 ** (1.5 * (k - 3))} for k in range(6)]
-    assert sizes.slope(rows) == pytest.approx(1.5)
-    assert sizes.slope(rows[:1]) is None
+    assert sizes.slope(pd.DataFrame(rows)) == pytest.approx(1.5)
+    assert sizes.slope(pd.DataFrame(rows[:1])) is None
 
 
 @pytest.mark.parametrize(

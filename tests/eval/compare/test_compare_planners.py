@@ -9,7 +9,7 @@ import pytest
 
 from eval.__main__ import main
 from eval.compare import planners
-from eval.compare.planner_report import planner_document
+from eval.compare.planners import planner_document
 from neuroprior.analysis.statistics import interquartile_mean, paired_difference
 from tests.support.reports import FROM_ELSEWHERE
 
@@ -72,7 +72,7 @@ def results(gap, seeds=4, worlds=("maze",)):
     """Samples that reach .5 to .53, and trees that reach `gap` more."""
 
     def entry(planner, number, share):
-        label = {"planner": planner, "prior": "gru", "sees": "initial", "num_plans": number, "share": share}
+        label = {"planner": planner, "prior": "gru", "context": "initial", "num_plans": number, "share": share}
         return label | {"model_steps": 8 * number, "seconds": 0.01 * number}
 
     for world in worlds:

@@ -41,7 +41,7 @@ def reported(runs, folder, asked=ASKED) -> tuple[dict, str, str]:
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory):
     """The report on two worlds with all there can be, its folder, and the runs."""
-    runs = worlds(SETTINGS["worlds"], 4, {**TIMES, "runs/mine": 3.0}, sees=("none", "initial"), rounds=1)
+    runs = worlds(SETTINGS["worlds"], 4, {**TIMES, "runs/mine": 3.0}, context=("none", "initial"), rounds=1)
     folder = tmp_path_factory.mktemp("compare")
     return *reported(runs, folder), folder, runs
 
@@ -52,7 +52,8 @@ def test_files(everything):
     assert results["settings"] == SETTINGS
     made = Results(runs, ASKED)
     for name in FRAMES:
-        own = records(getattr(made, name))
+        frame = getattr(made, FRAMES[name])
+        own = records(frame.assign(sees=frame["context"]))
         assert results[name] == own
         if name == "reasons":
             continue  # of made-up networks that are better everywhere there may be none
@@ -101,7 +102,7 @@ def test_printed(everything):
     half = max(row["high"] - row["oracle_share"], row["oracle_share"] - row["low"])
     line = next(line for line in lines if line.strip().startswith("uniform") and line.count("±") == 3)
     assert line.split()[3:5] == [f"{100 * row['oracle_share']:.1f}", f"±{100 * half:.1f}"]
-    (best,) = (row for row in results["words"] if (row["world"], row["sees"], row["rounds"]) == ("maze", "none", 0))
+    (best,) = (row for row in results["words"] if (row["world"], row["context"], row["rounds"]) == ("maze", "none", 0))
     line = next(line for line in lines if line.split()[:2] == ["maze", "none"]).split()
     assert line[2:4] == [f"{100 * best['second_share']:.1f}", f"{100 * best['first_share']:.1f}"]
     assert line[4] == f"{100 * best['difference']:+.1f}"
@@ -151,7 +152,7 @@ def test_curves_stand_where_they_are():
     assert np.allclose(named["gru"].get_xydata(), np.stack([BUDGETS, 100 * means], 1))
     assert len(axes.collections) == 3
     assert axes.get_title(loc="left") == "maze"
-    rounds = Results(worlds(["maze"], 2, rounds=2), ASKED).growth
+    rounds = Results(worlds(["maze"], 2, rounds=2), ASKED).curriculum
     axes = figures.curriculum_figure(rounds, ["gru"], STYLE).axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["0\n4", "1\n6", "2\n8"]
 

@@ -6,18 +6,19 @@ import pandas as pd
 import pytest
 
 from eval.__main__ import main
-from eval.compare.curriculum import curriculum_document, curriculum_figure
+from eval.compare.curriculum import curriculum_document
+from eval.compare.figures import score_panels
 from tests.support.sources import refuses
 
 
-def result(seed: int, share, sees="none", world="maze") -> dict:
+def result(seed: int, share, context="none", world="maze") -> dict:
     """A run with one prior, whose normalised score after each round at each length is `share(seed, round, length)`."""
-    growth = [
-        {"prior": "gru", "sees": sees, "round": turn, "length": n, "num_plans": 64, "share": share(seed, turn, n)}
+    curriculum = [
+        {"prior": "gru", "context": context, "round": turn, "length": n, "num_plans": 64, "share": share(seed, turn, n)}
         for turn in (0, 1, 2)
         for n in (4, 8)
     ]
-    return {"world": world, "seed": seed, "growth": growth}
+    return {"world": world, "seed": seed, "curriculum": curriculum}
 
 
 def document(results):
@@ -36,7 +37,7 @@ def test_gains_are_paired_differences_at_the_longest_plans():
     """Seeds that differ much, and gain the same: no doubt is left."""
     made = [result(seed, lambda seed, turn, n: seed / 10 + turn * n / 100) for seed in range(10)]
     (row,) = gains(made)
-    assert (row["world"], row["prior"], row["sees"]) == ("maze", "gru", "none")
+    assert (row["world"], row["prior"], row["context"]) == ("maze", "gru", "none")
     assert (row["length"], row["rounds"], row["seeds"]) == (8, 2, 10)
     assert [row["gain"], row["low"], row["high"]] == pytest.approx([0.16] * 3)
     assert row["p_value"] < 0.05
@@ -56,7 +57,7 @@ def test_the_lead_counts_what_is_significant():
     shares = [lambda s, turn, n: 0.5 + turn / 10, lambda s, turn, n: 0.5 - turn / 10, lambda s, turn, n: 0.5 + turn * s]
     contexts = ("none", "initial", "per-step")
     cases = list(zip(shares, contexts, strict=True))
-    made = [result(s - 5, share, sees=context) for share, context in cases for s in range(10)]
+    made = [result(s - 5, share, context=context) for share, context in cases for s in range(10)]
     lead = document(made).lead
     assert "2 of 3 differences are significant" in lead
     assert lead.endswith("1 positive, 1 negative.")
@@ -106,15 +107,15 @@ def test_figures_are_drawn_without_warnings(seeds):
 
 def test_the_context_is_in_the_tables_and_the_figure():
     for context in ("initial", "per-step"):
-        made = document([result(0, lambda *_: 0.5, sees=context)])
+        made = document([result(0, lambda *_: 0.5, context=context)])
         assert [table.rows[0][:2] for table in made.sections[1].tables] == [["gru", context]] * 2
         texts = made.sections[0].figures[0].figure.legends[0].get_texts()
         assert [text.get_text() for text in texts] == [f"gru, {context}"]
 
 
 def test_nothing_to_draw():
-    with refuses("rows: at least one"):
-        curriculum_figure(pd.DataFrame())
+    with refuses("views: at least one"):
+        score_panels([])
 
 
 @pytest.mark.parametrize(

@@ -176,13 +176,13 @@ def test_one_against_one_is_students_test():
 
 
 def test_pairs():
-    runs = worlds(["maze"], 6, sees=("none", "initial"), rounds=1)
+    runs = worlds(["maze"], 6, context=("none", "initial"), rounds=1)
     made = Results(runs, [16, 256]).paired
     # Twice two contexts and rounds; one neural prior and two chains; two numbers of plans.
     after, context = "after minus before the curriculum", "with minus without context"
     assert made["what"].value_counts().to_dict() == {BEST: 8, "neural minus Markov": 16, after: 12, context: 12}
     assert made["p_holm"].tolist() == pytest.approx(holm(made["p_value"]).tolist())
-    (row,) = found(made, what="neural minus Markov", second="markov-1", sees="none", rounds="0", num_plans=16)
+    (row,) = found(made, what="neural minus Markov", second="markov-1", context="none", rounds="0", num_plans=16)
     shares = {
         prior: [
             one["share"][4] for r in runs for one in r["entries"] if (one["prior"], *place(one)) == (prior, "none", 0)
@@ -197,11 +197,11 @@ def test_pairs():
         assert (row["difference"], row["low"], row["high"]) == pytest.approx([1 / 24] * 3, abs=1e-8)
         assert row["p_value"] == 2.0**-5
     assert {row["rounds"] for row in found(made, what=after)} == {"1 - 0"}
-    assert {row["sees"] for row in found(made, what=context)} == {"initial - none"}
+    assert {row["context"] for row in found(made, what=context)} == {"initial - none"}
 
 
 def place(one: dict[str, Any]) -> tuple[str, int]:
-    return one["sees"], one["rounds"]
+    return one["context"], one["rounds"]
 
 
 def test_saved_priors_meet_all_others():
@@ -291,24 +291,24 @@ def test_aggregates_over_worlds():
 
 
 def test_bits():
-    made = Results(worlds(["maze"], 6, noise=0, sees=("none", "initial")), ASKED).bits
-    (gru,) = found(made, prior="gru", sees="initial")
+    made = Results(worlds(["maze"], 6, noise=0, context=("none", "initial")), ASKED).bits
+    (gru,) = found(made, prior="gru", context="initial")
     assert gru["bits_per_action"] == pytest.approx(2 - 4 / 8 - 0.1)
     # One bit per eight-fold worth: markov-2 takes 1 / 8 more, whatever the context.
     assert (gru["more"], gru["more_low"], gru["more_high"]) == pytest.approx([-1 / 8] * 3)
-    assert found(made, prior="markov-2", sees="none")[0]["more"] == 0
+    assert found(made, prior="markov-2", context="none")[0]["more"] == 0
     runs = [run("maze", s, [entry("gru", curve(1), bits=1.0), entry("markov-1", curve(1))]) for s in range(3)]
     (row,) = records(Results(runs, ASKED).bits)
     assert (row["bits_per_action"], row["more"], row["p_value"], row["seeds"]) == (1.0, None, None, 3)
 
 
 def test_rounds_of_the_curriculum():
-    made = Results(worlds(["maze"], 3, noise=0, rounds=2), ASKED).growth
+    made = Results(worlds(["maze"], 3, noise=0, rounds=2), ASKED).curriculum
     assert len(made) == 3 * len(TIMES)
     (row,) = found(made, prior="gru", round=2)
     assert (row["length"], row["num_plans"], row["seeds"]) == (8, 256, 3)
     assert row["oracle_share"] == pytest.approx(curve(16)[-1])
-    assert Results(worlds(["maze"], 1), ASKED).growth.empty
+    assert Results(worlds(["maze"], 1), ASKED).curriculum.empty
 
 
 def explained(chain: float, network: float, bits: tuple[float, float], early: float = 0.0) -> Results:

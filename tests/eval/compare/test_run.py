@@ -22,7 +22,6 @@ from tests.support.sources import refuses, seeded
 
 SMALL = Settings((4, 16), ("markov", "gru"), ("none", "per-step"), 1, 3, 4, 30, 0)
 TINY = Task(
-    "tiny",
     ("left", "right", "forward"),
     "a small maze",
     partial(from_seeds, make=maze, height=5, width=5, num_layouts=3, egocentric=True, view=1),
@@ -33,7 +32,7 @@ TINY = Task(
 
 
 def run_in(task: Task, seed: int, settings: Settings) -> dict:
-    return compare_run(Run(task.name, seed), settings, {task.name: task})
+    return compare_run(Run("tiny", seed), settings, {"tiny": task})
 
 
 def bandit(actions: int, probability: float | None = None) -> TabularWorld:
@@ -50,7 +49,7 @@ def bandit(actions: int, probability: float | None = None) -> TabularWorld:
 
 def one_step(world: TabularWorld) -> Task:
     names = tuple(str(action) for action in range(world.num_actions))
-    return Task("bandit", names, "one step", lambda seed: Worlds(world, world, world), 1, (1,), "return")
+    return Task(names, "one step", lambda seed: Worlds(world, world, world), 1, (1,), "return")
 
 
 def test_the_curve_of_a_lottery():
@@ -58,7 +57,7 @@ def test_the_curve_of_a_lottery():
     world = bandit(5)
     starts = starts_of(one_step(world), world, 50, 1, seeded(0))
     budgets = [1, 2, 4, 8, 16]
-    found = curve(starts, UniformPrior(5), [*budgets, 4096], seeded(1))
+    found = curve(starts, UniformPrior(5), seeded(1), 1.0, [*budgets, 4096])
     for budget, share, at in zip(budgets, found["share"], found["at_oracle"], strict=False):
         truth = 1 - 0.8**budget
         error = (truth * (1 - truth) / (50 * 4096 // budget)) ** 0.5
@@ -71,7 +70,7 @@ def test_in_stochastic_worlds_plans_count_for_their_expected_score():
     """All plans gain 1 with probability 0.3, some seem to gain more: the best of many is worth 0.3 still."""
     world = bandit(4, 0.3)
     starts = starts_of(one_step(world), world, 20, 1, seeded(0))
-    found = curve(starts, UniformPrior(4), [1, 64], seeded(1))
+    found = curve(starts, UniformPrior(4), seeded(1), 1.0, [1, 64])
     assert found["share"] == pytest.approx([1.0, 1.0])
     assert found["score"] == pytest.approx([0.3, 0.3])
     decision = planner_of(starts, UniformPrior(4), 64, 1.0).plan(world, starts.state, seeded(2))
@@ -120,7 +119,7 @@ def test_the_best_temperature():
 def test_a_decision_is_timed_at_some_of_the_starts():
     world = bandit(3)
     starts = starts_of(one_step(world), world, 6, 1, seeded(0))
-    timed = seconds_per_decision(starts, UniformPrior(3), [2, 8], 2, seeded(0), 1.0)
+    timed = seconds_per_decision(starts, UniformPrior(3), seeded(0), 1.0, [2, 8], 2)
     assert [(budget, steps) for budget, (_, steps) in timed.items()] == [(2, 2), (8, 8)]
     assert all(0 < seconds < 5 for seconds, _ in timed.values())
 
@@ -131,10 +130,10 @@ def run() -> dict:
 
 
 def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
-    entries = [(one["prior"], one["sees"], one["rounds"]) for one in run["entries"]]
+    entries = [(one["prior"], one["context"], one["rounds"]) for one in run["entries"]]
     fitted = [f"markov-{order}" for order in range(5)] + ["gru"]
     expected = [(None, "none", 0), ("uniform", "none", 0)]
-    expected += [(prior, sees, turn) for sees in ("none", "per-step") for prior in fitted for turn in (0, 1)]
+    expected += [(prior, context, turn) for context in ("none", "per-step") for prior in fitted for turn in (0, 1)]
     assert entries == expected
     assert json.loads(json.dumps(run))["budgets"] == [1, 2, 4, 8, 16]
     for one in run["entries"][1:]:
@@ -143,8 +142,8 @@ def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
         assert 0 < one["share"][0] <= one["share"][-1] <= 1 + 1e-12
         assert one["model_steps"] == [None, None, 20, None, 80]
         assert 0 < one["bits"] < 3
-    growth = [(one["prior"], one["sees"], one["round"], one["length"]) for one in run["growth"]]
-    assert growth == [(p, s, r, (3, 5)[r]) for s in ("none", "per-step") for p in fitted for r in (0, 1)]
+    curriculum = [(one["prior"], one["context"], one["round"], one["length"]) for one in run["curriculum"]]
+    assert curriculum == [(p, s, r, (3, 5)[r]) for s in ("none", "per-step") for p in fitted for r in (0, 1)]
     for matrix in run["transitions"].values():
         assert torch.allclose(torch.tensor(matrix).sum(1), torch.ones(3))
     assert set(run["plans"]["paths"]) == {"uniform", "markov-2", "gru"}
@@ -169,7 +168,7 @@ def test_a_world_decides_contexts_and_the_number_of_training_starts(monkeypatch)
     monkeypatch.setattr(run_module, "collect", lambda *given, **how: asked.append(given[2]) or collect(*given, **how))
     task = replace(TINY, contexts=("none", "initial"), start_factor=3)
     found = run_in(task, 0, replace(SMALL, kinds=("markov",), context=(), rounds=0))
-    assert {one["sees"] for one in found["entries"]} == {"none", "initial"}
+    assert {one["context"] for one in found["entries"]} == {"none", "initial"}
     assert sorted(asked) == [22, 90]
 
 
@@ -188,7 +187,7 @@ def test_numbers_of_states_are_no_initial_context():
     """Where other states to start from are held out, the number of a start says nothing."""
     settings = replace(SMALL, kinds=("markov",), context=("none", "initial", "per-step"), rounds=0)
     for task, contexts in ((TASKS["cliff"], {"none", "per-step"}), (TINY, {"none", "initial", "per-step"})):
-        assert {one.sees for one in Contest(task, 0, settings, orders=(0,)).contestants()} == contexts
+        assert {one.context for one in Contest(Run("tiny", 0), task, settings, orders=(0,)).contestants()} == contexts
 
 
 def test_saved_priors_are_compared_as_they_are(tmp_path):
@@ -196,14 +195,16 @@ def test_saved_priors_are_compared_as_they_are(tmp_path):
     folder = str(save(MarkovPrior(3, 1).fit(plans), tmp_path / "mine"))
     found = run_in(TINY, 0, replace(SMALL, kinds=(), priors=(folder,)))
     assert [one["prior"] for one in found["entries"]] == [None, "uniform", folder]
-    assert found["growth"] == []
+    assert found["curriculum"] == []
 
 
 def test_the_curriculum_alone_with_lengths_of_its_own():
     settings = replace(SMALL, kinds=("markov",), context=("none",), rounds=2, lengths=(4, 6), num_plans=(8,))
     found = curriculum_run(Run("tiny", 0), settings, {"tiny": TINY})
-    assert {(one["round"], one["length"]) for one in found["growth"]} == {(r, n) for r in range(3) for n in (3, 4, 6)}
-    assert {one["num_plans"] for one in found["growth"]} == {8}
+    assert {(one["round"], one["length"]) for one in found["curriculum"]} == {
+        (r, n) for r in range(3) for n in (3, 4, 6)
+    }
+    assert {one["num_plans"] for one in found["curriculum"]} == {8}
 
 
 SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name.startswith("minigrid")]
@@ -213,7 +214,6 @@ SEARCHED = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name
 def test_worlds_of_the_suite(name):
     """No two of the three worlds are the same, actions are named, and something can be reached."""
     task = TASKS[name]
-    assert task.name == name
     worlds = task.worlds(3)
     for world in worlds:
         assert world.num_actions == task.num_actions
@@ -252,7 +252,7 @@ def test_temperatures_are_chosen_where_priors_did_not_learn(monkeypatch):
 
 def test_the_documentation_describes_the_worlds():
     text = (Path(__file__).parents[3] / "docs" / "compare.md").read_text()
-    for task in TASKS.values():
+    for name, task in TASKS.items():
         lengths, contexts = ", ".join(map(str, task.lengths)), ", ".join(task.contexts)
-        row = (f"`{task.name}`", task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
+        row = (f"`{name}`", task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
         assert f"| {' | '.join(map(str, row))} |" in text

@@ -23,7 +23,7 @@ def test_a_small_comparison(tmp_path, capsys):
     assert "Food eaten in 100 steps" in " ".join(printed.split())
     results = json.loads((out / "results.json").read_text())
     rows = results["rows"]
-    assert [(row["prior"], row["sees"], row["learns"], row["warm_start"]) for row in rows] == list(
+    assert [(row["prior"], row["context"], row["learns"], row["warm_start"]) for row in rows] == list(
         conditions(("markov",))
     )
     for row in rows:
@@ -63,9 +63,9 @@ def made_up(seeds=6, seasons=2, worlds=("forage_grid",)):
 
 def test_what_is_reported():
     results = made_up()
-    document, _ = live_document(results, {}, "")
+    document = live_document(results, {}, "")
     rows, gaps = (document.frames[name].to_dict("records") for name in ("rows", "paired"))
-    online = next(row for row in rows if row["learns"] == "online" and row["sees"] == "none")
+    online = next(row for row in rows if row["learns"] == "online" and row["context"] == "none")
     assert online["reward"] == pytest.approx(100 * (0.1 + 0.1 + 0.005), abs=0.3)
     assert online["after"] == pytest.approx(30.5, abs=0.6)
     assert online["late"] == pytest.approx(30.5, abs=0.6)
@@ -81,7 +81,7 @@ def test_what_is_reported():
     own, other = (
         [100 * np.mean(entry["rewards"]) for one in results for entry in one["entries"] if pick(entry)]
         for pick in (
-            lambda entry: entry["learns"] == "online" and entry["sees"] == "none",
+            lambda entry: entry["learns"] == "online" and entry["context"] == "none",
             lambda entry: entry["prior"] == "uniform" and entry["warm"],
         )
     )
@@ -97,16 +97,16 @@ def test_what_is_reported():
 
 
 def test_a_single_seed_and_season():
-    document, pictures = live_document(made_up(1, seasons=1), {}, "")
+    document = live_document(made_up(1, seasons=1), {}, "")
     assert document.frames["paired"].empty
     assert "need at least two seeds" in document.lead
     assert document.sections[1].tables[0].rows[0][5] == ""
-    assert list(pictures) == ["forage_grid"]
+    assert [box.name for box in document.sections[0].figures] == ["forage_grid"]
 
 
 def test_aggregates_over_worlds_are_shares_of_the_oracle():
-    across = live_document(made_up(worlds=("forage_grid", "forage_maze")), {}, "")[0].frames["across"]
-    online = across[(across["learns"] == "online") & (across["sees"] == "none")].iloc[0]
+    across = live_document(made_up(worlds=("forage_grid", "forage_maze")), {}, "").frames["across"]
+    online = across[(across["learns"] == "online") & (across["context"] == "none")].iloc[0]
     assert (online["worlds"], online["seeds"], online["improvement"]) == (2, 6, 1)
     assert online["first"] == pytest.approx(0.205 / 0.505, abs=0.02)
     assert online["second"] == pytest.approx(0.105 / 0.505, abs=0.02)

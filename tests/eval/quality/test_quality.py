@@ -31,7 +31,7 @@ def test_plans_have_the_probabilities_that_the_source_says(source):
             even = (1 - REPEAT) / source.num_actions
             total[:, t] = torch.where(actions[:, t] == actions[:, t - LAG], REPEAT + even, even).log()
         else:
-            probs = source.table[source.context_at(plans, t), history]
+            probs = source.table[context_at(source, plans, t), history]
             total[:, t] = probs.gather(1, actions[:, t, None])[:, 0].log()
             if t == LENGTH - 1:
                 likeliest = probs.argmax(1)
@@ -58,11 +58,18 @@ def test_markov_of_the_right_order_costs_what_estimation_costs(source):
     learned = prior.fit(training)(training.actions, context).double().log_softmax(-1)
     actions, divergence = training.actions.long(), torch.zeros(20_000, dtype=torch.double)
     for t in range(source.order, LENGTH):
-        probs = source.table[source.context_at(training, t), history_at(source, actions, t)]
+        probs = source.table[context_at(source, training, t), history_at(source, actions, t)]
         divergence += (probs * (probs.log() - learned[:, t])).sum(-1)
     free = source.table[..., 0].numel() * (source.num_actions - 1)
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], free)
     assert low < 2 * float(divergence.sum()) < high
+
+
+def context_at(source, plans: Plans, t: int) -> torch.Tensor | int:
+    """The context of `plans` at action t."""
+    if plans.context is None:
+        return 0
+    return plans.context[:, t] if source.context == "step" else plans.context
 
 
 def history_at(source, actions: torch.Tensor, t: int) -> torch.Tensor:
