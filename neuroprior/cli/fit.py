@@ -28,6 +28,9 @@ LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 """What a checkpoint must hold for a training to go on from it."""
 
+OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
+"""Options of `--data` that other commands have, too."""
+
 NETWORKS_ALONE = {"devices": 1, "num_nodes": 1, "precision": "32-true", "accumulate_grad_batches": 1, "max_time": None}
 """Options of the trainer, with their defaults, that do not reach the networks inside other priors."""
 
@@ -74,7 +77,7 @@ class FitCLI(LightningCLI):
                     "exit_on_error": False,
                 },
             },
-            args=_with_saved_config(_with_paths(arguments), program),
+            args=_with_saved_config(_in_full(arguments), program),
         )
 
     @staticmethod
@@ -203,14 +206,16 @@ def _check(checkpoint: Path, model: PriorModel) -> dict[str, Any]:
     return saved
 
 
-def _with_paths(arguments: list[str]) -> list[str]:
-    """The arguments, with the paths of recipes that are given by name."""
+def _in_full(arguments: list[str]) -> list[str]:
+    """The arguments, with the paths of recipes that are given by name, and the sections of short options."""
     out: list[str] = []
     for argument in arguments:
         if out and out[-1] in ("--config", "-c"):
             argument = recipe_path(argument)
         elif argument.startswith("--config="):
             argument = f"--config={recipe_path(argument.removeprefix('--config='))}"
+        elif argument.startswith(OF_TABLES):
+            argument = f"--data.{argument.removeprefix('--')}"
         out.append(argument)
     return out
 
@@ -240,7 +245,8 @@ def _with_saved_config(arguments: list[str], program: str) -> list[str]:
         raise ValueError(f"{place / CONFIG}: damaged, or not the configuration of a run")
     saved = ["--config", str(place / CONFIG), "--resume", str(place)]
     if (place / PLANS).exists():
-        saved += ["--data.file", str(place / PLANS)]
+        saved += ["--data.file", str(place / PLANS), "--data.columns=null", "--data.missing=gap"]
+        saved += ["--data.merge_repeats=false", "--data.max_gap=null"]
     return ["fit", *saved, *others]
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 
 from neuroprior.planners import Planner, collect
-from neuroprior.plans import Plans, read_plans
+from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.priors import Prior
 from neuroprior.priors.fitting import context_arguments, make_prior
 from neuroprior.training import PlansModule, PriorModule, Settings
@@ -48,6 +48,11 @@ class PlansData(PlansModule):
         file: plans to learn from: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
         num_actions: number of actions, where the file does not say.
         action_names: names of the actions in the order of their numbers, where the file does not say.
+        columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration;
+            `--columns.action` is short for `--data.columns.action`, and so on.
+        missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
+        merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
+        max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
         world: where plans are collected if no file is given, such as `neuroprior.worlds.gridworld`.
         planner: that chooses them, such as `ExhaustivePlanner`.
         num_plans: how many are collected.
@@ -68,6 +73,10 @@ class PlansData(PlansModule):
         file: str | None = None,
         num_actions: int | None = None,
         action_names: list[str] | None = None,
+        columns: Columns | None = None,
+        missing: Missing = "gap",
+        merge_repeats: bool = False,
+        max_gap: float | None = None,
         world: World | None = None,
         planner: Planner | None = None,
         num_plans: int = 10_000,
@@ -88,7 +97,15 @@ class PlansData(PlansModule):
             raise ValueError(f"data: validation and held_out leave nothing to learn from: {validation} + {held_out}")
         settings = Settings(max_steps, batch_size, window, check_every=check_every)
         if file is not None:
-            self.source = read_plans(file, num_actions=num_actions, action_names=action_names)
+            self.source = read_plans(
+                file,
+                num_actions=num_actions,
+                action_names=action_names,
+                columns=columns,
+                missing=missing,
+                merge_repeats=merge_repeats,
+                max_gap=max_gap,
+            )
         elif world is not None and planner is not None:
             generator = torch.Generator().manual_seed(seed)
             self.source = collect(planner, world, num_plans, context=context, generator=generator)

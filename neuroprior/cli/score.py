@@ -7,7 +7,7 @@ import pandas as pd
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, unit_name
-from neuroprior.plans import Plans, read_plans
+from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.report.document import printed, table, write_frames
@@ -21,6 +21,10 @@ def score(
     file: str,
     num_actions: int | None = None,
     action_names: list[str] | None = None,
+    columns: Columns | None = None,
+    missing: Missing = "gap",
+    merge_repeats: bool = False,
+    max_gap: float | None = None,
     out: str = "runs/score",
 ) -> None:
     """Score plans under a saved prior: log-likelihood and bits per action, of each plan and each group.
@@ -32,12 +36,24 @@ def score(
         file: plans: `.npz`, `.jsonl` or `.csv`, or `minari:` and the name of a Minari dataset.
         num_actions: number of actions, where the file does not say.
         action_names: names of the actions in the order of their numbers, where the file does not say.
+        columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration.
+        missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
+        merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
+        max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
         out: folder for `plans.csv` and `groups.csv`.
     """
     prior = load(folder)
     # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
     names = action_names or (learned_names(prior) if file.lower().endswith((".csv", ".tsv")) else None)
-    plans = read_plans(file, num_actions=num_actions, action_names=names)
+    plans = read_plans(
+        file,
+        num_actions=num_actions,
+        action_names=names,
+        columns=columns,
+        missing=missing,
+        merge_repeats=merge_repeats,
+        max_gap=max_gap,
+    )
     plans = match_plans(plans if plans.end is None else plans.without_end(), prior, folder)
     bits = action_bits(prior, plans)
     own = {"plan": range(len(plans)), "group": group_names(plans), "actions": plans.mask().sum(1).tolist()}

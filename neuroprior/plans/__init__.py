@@ -10,11 +10,12 @@ from neuroprior.plans.io import (
     write_plans,
 )
 from neuroprior.plans.plans import Plans, action_dtype, all_plans, check_context, is_per_step
-from neuroprior.plans.tables import Columns
+from neuroprior.plans.tables import Columns, Missing
 
 __all__ = [
     "BLOCKS",
     "Columns",
+    "Missing",
     "FEWEST_UNITS",
     "Plans",
     "action_dtype",

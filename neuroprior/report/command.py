@@ -6,6 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from neuroprior.plans import Columns, Missing
 from neuroprior.report.document import show
 from neuroprior.report.plan_report import INPUTS, MODELS, InputName, ModelName, report
 
@@ -22,6 +23,10 @@ def plans(
     patience: float = 0.25,
     num_actions: int | None = None,
     action_names: list[str] | None = None,
+    columns: Columns | None = None,
+    missing: Missing = "gap",
+    merge_repeats: bool = False,
+    max_gap: float | None = None,
     seed: int = 0,
     processes: int | None = None,
     dask: str | None = None,

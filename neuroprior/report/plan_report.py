@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._jobs import Progress
-from neuroprior.plans import Plans, read_plans
+from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
@@ -48,6 +48,10 @@ def report(
     patience: float = 0.25,
     num_actions: int | None = None,
     action_names: Sequence[str] | None = None,
+    columns: Columns | Mapping[str, Any] | None = None,
+    missing: Missing = "gap",
+    merge_repeats: bool = False,
+    max_gap: float | None = None,
     seed: int = 0,
     processes: int | None = None,
     dask: str | None = None,
@@ -72,6 +76,10 @@ def report(
         patience: share of these steps without improvement after which training stops; 1 trains to the end.
         num_actions: number of actions, where a file does not say.
         action_names: names of the actions in the order of their numbers, where a file does not say.
+        columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration.
+        missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
+        merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
+        max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
         seed: draws the folds and everything in training.
         processes: how many models are fitted at a time; all cores by default.
         dask: address of a Dask scheduler whose workers fit the models; None: this machine.
@@ -95,6 +103,8 @@ def report(
             raise ValueError(f"{name}: some of {', '.join(known)} are expected, not {', '.join(given) or 'none'}")
     _check(skip, max_steps, patience, seed, processes)
     file = "" if isinstance(plans, Plans) else str(plans)
+    reading: dict[str, Any] = {"num_actions": num_actions, "action_names": action_names, "columns": columns}
+    reading |= {"missing": missing, "merge_repeats": merge_repeats, "max_gap": max_gap}
     if priors is not None:
         if test is not None or folds is not None:
             raise ValueError("priors: they are scored on the plans as they are; leave test and folds out")
@@ -102,16 +112,16 @@ def report(
             raise ValueError("priors: at least one is expected")
         loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
         names = action_names or (learned_names(next(iter(loaded.values()))) if file[-4:].lower() in CSV else None)
-        found = evaluate_saved(loaded, _read(plans, num_actions, names), skip)
+        found = evaluate_saved(loaded, _read(plans, reading | {"action_names": names}), skip)
     else:
-        whole, empty = _with_actions(plans, num_actions, action_names)
+        whole, empty = _with_actions(plans, reading)
         other, cut = None, False
         if test is not None:
             if not isinstance(test, Plans) and file and Path(test).resolve() == Path(file).resolve():
                 raise ValueError("test: the very plans that are learned from; give others, or leave it out")
             if folds is not None:
                 raise ValueError("folds: with test plans nothing is held out of the others; leave folds out")
-            other, empty = _with_actions(test, num_actions, action_names)
+            other, empty = _with_actions(test, reading)
             other = _numbered_alike(whole, other, "test" if isinstance(test, Plans) else str(test))
         whole, other = _contexts_from_0(whole, other)
         learned, cut = _in_parts(whole)
@@ -181,18 +191,18 @@ def _check(skip: int, max_steps: int, patience: float, seed: int, processes: int
             raise ValueError(f"{name}: {expected} expected, not {value}")
 
 
-def _read(plans: Plans | str | Path, num_actions: int | None, names: Sequence[str] | None) -> Plans:
-    """The plans, without an end symbol."""
+def _read(plans: Plans | str | Path, reading: Mapping[str, Any]) -> Plans:
+    """The plans, without an end symbol; `reading`: further arguments of `read_plans`."""
     if not isinstance(plans, Plans):
-        plans = read_plans(plans, num_actions=num_actions, action_names=names)
-    elif num_actions is not None or names is not None:
-        raise ValueError("num_actions, action_names: for files only; plans have their own")
+        plans = read_plans(plans, **reading)
+    elif given := [name for name, value in reading.items() if value not in (None, False, "gap")]:
+        raise ValueError(f"{', '.join(given)}: for files only; plans have their own")
     return plans if plans.end is None else plans.without_end()
 
 
-def _with_actions(plans: Plans | str | Path, num_actions: int | None, names: Sequence[str] | None) -> tuple[Plans, int]:
+def _with_actions(plans: Plans | str | Path, reading: Mapping[str, Any]) -> tuple[Plans, int]:
     """The plans that have actions, and how many have none: these are of no use to models."""
-    read, file = _read(plans, num_actions, names), "plans" if isinstance(plans, Plans) else plans
+    read, file = _read(plans, reading), "plans" if isinstance(plans, Plans) else plans
     if read.num_actions > MOST_ACTIONS:
         raise ValueError(
             f"{file}: action numbers go up to {read.num_actions - 1}; number the actions from 0, or write names"

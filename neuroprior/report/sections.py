@@ -26,7 +26,7 @@ from neuroprior.priors import learn_macros
 from neuroprior.report import figures
 from neuroprior.report.document import Column, table
 from neuroprior.report.fits import ACTIONS, CONTEXT
-from neuroprior.report.page import FigureBox, Section
+from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.report.scores import Evaluation, Model
 
 MOST_ORDER, MOST_LAG, MOST_MACROS = 6, 20, 16
@@ -48,10 +48,43 @@ class Part(NamedTuple):
 
 def file_section(found: Evaluation) -> Part:
     """What is in the file."""
+    frame = action_frame(found.plans)
+    return Part(Section("Plans", tables=plans_tables(found.plans)), {"actions": frame})
+
+
+def plans_tables(plans: Plans) -> list[Table]:
+    """What was read: how many plans of which kind, with what readers noted of them, and the commonest actions."""
     columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
     columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "context"}
-    shown = table(pd.DataFrame([describe(found.plans)]), columns, align="rrrrrrl")
-    return Part(Section("Plans", tables=[shown]), {})
+    columns |= {"conditions": "conditions"} if plans.condition is not None else {}
+    notes = "".join(f"{note[:1].upper()}{note[1:]}. " for note in plans.notes).strip()
+    described = table(pd.DataFrame([describe(plans)]), columns, notes, "Plans", "rrrrrrl" + "r" * (len(columns) - 7))
+    frame = action_frame(plans)
+    counted: dict[str, Column] = {
+        "action": "action",
+        "count": "count:,",
+        "%": lambda row: f"{100 * row.share:.1f}",
+        "plans": "plans:,",
+    }
+    if plans.durations is not None:
+        counted |= {"median duration": "median_duration:.3g"}
+    caption = f"The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
+    return [described, table(frame[:LISTED], counted, caption, "Actions")]
+
+
+def action_frame(plans: Plans) -> pd.DataFrame:
+    """How often each action occurs, in how many plans, and its median duration; the commonest first."""
+    mask = plans.mask()
+    plan = mask.nonzero()[:, 0]
+    data = {"action": plans.actions[mask].tolist(), "plan": plan.tolist()}
+    data["duration"] = [None] * len(plan) if plans.durations is None else plans.durations[mask].tolist()
+    found = pd.DataFrame(data).astype({"duration": "float64"}).groupby("action")
+    frame = found.agg(count=("plan", "size"), plans=("plan", "nunique"), median_duration=("duration", "median"))
+    names = action_names(plans)
+    frame.insert(0, "action", [names[action] for action in frame.index])
+    frame.insert(2, "share", frame["count"] / max(len(plan), 1))
+    frame = frame.sort_values("count", ascending=False, kind="stable").reset_index(drop=True)
+    return frame if plans.durations is not None else frame.drop(columns="median_duration")
 
 
 def describe(plans: Plans) -> dict[str, Any]:
@@ -69,6 +102,9 @@ def describe(plans: Plans) -> dict[str, Any]:
         "kinds of actions": plans.num_actions,
         "groups": 0 if plans.group is None else len(plans.group.unique()),
         "context": context,
+        "conditions": 0 if plans.condition is None else len(plans.condition.unique()),
+        "durations": plans.durations is not None,
+        "notes": list(plans.notes),
     }
 
 
