@@ -280,26 +280,33 @@ def _digest(module: str) -> str:
         name = todo.pop()
         if name in found:
             continue
-        spec = find_spec(name) if name != "__main__" else None
-        if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+        source = _source(name)
+        if source is None:
             continue
-        found[name] = Path(spec.origin).read_bytes()
+        found[name] = source.read_bytes()
         for node in ast.walk(ast.parse(found[name])):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            todo += [each for each in names if each.split(".")[0] in PACKAGES and _is_module(each)]
+            todo += [each for each in names if each.split(".")[0] in PACKAGES]
     digest = hashlib.sha256()
     for name in sorted(found):
         digest.update(name.encode() + b"\0" + found[name] + b"\0")
     return digest.hexdigest()
 
 
-def _is_module(name: str) -> bool:
-    try:
-        return find_spec(name) is not None
-    except ModuleNotFoundError:
-        return False
+def _source(module: str) -> Path | None:
+    """The file of a module, which is not imported for it; None for what is no module or is not written in Python."""
+    top, *rest = module.split(".")
+    spec = find_spec(top) if top != "__main__" else None
+    if spec is None:
+        return None
+    for folder in spec.submodule_search_locations or ():
+        place = Path(folder, *rest)
+        for file in (place / "__init__.py", place.with_suffix(".py")):
+            if file.is_file():
+                return file
+    return Path(spec.origin) if not rest and spec.origin and spec.origin.endswith(".py") else None
 
 
 @lru_cache

@@ -25,8 +25,11 @@ Arrays = dict[str, np.ndarray[Any, Any]]
 ACTIONS, CONTEXT = "actions", "actions and context"
 """The input of a model."""
 
-KINDS = ("mixture", "gru-large", "stacked", "transformer", "gru", "lags", "counts")
+KINDS = ("mixture", "gru-large", "stacked", "transformer", "gru", "gru-lags", "lags", "counts")
 """What one job fits; the slowest first."""
+
+LAGS = ("lags", "gru-lags")
+"""Jobs of the information by lag, by counts and by a GRU; of one fold only."""
 
 NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "gru": (GRUPrior, {}),
@@ -111,7 +114,7 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     Returns:
         Arrays by the name of the model and what they are, such as "gru/bits". "how": its settings. "bits" `[n, L]`,
         float32: those of each held-out action. "calibration": the sums of a `Reliability`. In the first fold,
-        "generated" `[g, L]`: plans sampled from it. Or, of the job "lags", "bits" and "actions" `[J, U]`: those of the
+        "generated" `[g, L]`: plans sampled from it. Or, of `LAGS`, "bits" and "actions" `[J, U]`: those of the
         same actions with 0, 1, ... J - 1 past ones known, by independent unit.
     """
     learned, index = split(plans, test, design, job.fold)
@@ -121,8 +124,8 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     if job.inputs == ACTIONS:
         learned, scored = (replace(some, context=None, context_names=None) for some in (learned, scored))
     seed = design.seed * 1000 + job.fold
-    if job.kind == "lags":
-        return _by_lag(learned, scored, design, seed)
+    if job.kind in LAGS:
+        return _by_lag(job.kind, learned, scored, design, seed)
     found: Arrays = {}
     world = None if job.fold else _world(learned, _sizes(learned, scored).get("num_contexts", 0))
     for name, how, prior in _fitted(job.kind, learned, scored, design, seed):
@@ -191,7 +194,7 @@ def _sizes(*some: Plans) -> dict[str, int]:
     return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
 
 
-def _by_lag(learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
+def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
     """The bits of the last actions of short pieces, with 0, 1, 2 and more of the actions before them known."""
     # At most half of what the median plan has, so that pieces stand anywhere in plans.
     halves = (int(plans.mask().sum(1).double().median()) // 2 for plans in (learned, scored))
@@ -207,16 +210,15 @@ def _by_lag(learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
     short = pieces(learned, reach + 1, MOST_PIECES * 5, generator)
     if held_out.group is None or len(held_out.group.unique()) < FEWEST_UNITS:
         return {}
-    neural = GRUPrior(learned.num_actions, seed=seed, **sizes)
-    neural.fit(divisible(short), generator=generator, batch_size=PIECES_A_STEP, **design.training)
-    found = {"gru": [_of_last(neural, held_out, known) for known in range(reach + 1)]}
-    if "context_size" not in sizes:
-        found[COUNTED] = _chains(learned, held_out, reach, sizes.get("num_contexts"))
-    return {
-        f"{name}/{what}": np.stack([getattr(score, what) for score in scores])
-        for name, scores in found.items()
-        for what in ("bits", "actions")
-    }
+    if kind == "gru-lags":
+        name, neural = "gru", GRUPrior(learned.num_actions, seed=seed, **sizes)
+        neural.fit(divisible(short), generator=generator, batch_size=PIECES_A_STEP, **design.training)
+        scores = [_of_last(neural, held_out, known) for known in range(reach + 1)]
+    elif "context_size" in sizes:
+        return {}  # features cannot be counted
+    else:
+        name, scores = COUNTED, _chains(learned, held_out, reach, sizes.get("num_contexts"))
+    return {f"{name}/{what}": np.stack([getattr(score, what) for score in scores]) for what in ("bits", "actions")}
 
 
 def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | None) -> list[Score]:

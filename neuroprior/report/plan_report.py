@@ -14,7 +14,7 @@ from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.report.document import Document, write_document
-from neuroprior.report.fits import ACTIONS, CONTEXT, Design, counted
+from neuroprior.report.fits import ACTIONS, CONTEXT, LAGS, Design, counted
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.report.sections import SECTIONS, describe
 
@@ -129,7 +129,9 @@ def report(
             other, cut = _in_parts(other)
         number = 1 if other is not None else _folds(file or "plans", learned, folds)
         design = Design(number, seed, skip, max_steps, patience, cut=cut)
-        kinds = [*models, *(["lags"] if "lags" in sections else [])]
+        kinds: list[str] = [*models]
+        if "lags" in sections:
+            kinds += LAGS if set(models) != {"counts"} else LAGS[:1]
         given = [ACTIONS] * ("actions" in inputs) + [CONTEXT] * ("context" in inputs and learned.context is not None)
         if not given:
             raise ValueError("inputs: the plans have no context; leave context out")
@@ -236,6 +238,8 @@ def _contexts_from_0(plans: Plans, test: Plans | None) -> tuple[Plans, Plans | N
     """The plans with the contexts that occur numbered from 0, where they have no names: gaps make no model larger."""
     contexts = [some.context for some in (plans, test) if some is not None and some.context is not None]
     named = plans.context_names is not None or (test is not None and test.context_names is not None)
+    if contexts and contexts[0].is_floating_point() and not contexts[0].shape[-1]:
+        raise ValueError("context: it has no features; leave it out of the plans")
     if not contexts or named or contexts[0].is_floating_point():
         return plans, test
     present = torch.cat([context.flatten().long() for context in contexts]).unique()

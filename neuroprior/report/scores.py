@@ -22,7 +22,7 @@ from neuroprior.plans import Plans
 from neuroprior.priors import Prior
 from neuroprior.priors.matching import match_plans
 from neuroprior.report import fits
-from neuroprior.report.fits import ACTIONS, CONTEXT, COUNTED, KINDS, Arrays, Design, Job, counted, split
+from neuroprior.report.fits import ACTIONS, CONTEXT, COUNTED, KINDS, LAGS, Arrays, Design, Job, counted, split
 
 ORDERED = ["uniform", *(f"markov-{order}" for order in ORDERS)]
 ORDERED += ["context tree", "gru", "transformer", "gru-large", "stacked", "mixture"]
@@ -114,7 +114,7 @@ def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Jo
         Job(fold, kind, each)
         for kind in KINDS
         if kind in kinds
-        for fold in range(1 if kind == "lags" else design.folds)
+        for fold in range(1 if kind in LAGS else design.folds)
         for each in reversed(inputs)
     ]
 
@@ -129,7 +129,7 @@ def evaluate(plans: Plans, test: Plans | None, design: Design, todo: Sequence[Jo
     for job, arrays in zip(todo, found, strict=True):
         results.setdefault((job.kind, job.inputs), []).append(arrays)
     for (kind, inputs), by_fold in results.items():
-        if kind == "lags":
+        if kind in LAGS:
             gains += _gains(by_fold[0], inputs)
             continue
         for name in [key.removesuffix("/how") for key in by_fold[0] if key.endswith("/how")]:
@@ -140,7 +140,8 @@ def evaluate(plans: Plans, test: Plans | None, design: Design, todo: Sequence[Jo
                 models.append(_model(name, inputs, how, parts, held_out, scored, mask))
     models.sort(key=lambda model: (model.inputs == CONTEXT, ORDERED.index(model.name)))
     best = min(models, key=lambda model: model.cost)
-    table = pd.DataFrame(gains).sort_values("context", kind="stable") if gains else pd.DataFrame()
+    gains.sort(key=lambda row: (row["context"] == CONTEXT, row["model"] != COUNTED))
+    table = pd.DataFrame(gains)
     reference = best, f"{best.name} ({best.inputs})"
     return Evaluation(plans, scored, mask, models, reference, scored[held_out[0]], table, asdict(design))
 

@@ -212,7 +212,8 @@ def program(plans: Path, out: Path) -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
+@pytest.mark.slow  # as in test_jobs.py
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_run_goes_on(how, alone):
     """Ctrl-C or a killed main process: nobody is left behind, nothing that is finished is done again.
 

@@ -217,6 +217,7 @@ LONG = ["--data.check_every", "5", "--trainer.max_steps", "100", "--trainer.pati
 LONG += ["--model.prior.dropout", "0.1"]
 
 
+@pytest.mark.slow  # runs that are killed at set moments are resumed in test_train_resume.py
 def test_killed_and_resumed_gives_the_same_prior_bit_for_bit(tmp_path):
     assert main([*small("gru", tmp_path / "whole"), *LONG]) == 0
     process = subprocess.Popen(

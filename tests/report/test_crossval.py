@@ -71,12 +71,12 @@ def test_whatever_changes_results_makes_another_run(tmp_path):
 
 
 def test_jobs():
-    made = jobs(Design(3), ["counts", "lags", "gru"], [ACTIONS, CONTEXT])
-    assert len(made) == len(set(made)) == 3 * 2 * 2 + 2
+    made = jobs(Design(3), ["counts", "lags", "gru-lags", "gru"], [ACTIONS, CONTEXT])
+    assert len(made) == len(set(made)) == 3 * 2 * 2 + 4
     assert len({str(job) for job in made}) == len(made)
     kinds = [job.kind for job in made]
     assert kinds == sorted(kinds, key=KINDS.index)  # the slowest first
-    assert {job.fold for job in made if job.kind == "lags"} == {0}
+    assert {job.fold for job in made if "lags" in job.kind} == {0}
     for inputs in (ACTIONS, CONTEXT):
         assert {job.fold for job in made if (job.kind, job.inputs) == ("gru", inputs)} == {0, 1, 2}
 
@@ -181,7 +181,7 @@ def test_units_of_folds_are_those_of_the_whole(skip):
 def test_few_plans_have_scores_and_short_lags(plans, tmp_path):
     """Down to a single held-out plan, of which a piece as long as itself would be the only one."""
     plans = replace(plans, lengths=None)
-    found = evaluated(plans, tmp_path, ("lags", "counts"))
+    found = evaluated(plans, tmp_path, ("lags", "gru-lags", "counts"))
     assert len(found.models) == 9
     longest = 0
     if len(found.gains):
@@ -230,7 +230,7 @@ def test_a_job_that_fails_leaves_nothing(tmp_path, monkeypatch):
 
 def test_finished_folds_are_not_fitted_again(tmp_path):
     plans, design = chain(), Design(3, max_steps=STEPS)
-    run, todo = cross_validation(tmp_path, plans, None, design), jobs(design, ["counts", "lags"], [ACTIONS])
+    run, todo = cross_validation(tmp_path, plans, None, design), jobs(design, ["counts", "lags", "gru-lags"], [ACTIONS])
     run.do(todo, processes=1)
     whole = {job: run.path(job).read_bytes() for job in todo}
     times = {job: run.path(job).stat().st_mtime_ns for job in todo}

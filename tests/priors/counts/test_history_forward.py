@@ -45,7 +45,9 @@ def equals_stepping(prior: Prior, length: int, kind: str, seed: int = 0, num: in
 
 
 @pytest.mark.parametrize("kind", ["none", "plan", "step"])
-@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if PRIORS[name][1] in (0, 3, 10) else pytest.mark.slow) for name in PRIORS]
+)
 def test_forward_is_stepping(name, kind):
     """At every length from which plans are read in other chunks; the shorter ones are beginnings of the longest."""
     make, depth, more = PRIORS[name]
