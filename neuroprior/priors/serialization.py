@@ -19,6 +19,9 @@ FILES = ("model.safetensors", "config.json")
 FORMAT = "neuroprior model"
 VERSION = 1
 
+SPARE = 2**26
+"""Numbers that a prior may hold beyond those of its file before these are read."""
+
 
 def save(prior: Prior, folder: str | os.PathLike[str]) -> Path:
     """Save a prior to a folder, made if need be: `model.safetensors` (weights or counts) and `config.json`.
@@ -77,21 +80,40 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
     if digest != config["sha256"]:
         raise ValueError(f"{folder / 'model.safetensors'}: truncated, changed or of another model than config.json")
     try:
-        prior = Prior.known[config["prior"]](**config["config"])
-        prior.restore(config["learned"])
-    except (RuntimeError, TypeError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{folder / 'config.json'}: no configuration of a {config['prior']} ({reason})") from error
-    try:
-        prior.load_state_dict(read_tensors(data))
+        tensors = read_tensors(data)
+        # Tables of counts take their sizes from the file, so that less may be wanted than there is.
+        if _size(config) > SPARE + sum(value.numel() for value in tensors.values()):
+            raise RuntimeError("larger than the file")
+        prior = _made(config)
+        prior.load_state_dict(tensors)
     except (SafetensorError, RuntimeError) as error:
         raise ValueError(
             f"{folder / 'model.safetensors'}: does not fit the prior that config.json describes"
         ) from error
+    except (TypeError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{folder / 'config.json'}: no configuration of a {config['prior']} ({reason})") from error
     try:
         return prior.to(device).eval()
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device: {str(device)!r} cannot be used here ({str(error).splitlines()[0][:200]})") from error
+
+
+def _made(config: dict[str, Any]) -> Prior:
+    """The prior that a configuration describes, before its tensors are loaded."""
+    prior = Prior.known[config["prior"]](**config["config"])
+    prior.restore(config["learned"])
+    return prior
+
+
+def _size(config: dict[str, Any]) -> int:
+    """How many numbers a prior holds, without the memory for them: a damaged configuration may ask for any size."""
+    try:
+        with torch.device("meta"):
+            return sum(value.numel() for value in _made(config).state_dict().values())
+    except (NotImplementedError, RuntimeError):  # it computes with its numbers, which are not there; of each action it has one
+        actions = config["config"].get("num_actions")
+        return actions if isinstance(actions, int) else 0
 
 
 def _read_config(path: Path) -> dict[str, Any]:

@@ -254,3 +254,13 @@ def test_a_class_of_ones_own_is_found_by_name(tmp_path):
     assert type(load(tmp_path)) is OwnPrior
     del Prior.known["OwnPrior"]
     refused(tmp_path, "OwnPrior", "import")
+
+
+@pytest.mark.parametrize("make", [lambda: MarkovPrior(3, 2), lambda: GRUPrior(3, hidden_size=8)])
+def test_a_configuration_cannot_ask_for_more_than_the_file_holds(make, tmp_path):
+    """Nothing of that size is made: 10**12 numbers would not fit into any memory here."""
+    folder = save(make(), tmp_path / "prior")
+    place = folder / "config.json"
+    place.write_text(place.read_text().replace('"num_actions": 3', '"num_actions": 1000000000000'))
+    with pytest.raises(ValueError, match="does not fit the prior"):
+        load(folder)
