@@ -138,6 +138,8 @@ def _item_of(hint: Any) -> Any:
 def _one_line(message: str, hints: Mapping[str, Any]) -> str:
     """What the parser objects to, in one line that begins with the option."""
     line = " ".join(message.split())
+    if nested := re.search(r"NestedArg\(key='([^']*)'", line):
+        return f"{nested[1]}: there is no such option ({line.partition('NestedArg')[0].strip()})"
     found = re.match(r'Parser key "([^"]+)"(?: element \d+)?: (.*)', line)
     if found is None or found[1] not in hints:
         return line

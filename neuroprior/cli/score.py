@@ -66,14 +66,14 @@ def score(
     first, frame = (
         ({"plan": "plan"}, scores) if plans.group is None else ({"group": "group", "plans": "plans:,"}, groups)
     )
-    columns = {
+    numbers = {
         "actions": "actions:,",
         "log-likelihood (nats)": "log_likelihood:.2f",
         "bits per action": "bits_per_action:.4f",
     }
     caption = f"the first {MOST_ROWS} of {len(frame):,}; all are in the CSV file" if len(frame) > MOST_ROWS else ""
     console = Console()
-    console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | columns, caption)))
+    console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
     whole = score_bits(folder, "", bits, plans).bits_per_action()
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     console.print(f"{whole.mean:.4f} bits per action, {interval}", highlight=False)

@@ -69,6 +69,9 @@ def test_the_entropy_rate_is_reached(second_order):
         "longest": 30,
         "kinds of actions": 3,
         "groups": 0,
+        "conditions": 0,
+        "durations": False,
+        "notes": [],
         "context": "none",
         "sees": "none",
     }

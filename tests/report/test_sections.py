@@ -57,7 +57,8 @@ def made() -> Document:
 
 def test_a_report_has_its_tables_and_figures(made):
     assert {*made.tables, "motifs", "macros"} == {
-        *("plans", "lags", "orders", "calibration", "transitions", "transition_test", "motifs", "macros"),
+        *("plans", "actions", "lags", "orders", "calibration", "transitions", "transition_test"),
+        *("motifs", "macros"),
         *("likeness", "drift", "drift_tests", "action_drift"),
     }
     assert all(isinstance(frame, pd.DataFrame) for frame in made.tables.values())

@@ -1,0 +1,60 @@
+"""Tables of a laboratory on the command line: the same options in every command."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from neuroprior import load
+from neuroprior.cli.__main__ import main
+
+COLUMNS = ["--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
+COLUMNS += ["--columns.start", "t", "--columns.condition", "drug"]
+
+
+@pytest.fixture
+def table(tmp_path, monkeypatch):
+    """Eight animals, two sessions each, with a row without a label in each."""
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        (f"m{animal}", session, "saline" if animal % 2 else "drug", "?" if t == 9 else "abc"[(t * t + animal) % 3], t)
+        for animal in range(8)
+        for session in (1, 2)
+        for t in range(20)
+    ]
+    pd.DataFrame(rows, columns=["animal", "session", "drug", "behaviour", "t"]).to_csv("lab.csv", index=False)
+
+
+def test_report_fit_and_score_read_it_alike(table, capsys):
+    assert main(["report", "lab.csv", *COLUMNS, "--models", "counts", "--processes", "1", "--out", "report"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "16 rows have no label. 16 gaps end a plan" in said
+    results = json.loads(Path("report/results.json").read_text())
+    assert results["file"]["plans"] == 32
+    assert (results["file"]["groups"], results["file"]["conditions"]) == (8, 2)
+    assert results["unit"] == "groups"
+    fit = ["fit", "--config", "markov", "--data.file", "lab.csv", "--data.held_out", "0.25", "--out", "prior"]
+    assert main([*fit, *COLUMNS]) == 0
+    assert load("prior").action_names == ("a", "b", "c")
+    assert main(["fit", "--resume", "prior"]) == 0
+    assert main(["score", "prior", "lab.csv", *COLUMNS, "--out", "score"]) == 0
+    assert len(pd.read_csv("score/groups.csv")) == 8
+    assert len(pd.read_csv("score/plans.csv")) == 32
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--missing", "error", *COLUMNS], "lab.csv, line 11"),
+        (["--missing", "drop", *COLUMNS], "one of gap, label, error"),
+        (["--columns.action", "act"], "'act'"),
+        (["--columns.act", "behaviour"], "act"),
+        ([], "--columns.action"),
+    ],
+)
+def test_bad_options_are_one_line(options, words, table, capsys):
+    assert main(["report", "lab.csv", *options, "--out", "report"]) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
