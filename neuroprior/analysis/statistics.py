@@ -12,8 +12,8 @@ with 10 units), as it takes the spread of few values for the true one. No method
 mean: if one seed in ten fails, ten seeds contain no failure in a third of all cases, and the interval is too narrow.
 `tests/analysis/test_statistics.py` repeats the simulations.
 
-Exceptions are intervals of what is no mean: `share_interval` (Wilson) for a share of independent yes-or-no trials, those
-of counts (`motifs`) and rank correlations (`drift`), and, in the comparison of priors, of medians and of the best ones.
+Exceptions are intervals of what is no mean: `share_interval` (Wilson) for a share of independent yes-or-no trials,
+those of counts (`motifs`) and rank correlations (`drift`), and, in the comparison of priors, of medians and best ones.
 """
 
 from collections.abc import Sequence
