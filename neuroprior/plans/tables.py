@@ -361,8 +361,8 @@ def _running_maximum(ends: NDArray[np.float64], plan: Integers) -> NDArray[np.fl
     """The latest end so far in each plan."""
     import pandas as pd
 
-    latest: NDArray[np.float64] = pd.Series(ends).groupby(plan).cummax().groupby(plan).ffill().to_numpy()
-    return latest
+    latest = pd.Series(ends).groupby(plan).cummax().groupby(plan).ffill()
+    return np.asarray(latest, np.float64)
 
 
 def _numbered(

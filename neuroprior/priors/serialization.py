@@ -111,7 +111,10 @@ def _size(config: dict[str, Any]) -> int:
     try:
         with torch.device("meta"):
             return sum(value.numel() for value in _made(config).state_dict().values())
-    except (NotImplementedError, RuntimeError):  # it computes with its numbers, which are not there; of each action it has one
+    except (
+        NotImplementedError,
+        RuntimeError,
+    ):  # it computes with its numbers, which are not there; of each action it has one
         actions = config["config"].get("num_actions")
         return actions if isinstance(actions, int) else 0
 

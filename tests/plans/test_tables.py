@@ -198,3 +198,41 @@ def test_durations_and_conditions_stay_with_their_plans():
         Plans(plans.actions, 2, durations=torch.ones(2))
     with refuses("condition"):
         Plans(plans.actions, 2, condition=torch.tensor([0.5, 1]))
+
+
+BORIS = """\
+Observation id,Observation date,Description,Subject,Behavior,Behavioral category,Behavior type,Start (s),Stop (s),Duration (s)
+day1,2024-05-01 10:00:00,,mouse 1,walk,move,STATE,0.5,2.5,2.0
+day1,2024-05-01 10:00:00,,mouse 1,rear,move,POINT,2.5,2.5,NA
+day1,2024-05-01 10:00:00,,mouse 2,groom,self,STATE,1.0,4.0,3.0
+day1,2024-05-01 10:00:00,,mouse 1,groom,self,STATE,3.0,4.5,1.5
+"""
+
+
+def test_aggregated_events_of_boris(tmp_path):
+    columns = {"plan": "Observation id", "group": "Subject", "action": "Behavior"}
+    plans = read(tmp_path, BORIS, columns=columns | {"start": "Start (s)", "stop": "Stop (s)"})
+    assert listed(plans) == [["walk", "rear", "groom"], ["groom"]]
+    assert plans.group_names == ("mouse 1", "mouse 2")
+    assert plans.durations.tolist() == [[2, 0, 1.5], [3, 0, 0]]
+
+
+MOSEQ = """name,centroid_x,centroid_y,heading,angular_velocity,velocity_px_s,syllable,frame_index,group,onset
+21_11_8_one,10.1,5.2,0.1,0.0,0.0,3,0,wild,False
+21_11_8_one,10.2,5.2,0.1,0.0,1.0,3,1,wild,False
+21_11_8_one,10.2,5.3,0.2,0.1,1.0,0,2,wild,True
+21_12_2_two,3.0,4.0,1.1,0.0,0.0,0,0,mutant,False
+21_12_2_two,3.0,4.1,1.2,0.0,0.2,1,1,mutant,True
+21_12_2_two,3.0,4.1,1.2,0.0,0.2,1,2,mutant,False
+"""
+
+
+def test_frames_of_keypoint_moseq(tmp_path):
+    columns = {"plan": "name", "action": "syllable", "condition": "group"}
+    plans = read(tmp_path, MOSEQ, columns=columns, merge_repeats=True)
+    assert listed(plans) == [[3, 0], [0, 1]]
+    assert plans.durations.tolist() == [[2, 1], [1, 2]]
+    assert [plans.condition_names[c] for c in plans.condition] == ["wild", "mutant"]
+    assert plans.group is None
+    assert "actions are numbers from 0 to 3, of which 2 never occurs" in plans.notes
+    assert len(read(tmp_path, MOSEQ, columns=columns).actions[0]) == 3  # only on request
