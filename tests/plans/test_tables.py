@@ -201,11 +201,11 @@ def test_durations_and_conditions_stay_with_their_plans():
 
 
 BORIS = """\
-Observation id,Observation date,Description,Subject,Behavior,Behavioral category,Behavior type,Start (s),Stop (s),Duration (s)
-day1,2024-05-01 10:00:00,,mouse 1,walk,move,STATE,0.5,2.5,2.0
-day1,2024-05-01 10:00:00,,mouse 1,rear,move,POINT,2.5,2.5,NA
-day1,2024-05-01 10:00:00,,mouse 2,groom,self,STATE,1.0,4.0,3.0
-day1,2024-05-01 10:00:00,,mouse 1,groom,self,STATE,3.0,4.5,1.5
+Observation id,Description,Subject,Behavior,Behavioral category,Behavior type,Start (s),Stop (s),Duration (s)
+day1,,mouse 1,walk,move,STATE,0.5,2.5,2.0
+day1,,mouse 1,rear,move,POINT,2.5,2.5,NA
+day1,,mouse 2,groom,self,STATE,1.0,4.0,3.0
+day1,,mouse 1,groom,self,STATE,3.0,4.5,1.5
 """
 
 
