@@ -6,6 +6,7 @@ Here are the names that most programs need; everything else is in its room: `neu
 """
 
 from neuroprior._version import __version__
+from neuroprior.analysis.scoring import score
 from neuroprior.planners import (
     ExhaustivePlanner,
     FrontierPlanner,
@@ -63,5 +64,6 @@ __all__ = [
     "read_plans",
     "sample",
     "save",
+    "score",
     "write_plans",
 ]

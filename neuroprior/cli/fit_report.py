@@ -9,6 +9,7 @@ from rich.console import Console
 
 from neuroprior._files import versions, write_json
 from neuroprior.analysis.comparison import Score, baselines, score, unit_name
+from neuroprior.analysis.scoring import keep_learned
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
 from neuroprior.priors import save
 from neuroprior.report.document import printed, records, table, write_figures, write_frames
@@ -22,6 +23,7 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
     console = Console()
     prior, name = model.prior.cpu().eval(), type(model.prior).__name__
     save(prior, folder)
+    keep_learned(folder, data.learned_from, data.chosen_on)
     trained = score(name, prior, data.held_out)
     rows = []
     contexts = data.num_contexts if prior.takes_context else None

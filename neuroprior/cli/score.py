@@ -1,13 +1,13 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
-from math import log
 from pathlib import Path
 
-import pandas as pd
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, unit_name
-from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.analysis.scoring import learned_from
+from neuroprior.analysis.scoring import score as score_plans
+from neuroprior.plans import Columns, Missing, read_plans
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.report.document import printed, table, write_frames
@@ -29,7 +29,7 @@ def score(
 ) -> None:
     """Score plans under a saved prior: log-likelihood and bits per action, of each plan and each group.
 
-    A prior predicts the plans that it has learned from better than new ones: score plans that it was not fitted on.
+    A prior predicts the plans that it has learned from better than new ones; those of them that are scored are marked.
 
     Args:
         folder: a saved prior, as `neuroprior fit` writes it.
@@ -40,7 +40,7 @@ def score(
         missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
         merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
         max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
-        out: folder for `plans.csv` and `groups.csv`.
+        out: folder for `plans.csv` and, where there are any, `groups.csv` and `conditions.csv`.
     """
     prior = load(folder)
     # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
@@ -54,38 +54,36 @@ def score(
         merge_repeats=merge_repeats,
         max_gap=max_gap,
     )
-    plans = match_plans(plans if plans.end is None else plans.without_end(), prior, folder)
-    bits = action_bits(prior, plans)
-    own = {"plan": range(len(plans)), "group": group_names(plans), "actions": plans.mask().sum(1).tolist()}
-    scores = pd.DataFrame(own | {"log_likelihood": (-log(2) * bits.sum(1)).tolist()})
-    groups = scores.groupby("group", sort=False, as_index=False).agg(
-        plans=("plan", "size"), actions=("actions", "sum"), log_likelihood=("log_likelihood", "sum")
-    )
-    for frame in (scores, groups):
-        frame["bits_per_action"] = -frame["log_likelihood"] / log(2) / frame["actions"].where(frame["actions"] > 0)
-    first, frame = (
-        ({"plan": "plan"}, scores) if plans.group is None else ({"group": "group", "plans": "plans:,"}, groups)
-    )
+    plans = plans if plans.end is None else plans.without_end()
+    scores = score_plans(prior, plans)
+    known = learned_from(Path(folder), plans)
+    scores.insert(1, "training_data", known)
+    frames = {"plans": scores}
+    for by in ("group", "condition"):
+        if getattr(plans, by) is not None:
+            frames[f"{by}s"] = score_plans(prior, plans, by)
+    name = "groups" if "groups" in frames else "plans"
+    frame = frames[name]
+    first = {name[:-1]: name[:-1]} | ({"plans": "plans:,"} if name == "groups" else {})
     numbers = {
         "actions": "actions:,",
         "log-likelihood (nats)": "log_likelihood:.2f",
         "bits per action": "bits_per_action:.4f",
     }
-    caption = f"the first {MOST_ROWS} of {len(frame):,}; all are in the CSV file" if len(frame) > MOST_ROWS else ""
+    caption = f"the first {MOST_ROWS} of {len(frame):,}; all are in the CSV file. " if len(frame) > MOST_ROWS else ""
+    if any(known):
+        caption += (
+            f"Training data: {sum(known):,} of {len(known):,} plans are the same as plans that it has learned from."
+        )
     console = Console()
     console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
-    whole = score_bits(folder, "", bits, plans).bits_per_action()
+    own = match_plans(plans, prior, folder)
+    whole = score_bits(folder, "", action_bits(prior, own), own).bits_per_action()
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     console.print(f"{whole.mean:.4f} bits per action, {interval}", highlight=False)
     place = Path(out)
     place.mkdir(parents=True, exist_ok=True)
-    write_frames(place, {"plans": scores, "groups": groups})
-    console.print(f"tables: {place / 'plans.csv'}, {place / 'groups.csv'}", highlight=False, soft_wrap=True)
-
-
-def group_names(plans: Plans) -> list[str]:
-    """The name of each plan's group; empty where there are no groups."""
-    if plans.group is None:
-        return [""] * len(plans)
-    names = plans.group_names
-    return [str(group) if names is None else names[group] for group in plans.group.tolist()]
+    write_frames(place, frames)
+    console.print(
+        f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
+    )

@@ -252,6 +252,13 @@ class Prior(nn.Module, ABC):
     def _check_scored(self, plans: Plans) -> None:
         if plans.num_actions != self.num_actions:
             raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
+        for what in ("action_names", "context_names"):
+            own, names = getattr(self, what), getattr(plans, what)
+            if None not in (own, names) and tuple(own) != tuple(names):
+                raise ValueError(
+                    f"{what}: {', '.join(names)} in the plans, {', '.join(own)} in this prior; number them alike"
+                    " (neuroprior.priors.match_plans)"
+                )
         self.check_context_of(plans)
 
     def sample(

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._jobs import Progress
+from neuroprior.analysis.scoring import learned_from
 from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
@@ -113,6 +114,9 @@ def report(
         loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
         names = action_names or (learned_names(next(iter(loaded.values()))) if file[-4:].lower() in CSV else None)
         found = evaluate_saved(loaded, _read(plans, reading | {"action_names": names}), skip)
+        same = {} if isinstance(priors, Mapping) else {one: sum(learned_from(Path(one), found.plans)) for one in priors}
+        if any(same.values()):
+            found = replace(found, settings=found.settings | {"training data": {k: n for k, n in same.items() if n}})
     else:
         whole, empty = _with_actions(plans, reading)
         other, cut = None, False

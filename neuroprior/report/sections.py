@@ -112,8 +112,9 @@ def score_section(found: Evaluation) -> Part:
     """The main table."""
     scores = found.table()
     more = scores["more_high"] - scores["more"]
+    learned, saved = found.settings.get("training data", {}), "priors" in found.settings
     columns: Mapping[str, Column] = {
-        "model": "model",
+        "model": lambda row: f"{row.model} (training data)" if row.model in learned else str(row.model),
         "input": _input,
         "nats": "nats_per_action:.4f",
         "bits per\naction": lambda row: f"{row.bits_per_action:.4f}±{row.high - row.bits_per_action:.4f}",
@@ -121,24 +122,27 @@ def score_section(found: Evaluation) -> Part:
         "more bits": lambda row: "" if pd.isna(row.more) else f"{row.more:+.4f}±{more[row.name]:.4f}",
     }
     caption = (
-        f"On held-out actions. ±: 95 % intervals over {found.unit}. more bits: the difference from"
+        f"{'' if saved else 'On held-out actions. '}±: 95 % intervals over {found.unit}. more bits: the difference from"
         f" {found.reference[1]}, paired."
     )
+    if learned:
+        same = "; ".join(f"{number:,} of {len(found.plans):,} plans for {name}" for name, number in learned.items())
+        caption += f" Training data: plans that are the same as plans which the prior has learned from ({same})."
     text = [
-        "The bits of each model for actions that it has not learned from: the fewer, the more of the structure it"
-        " predicts; a nat is 1.44 bits. Perplexity (perpl.) is the number of equally likely actions that would take as"
+        f"The bits of each model{'' if saved else ' for actions that it has not learned from'}: the fewer, the more of the"
+        " structure it predicts; a nat is 1.44 bits. Perplexity (perpl.) is the number of equally likely actions that would take as"
         " many bits.",
         "Order, back-off and smoothing of count-based models were chosen within the training plans. A difference whose"
         " interval holds 0 is not significant. The reference is the best of all models on the same plans, which favours"
         " it a little; differences are not corrected for the number of models.",
     ]
-    caption_of_figure = f"Bits per held-out action, 95 % intervals over {found.unit}."
+    caption_of_figure = f"Bits per {'' if saved else 'held-out '}action, 95 % intervals over {found.unit}."
     best = found.best
     alt = f"Bits per action of each model, the fewest {best.cost:.3f} of {best.label}."
     box = FigureBox(figures.score_figure(scores), caption_of_figure, alt, "scores")
-    return Part(
-        Section("Held-out scores", text, [table(scores, columns, caption, align="llrrrr")], [box]), {"plans": scores}
-    )
+    title = "Scores" if saved else "Held-out scores"
+    shown = table(scores, columns, caption, align="llrrrr")
+    return Part(Section(title, text[:1] if saved else text, [shown], [box]), {"plans": scores})
 
 
 def lag_section(found: Evaluation) -> Part | None:

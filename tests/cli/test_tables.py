@@ -40,7 +40,15 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     assert main(["fit", "--resume", "prior"]) == 0
     assert main(["score", "prior", "lab.csv", *COLUMNS, "--out", "score"]) == 0
     assert len(pd.read_csv("score/groups.csv")) == 8
-    assert len(pd.read_csv("score/plans.csv")) == 32
+    plans = pd.read_csv("score/plans.csv")
+    assert len(plans) == 32
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"Training data: {plans['training_data'].sum()} of 32 plans" in said
+    assert plans["training_data"].sum() >= 24  # all but the held-out ones, and those of these that are the same
+    assert main(["report", "lab.csv", *COLUMNS, "--priors", "prior", "--out", "scored"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Held-out scores" not in said
+    assert "(training data)" in said
 
 
 @pytest.mark.parametrize(

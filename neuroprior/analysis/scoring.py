@@ -1,0 +1,90 @@
+"""How probable plans are under a fitted prior, as a table; and whether the prior has learned from them.
+
+`score` needs pandas (`pip install 'neuroprior[report]'`).
+"""
+
+import hashlib
+from math import log
+from pathlib import Path
+from typing import Any, Literal
+
+from neuroprior._files import read_json, write_json
+from neuroprior.analysis.comparison import action_bits
+from neuroprior.plans import Plans
+from neuroprior.priors import Prior
+from neuroprior.priors.matching import match_plans
+
+LEARNED = "learned.json"
+"""In the folder of a saved prior: the digests of the plans that it has learned from."""
+
+
+def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", "action"] = "plan") -> Any:
+    """The log-likelihood of plans under a prior, summed by plan, group, condition or action.
+
+    Args:
+        prior: fitted.
+        plans: N of them, without an end symbol; their actions and contexts are matched by name, where both have names.
+        by: what a row is.
+
+    Returns:
+        A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, and its `group` and
+        `condition`, where there are any); `log_likelihood`, nats; `bits_per_action`. The likelihood of a plan's end,
+        where the prior predicts it, counts for the plan, not for an action.
+
+    Raises:
+        ValueError: the prior does not know the actions or contexts, or plans have no groups or conditions.
+    """
+    import pandas as pd
+
+    if by not in ("plan", "group", "condition", "action"):
+        raise ValueError(f"by: one of plan, group, condition, action is expected, not {by!r}")
+    if by in ("group", "condition") and getattr(plans, by) is None:
+        raise ValueError(f"by: the plans have no {by}")
+    bits, mask = action_bits(prior, match_plans(plans, prior)), plans.mask()
+    if by == "action":
+        names = plans.action_names or tuple(map(str, range(plans.num_actions)))
+        data = {"action": plans.actions[mask].tolist(), "plan": mask.nonzero()[:, 0].tolist()}
+        frame = pd.DataFrame(data | {"bits": bits[:, : plans.max_length][mask].tolist()}).groupby("action")
+        found = frame.agg(plans=("plan", "nunique"), actions=("plan", "size"), bits=("bits", "sum")).reset_index()
+        found["action"] = [names[action] for action in found["action"]]
+    else:
+        own = {what: _names(plans, what) for what in ("group", "condition")}
+        found = pd.DataFrame({"plan": range(len(plans))} | {what: names for what, names in own.items() if names})
+        found = found.assign(actions=mask.sum(1).tolist(), bits=bits.sum(1).tolist())
+        if by != "plan":
+            sums = found.groupby(by, sort=False, as_index=False)
+            found = sums.agg(plans=("plan", "size"), actions=("actions", "sum"), bits=("bits", "sum"))
+    found["log_likelihood"] = -log(2) * found["bits"]
+    found["bits_per_action"] = found["bits"] / found["actions"].where(found["actions"] > 0)
+    return found.drop(columns="bits")
+
+
+def _names(plans: Plans, what: str) -> list[Any] | None:
+    """The group or the condition of each plan, by name where it has one."""
+    numbers, names = getattr(plans, what), getattr(plans, f"{what}_names")
+    return None if numbers is None else [number if names is None else names[number] for number in numbers.tolist()]
+
+
+def plan_digests(plans: Plans) -> list[str]:
+    """A digest of the actions of each plan, by their names where they have any: equal for equal plans."""
+    names = plans.action_names or tuple(map(str, range(plans.num_actions)))
+    rows = zip(plans.actions.tolist(), plans.mask().sum(1).tolist(), strict=True)
+    texts = ("\0".join(names[action] for action in row[:length]) for row, length in rows)
+    return [hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:16] for text in texts]
+
+
+def keep_learned(folder: Path, *parts: Plans) -> None:
+    """Write down, in the folder of a saved prior, which plans it has learned from."""
+    without_end = (part if part.end is None else part.without_end() for part in parts)
+    write_json(folder / LEARNED, {"plans": sorted({one for part in without_end for one in plan_digests(part)})})
+
+
+def learned_from(folder: Path, plans: Plans) -> list[bool]:
+    """Which plans are the same as plans that the prior saved in a folder has learned from; none where it is not known.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    place = folder / LEARNED
+    known = set(read_json(place).get("plans", ())) if place.is_file() else set()
+    return [digest in known for digest in plan_digests(plans)]

@@ -1,0 +1,81 @@
+"""Plans scored under a prior, as a table; plans that the prior has learned from are known again."""
+
+from math import log
+
+import pytest
+import torch
+
+from neuroprior import MarkovPrior, Plans, score
+from neuroprior.analysis.scoring import keep_learned, learned_from
+from neuroprior.priors import match_plans
+from tests.support.sources import refuses, seeded
+
+NAMES = ("groom", "rear", "walk")
+TRAINING = Plans(torch.randint(3, (40, 8), generator=seeded(0)), 3, action_names=NAMES)
+PRIOR = MarkovPrior(3, 1).fit(TRAINING)
+NEW = Plans(
+    torch.tensor([[0, 1, 1], [1, 0, 0], [0, 0, 1]]),
+    2,
+    torch.tensor([3, 2, 0]),
+    action_names=("rear", "walk"),
+    group=torch.tensor([0, 1, 0]),
+    group_names=("m1", "m2"),
+    condition=torch.tensor([1, 1, 0]),
+    condition_names=("drug", "saline"),
+)
+"""Plans in which one action does not occur, so that the others have other numbers."""
+
+
+def by_hand() -> list[float]:
+    actions = [[1, 2, 2], [2, 1]]
+    return [float(PRIOR.log_prob(torch.tensor([plan]))) for plan in actions] + [0.0]
+
+
+def test_actions_are_matched_by_name():
+    frame = score(PRIOR, NEW)
+    assert frame["log_likelihood"].tolist() == pytest.approx(by_hand())
+    assert frame["group"].tolist() == ["m1", "m2", "m1"]
+    assert frame["condition"].tolist() == ["saline", "saline", "drug"]
+    assert frame["bits_per_action"].tolist()[:2] == pytest.approx(
+        [-by_hand()[0] / log(2) / 3, -by_hand()[1] / log(2) / 2]
+    )
+    assert frame["bits_per_action"].isna().tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("by", ["group", "condition", "action"])
+def test_sums_are_those_of_the_plans(by):
+    frame = score(PRIOR, NEW, by)
+    assert frame["log_likelihood"].sum() == pytest.approx(sum(by_hand()))
+    assert frame["actions"].sum() == 5
+    if by == "group":
+        assert dict(zip(frame["group"], frame["log_likelihood"], strict=True)) == pytest.approx(
+            {"m1": by_hand()[0], "m2": by_hand()[1]}
+        )
+    if by == "action":
+        assert set(frame["action"]) == {"rear", "walk"}
+
+
+def test_other_numbers_are_never_taken_for_the_same():
+    wider = Plans(NEW.actions, 3, NEW.lengths, action_names=("rear", "walk", "groom"))
+    with refuses("action_names", "rear, walk, groom in the plans", "groom, rear, walk in this prior", "match_plans"):
+        PRIOR.log_prob(wider)
+    assert PRIOR.log_prob(match_plans(wider, PRIOR)).tolist() == pytest.approx(by_hand())
+
+
+def test_bad_input():
+    with refuses("by", "'animal'"):
+        score(PRIOR, NEW, "animal")
+    with refuses("by", "no condition"):
+        score(PRIOR, TRAINING, "condition")
+
+
+def test_plans_that_were_learned_from_are_known_again(tmp_path):
+    assert learned_from(tmp_path, TRAINING) == [False] * 40
+    keep_learned(tmp_path, TRAINING[:10].with_end(), TRAINING[20:25])
+    known = learned_from(tmp_path, TRAINING)
+    assert all(known[:10])
+    assert all(known[20:25])
+    # By names, whatever their numbers are.
+    other = Plans(2 - TRAINING.actions.long(), 3, action_names=NAMES[::-1])
+    assert learned_from(tmp_path, other) == known
+    assert sum(learned_from(tmp_path, Plans(TRAINING.actions, 3))) == 0
