@@ -287,6 +287,7 @@ def _require(holds: bool, name: str, wanted: str, given: object) -> None:
 
 
 def _check_goal(world: TabularWorld, goal: int) -> int:
+    _require(isinstance(world, TabularWorld), "world", "a TabularWorld", type(world).__name__)
     _require(goal in range(world.num_states), "goal", f"a cell from 0 to {world.num_states - 1}", goal)
     return int(goal)
 

@@ -41,6 +41,8 @@ def oracle(
     """
     check_sizes(length=length)
     check_objective(objective, discount)
+    if not isinstance(world, TabularWorld):
+        raise ValueError(f"world: a TabularWorld is expected, not {type(world).__name__}")
     world.check_state(state)
     maps, states, actions = world.num_maps, world.num_states, world.num_actions
     reward = world.mean_reward()

@@ -166,6 +166,8 @@ class PriorPlanner(Planner):
         super().__init__(**goal)
         check_sizes(length=length, num_plans=num_plans)
         check_temperature(temperature)
+        if not isinstance(prior, Steppable):
+            raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
 
     def _check(self, world: World, state: Tensor, generator: torch.Generator | None) -> torch.Generator:

@@ -8,9 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior._checks import check_range, is_integer
+from neuroprior._checks import check_range, check_sizes, is_integer
 from neuroprior._random import generator_on
 from neuroprior.plans.tables import Columns, Missing, fields_of
+
+MOST_ACTIONS = 2**31
+"""Actions beyond which their numbers are something else."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +58,9 @@ class Plans:
     notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.num_actions, int) or self.num_actions < 1:
-            raise ValueError(f"num_actions: an integer of at least 1 is expected, not {self.num_actions!r}")
+        check_sizes(num_actions=self.num_actions)
+        if self.num_actions > MOST_ACTIONS:
+            raise ValueError(f"num_actions: at most {MOST_ACTIONS}, not {self.num_actions}; number the actions from 0")
         actions = torch.as_tensor(self.actions)
         if actions.dim() != 2:
             raise ValueError(f"actions: shape [N, L] is expected, not {list(actions.shape)}")
@@ -95,6 +99,8 @@ class Plans:
         if self.context is not None:
             object.__setattr__(self, "context", torch.as_tensor(self.context))
             check_context(self.context, num, length)
+        for what in ("action", "context", "group", "condition"):
+            _check_texts(f"{what}_names", getattr(self, f"{what}_names"))
         _check_names("group", self.group, self.group_names)
         _check_names("condition", self.condition, self.condition_names)
         _check_names("context", self.context, self.context_names)
@@ -341,6 +347,16 @@ def is_per_step(context: Tensor | None) -> bool:
 def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
     if tuple(values.shape) != shape:
         raise ValueError(f"{name}: shape {list(shape)} is expected, not {list(values.shape)}")
+
+
+def _check_texts(what: str, names: Sequence[str] | None) -> None:
+    """Raise ValueError unless names are texts, each of them once."""
+    if names is None:
+        return
+    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{what}: {next(name for name in names if list(names).count(name) > 1)!r} is there twice")
 
 
 def _check_names(what: str, numbers: Tensor | None, names: Sequence[str] | None) -> None:

@@ -11,7 +11,7 @@ from neuroprior.plans import Plans
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
 from neuroprior.priors.ensembles import MixturePrior, StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, as_actions
 from neuroprior.priors.uniform import UniformPrior
 
 MakePrior = Callable[..., Prior]
@@ -42,7 +42,7 @@ def fit(
         ValueError: an unknown name, plans that the prior cannot learn from, or a setting that it does not have.
     """
     if not isinstance(plans, Plans):
-        actions = torch.as_tensor(plans)
+        actions = as_actions(plans)
         plans = Plans(actions, int(actions.max()) + 1 if actions.numel() else 1)
     if isinstance(prior, str):
         if prior not in NAMES:

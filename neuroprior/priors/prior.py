@@ -247,7 +247,7 @@ class Prior(nn.Module, ABC):
             yield part, torch.log_softmax(logits, -1)
 
     def _as_plans(self, plans: Plans | Tensor) -> Plans:
-        return plans if isinstance(plans, Plans) else Plans(torch.as_tensor(plans), self.num_actions)
+        return plans if isinstance(plans, Plans) else Plans(as_actions(plans), self.num_actions)
 
     def _check_scored(self, plans: Plans) -> None:
         if plans.num_actions != self.num_actions:
@@ -332,6 +332,14 @@ class Prior(nn.Module, ABC):
                 raise ValueError(
                     f"{name}: not a setting of {type(self).__name__}.fit, which takes {', '.join(known) or 'none'}"
                 )
+
+
+def as_actions(plans: Any) -> Tensor:
+    """Plans that are not `Plans` as a tensor; ValueError for what is none."""
+    try:
+        return torch.as_tensor(plans)
+    except (RuntimeError, TypeError, ValueError):
+        raise ValueError(f"plans: Plans or a tensor is expected, not {type(plans).__name__}") from None
 
 
 def _call(kind: type[Prior], config: Mapping[str, Any]) -> str:

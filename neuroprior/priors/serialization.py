@@ -93,6 +93,8 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
     except (TypeError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{folder / 'config.json'}: no configuration of a {config['prior']} ({reason})") from error
+    if broken := [name for name, value in tensors.items() if value.is_floating_point() and bool(value.isnan().any())]:
+        raise ValueError(f"{folder / 'model.safetensors'}: {broken[0]} has numbers that are NaN")
     try:
         return prior.to(device).eval()
     except (RuntimeError, AssertionError) as error:

@@ -128,10 +128,10 @@ def score_section(found: Evaluation) -> Part:
     if learned:
         same = "; ".join(f"{number:,} of {len(found.plans):,} plans for {name}" for name, number in learned.items())
         caption += f" Training data: plans that are the same as plans which the prior has learned from ({same})."
+    held_out = "" if saved else " for actions that it has not learned from"
     text = [
-        f"The bits of each model{'' if saved else ' for actions that it has not learned from'}: the fewer, the more of the"
-        " structure it predicts; a nat is 1.44 bits. Perplexity (perpl.) is the number of equally likely actions that would take as"
-        " many bits.",
+        f"The bits of each model{held_out}: the fewer, the more of the structure it predicts; a nat is 1.44 bits."
+        " Perplexity (perpl.) is the number of equally likely actions that would take as many bits.",
         "Order, back-off and smoothing of count-based models were chosen within the training plans. A difference whose"
         " interval holds 0 is not significant. The reference is the best of all models on the same plans, which favours"
         " it a little; differences are not corrected for the number of models.",

@@ -1,6 +1,6 @@
 """What sampling needs of a prior (`Steppable`), and one way to step any prior, whatever else it offers (`Stepper`)."""
 
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from neuroprior.sampling.draws import after_end
 from neuroprior.worlds.world import World
 
 
+@runtime_checkable
 class Steppable(Protocol):
     """What samplers and planners need of a prior: any class with these three will do.
 

@@ -240,7 +240,6 @@ def test_one_long_plan_among_many_short_ones(tmp_path):
         (Plans(torch.zeros(1, 0, dtype=torch.long), 2), "a.csv", ["none has an action"]),
         (ONE.with_end(), "a.csv", ["end symbol", "without_end"]),
         (Plans(torch.tensor([[0]]), 1, action_names=[" a"]), "a.csv", ["action_names", "' a'"]),
-        (Plans(torch.tensor([[0]]), 2, action_names=["a", "a"]), "a.jsonl", ["'a' is there twice"]),
         (Plans(torch.tensor([[0]]), 1, context=torch.tensor([0]), context_names=["7"]), "a.csv", ["context_names"]),
         (Plans(torch.tensor([[0]]), 2, action_names=["1", "x"]), "a.csv", ["action_names", "'1'", "a number"]),
         (Plans(torch.tensor([[0]]), 2, action_names=["x", "NA"]), "a.csv", ["action_names", "'NA'", "as missing"]),
