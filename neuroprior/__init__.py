@@ -6,7 +6,6 @@ Here are the names that most programs need; everything else is in its room: `neu
 """
 
 from neuroprior._version import __version__
-from neuroprior.analysis.scoring import score
 from neuroprior.planners import (
     ExhaustivePlanner,
     FrontierPlanner,
@@ -32,6 +31,7 @@ from neuroprior.priors import (
     load,
     save,
 )
+from neuroprior.priors.scoring import score
 from neuroprior.sampling import sample
 from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
 

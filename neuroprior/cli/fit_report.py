@@ -9,9 +9,9 @@ from rich.console import Console
 
 from neuroprior._files import versions, write_json
 from neuroprior.analysis.comparison import Score, baselines, score, unit_name
-from neuroprior.analysis.scoring import keep_learned
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
 from neuroprior.priors import save
+from neuroprior.priors.scoring import keep_learned
 from neuroprior.report.document import printed, records, table, write_figures, write_frames
 
 

@@ -5,11 +5,11 @@ from pathlib import Path
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, unit_name
-from neuroprior.analysis.scoring import learned_from
-from neuroprior.analysis.scoring import score as score_plans
 from neuroprior.plans import Columns, Missing, read_plans
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans
+from neuroprior.priors.scoring import learned_from
+from neuroprior.priors.scoring import score as score_plans
 from neuroprior.report.document import printed, table, write_frames
 
 MOST_ROWS = 20

@@ -9,11 +9,11 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._jobs import Progress
-from neuroprior.analysis.scoring import learned_from
 from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
+from neuroprior.priors.scoring import learned_from
 from neuroprior.report.document import Document, write_document
 from neuroprior.report.fits import ACTIONS, CONTEXT, LAGS, Design, counted
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs

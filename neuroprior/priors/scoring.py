@@ -8,11 +8,12 @@ from math import log
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from neuroprior._files import read_json, write_json
-from neuroprior.analysis.comparison import action_bits
 from neuroprior.plans import Plans
-from neuroprior.priors import Prior
 from neuroprior.priors.matching import match_plans
+from neuroprior.priors.prior import Prior
 
 LEARNED = "learned.json"
 """In the folder of a saved prior: the digests of the plans that it has learned from."""
@@ -40,7 +41,9 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
         raise ValueError(f"by: one of plan, group, condition, action is expected, not {by!r}")
     if by in ("group", "condition") and getattr(plans, by) is None:
         raise ValueError(f"by: the plans have no {by}")
-    bits, mask = action_bits(prior, match_plans(plans, prior)), plans.mask()
+    with torch.no_grad():
+        bits = -prior.action_log_probs(match_plans(plans, prior)).cpu().double() / log(2)
+    mask = plans.mask()
     if by == "action":
         names = plans.action_names or tuple(map(str, range(plans.num_actions)))
         data = {"action": plans.actions[mask].tolist(), "plan": mask.nonzero()[:, 0].tolist()}

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans, score
-from neuroprior.analysis.scoring import keep_learned, learned_from
 from neuroprior.priors import match_plans
+from neuroprior.priors.scoring import keep_learned, learned_from
 from tests.support.sources import refuses, seeded
 
 NAMES = ("groom", "rear", "walk")
