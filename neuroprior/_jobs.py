@@ -275,11 +275,9 @@ def code_version(run: Callable[..., Any]) -> str:
 @lru_cache
 def _digest(module: str) -> str:
     found: dict[str, bytes] = {}
-    todo = [module]
+    todo, met = [module], {module}
     while todo:
         name = todo.pop()
-        if name in found:
-            continue
         source = _source(name)
         if source is None:
             continue
@@ -288,7 +286,9 @@ def _digest(module: str) -> str:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            todo += [each for each in names if each.split(".")[0] in PACKAGES]
+            new = {each for each in names if each.split(".")[0] in PACKAGES} - met
+            todo += new
+            met |= new
     digest = hashlib.sha256()
     for name in sorted(found):
         digest.update(name.encode() + b"\0" + found[name] + b"\0")

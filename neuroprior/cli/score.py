@@ -8,8 +8,7 @@ from neuroprior.analysis.comparison import action_bits, score_bits, unit_name
 from neuroprior.plans import Columns, Missing, read_plans
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans
-from neuroprior.priors.scoring import learned_from
-from neuroprior.priors.scoring import score as score_plans
+from neuroprior.priors.scoring import learned_from, scores_by
 from neuroprior.report.document import printed, table, write_frames
 
 MOST_ROWS = 20
@@ -55,13 +54,15 @@ def score(
         max_gap=max_gap,
     )
     plans = plans if plans.end is None else plans.without_end()
-    scores = score_plans(prior, plans)
+    own = match_plans(plans, prior, folder)
+    bits = action_bits(prior, own)
+    scores = scores_by(bits, plans, "plan")
     known = learned_from(Path(folder), plans)
     scores.insert(1, "training_data", known)
     frames = {"plans": scores}
     for by in ("group", "condition"):
         if getattr(plans, by) is not None:
-            frames[f"{by}s"] = score_plans(prior, plans, by)
+            frames[f"{by}s"] = scores_by(bits, plans, by)
     name = "groups" if "groups" in frames else "plans"
     frame = frames[name]
     first = {name[:-1]: name[:-1]} | ({"plans": "plans:,"} if name == "groups" else {})
@@ -77,8 +78,7 @@ def score(
         )
     console = Console()
     console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
-    own = match_plans(plans, prior, folder)
-    whole = score_bits(folder, "", action_bits(prior, own), own).bits_per_action()
+    whole = score_bits(folder, "", bits, own).bits_per_action()
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     console.print(f"{whole.mean:.4f} bits per action, {interval}", highlight=False)
     place = Path(out)

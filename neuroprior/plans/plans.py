@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from neuroprior._checks import check_range, check_sizes, is_integer
 from neuroprior._random import generator_on
+from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.tables import Columns, Missing, fields_of
 
 MOST_ACTIONS = 2**31
@@ -355,8 +356,7 @@ def _check_texts(what: str, names: Sequence[str] | None) -> None:
         return
     if isinstance(names, str) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
-    if len(set(names)) < len(names):
-        raise ValueError(f"{what}: {next(name for name in names if list(names).count(name) > 1)!r} is there twice")
+    check_distinct(what, names)
 
 
 def _check_names(what: str, numbers: Tensor | None, names: Sequence[str] | None) -> None:

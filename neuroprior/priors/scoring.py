@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from neuroprior._files import read_json, write_json
 from neuroprior.plans import Plans
@@ -35,14 +36,19 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
     Raises:
         ValueError: the prior does not know the actions or contexts, or plans have no groups or conditions.
     """
+    with torch.no_grad():
+        log_probs = prior.action_log_probs(match_plans(plans, prior))
+    return scores_by(-log_probs.cpu().double() / log(2), plans, by)
+
+
+def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
+    """The frame of `score` from the bits `[N, L]`, or `[N, L + 1]` with those of a plan's end, of each action."""
     import pandas as pd
 
     if by not in ("plan", "group", "condition", "action"):
         raise ValueError(f"by: one of plan, group, condition, action is expected, not {by!r}")
     if by in ("group", "condition") and getattr(plans, by) is None:
         raise ValueError(f"by: the plans have no {by}")
-    with torch.no_grad():
-        bits = -prior.action_log_probs(match_plans(plans, prior)).cpu().double() / log(2)
     mask = plans.mask()
     if by == "action":
         names = plans.action_names or tuple(map(str, range(plans.num_actions)))

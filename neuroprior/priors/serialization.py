@@ -79,20 +79,24 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
         config = _read_config(unfinished)
     if digest != config["sha256"]:
         raise ValueError(f"{folder / 'model.safetensors'}: truncated, changed or of another model than config.json")
+    misfit = f"{folder / 'model.safetensors'}: does not fit the prior that config.json describes"
     try:
         tensors = read_tensors(data)
-        # Tables of counts take their sizes from the file, so that less may be wanted than there is.
-        if _size(config) > SPARE + sum(value.numel() for value in tensors.values()):
-            raise RuntimeError("larger than the file")
-        prior = _made(config)
-        prior.load_state_dict(tensors)
-    except (SafetensorError, RuntimeError) as error:
-        raise ValueError(
-            f"{folder / 'model.safetensors'}: does not fit the prior that config.json describes"
-        ) from error
-    except (TypeError, ValueError, KeyError) as error:
+    except SafetensorError as error:
+        raise ValueError(misfit) from error
+    # Tables of counts take their sizes from the file, so that less may be wanted than there is.
+    most = SPARE + sum(value.numel() for value in tensors.values())
+    try:
+        prior = _made(config) if _size(config) <= most else None
+    except (RuntimeError, TypeError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{folder / 'config.json'}: no configuration of a {config['prior']} ({reason})") from error
+    if prior is None:
+        raise ValueError(misfit)
+    try:
+        prior.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise ValueError(misfit) from error
     if broken := [name for name, value in tensors.items() if value.is_floating_point() and bool(value.isnan().any())]:
         raise ValueError(f"{folder / 'model.safetensors'}: {broken[0]} has numbers that are NaN")
     try:
@@ -113,10 +117,8 @@ def _size(config: dict[str, Any]) -> int:
     try:
         with torch.device("meta"):
             return sum(value.numel() for value in _made(config).state_dict().values())
-    except (
-        NotImplementedError,
-        RuntimeError,
-    ):  # it computes with its numbers, which are not there; of each action it has one
+    except RuntimeError:
+        # It computes with its numbers, which are not there; it holds one at least for each action.
         actions = config["config"].get("num_actions")
         return actions if isinstance(actions, int) else 0
 

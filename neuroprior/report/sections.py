@@ -49,17 +49,21 @@ class Part(NamedTuple):
 def file_section(found: Evaluation) -> Part:
     """What is in the file."""
     frame = action_frame(found.plans)
-    return Part(Section("Plans", tables=plans_tables(found.plans)), {"actions": frame})
+    return Part(Section("Plans", tables=plans_tables(found.plans, frame)), {"actions": frame})
 
 
-def plans_tables(plans: Plans) -> list[Table]:
-    """What was read: how many plans of which kind, with what readers noted of them, and the commonest actions."""
+def plans_tables(plans: Plans, frame: pd.DataFrame) -> list[Table]:
+    """What was read: how many plans of which kind, with what readers noted of them, and the commonest of the actions.
+
+    Args:
+        plans: the plans.
+        frame: their `action_frame`.
+    """
     columns = {"plans": "plans:,", "actions": "actions:,", "shortest": "shortest", "longest": "longest"}
     columns |= {"kinds of\nactions": "kinds of actions", "groups": "groups", "context": "context"}
     columns |= {"conditions": "conditions"} if plans.condition is not None else {}
     notes = "".join(f"{note[:1].upper()}{note[1:]}. " for note in plans.notes).strip()
     described = table(pd.DataFrame([describe(plans)]), columns, notes, "Plans", "rrrrrrl" + "r" * (len(columns) - 7))
-    frame = action_frame(plans)
     counted: dict[str, Column] = {
         "action": "action",
         "count": "count:,",

@@ -19,7 +19,6 @@ from neuroprior.plans.columns import (
     Floats,
     Integers,
     Names,
-    check_distinct,
     is_missing,
     named,
     number_in,
@@ -279,7 +278,6 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
         raise ValueError(f"{path}: CSV cannot hold plans of which none has an action")
     for what in ("action", "context", "group", "condition"):
         names = getattr(plans, f"{what}_names")
-        check_distinct(f"{what}_names", names)
         for name in names or ():
             if not name.strip() or name != name.strip() or "\n" in name or "\r" in name:
                 raise ValueError(

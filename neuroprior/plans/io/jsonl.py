@@ -71,8 +71,6 @@ def read_jsonl(path: Path, num_actions: int | None, action_names: Names | None) 
 
 def write_jsonl(plans: Plans, path: Path) -> None:
     """Write a JSONL file; its first line holds what the others do not: `num_actions`, names, `end`."""
-    for key in ("action_names", "context_names", "group_names", "condition_names"):
-        check_distinct(key, getattr(plans, key))
     header = {key: getattr(plans, key) for key in HEADER if getattr(plans, key) is not None}
     with written_whole(path) as file:
         file.write(json.dumps(header, ensure_ascii=False) + "\n")
