@@ -25,6 +25,9 @@ from numpy.typing import ArrayLike
 from scipy import special, stats
 from torch import Tensor
 
+ENOUGH_UNITS = 5
+"""Independent units below which no verdict is drawn: intervals are given, and nothing is called significant."""
+
 
 class Interval(NamedTuple):
     """An estimate with its confidence interval."""

@@ -3,11 +3,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from math import log
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 import torch
-from torch import Tensor
 
 from neuroprior.analysis import (
     action_drift,
@@ -21,29 +20,21 @@ from neuroprior.analysis import (
     two_sample_tests,
 )
 from neuroprior.analysis.comparison import unit_name
+from neuroprior.analysis.statistics import ENOUGH_UNITS
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors import learn_macros
 from neuroprior.report import figures
 from neuroprior.report.document import Column, table
 from neuroprior.report.fits import ACTIONS, CONTEXT
 from neuroprior.report.page import FigureBox, Section, Table
+from neuroprior.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
 from neuroprior.report.scores import Evaluation, Model
 
 MOST_ORDER, MOST_LAG, MOST_MACROS = 6, 20, 16
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
-LISTED = 12  # over-represented sequences, and actions in the table of drift
 DRAWN = 12  # sequences, real and generated
-SIGNIFICANT = 0.05
 MANY_REPEATS = 0.2  # of all actions: beyond, over-represented sequences are also sought with repeats merged
-ENOUGH_UNITS = 5  # below, no gain is marked as significant
 LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
-
-
-class Part(NamedTuple):
-    """A section, and its tables of results by name."""
-
-    section: Section
-    frames: dict[str, pd.DataFrame]
 
 
 def file_section(found: Evaluation) -> Part:
@@ -307,7 +298,7 @@ def motif_section(found: Evaluation) -> Part | None:
         "expected": "expected:,.1f",
         "ratio": "ratio:.2f",
         "95 % interval": lambda row: f"{row.low:.2f} to {row.high:.2f}",
-        "p": lambda row: _p(row.corrected),
+        "p": lambda row: p_text(row.corrected),
     }
     tables, boxes = [], []
     for repeats, own in frame.groupby("repeats", sort=False) if rows else []:
@@ -476,7 +467,7 @@ def drift_section(found: Evaluation) -> Part | None:
             "first": lambda row: f"{100 * row.first_half:.2f}",
             "second": lambda row: f"{100 * row.second_half:.2f}",
             "change": lambda row: f"{100 * row.change:+.2f} ± {100 * (row.high - row.change):.2f}",
-            "p": lambda row: _p(row.corrected),
+            "p": lambda row: p_text(row.corrected),
         }
         caption = "Share of all actions, %, in the first and in the second half of the plans. p: corrected (Holm)."
         tables.append(table(most, columns, caption))
@@ -515,16 +506,6 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
 """By name, in the order of the page."""
 
 
-def action_names(plans: Plans) -> list[str]:
-    """Names of the actions; their numbers where they have none."""
-    return list(plans.action_names or map(str, range(plans.num_actions)))
-
-
-def group_names(plans: Plans, groups: Tensor) -> list[str]:
-    """Names of these groups; their numbers where they have none."""
-    return [plans.group_names[g] if plans.group_names else f"group {g}" for g in groups.tolist()]
-
-
 def _num_contexts(plans: Plans) -> int | None:
     """The number of context indices; None without."""
     if plans.context is None or plans.context.is_floating_point() or not plans.context.numel():
@@ -540,7 +521,3 @@ def _shuffles() -> torch.Generator:
 def _input(row: Any) -> str:
     """The input of a model, short enough for a terminal."""
     return str(row["context"]).replace(" and ", ", ")
-
-
-def _p(value: float) -> str:
-    return f"{value:.1g}" if value else "<1e-300"
