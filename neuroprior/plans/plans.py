@@ -253,18 +253,15 @@ class Plans:
             raise ValueError(f"end: the last action, {self.num_actions - 1}, is expected, not {self.end!r}")
         taken = self.mask() & (self.actions != self.end)
         lengths = taken.sum(1)
-        longest = int(lengths.max()) if len(self) else self.max_length
-        context = self.context
-        return replace(
+        opened = replace(
             self,
-            actions=self.actions.masked_fill(~taken, 0)[:, :longest],
+            actions=self.actions.masked_fill(~taken, 0),
             num_actions=self.num_actions - 1,
             lengths=lengths,
             action_names=None if self.action_names is None else self.action_names[:-1],
-            context=context[:, :longest] if context is not None and is_per_step(context) else context,
             end=None,
-            durations=None if self.durations is None else self.durations[:, :longest],
         )
+        return opened.steps(stop=int(lengths.max())) if len(self) else opened
 
     def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple["Plans", "Plans"]:
         """Split at random into plans for training and plans for validation; groups stay together.
@@ -285,7 +282,7 @@ class Plans:
         length = int(self.mask().sum()) if len(self) == 1 else 0
         if length > 1:
             cut = length - min(max(round(length * validation), 1), length - 1)
-            return self._between(0, cut), self._between(cut, length)
+            return self.steps(0, cut), self.steps(cut, length)
         unit = torch.arange(len(self)) if self.group is None else self.group.unique(return_inverse=True)[1].cpu()
         units = int(unit.max()) + 1 if len(unit) else 0
         if units < 2:
@@ -297,15 +294,31 @@ class Plans:
         index = chosen[unit].to(self.actions.device)
         return self[~index], self[index]
 
-    def _between(self, first: int, stop: int) -> "Plans":
-        """The actions `first` to `stop` - 1 of plans that all have as many."""
-        context = self.context
+    def steps(self, first: int = 0, stop: int | None = None) -> "Plans":
+        """Actions `first` to `stop` - 1 of each plan, with what belongs to them; shorter plans have fewer, or none.
+
+        Args:
+            first: how many actions of each plan are left out at its beginning, at least 0.
+            stop: the number of the first action that is left out at the end; None: none is.
+
+        Raises:
+            ValueError: `first` is negative, or `stop` is less than `first`.
+        """
+        stop = self.max_length if stop is None else min(stop, self.max_length)
+        if not 0 <= first:
+            raise ValueError(f"first: at least 0 is expected, not {first}")
+        if stop < min(first, self.max_length):
+            raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
+
+        def cut(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values[:, first:stop]
+
         return replace(
             self,
             actions=self.actions[:, first:stop],
-            lengths=None if self.lengths is None else torch.full_like(self.lengths, stop - first),
-            context=context[:, first:stop] if context is not None and is_per_step(context) else context,
-            durations=None if self.durations is None else self.durations[:, first:stop],
+            lengths=None if self.lengths is None else (self.lengths - first).clamp(0, max(stop - first, 0)),
+            context=cut(self.context) if is_per_step(self.context) else self.context,
+            durations=cut(self.durations),
         )
 
 

@@ -203,7 +203,7 @@ def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         return {}
     sizes = _sizes(learned, scored)
     generator = torch.Generator().manual_seed(seed)
-    late = _after(scored, 0 if design.cut else design.skip - reach)
+    late = scored.steps(0 if design.cut else max(design.skip - reach, 0))
     if int(late.mask().sum(1).max()) <= reach:
         return {}
     held_out = pieces(late, reach + 1, MOST_PIECES, generator)
@@ -240,17 +240,8 @@ def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | Non
 def _of_last(prior: Prior, held_out: Plans, known: int) -> Score:
     """The bits of the last action of each piece, with so many before it known: the same actions whatever is known."""
     length = held_out.max_length
-    bits = action_bits(prior, replace(_after(held_out, length - known - 1), lengths=None))
-    return score_bits("", "", bits[:, -1:], replace(_after(held_out, length - 1), lengths=None))
-
-
-def _after(plans: Plans, skip: int) -> Plans:
-    """The plans without their first `skip` actions."""
-    skip = min(max(skip, 0), max(plans.max_length - 1, 0))
-    lengths = (plans.mask().sum(1) - skip).clamp(min=0)
-    context = plans.context[:, skip:] if is_per_step(plans.context) and plans.context is not None else plans.context
-    durations = None if plans.durations is None else plans.durations[:, skip:]
-    return replace(plans, actions=plans.actions[:, skip:], lengths=lengths, context=context, durations=durations)
+    bits = action_bits(prior, replace(held_out.steps(length - known - 1), lengths=None))
+    return score_bits("", "", bits[:, -1:], replace(held_out.steps(length - 1), lengths=None))
 
 
 def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:

@@ -185,3 +185,29 @@ def test_names_must_name_every_number():
         Plans(ACTIONS, 3, group=torch.tensor([0, 1, 2, 2]), group_names=("a", "b"))
     with refuses("context_names"):
         Plans(ACTIONS, 3, context_names=("a",))
+
+
+def test_steps_of_plans() -> None:
+    plans = Plans(
+        torch.tensor([[0, 1, 2, 3], [3, 2, 0, 0], [1, 0, 0, 0]]),
+        4,
+        torch.tensor([4, 2, 1]),
+        context=torch.arange(12).view(3, 4),
+        durations=torch.arange(12.0).view(3, 4),
+        group=torch.tensor([0, 0, 1]),
+    )
+    cut = plans.steps(1, 3)
+    assert cut.lengths.tolist() == [2, 1, 0]
+    assert cut.actions.tolist() == [[1, 2], [2, 0], [0, 0]]
+    assert cut.context.tolist() == [[1, 2], [5, 6], [9, 10]]
+    assert cut.durations.tolist() == [[1, 2], [5, 0], [0, 0]]
+    assert cut.group.tolist() == [0, 0, 1]
+    assert plans.steps(7).max_length == 0
+    assert plans.steps(7).lengths.tolist() == [0, 0, 0]
+    assert plans.steps().actions.equal(plans.actions)
+    once = Plans(plans.actions, 4, context=torch.tensor([5, 6, 7])).steps(2)
+    assert once.context.tolist() == [5, 6, 7]
+    with pytest.raises(ValueError, match="first: at least 0"):
+        plans.steps(-1)
+    with pytest.raises(ValueError, match="stop: at least 3"):
+        plans.steps(3, 2)
