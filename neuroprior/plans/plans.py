@@ -305,7 +305,7 @@ class Plans:
             ValueError: `first` is negative, or `stop` is less than `first`.
         """
         stop = self.max_length if stop is None else min(stop, self.max_length)
-        if not 0 <= first:
+        if first < 0:
             raise ValueError(f"first: at least 0 is expected, not {first}")
         if stop < min(first, self.max_length):
             raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
