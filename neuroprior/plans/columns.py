@@ -76,7 +76,7 @@ class Column(dict[str, int]):
         names: the possible names in the order of their numbers; None where the file decides.
         count: how many different ones are possible, if known.
         untyped: texts are cells of a CSV file: whole numbers if all of them can be read as such.
-        blank: an empty cell is allowed, and gets the number -1.
+        blank: a missing label is allowed, and gets the number -1.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Column(dict[str, int]):
     def __missing__(self, text: str) -> int:
         """Number a new text; ValueError (which does not know the line) for one that is neither a number nor a name."""
         label = text.strip() if self.untyped else text
-        if self.blank and not label:
+        if self.blank and is_missing(label) and label not in (self.names or ()):
             number = -1
         else:
             if self.untyped and label not in self.labels:

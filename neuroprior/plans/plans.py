@@ -167,6 +167,7 @@ class Plans:
         start: str | None = None,
         stop: str | None = None,
         duration: str | None = None,
+        event_type: str | None = None,
         missing: Missing = "gap",
         merge_repeats: bool = False,
         max_gap: float | None = None,
@@ -181,8 +182,9 @@ class Plans:
 
         Args:
             frame: a pandas frame.
-            action, plan, context, group, condition, start, stop, duration: names of its columns, see `Columns`; where
-                one is not given, the column of that very name is taken, if there is one.
+            action, plan, context, group, condition, start, stop, duration, event_type: names of its columns, see
+                `Columns`; where one is not given, the column of that very name is taken, if there is one (but for
+                event_type).
             missing: what rows without a label do: a "gap" ends the plan, and another one begins after it; as "label"
                 they count as an action, "missing"; "error" refuses them. Without groups the parts of a plan become one.
             merge_repeats: take the same label in successive rows for one action, as in tables with a row a frame; it
@@ -195,7 +197,7 @@ class Plans:
         Raises:
             ValueError: a column is not there, or an entry is wrong; the message names the row.
         """
-        columns = Columns(action, plan, context, group, condition, start, stop, duration)
+        columns = Columns(action, plan, context, group, condition, start, stop, duration, event_type)
         fields = fields_of(
             frame,
             columns,

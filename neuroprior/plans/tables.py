@@ -7,6 +7,7 @@ import contextlib
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -18,6 +19,9 @@ from neuroprior.plans.columns import Column, Floats, Integers, Names, check_name
 
 Missing = Literal["gap", "label", "error"]
 MISSING: tuple[Missing, ...] = ("gap", "label", "error")
+
+EVENT_TYPES = ("START", "STOP", "POINT")
+"""What a row of a table says of an action: see `Columns.event_type`."""
 
 UNLABELLED = "missing"
 """The action of rows without a label, where these are to count as one."""
@@ -43,6 +47,8 @@ class Columns:
         start: when the action began: numbers, times of day or dates; the rows of a plan are put in this order.
         stop: when it ended, as `start`.
         duration: how long it took, in place of `stop`.
+        event_type: START, STOP or POINT, where the start and the stop of an action are rows of their own, as in the
+            tabular export of BORIS; `start` is the time of each row then.
     """
 
     action: str | None = None
@@ -53,6 +59,7 @@ class Columns:
     start: str | None = None
     stop: str | None = None
     duration: str | None = None
+    event_type: str | None = None
 
 
 class Table:
@@ -83,7 +90,8 @@ class Table:
         taken = {*self.at.values(), *self.context}
         usual = {str(name).strip().lower(): i for i, name in reversed(list(enumerate(frame.columns))) if i not in taken}
         for what in given:
-            if what not in self.at and what in usual:
+            # Under the name event_type tables have anything.
+            if what not in self.at and what in usual and what != "event_type":
                 self.at[what] = usual[what]
         if not self.context:
             numbered = [f"context_{i}" for i in range(1, 1 + len(frame.columns))]
@@ -197,9 +205,14 @@ def fields_of(
     table = Table(frame, columns, place, of)
     if not len(frame):
         raise ValueError(f"{of}: a header and no row below it")
+    noted: list[str] = []
+    if "event_type" in table.at:
+        table, noted = _paired(table)
+    place = table.place
     plan, plan_names = _plans_of_rows(table)
     start = table.numbers("start", table.at["start"], times=True) if "start" in table.at else None
     order, notes = _order(table, plan, plan_names, start)
+    notes += noted
     codes, labels = table.texts(table.at["action"])
     notes += _alike(labels, "action")
     without = codes < 0
@@ -280,6 +293,49 @@ def fields_of(
     if unused := table.unused():
         notes.append(f"columns that are not used: {_list(unused)}")
     return found | {"notes": tuple(notes)}
+
+
+def _paired(table: Table) -> tuple[Table, list[str]]:
+    """The table with a row for each action, made of one whose starts and stops are rows of their own; and a note."""
+    if "start" not in table.at:
+        raise ValueError("columns.event_type: the column of the times (columns.start) is expected with it")
+    if given := [what for what in ("stop", "duration") if what in table.at]:
+        raise ValueError(f"columns.{given[0]}: stops are rows of their own (columns.event_type); leave it out")
+    plan, _ = _plans_of_rows(table)
+    time = table.numbers("start", table.at["start"], times=True)
+    action, labels = table.texts(table.at["action"])
+    kinds, words = table.texts(table.at["event_type"])
+    known = np.array([*(EVENT_TYPES.index(w.upper()) if w.upper() in EVENT_TYPES else -1 for w in words), -1])
+    kind = known[kinds]
+    if (kind < 0).any():
+        row = int((kind < 0).argmax())
+        found = words[kinds[row]] if kinds[row] >= 0 else "an empty cell"
+        raise ValueError(f"{table.place(row)}: event_type: {', '.join(EVENT_TYPES)} are expected, not {found}")
+    # The starts and stops of each action of a plan in the order of time, and of the file where times are the same.
+    order = np.lexsort((np.arange(len(plan)), time, action, plan))
+    order = order[kind[order] != EVENT_TYPES.index("POINT")]
+    is_stop = kind[order] == EVENT_TYPES.index("STOP")
+    first = (np.diff(plan[order], prepend=-1) != 0) | (np.diff(action[order], prepend=-2) != 0)
+    after_start = np.append(False, ~is_stop[:-1]) & ~first
+    wrong = np.flatnonzero(is_stop != after_start)
+    if wrong.size:
+        row = int(order[wrong[0]])
+        label = labels[action[row]] if action[row] >= 0 else "no label"
+        what = "STOP without a START" if is_stop[wrong[0]] else "START, and no STOP since the last one"
+        raise ValueError(f"{table.place(row)}: {label!r}: a {what}; mend the row, or name the subject (columns.group)")
+    stop = np.where(kind == EVENT_TYPES.index("POINT"), time, np.nan)
+    ended = order[1:][is_stop[1:]]
+    stop[order[:-1][is_stop[1:]]] = time[ended]
+    rows = np.flatnonzero(kind != EVENT_TYPES.index("STOP"))
+    frame = table.frame.iloc[rows].reset_index(drop=True)
+    frame.isetitem(table.at["start"], time[rows])
+    frame.isetitem(table.at["event_type"], stop[rows])
+    paired = copy(table)
+    paired.frame = frame
+    paired.place = lambda i: table.place(int(rows[i]))
+    paired.at = {"stop" if what == "event_type" else what: at for what, at in table.at.items()}
+    open_ended = int(np.isnan(stop[rows]).sum())
+    return paired, [f"{open_ended:,} actions have a START and no STOP"] if open_ended else []
 
 
 def _plans_of_rows(table: Table) -> tuple[Integers, list[str]]:

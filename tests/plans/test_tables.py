@@ -227,6 +227,63 @@ MOSEQ = """name,centroid_x,centroid_y,heading,angular_velocity,velocity_px_s,syl
 """
 
 
+TABULAR = """Observation id,Subject,Behavior,Behavior type,Time,Media file
+ob1,ann,dig,START,0.5,a.mp4
+ob1,ben,dig,START,1.0,a.mp4
+ob1,ann,call,POINT,2.0,a.mp4
+ob1,ann,dig,STOP,2.5,a.mp4
+ob1,ann,eat,START,2.5,a.mp4
+ob1,ben,dig,STOP,4.0,a.mp4
+ob1,ann,eat,STOP,3.0,a.mp4
+ob1,ann,dig,START,3.0,a.mp4
+"""
+OF_TABULAR = {"plan": "Observation id", "group": "Subject", "action": "Behavior", "start": "Time"}
+OF_TABULAR |= {"event_type": "Behavior type"}
+
+
+def test_tabular_events_of_boris(tmp_path):
+    plans = read(tmp_path, TABULAR, columns=OF_TABULAR)
+    assert listed(plans) == [["dig", "call", "eat", "dig"], ["dig"]]
+    assert plans.durations[0].tolist()[:3] == [2.0, 0.0, 0.5]
+    assert plans.durations[0, 3].isnan()
+    assert plans.durations[1, 0] == 3.0
+    assert "1 actions have a START and no STOP" in plans.notes
+    assert "columns that are not used: Media file" in plans.notes
+    frame = Plans.from_dataframe(pd.read_csv(tmp_path / "lab.csv"), **OF_TABULAR)
+    assert listed(frame) == listed(plans)
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        (("ob1,ann,dig,STOP,2.5", "ob1,ann,dig,START,2.5"), {}, ["line 5", "'dig'", "START, and no STOP"]),
+        (("ob1,ann,eat,START,2.5", "ob1,ann,eat,STOP,2.5"), {}, ["line 6", "'eat'", "STOP without a START"]),
+        (("POINT", "BEGIN"), {}, ["line 4", "event_type", "START, STOP, POINT", "BEGIN"]),
+        (("", ""), {"start": None}, ["columns.event_type", "columns.start"]),
+        (("", ""), {"stop": "Media file"}, ["columns.stop", "leave it out"]),
+        (("", ""), {"group": None}, ["line 3", "columns.group"]),
+    ],
+)
+def test_bad_tabular_events(tmp_path, change, options, words):
+    with refuses(*words):
+        read(tmp_path, TABULAR.replace(*change) if change[0] else TABULAR, columns=OF_TABULAR | options)
+
+
+def test_missing_labels_with_one_plan_a_row(tmp_path):
+    text = "action_1,action_2,action_3,action_4,group,context\na,b,NA,a,x,0\nb,,,,x,1\na,,b,,y,2\n"
+    plans = read(tmp_path, text)
+    assert listed(plans) == [["a", "b"], ["a"], ["b"], ["a"], ["b"]]
+    assert [plans.group_names[g] for g in plans.group] == ["x", "x", "x", "y", "y"]
+    assert plans.context.tolist() == [0, 0, 1, 2, 2]
+    assert "2 gaps end a plan, and the next begins after each" in plans.notes
+    whole = read(tmp_path, text, missing="label")
+    assert listed(whole) == [["a", "b", "missing", "a"], ["b"], ["a", "missing", "b"]]
+    with refuses("lab.csv, line 2", "no label"):
+        read(tmp_path, text, missing="error")
+    assert listed(read(tmp_path, "a,a,b\nb,b,\n", merge_repeats=True)) == [["a", "b"], ["b"]]
+    assert listed(read(tmp_path, "NA,b\nb,NA\n", action_names=["NA", "b"])) == [["NA", "b"], ["b", "NA"]]
+
+
 def test_frames_of_keypoint_moseq(tmp_path):
     columns = {"plan": "name", "action": "syllable", "condition": "group"}
     plans = read(tmp_path, MOSEQ, columns=columns, merge_repeats=True)

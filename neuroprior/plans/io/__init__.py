@@ -60,7 +60,8 @@ def read_plans(
       other columns, which `columns` names. See `Plans.from_dataframe`. The rows of a plan stand together, in their
       order, unless there is a `start`.
     - `.csv`, `.tsv` with one plan a row: columns `action_1`, `action_2`, ..., empty after a plan's end, and perhaps a
-      context, `group` and `condition`; or no header, and all cells are actions.
+      context, `group` and `condition`; or no header, and all cells are actions. A label that is missing before a plan's
+      end is a gap, as with one action a row.
 
     Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if any of them is not a
     number.
@@ -70,7 +71,7 @@ def read_plans(
         num_actions: A; None for what the file says, else the number of names, else the largest action + 1.
         action_names: A names in the order of their numbers; without them the names are sorted.
         columns: of a CSV file with one action a row: which hold what, if they have other names; `Columns` or a dict.
-        missing, merge_repeats, max_gap: of such a file, see `Plans.from_dataframe`.
+        missing, merge_repeats, max_gap: of a CSV file, see `Plans.from_dataframe`.
 
     Returns:
         N plans, padded to the longest: context and group are int64, features float32 (`.npz`: as they are).
@@ -87,7 +88,7 @@ def read_plans(
     table |= {} if max_gap is None else {"max_gap": max_gap}
     is_dataset = isinstance(path, str) and path.startswith(MINARI)
     if table and (is_dataset or FILES[_suffix(Path(path))].read is not read_csv):
-        raise ValueError(f"{next(iter(table))}: for CSV files with one action a row only, not for {path}")
+        raise ValueError(f"{next(iter(table))}: for CSV files only, not for {path}")
     if isinstance(path, str) and is_dataset:
         return read_minari(path.removeprefix(MINARI))
     place = Path(path)

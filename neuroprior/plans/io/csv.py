@@ -41,9 +41,9 @@ T = TypeVar("T")
 
 def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
     """Plans of a CSV file: see `read_plans`."""
-    sheet = _Sheet(path, bool(table))
+    sheet = _Sheet(path, "columns" in table)
     action_columns = sheet.numbered("action") if sheet.has_header else list(range(sheet.width))
-    if table or not action_columns:
+    if "columns" in table or not action_columns:
         return _read_events(sheet, num_actions=num_actions, action_names=action_names, **table)
     at = sheet.columns
     if "action" in at:
@@ -54,7 +54,7 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
     actions = Column("action", action_names, num_actions, untyped=True, blank=True)
     others = {what: Column(what, untyped=True) for what in ("context", "group", "condition") if what in at}
 
-    def parse(rows: list[Row]) -> tuple[Integers, Integers, Floats | None, list[Integers]]:
+    def parse(rows: list[Row]) -> tuple[Integers, Integers | None, Floats | None, list[Integers]]:
         flat, sizes = _actions(actions, action_columns, rows)
         features = _features(rows, feature_columns) if feature_columns else None
         return flat, sizes, features, [other.look_up([row[at[what]] for row in rows]) for what, other in others.items()]
@@ -62,6 +62,8 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
     all_sizes, all_features, all_lines = [], [], []
     for block_lines, rows in sheet.blocks():
         flat, block_sizes, features, numbers = sheet.parse(parse, block_lines, rows)
+        if block_sizes is None or table:
+            return _read_gaps(sheet, action_columns, num_actions=num_actions, action_names=action_names, **table)
         actions.add_numbers(flat)
         for other, block in zip(others.values(), numbers, strict=True):
             other.add_numbers(block)
@@ -91,12 +93,7 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
 
 def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
     """Plans of a file with one action a row; see `Plans.from_dataframe`."""
-    try:
-        import pandas as pd
-    except ImportError as error:
-        raise ImportError(
-            f"{sheet.path}: files with one action a row need pandas: pip install 'neuroprior[report]'"
-        ) from error
+    pd = _pandas(sheet.path)
     if not sheet.columns:
         raise ValueError(f"{sheet.path}, line 1: a header is expected, and this looks like data")
     blocks = list(sheet.blocks())
@@ -114,15 +111,51 @@ def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
         raise error if named else ValueError(f"{sheet.path}: {error}") from None
 
 
-def _actions(actions: Column, columns: list[int], rows: list[Row]) -> tuple[Integers, Integers]:
-    """The actions of some rows end to end, and how many each row has."""
+def _pandas(path: Path) -> Any:
+    try:
+        import pandas
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: files with one action a row or with missing labels need pandas: pip install 'neuroprior[report]'"
+        ) from error
+    return pandas
+
+
+def _read_gaps(sheet: "_Sheet", action_columns: list[int], **table: Any) -> Plans:
+    """Plans of a file with one plan a row, with missing labels or with options of tables: as one with an action a row.
+
+    Empty cells behind the last action of a row are the end of its plan.
+    """
+    pd = _pandas(sheet.path)
+    blocks = list(sheet.blocks())
+    lines = np.concatenate([lines for lines, _ in blocks])
+    cells = np.array([[cell.strip() for cell in row] for _, rows in blocks for row in rows], dtype=object)
+    actions = cells[:, action_columns]
+    reach = np.where(actions != "", np.arange(1, 1 + len(action_columns)), 0).max(1, initial=0)
+    taken = np.arange(len(action_columns)) < reach[:, None]
+    row = taken.nonzero()[0]
+    others = {
+        name: cells[row, i]
+        for name, i in sheet.columns.items()
+        if re.fullmatch(r"group|condition|context(_\d+)?", name)
+    }
+    frame = pd.DataFrame({"plan": row, "action": actions[taken]} | others)
+    fields = fields_of(frame, place=lambda i: f"{sheet.path}, line {lines[row[i]]}", of=str(sheet.path), **table)
+    if fields.get("context") is not None:
+        fields["context"] = fields["context"][:, 0]  # one for each plan, repeated on its rows
+    if empty := int((reach == 0).sum()):
+        fields["notes"] = (*fields["notes"], f"{empty:,} plans without any label are left out")
+    return Plans(**fields)
+
+
+def _actions(actions: Column, columns: list[int], rows: list[Row]) -> tuple[Integers, Integers | None]:
+    """The actions of some rows end to end, and how many each row has; None where labels are missing within plans."""
     numbers = actions.look_up(_cells(rows, columns)).reshape(len(rows), len(columns))
     there = numbers >= 0
     sizes = there.sum(1)
-    gaps = there != (np.arange(len(columns)) < sizes[:, None])
-    if gaps.any():
-        first = int(there[int(gaps.any(1).argmax())].argmin()) + 1
-        raise ValueError(f"action {first} is empty, but not those after it; only the end of a plan may be empty")
+    unlabelled = any(number < 0 and text.strip() for text, number in actions.items())
+    if unlabelled or (there != (np.arange(len(columns)) < sizes[:, None])).any():
+        return numbers[there], None
     return numbers[there], sizes
 
 
