@@ -1,22 +1,26 @@
-"""`neuroprior example`: a file of plans to try the other commands on."""
+"""`neuroprior example`: a file of behaviour to try the other commands on."""
 
-from importlib.resources import files
 from pathlib import Path
 
-from neuroprior._files import write_whole
+from neuroprior._files import written_whole
+from neuroprior.testing import simulated_study
 
 
 def example(file: str) -> None:
-    """Write an example file of plans: simulated behaviour of eight animals, three sessions each.
+    """Write an example file: a simulated study of twelve animals with two sessions each, six of them treated.
 
-    What is done next depends on the last action; grooming follows "sniff, rear" more often than either alone suggests;
-    and the four treated animals go on walking more often than the control animals.
+    A row is an event, with the columns animal, session, behaviour, start, stop, treatment and observer. What is done
+    next depends on the last behaviour; grooming follows "eat, drink" more often than drinking alone suggests; treated
+    animals groom more often after they reared, where the others walk, and rest longer.
 
     Args:
-        file: where to write it; a file that is there already is left alone.
+        file: where to write it (CSV); a file that is there already is left alone.
     """
     place = Path(file)
     if place.exists():
         raise ValueError(f"{place}: is there already; give another name")
-    write_whole(place, files("neuroprior.cli").joinpath("example.csv").read_bytes())
-    print(f"wrote {place}; next: neuroprior report {place}")
+    with written_whole(place) as stream:
+        simulated_study(seed=0).to_csv(stream, index=False, lineterminator="\n")
+    columns = {"action": "behaviour", "plan": "session", "group": "animal", "condition": "treatment"}
+    options = " ".join(f"--columns.{what} {name}" for what, name in columns.items())
+    print(f"wrote {place}; next: neuroprior report {place} {options}")

@@ -29,7 +29,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "neuroprior",
         next(n for n in names if "dist-info" in n).split("/")[0],
     }
-    for needed in ("cli/example.csv", "cli/recipes/gru.yaml", "report/page.html.j2", "py.typed"):
+    for needed in ("cli/recipes/gru.yaml", "report/page.html.j2", "py.typed"):
         assert f"neuroprior/{needed}" in names
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)
     python = folder / "venv" / "bin" / "python"
@@ -52,24 +52,25 @@ def run(installed: Path, folder: Path, *words: str, code: int = 0) -> subprocess
 
 
 def test_the_four_commands(installed: Path, tmp_path: Path) -> None:
-    run(installed, tmp_path, "example", "plans.csv")
+    run(installed, tmp_path, "example", "study.csv")
+    study = ["study.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
     quick = ["--trainer.max_steps", "20", "--trainer.accelerator", "cpu"]
-    fitted = run(installed, tmp_path, "fit", "--config", "gru", "--data.file", "plans.csv", "--out", "gru", *quick)
+    fitted = run(installed, tmp_path, "fit", "--config", "gru", "--data.file", *study, "--out", "gru", *quick)
     assert "bits per action" in fitted.stdout
     report = ["--models", "counts", "--processes", "1", "--out", "report"]
-    assert "report: report/report.html" in run(installed, tmp_path, "report", "plans.csv", *report).stdout
+    assert "report: report/report.html" in run(installed, tmp_path, "report", *study, *report).stdout
     assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
-    scored = run(installed, tmp_path, "score", "gru", "plans.csv", "--out", "score")
+    scored = run(installed, tmp_path, "score", "gru", *study, "--out", "score")
     assert "bits per action" in scored.stdout
     plans = pd.read_csv(tmp_path / "score" / "plans.csv")
     groups = pd.read_csv(tmp_path / "score" / "groups.csv")
-    assert (len(plans), len(groups)) == (24, 8)
+    assert (len(plans), len(groups)) == (100, 12)
     assert plans["log_likelihood"].sum() == pytest.approx(groups["log_likelihood"].sum())
     said = run(installed, tmp_path, "sample", "gru", "--num-plans", "7", "--length", "5").stdout.splitlines()
     actions = [json.loads(line)["actions"] for line in said if "actions" in json.loads(line)]
     assert [len(some) for some in actions] == [5] * 7
     run(installed, tmp_path, "sample", "gru", "--num-plans", "3", "--out", "new.csv")
-    known = {"eat", "groom", "rear", "rest", "sniff", "walk"}
+    known = {"drink", "eat", "freeze", "groom", "rear", "rest", "sniff", "walk"}
     assert set(pd.read_csv(tmp_path / "new.csv").stack()) <= known
 
 
