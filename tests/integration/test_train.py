@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, load
+from neuroprior.analysis import Baseline
 from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.training import PriorModule
 from tests.support.sources import seeded
@@ -81,8 +82,19 @@ def test_each_recipe(name, tmp_path, capsys):
     assert (tmp_path / "run" / "learning_curve.png").exists() == (name != "markov")
 
 
-def test_the_table_is_of_the_held_out_plans(tmp_path):
-    """The trained prior's row is what the saved prior takes for the plans that the split holds out."""
+def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch):
+    """The trained prior's row is what the saved prior takes for the plans that the split holds out.
+
+    Baselines learn from the training plans and are chosen on the validation plans alone: here the worst is chosen.
+    """
+    given = []
+
+    def baselines(training, validation, *_):
+        given.extend([training, validation])
+        for name, prior, bits in (("markov-1", MarkovPrior(3, 1), 9.0), ("markov-0", MarkovPrior(3, 0), 1.0)):
+            yield Baseline(name, "as given", prior.fit(training), bits)
+
+    monkeypatch.setattr("neuroprior.cli.fit_report.baselines", baselines)
     write_plans(some_plans(), tmp_path / "plans.npz")
     out = tmp_path / "run"
     assert main([*recipe("markov"), "--data.file", str(tmp_path / "plans.npz"), "--out", str(out)]) == 0
@@ -92,7 +104,10 @@ def test_the_table_is_of_the_held_out_plans(tmp_path):
     assert report["plans"] == {"training": 240, "validation": 30, "held_out": 30}
     bits = -load(out).log_prob(held_out).sum() / torch.log(torch.tensor(2.0))
     assert report["rows"][-1]["bits_per_action"] == pytest.approx(float(bits / held_out.lengths.sum()), abs=1e-5)
-    learned, _ = rest.split(1 / 9, generator)
+    learned, chosen_on = rest.split(1 / 9, generator)
+    assert [plans.actions.tolist() for plans in given] == [learned.actions.tolist(), chosen_on.actions.tolist()]
+    assert report["rows"][0]["bits_per_action"] < report["rows"][1]["bits_per_action"]
+    assert report["chosen"] == "markov-0"
     again = MarkovPrior(3, 3).fit(learned)
     assert torch.equal(again.log_prob(held_out.actions), load(out).log_prob(held_out.actions))
 

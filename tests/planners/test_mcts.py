@@ -70,6 +70,18 @@ def test_scores_guide_it_better_than_random_search():
     assert found.score.mean() > 1.05 * sampled.score.mean()
 
 
+def test_scores_are_scaled_to_their_range():
+    """Multiplied by 64 and raised by 16 (exact in binary), rewards guide the search in the same way."""
+    world = gridworld(9, 9, "torus", num_worlds=3)
+    reward = (world.reward * 64).floor() / 64
+    state, planner, found = world.reset(40, seeded(0)), MCTSPlanner(UniformPrior(4), 6, 12), []
+    for scale, rise in ((1, 0), (64, 0), (1, 16)):
+        changed = TabularWorld(world.next_state, reward * scale + rise)
+        found.append(planner.plan(changed, state, seeded(1)))
+        assert torch.equal(found[-1].plan, found[0].plan)
+        assert torch.equal(found[-1].score, found[0].score * scale + rise)
+
+
 def test_other_states_than_numbers_and_priors_that_see():
     world = cube(scramble=2)
     state = world.reset(10, seeded(0))

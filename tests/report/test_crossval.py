@@ -9,7 +9,7 @@ import torch
 
 from neuroprior.analysis.comparison import BACKOFFS_TRIED, DEPTH, score_bits, units
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import folds
+from neuroprior.plans.folds import folds, in_parts
 from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior
 from neuroprior.report import fits
 from neuroprior.report.fits import ACTIONS, CONTEXT, KINDS, Design, Job, counted, split
@@ -47,6 +47,8 @@ def test_which_plans_are_scored():
     mask = plans.mask()
     mask[:, :2] = False
     assert counted(plans, 2).equal(mask)
+    parts = in_parts(Plans(torch.zeros(1, 10, dtype=torch.long), 3), 4)  # of 3, 3, 3 and 1 actions
+    assert counted(parts, 4, cut=True).int().tolist() == [[0, 0, 0], [0, 1, 1], [1, 1, 1], [1, 0, 0]]
     for fold, (training, held_out) in enumerate(folds(plans, 3, 0)):
         own, index = split(plans, None, Design(3), fold)
         assert own.actions.equal(plans[training].actions)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior
-from neuroprior.training import PlansModule, PriorModule, Settings
+from neuroprior.training import PlansModule, PriorModule, Settings, train
 from neuroprior.training.batches import MOST_DISTINCT
 
 
@@ -48,6 +48,18 @@ def test_plans_of_other_lengths_are_not_merged() -> None:
 def test_bad_settings(setting: str, value: float) -> None:
     with pytest.raises(ValueError, match=setting):
         Settings(**{setting: value})
+
+
+def test_the_best_weights_are_kept_not_the_last() -> None:
+    """Noise is learned by heart: the loss on the plans held out rises again after the first steps."""
+    plans = Plans(torch.randint(3, (40, 8), generator=generator()), 3)
+    _, held_out = plans.split(0.3, generator(7))
+
+    prior = GRUPrior(3, 16)
+    how = Settings(50, learning_rate=0.05, validation=0.3, check_every=10, patience=1000, progress=False)
+    best = train(prior, plans, how, 7)
+    bits = -float(prior.log_prob(held_out).detach().mean()) / 8 / math.log(2)
+    assert bits == pytest.approx(best, abs=1e-5)
 
 
 def test_a_training_that_diverges_is_said(recwarn: pytest.WarningsRecorder) -> None:
