@@ -115,6 +115,18 @@ def test_every_setting_changes_the_training() -> None:
     assert [name for name, value in others.items() if score(**{name: value}) == base] == []
 
 
+def test_the_last_checkpoint_is_written_after_each_validation(tmp_path: Path) -> None:
+    """Where noise is learned by heart the best one is the first; a training is resumed from the last."""
+    plans = Plans(torch.randint(3, (40, 8), generator=generator()), 3)
+    how = Settings(30, learning_rate=0.05, check_every=10, patience=1000)
+    module = trained(GRUPrior(3, 16), plans[:28], plans[28:], how, tmp_path)
+    bits = [entry["validation_bits"] for entry in module.curve]
+    assert bits == sorted(bits)
+    saved = {path.stem: torch.load(path, weights_only=True) for path in (tmp_path / "checkpoints").iterdir()}
+    assert {name: one["global_step"] for name, one in saved.items()} == {"best": 10, "last": 30}
+    assert len(saved["last"]["curve"]) == 3
+
+
 def test_a_training_that_diverges_is_said(recwarn: pytest.WarningsRecorder) -> None:
     plans = torch.randint(3, (50, 4), generator=generator())
     with pytest.raises(ValueError, match="diverged"):
