@@ -100,6 +100,14 @@ def test_it_learns_from_what_it_did():
     assert torch.equal(one.prior.log_prob(every_plan(4, 3)), due.log_prob(every_plan(4, 3)))
 
 
+def test_it_learns_only_so_often(monkeypatch):
+    """After 12, 24 and 36 steps, from all that was executed so far."""
+    one, sizes = agent(retention=1.0), []
+    monkeypatch.setattr(one.prior, "fit", lambda plans, **_: sizes.append(len(plans)))
+    one.run(36)
+    assert sizes == [10, 20, 30]
+
+
 @pytest.mark.parametrize("per", ["plan", "step"])
 def test_it_stores_what_it_observed(per):
     prior, world = MarkovPrior(4, 1, num_contexts=36), foraging()

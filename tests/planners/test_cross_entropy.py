@@ -81,6 +81,16 @@ def test_elites_are_those_of_all_rounds():
     assert [plans.unique().tolist() for plans in tried] == [[0], [0, 1], [0, 2]]
 
 
+def test_elites_are_a_share_of_the_candidates_so_far():
+    """Two candidates, of which the better is the only elite; with next to no prior it alone is tried again."""
+    world, tried = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.tensor([[[1.0, 0.0]]])), []
+    rollout = world.rollout
+    world.rollout = lambda state, plans, *rest: tried.append(plans) or rollout(state, plans, *rest)
+    planner = CrossEntropyPlanner(UniformPrior(2), 1, 4, rounds=2, elites=0.5, strength=1e-9)
+    planner.plan(world, torch.zeros(300, dtype=torch.long), seeded(0))
+    assert torch.equal(tried[1], tried[0].amin(1, keepdim=True).expand(-1, 2, -1))
+
+
 def test_candidates_are_drawn_at_the_temperature():
     """In the only round there are no elites: chi-square against the prior at temperature 2."""
     prior, world = MarkovPrior(3, 0).fit(torch.tensor([[0] * 9, [1] * 9, [0] * 9, [2] * 9, [0] * 9])), random_world(0)

@@ -116,11 +116,15 @@ def test_rewards_are_as_precise_as_the_worlds():
 
 
 def test_the_start_that_took_most_steps_tells_how_many():
-    """A start where little can be tried before others, in chunks of one."""
-    world = TabularWorld(torch.tensor([[0, 0], [2, 3], [4, 5], [6, 1], [1, 2], [3, 4], [5, 6]]), torch.rand(7))
+    """Before and after another one a start where little can be tried, in chunks of one."""
+    table = torch.tensor([[0, 0], [2, 3], [4, 5], [6, 1], [1, 2], [3, 4], [5, 6]])
+    legal = torch.ones(7, 2, dtype=torch.bool)
+    legal[0, 1] = False
+    world = TabularWorld(table, torch.arange(7.0), legal)
     state = torch.tensor([0, 1, 0])
     planner = MCTSPlanner(UniformPrior(2), 4, 6)
     together = planner.plan(world, state, seeded(0)).model_steps
+    assert planner.plan(world, state[:1], seeded(0)).model_steps == 4 + 3 + 2 + 1
     planner.steps_at_once = 1
     assert planner.plan(world, state, seeded(0)).model_steps == together == 24
 

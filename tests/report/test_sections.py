@@ -10,7 +10,7 @@ from neuroprior.priors import MarkovPrior, UniformPrior, learn_macros
 from neuroprior.report import Document, FigureBox, report
 from neuroprior.report.fits import counted
 from neuroprior.report.scores import evaluate_saved
-from neuroprior.report.sections import SECTIONS, macro_section
+from neuroprior.report.sections import SECTIONS, action_frame, macro_section
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICK
 from tests.support.sources import refuses, seeded
@@ -68,6 +68,23 @@ def test_a_report_has_its_tables_and_figures(made):
     boxes = [box for section in made.sections for box in section.figures]
     assert all(isinstance(box, FigureBox) and box.caption and box.alt and box.name for box in boxes)
     assert len(made.sections) >= len(SECTIONS) - 2
+
+
+def test_what_is_asked_for_is_done():
+    asked = {"folds": 3, "skip": 1, "max_steps": 7, "patience": 0.125, "seed": 5}
+    plans = markov_plans(markov_probs(3, 1, 0), 9, 6, 1)
+    made = report(plans, models=["counts"], sections=["scores"], processes=1, **asked)
+    assert made.settings | asked == made.settings
+
+
+def test_actions_are_counted_by_plan():
+    plans = Plans(torch.tensor([[2, 2, 1], [2, 0, 0]]), 3, durations=torch.tensor([[1.0, 5, 2], [3, 4, 8]]))
+    frame = action_frame(plans)
+    assert frame[["action", "count", "plans", "median_duration"]].to_numpy().tolist() == [
+        ["2", 3, 2, 3.0],
+        ["0", 2, 1, 6.0],
+        ["1", 1, 1, 2.0],
+    ]
 
 
 def test_the_lead_names_the_best_model(made):

@@ -176,7 +176,7 @@ def test_what_cannot_occur_is_no_start():
     """Three states in a row; the first action may lead back, with probability 0, to a fourth."""
     after = torch.tensor([[[1, 3]], [[2, 3]], [[2, 2]], [[3, 3]]])
     probability = torch.tensor([[[1.0, 0.0]]]).expand(4, 1, 2)
-    ended = torch.tensor([False, False, True, True])
+    ended = torch.tensor([False, False, True, False])
     world = EpisodicWorld(after, torch.zeros(4), None, torch.eye(4)[0], ended, probability=probability)
     assert world.start_anywhere().starts.tolist() == [0.5, 0.5, 0, 0]
 
