@@ -27,6 +27,14 @@ def test_numbers_and_their_complements_have_different_hashes():
     assert len(row_hashes(torch.arange(-4, 5)[:, None]).unique()) == 9
 
 
+def test_fractions_count():
+    """All pairs of eighths from 0 to 1, of either precision."""
+    rows = torch.cartesian_prod(*[torch.arange(8) / 8] * 2)
+    for some in (rows, rows.double()):
+        assert len(row_hashes(some).unique()) == 64
+    assert len(row_hashes(torch.arange(8) / 8).unique()) == 8
+
+
 def test_no_rows():
     for shape in ((0,), (0, 3), (0, 2, 3)):
         assert row_hashes(torch.zeros(shape)).shape == (0,)

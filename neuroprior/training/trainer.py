@@ -119,13 +119,16 @@ def make_trainer(
         if number < 1:
             raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
     stopping = Stopping("validation_bits", patience=ceil(patience / validate_every), min_delta=1e-4)
-    checkpoints = Checkpoints(
-        Path(folder) / CHECKPOINTS,
-        "best",
-        monitor="validation_bits",
-        save_last=True,
-        save_on_train_epoch_end=True,
-        enable_version_counter=False,
+    # Two callbacks: with `save_last` Lightning writes the last one only where it writes the best one, too.
+    best, last = (
+        Checkpoints(
+            Path(folder) / CHECKPOINTS,
+            name,
+            monitor=monitor,
+            save_on_train_epoch_end=True,
+            enable_version_counter=False,
+        )
+        for name, monitor in (("best", "validation_bits"), ("last", None))
     )
     return lightning.Trainer(
         max_epochs=ceil(max_steps / validate_every),
@@ -138,7 +141,7 @@ def make_trainer(
         accumulate_grad_batches=accumulate_grad_batches,
         max_time=max_time,
         enable_progress_bar=enable_progress_bar,
-        callbacks=[stopping, checkpoints, *(callbacks or [])],
+        callbacks=[stopping, best, last, *(callbacks or [])],
         logger=[CSVLogger(folder, "logs"), TensorBoardLogger(folder, "tensorboard", "")] if logs else False,
         plugins=[WholeCheckpoints()],
         num_sanity_val_steps=0,
@@ -197,7 +200,7 @@ class Stopping(EarlyStopping):
 
 
 class Checkpoints(ModelCheckpoint):
-    """The best and the last checkpoint in a folder that may be moved between two runs."""
+    """Checkpoints in a folder that may be moved between two runs."""
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         def here(path: str) -> str:

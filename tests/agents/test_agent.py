@@ -6,7 +6,19 @@ import re
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, SamplingPlanner, UniformPrior, execute, gridworld, load, save
+from neuroprior import (
+    ExhaustivePlanner,
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    SamplingPlanner,
+    TabularWorld,
+    UniformPrior,
+    execute,
+    gridworld,
+    load,
+    save,
+)
 from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
 from neuroprior.worlds import ForagingWorld, patches
 from tests.support.sources import corridor, every_plan, refuses, seeded
@@ -47,6 +59,37 @@ def test_warm_starts_are_counted():
     assert agent(learn_every=None).run(10).model_steps == 5 * 48 + 4 * 6
 
 
+def rhythm():
+    """Eight cells in a circle; action `cell % 4` is rewarded, any other costs as much, and all lead on."""
+    cell = torch.arange(8)
+    reward = 2 * torch.nn.functional.one_hot(cell % 4, 4).float() - 1
+    return TabularWorld(((cell + 1) % 8)[:, None].expand(8, 4), reward[None])
+
+
+def test_the_rest_of_the_last_plan_begins_where_the_agent_stopped():
+    """One perfect plan of six actions, and from then on nothing but a random one each time: the agent keeps to it."""
+    world, state = rhythm(), torch.arange(5)
+    planner = ExhaustivePlanner(6, objective="return")
+    one = Agent(world, planner, UniformPrior(4), state, replan_every=2, learn_every=None, generator=seeded(0))
+    begun = one.run(2)
+    one.planner = SamplingPlanner(UniformPrior(4), 6, 1, objective="return")
+    done = torch.cat([begun.actions, one.run(2).actions], 1)
+    assert torch.equal(done, (state[:, None] + torch.arange(4)) % 4)
+
+
+def test_after_the_end_of_the_last_plan_its_prior_goes_on():
+    """A plan that ends after four actions, of which two are left; the prior nearly always takes action 3."""
+    world, prior = rhythm(), MarkovPrior(4, 0).fit(torch.full((10_000, 6), 3))
+    world.reward[0, 4:] = -1.0
+    planner = ExhaustivePlanner(6, objective="return", any_prefix=True)
+    state = torch.zeros(1, dtype=torch.long)
+    one = Agent(world, planner, prior, state, replan_every=2, learn_every=None, generator=seeded(0))
+    one.run(2)
+    world.reward[0, 4:, 3] = 1.0
+    one.planner = SamplingPlanner(UniformPrior(4), 6, 1, objective="return", any_prefix=True)
+    assert one.run(4).actions.tolist() == [[2, 3, 3, 3]]
+
+
 def test_it_learns_from_what_it_did():
     """All that was executed, cut into plans of six: a prior that is fitted to it is what the agent has learned."""
     one = agent(retention=1.0)
@@ -55,6 +98,14 @@ def test_it_learns_from_what_it_did():
     assert torch.equal(one.replay.plans.actions.long(), plans)
     due = MarkovPrior(4, 2).fit(Plans(plans, 4))
     assert torch.equal(one.prior.log_prob(every_plan(4, 3)), due.log_prob(every_plan(4, 3)))
+
+
+def test_it_learns_only_so_often(monkeypatch):
+    """After 12, 24 and 36 steps, from all that was executed so far."""
+    one, sizes = agent(retention=1.0), []
+    monkeypatch.setattr(one.prior, "fit", lambda plans, **_: sizes.append(len(plans)))
+    one.run(36)
+    assert sizes == [10, 20, 30]
 
 
 @pytest.mark.parametrize("per", ["plan", "step"])

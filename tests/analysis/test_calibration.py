@@ -34,6 +34,14 @@ def test_by_hand():
     assert found.expected_calibration_error == pytest.approx(error)
 
 
+def test_units_not_forecasts_are_the_trials_of_a_share_without_spread():
+    """Six places of two units: an action that was never taken, and one that always was."""
+    log_probs = torch.tensor([[0.9, 0.1]]).double().log().expand(6, 2)
+    found = reliability(log_probs, torch.zeros(6).long(), torch.tensor([0, 0, 0, 1, 1, 1]), 2).bins
+    assert [b.taken for b in found] == [share_interval(0, 2), share_interval(2, 2)]
+    assert [b.number for b in found] == [6, 6]
+
+
 def test_edges_and_certainty():
     """A forecast on an edge belongs above it; 0 and 1 are forecasts."""
     log_probs = torch.tensor([[0.5, 0.5], [0.0, 1.0]]).double().log()

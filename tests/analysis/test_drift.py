@@ -150,6 +150,11 @@ def test_rank_correlation_of_few_plans_is_exact(values):
     assert -1 < found.low < rho < found.high < 1
 
 
+def test_plans_that_are_all_the_same_have_no_trend():
+    plans = plans_of(8, 2)
+    assert by_plan(plans, torch.ones(8, 2), plans.mask()).trend == (0, -1, 1, 1)
+
+
 def test_groups_of_which_all_go_the_same_way():
     """Three groups of three plans, all in order: three equal signs, which occur at random one time in four."""
     plans = plans_of(9, 1, group=torch.arange(9) // 3)

@@ -246,10 +246,14 @@ def test_codes_do_not_overflow():
 
 def test_repeats_are_merged():
     """Within plans, never across; runs of one action then do not come first."""
-    plans = Plans(torch.tensor([[0, 0, 1, 1, 1, 0], [0, 2, 2, 2, 0, 0], [1, 1, 0, 0, 0, 0]]).repeat(8, 1), 3)
-    merged = Plans(torch.tensor([[0, 1, 0], [0, 2, 0], [1, 0, 0]]).repeat(8, 1), 3, torch.tensor([3, 3, 2] * 8))
-    for lengths in ((3,), (3, 4)):
-        assert motifs(plans, lengths, collapse_repeats=True) == motifs(merged, lengths)
+    probs = markov_probs(4, 2, 0, 1.5)
+    probs[torch.arange(16), torch.arange(16) % 4] = 0
+    alone = markov_plans(probs, 60, 12, 1).actions[:, 1:]
+    assert (alone[1:, 0] == alone[:-1, -1]).sum() > 10  # plans that begin as the one before them ended
+    plans = Plans(alone.repeat_interleave(torch.arange(11) % 3 + 1, 1), 4)
+    found = motifs(plans, (3, 4), collapse_repeats=True)
+    assert found == motifs(Plans(alone, 4), (3, 4))
+    assert len(found) > 20
     chain = markov_plans(markov_probs(3, 1, 0), 20, 60, 0)
     again = Plans(chain.actions.repeat_interleave(torch.arange(60) % 3 + 1, 1), 3)
     assert any(m.corrected <= 0.05 for m in motifs(again, (3, 4)))

@@ -187,3 +187,13 @@ def test_holm_keeps_the_family_wise_rate():
     wrong = sum(holm(row).min() <= 0.05 for row in draws)
     rate = 1 - 0.99**5
     assert stats.binom.ppf(FALSE_ALARM / 2, 2000, rate) <= wrong <= stats.binom.isf(FALSE_ALARM / 2, 2000, rate)
+
+
+def test_of_many_plans_some_are_drawn():
+    """100 plans of one action and then 100 of another: of 60 drawn 10 to 50 are of either but once in 10**9 times."""
+    plans = Plans((torch.arange(200) // 100)[:, None].expand(200, 3), 2)
+    shuffled = plans[torch.randperm(200, generator=seeded(1))]
+    (found, *_) = two_sample_tests(plans, shuffled, 99, seeded(0), max_plans=60)
+    assert found.statistic == "1-grams"
+    assert found.real.sum() == pytest.approx(1)
+    assert float(found.real.min()) > 1 / 6

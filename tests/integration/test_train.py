@@ -13,8 +13,10 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, load
+from neuroprior.analysis import Baseline
 from neuroprior.plans import read_plans, write_minari, write_plans
-from neuroprior.training import PriorModule
+from neuroprior.priors.scoring import learned_from
+from neuroprior.training import PriorModule, Settings
 from tests.support.sources import seeded
 from train.__main__ import main
 
@@ -81,8 +83,19 @@ def test_each_recipe(name, tmp_path, capsys):
     assert (tmp_path / "run" / "learning_curve.png").exists() == (name != "markov")
 
 
-def test_the_table_is_of_the_held_out_plans(tmp_path):
-    """The trained prior's row is what the saved prior takes for the plans that the split holds out."""
+def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch):
+    """The trained prior's row is what the saved prior takes for the plans that the split holds out.
+
+    Baselines learn from the training plans and are chosen on the validation plans alone: here the worst is chosen.
+    """
+    given = []
+
+    def baselines(training, validation, *_):
+        given.extend([training, validation])
+        for name, prior, bits in (("markov-1", MarkovPrior(3, 1), 9.0), ("markov-0", MarkovPrior(3, 0), 1.0)):
+            yield Baseline(name, "as given", prior.fit(training), bits)
+
+    monkeypatch.setattr("neuroprior.cli.fit_report.baselines", baselines)
     write_plans(some_plans(), tmp_path / "plans.npz")
     out = tmp_path / "run"
     assert main([*recipe("markov"), "--data.file", str(tmp_path / "plans.npz"), "--out", str(out)]) == 0
@@ -92,7 +105,13 @@ def test_the_table_is_of_the_held_out_plans(tmp_path):
     assert report["plans"] == {"training": 240, "validation": 30, "held_out": 30}
     bits = -load(out).log_prob(held_out).sum() / torch.log(torch.tensor(2.0))
     assert report["rows"][-1]["bits_per_action"] == pytest.approx(float(bits / held_out.lengths.sum()), abs=1e-5)
-    learned, _ = rest.split(1 / 9, generator)
+    learned, chosen_on = rest.split(1 / 9, generator)
+    assert [plans.actions.tolist() for plans in given] == [learned.actions.tolist(), chosen_on.actions.tolist()]
+    assert report["rows"][0]["bits_per_action"] < report["rows"][1]["bits_per_action"]
+    assert report["chosen"] == "markov-0"
+    assert all(learned_from(out, learned))
+    assert all(learned_from(out, chosen_on))
+    assert not all(learned_from(out, held_out))
     again = MarkovPrior(3, 3).fit(learned)
     assert torch.equal(again.log_prob(held_out.actions), load(out).log_prob(held_out.actions))
 
@@ -171,23 +190,20 @@ MADE_OF_PRIORS = {
 
 @pytest.mark.parametrize("name", MADE_OF_PRIORS)
 def test_the_settings_of_a_recipe_reach_the_networks_inside_other_priors(name, plans_file, tmp_path, monkeypatch):
-    """The steps of training are those of `--trainer.max_steps`; the seed and the learning rate change the weights."""
-    step, steps = PriorModule.training_step, []
-    monkeypatch.setattr(PriorModule, "training_step", lambda self, *batch: steps.append(1) or step(self, *batch))
-
-    def weights(*more: str) -> bytes:
-        out = tmp_path / str(len(list(tmp_path.iterdir())))
-        arguments = ["--model.prior", name, *MADE_OF_PRIORS[name], "--data.file", plans_file, "--out", str(out)]
-        assert main(["fit", *arguments, "--trainer.max_steps", "3", *more]) == 0
-        return (out / "model.safetensors").read_bytes()
-
-    first = weights()
-    assert len(steps) == 3
-    assert weights("--trainer.max_steps", "5") != first
-    assert len(steps) == 8
-    if name == "MixturePrior":
-        assert weights("--model.learning_rate", "0.1") != first
-        assert weights("--seed_everything", "1") != first
+    """All of them, and a seed that depends on that of the command."""
+    trained = []
+    monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append((how, seed)))
+    asked = {"trainer": {"max_steps": 3, "patience": 7, "gradient_clip_val": 0.3}}
+    asked |= {"data": {"batch_size": 16, "window": 5, "validation": 0.2, "check_every": 2}}
+    asked |= {"model": {"learning_rate": 0.02, "weight_decay": 0.5}}
+    options = [f"--{part}.{option}={value}" for part, own in asked.items() for option, value in own.items()]
+    for seed in ("0", "1"):
+        arguments = ["--model.prior", name, *MADE_OF_PRIORS[name], *options, "--data.file", plans_file]
+        assert main(["fit", *arguments, "--seed_everything", seed, "--out", str(tmp_path / seed)]) == 0
+    due = Settings(3, 16, 5, 0.02, 0.5, gradient_clip=0.3, validation=0.2, check_every=2, patience=7, progress=False)
+    (first, seed), (second, other) = trained
+    assert first == second == due
+    assert seed != other
 
 
 def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans_file, tmp_path, capsys):

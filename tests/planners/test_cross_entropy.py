@@ -53,6 +53,54 @@ def test_elites_are_the_best_plans_so_far():
         assert torch.equal(counts[start], expected.float())
 
 
+class Turns:
+    """A prior that takes action 0 in the first round, action 1 in the second, and so on."""
+
+    num_actions, device = 5, "cpu"
+
+    def __init__(self):
+        self.turn = -1
+
+    def start(self, batch_size):
+        self.turn += 1
+        return self.step(None, torch.zeros(batch_size, 1))
+
+    def step(self, action, state):
+        logits = torch.full((len(state), 5), -torch.inf)
+        logits[:, self.turn] = 0
+        return logits, state
+
+
+def test_elites_are_those_of_all_rounds():
+    """Action 0 is the best; action 1, of every other candidate of the second round, is forgotten in the third."""
+    world, tried = TabularWorld(torch.zeros(1, 5, dtype=torch.long), torch.tensor([[[9.0, 0, 0, 0, 0]]])), []
+    rollout = world.rollout
+    world.rollout = lambda state, plans, *rest: tried.append(plans) or rollout(state, plans, *rest)
+    planner = CrossEntropyPlanner(Turns(), 1, 3, rounds=3, strength=1.0)
+    planner.plan(world, torch.zeros(200, dtype=torch.long), seeded(0))
+    assert [plans.unique().tolist() for plans in tried] == [[0], [0, 1], [0, 2]]
+
+
+def test_elites_are_a_share_of_the_candidates_so_far():
+    """Two candidates, of which the better is the only elite; with next to no prior it alone is tried again."""
+    world, tried = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.tensor([[[1.0, 0.0]]])), []
+    rollout = world.rollout
+    world.rollout = lambda state, plans, *rest: tried.append(plans) or rollout(state, plans, *rest)
+    planner = CrossEntropyPlanner(UniformPrior(2), 1, 4, rounds=2, elites=0.5, strength=1e-9)
+    planner.plan(world, torch.zeros(300, dtype=torch.long), seeded(0))
+    assert torch.equal(tried[1], tried[0].amin(1, keepdim=True).expand(-1, 2, -1))
+
+
+def test_candidates_are_drawn_at_the_temperature():
+    """In the only round there are no elites: chi-square against the prior at temperature 2."""
+    prior, world = MarkovPrior(3, 0).fit(torch.tensor([[0] * 9, [1] * 9, [0] * 9, [2] * 9, [0] * 9])), random_world(0)
+    planner, tried = CrossEntropyPlanner(prior, 1, 5000, rounds=1, temperature=2.0), []
+    rollout = world.rollout
+    world.rollout = lambda state, plans, *rest: tried.append(plans) or rollout(state, plans, *rest)
+    planner.plan(world, torch.zeros(1, dtype=torch.long), seeded(0))
+    assert fits(tried[0][0], (prior.start(1)[0][0] / 2).softmax(0), 3)
+
+
 def test_it_comes_nearer_step_by_step():
     """The more of eight digits are right the better, and a sample has two of them: refitting finds nearly all."""
     table = torch.arange(9)[:, None].expand(9, 4).clone()

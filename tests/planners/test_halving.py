@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from neuroprior import SamplingPlanner, TabularWorld, UniformPrior
 from neuroprior.planners import expected_score
 from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
-from tests.support.sources import every_plan, seeded, stochastic_world
+from neuroprior.worlds.world import Rollout, World
+from tests.support.sources import FALSE_ALARM, every_plan, p_value, seeded, stochastic_world
 
 
 @given(num_plans=st.integers(1, 500), num_rollouts=st.integers(1, 50))
@@ -39,6 +40,42 @@ def test_scores_are_means_over_all_rollouts_of_the_plans_that_are_left(prefix):
     if not prefix:
         everything = expected_score(world, state, plans.expand(10, -1, -1))
         assert (want.amax(1) > everything.amax(1) - 0.11).all()
+
+
+class Turns(World):
+    """Pays plans by a table with a row for each call of `rollout`: what they get in each round of halving."""
+
+    num_actions, stochastic = 4, True
+
+    def __init__(self, paid):
+        self.paid = iter(paid)
+
+    def reset(self, batch_size, generator=None):
+        return torch.zeros(batch_size, dtype=torch.long)
+
+    def step(self, state, action, generator=None):
+        raise NotImplementedError
+
+    def rollout(self, state, plans, generator=None, keep_states=False):
+        return Rollout(state[:, None].expand(plans.shape[:2]), torch.tensor(next(self.paid))[plans.long()])
+
+
+def test_all_rounds_count_by_their_rollouts():
+    """Four plans of one action with four rollouts each: two rollouts of each, and four more of the better two."""
+    world = Turns([[0.0, 9.0, 3.0, 0.0], [0.0, 0.0, 6.0, 0.0]])
+    planner = SamplingPlanner(UniformPrior(4), 1, 4)
+    left, score, _ = halved_scores(planner, world, world.reset(1), torch.arange(4).view(1, 4, 1), 4, seeded(0))
+    found = dict(zip(left.flatten().tolist(), score.flatten().tolist(), strict=True))
+    assert found == {1: pytest.approx(2 * 9 / 6), 2: pytest.approx((2 * 3 + 4 * 6) / 6)}
+
+
+def test_of_equals_any_is_kept():
+    """Which of four equal plans comes first among those that are left: chi-square over 4,000 starts."""
+    world = Turns([[0.0] * 4] * 2)
+    planner, plans = SamplingPlanner(UniformPrior(4), 1, 4), torch.arange(4).view(1, 4, 1).expand(4000, -1, -1)
+    left, _, _ = halved_scores(planner, world, world.reset(4000), plans, 2, seeded(0))
+    assert left.shape == (4000, 2, 1)
+    assert p_value(left[:, 0], torch.ones(4)) > FALSE_ALARM
 
 
 def test_it_finds_better_plans_with_as_many_steps():

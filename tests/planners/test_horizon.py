@@ -97,6 +97,31 @@ def test_ties_over_rounds():
     assert p_value(number, torch.ones(8)) > FALSE_ALARM
 
 
+class Turns:
+    """A prior that takes action 0 throughout its first plans, action 1 throughout the next ones, and so on."""
+
+    num_actions, device = 5, "cpu"
+
+    def __init__(self):
+        self.turn = -1
+
+    def start(self, batch_size):
+        self.turn += 1
+        return self.step(None, torch.zeros(batch_size, 1))
+
+    def step(self, action, state):
+        logits = torch.full((len(state), 5), -torch.inf)
+        logits[:, self.turn] = 0
+        return logits, state
+
+
+def test_each_of_equal_candidates_wins_as_often_whenever_it_was_tried():
+    """Four plans at first, and one in each of four rounds: chi-square over 8,000 decisions."""
+    world, state = TabularWorld(torch.zeros(1, 5, dtype=torch.long), torch.ones(1)), torch.zeros(8000, dtype=torch.long)
+    decision = HorizonPlanner(Turns(), 1, 8, rounds=4).plan(world, state, seeded(0))
+    assert p_value(decision.plan[:, 0].long(), torch.tensor([4.0, 1, 1, 1, 1])) > FALSE_ALARM
+
+
 def test_in_stochastic_worlds_and_where_not_all_is_legal():
     world = stochastic_world(0)
     planner = HorizonPlanner(UniformPrior(3), 4, 10, objective="return", num_rollouts=5)

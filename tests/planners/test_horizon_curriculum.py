@@ -137,12 +137,36 @@ def test_only_plans_that_led_somewhere():
     assert bool((ends.gather(1, plans.lengths[:, None] - 1) == 1).all())
 
 
+def test_of_plans_that_go_on_after_the_end_only_the_beginning_is_kept():
+    """A prefix that goes on beyond the end of the world is as good as the one that ends there."""
+    world = TabularWorld(torch.tensor([[1], [2], [2]]), torch.zeros(3))
+    planner = ExhaustivePlanner(6, any_prefix=True, value=lambda state: (state == 2).float())
+    plans = collect(planner, world, state=torch.zeros(50, dtype=torch.long), generator=seeded(0))
+    assert plans.lengths.tolist() == [2] * 50
+
+
+def test_only_plans_that_score_more_are_kept():
+    """Cell 1 pays, cell 0 does not, and none leads to the other; in every round of a curriculum, too."""
+    world = TabularWorld(torch.tensor([[0], [1]]), torch.tensor([0.0, 1.0]))
+    state = torch.tensor([0, 1, 0, 1, 1])
+    assert len(collect(ExhaustivePlanner(2), world, state=state, min_score=0.0)) == 3
+    with refuses("min_score"):
+        collect(ExhaustivePlanner(2), world, state=state, min_score=1.0)
+    plans = Plans(torch.zeros(4, 2, dtype=torch.long), 1)
+    how = {"num_starts": 40, "num_plans": 2, "generator": seeded(0)}
+    *_, every = extend_horizon(MarkovPrior(1, 0), plans, world, (3,), **how)
+    *_, best = extend_horizon(MarkovPrior(1, 0), plans, world, (3,), min_score=0.0, **how)
+    assert 0 < len(best.plans) < len(every.plans) == 40
+
+
 def test_plans_end_where_it_is_over():
     """Chosen for their reward at the water or the solved cube, wherever they would have led on from there."""
     world = labyrinth(absorbing=True)
     assert world.terminated(torch.arange(127)).nonzero()[:, 0].tolist() == [WATER]
     assert not labyrinth().terminated(torch.arange(127)).any()
-    plans = collect(ExhaustivePlanner(6, objective="return"), world, 400, context="step", min_score=0.0)
+    plans = collect(
+        ExhaustivePlanner(6, objective="return"), world, 400, context="step", min_score=0.0, generator=seeded(0)
+    )
     assert plans.context is not None
     after = world.next_state[plans.context, plans.actions.long()]
     lengths = plans.mask().sum(1)

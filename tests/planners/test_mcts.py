@@ -70,6 +70,18 @@ def test_scores_guide_it_better_than_random_search():
     assert found.score.mean() > 1.05 * sampled.score.mean()
 
 
+def test_scores_are_scaled_to_their_range():
+    """Multiplied by 64 and raised by 16 (exact in binary), rewards guide the search in the same way."""
+    world = gridworld(9, 9, "torus", num_worlds=3)
+    reward = (world.reward * 64).floor() / 64
+    state, planner, found = world.reset(40, seeded(0)), MCTSPlanner(UniformPrior(4), 6, 12), []
+    for scale, rise in ((1, 0), (64, 0), (1, 16)):
+        changed = TabularWorld(world.next_state, reward * scale + rise)
+        found.append(planner.plan(changed, state, seeded(1)))
+        assert torch.equal(found[-1].plan, found[0].plan)
+        assert torch.equal(found[-1].score, found[0].score * scale + rise)
+
+
 def test_other_states_than_numbers_and_priors_that_see():
     world = cube(scramble=2)
     state = world.reset(10, seeded(0))
@@ -104,11 +116,15 @@ def test_rewards_are_as_precise_as_the_worlds():
 
 
 def test_the_start_that_took_most_steps_tells_how_many():
-    """A start where little can be tried before others, in chunks of one."""
-    world = TabularWorld(torch.tensor([[0, 0], [2, 3], [4, 5], [6, 1], [1, 2], [3, 4], [5, 6]]), torch.rand(7))
+    """Before and after another one a start where little can be tried, in chunks of one."""
+    table = torch.tensor([[0, 0], [2, 3], [4, 5], [6, 1], [1, 2], [3, 4], [5, 6]])
+    legal = torch.ones(7, 2, dtype=torch.bool)
+    legal[0, 1] = False
+    world = TabularWorld(table, torch.arange(7.0), legal)
     state = torch.tensor([0, 1, 0])
     planner = MCTSPlanner(UniformPrior(2), 4, 6)
     together = planner.plan(world, state, seeded(0)).model_steps
+    assert planner.plan(world, state[:1], seeded(0)).model_steps == 4 + 3 + 2 + 1
     planner.steps_at_once = 1
     assert planner.plan(world, state, seeded(0)).model_steps == together == 24
 

@@ -36,6 +36,18 @@ def test_rewards_that_are_not_numbers_are_said(planner: Planner) -> None:
         planner.plan(Broken(), torch.zeros(50, 1))
 
 
+def test_scores_of_prefixes_are_those_of_plans_as_long() -> None:
+    """Rewards 1, 2, 4 and values 1, 3, 9 at a discount of one half, by hand."""
+    rewards, states = torch.tensor([[1.0, 2.0, 4.0]]), torch.tensor([[1, 3, 9]])
+    how = {"value": lambda state: state.double()}
+    due = {"terminal": [1 + 1, 2 + 3, 4 + 9], "return": [1 + 1 / 2, 1 + 1 + 3 / 4, 1 + 1 + 1 + 9 / 8]}
+    for objective, scores in due.items():
+        discount = 0.5 if objective == "return" else 1.0
+        planner = ExhaustivePlanner(3, objective=objective, discount=discount, **how)
+        assert planner.prefix_scores(rewards, states).tolist() == [scores]
+        assert [float(planner.score(rewards[:, :k], states[:, k - 1])) for k in (1, 2, 3)] == scores
+
+
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int32, torch.float32])
 def test_states_of_another_dtype_are_refused(dtype: torch.dtype) -> None:
     world = gridworld(20, 20)

@@ -77,7 +77,8 @@ def in_steps(length: int, kind: str, pad: int = 0) -> Plans:
         "features a step": torch.stack([place.double(), -place.double()], -1)[None],
     }[kind]
     lengths = torch.tensor([length]) if pad else None
-    return Plans(actions[None], 5, lengths, context=context, group=torch.tensor([4]), action_names=tuple("abcde"))
+    more = {"durations": place[None] / 4, "condition": torch.tensor([1]), "condition_names": ("wild", "tame")}
+    return Plans(actions[None], 5, lengths, tuple("abcde"), context, torch.tensor([4]), **more)
 
 
 @pytest.mark.parametrize("kind", ["none", "index a plan", "features a plan", "index a step", "features a step"])
@@ -93,6 +94,9 @@ def test_parts_make_the_plan_again(length, number, pad, kind):
     assert parts.actions[mask].tolist() == plan.actions[0, :length].tolist()
     assert parts.action_names == plan.action_names
     assert parts.group is None
+    assert parts.durations[mask].tolist() == plan.durations[0, :length].tolist()
+    assert parts.condition.tolist() == [1] * len(parts)
+    assert parts.condition_names == plan.condition_names
     if kind.endswith("step"):
         assert parts.context[mask].equal(plan.context[0, :length])
     elif kind.endswith("plan"):

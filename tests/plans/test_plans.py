@@ -163,6 +163,12 @@ def test_the_end_symbol_closes_every_plan_and_comes_off_again():
     )
 
 
+def test_the_end_symbol_has_the_context_of_the_last_action():
+    context = torch.arange(1, 10).view(3, 3)
+    closed = Plans(torch.zeros(3, 3, dtype=torch.long), 2, torch.tensor([1, 2, 3]), context=context).with_end()
+    assert closed.context[closed.mask()].tolist() == [1, 1, 4, 5, 5, 7, 8, 9, 9]
+
+
 def test_without_lengths_plans_end_at_the_first_end_symbol():
     sampled = torch.tensor([[0, 2, 2], [2, 2, 2], [0, 1, 0]])
     assert Plans(sampled, 3, end=2).lengths.tolist() == [2, 1, 3]

@@ -52,7 +52,7 @@ def test_sums_are_those_of_the_plans(by):
             {"m1": by_hand()[0], "m2": by_hand()[1]}
         )
     if by == "action":
-        assert set(frame["action"]) == {"rear", "walk"}
+        assert frame[["action", "plans", "actions"]].to_numpy().tolist() == [["rear", 2, 2], ["walk", 2, 3]]
 
 
 def test_other_numbers_are_never_taken_for_the_same():
@@ -78,4 +78,7 @@ def test_plans_that_were_learned_from_are_known_again(tmp_path):
     # By names, whatever their numbers are.
     other = Plans(2 - TRAINING.actions.long(), 3, action_names=NAMES[::-1])
     assert learned_from(tmp_path, other) == known
+    # Whatever stands beyond their end.
+    longer = Plans(torch.nn.functional.pad(TRAINING.actions, (0, 2)), 3, torch.full((40,), 8), action_names=NAMES)
+    assert learned_from(tmp_path, longer) == known
     assert sum(learned_from(tmp_path, Plans(TRAINING.actions, 3))) == 0

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import pickle
+from pathlib import Path
 
 import pytest
 import torch
@@ -88,6 +89,25 @@ def test_saving_over_a_folder(folder):
         assert type(again) is type(prior)
         torch.testing.assert_close(again.log_prob(plans), prior.log_prob(plans))
     assert len(list(folder.iterdir())) == 2
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json"])
+def test_a_save_that_is_cut_off_leaves_what_was_there(folder, name, monkeypatch):
+    """The disk is full before either of the two files is written."""
+    before, write = load(folder), Path.write_bytes
+
+    def full(path, content):
+        if name in path.name:
+            write(path, content[:10])
+            raise OSError(28, "No space left on device", str(path))
+        return write(path, content)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_bytes", full)
+        with pytest.raises(OSError, match="No space"):
+            save(MarkovPrior(A, 3), folder)
+    plans = torch.randint(A, (20, 5), generator=seeded(1))
+    assert torch.equal(load(folder).log_prob(plans), before.log_prob(plans))
 
 
 def test_missing(folder):

@@ -9,7 +9,7 @@ import torch
 
 from neuroprior.analysis.comparison import BACKOFFS_TRIED, DEPTH, score_bits, units
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import folds
+from neuroprior.plans.folds import folds, in_parts
 from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior
 from neuroprior.report import fits
 from neuroprior.report.fits import ACTIONS, CONTEXT, KINDS, Design, Job, counted, split
@@ -47,6 +47,8 @@ def test_which_plans_are_scored():
     mask = plans.mask()
     mask[:, :2] = False
     assert counted(plans, 2).equal(mask)
+    parts = in_parts(Plans(torch.zeros(1, 10, dtype=torch.long), 3), 4)  # of 3, 3, 3 and 1 actions
+    assert counted(parts, 4, cut=True).int().tolist() == [[0, 0, 0], [0, 1, 1], [1, 1, 1], [1, 0, 0]]
     for fold, (training, held_out) in enumerate(folds(plans, 3, 0)):
         own, index = split(plans, None, Design(3), fold)
         assert own.actions.equal(plans[training].actions)
@@ -159,6 +161,10 @@ def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
         assert sums.tolist() == pytest.approx([number, number, 3 * number], rel=1e-5)
         assert model.generated.shape == (len(first), 7)
         assert model.generated.max() < 3
+    *chains, tree = found.models[1:]
+    best = min(chains, key=lambda model: model.cost)
+    assert best != chains[0]
+    assert found.leading(ACTIONS) == [best, tree]
     (one,) = found.models[0].calibration.bins
     assert one.forecast == pytest.approx(1 / 3, abs=1e-6)
     assert one.taken.mean == pytest.approx(1 / 3)
@@ -188,6 +194,14 @@ def test_few_plans_have_scores_and_short_lags(plans, tmp_path):
         assert found.gains["bits"].map(math.isfinite).all()
         longest = found.gains["lag"].max()
     assert longest == (3 if len(plans) == 2 else 1)  # half of a plan
+
+
+@pytest.mark.parametrize("skip", [0, 2, 5])
+def test_information_by_lag_is_of_the_actions_that_count(skip):
+    """Of plans of 12 actions: those after the first `skip` that have three before them."""
+    plans, design = replace(chain(10, 12), lengths=None), Design(2, skip=skip, reach=3)
+    arrays = fits.fit_and_score(plans, None, design, Job(0, "lags", ACTIONS))
+    assert arrays["markov/actions"].sum(1).tolist() == [5 * (12 - max(skip, 3))] * 4
 
 
 def test_empty_and_short_plans_to_choose_on_are_no_obstacle(tmp_path):

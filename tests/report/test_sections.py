@@ -1,5 +1,7 @@
 """The sections of a report on plans, and the report as a function."""
 
+from typing import Any
+
 import pandas as pd
 import pytest
 import torch
@@ -10,7 +12,7 @@ from neuroprior.priors import MarkovPrior, UniformPrior, learn_macros
 from neuroprior.report import Document, FigureBox, report
 from neuroprior.report.fits import counted
 from neuroprior.report.scores import evaluate_saved
-from neuroprior.report.sections import SECTIONS, macro_section
+from neuroprior.report.sections import SECTIONS, action_frame, macro_section
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICK
 from tests.support.sources import refuses, seeded
@@ -49,10 +51,13 @@ def test_where_nothing_repeats_there_is_no_section():
     assert macro_section(found_in(plans)) is None
 
 
+ASKED: dict[str, Any] = {"folds": 2, "skip": 1, "patience": 0.125, "seed": 5} | QUICK
+
+
 @pytest.fixture(scope="module")
 def made() -> Document:
     plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 3)
-    return report(plans, folds=2, **QUICK)
+    return report(plans, **ASKED)
 
 
 def test_a_report_has_its_tables_and_figures(made):
@@ -70,6 +75,21 @@ def test_a_report_has_its_tables_and_figures(made):
     assert len(made.sections) >= len(SECTIONS) - 2
 
 
+def test_what_is_asked_for_is_done(made):
+    asked = {name: value for name, value in ASKED.items() if name not in ("models", "processes")}
+    assert made.settings | asked == made.settings
+
+
+def test_actions_are_counted_by_plan():
+    plans = Plans(torch.tensor([[2, 2, 1], [2, 0, 0]]), 3, durations=torch.tensor([[1.0, 5, 2], [3, 4, 8]]))
+    frame = action_frame(plans)
+    assert frame[["action", "count", "plans", "median_duration"]].to_numpy().tolist() == [
+        ["2", 3, 2, 3.0],
+        ["0", 2, 1, 6.0],
+        ["1", 1, 1, 2.0],
+    ]
+
+
 def test_the_lead_names_the_best_model(made):
     best = made.tables["plans"].sort_values("bits_per_action").iloc[0]
     assert made.lead == (
@@ -83,7 +103,7 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
 
     plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 3)
     write_plans(plans, tmp_path / "plans.npz")
-    again = report(tmp_path / "plans.npz", folds=2, sections=["scores"], out=tmp_path / "out", **QUICK)
+    again = report(tmp_path / "plans.npz", sections=["scores"], out=tmp_path / "out", **ASKED)
     pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
 

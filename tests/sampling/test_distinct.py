@@ -138,9 +138,10 @@ def test_along_with_a_world(legal, per):
 def test_the_most_probable_plans(actions, length, batch, seed, share):
     prior = TablePrior.random(actions, length, batch, seed)
     number = max(int(actions**length * share), 1)
-    plans, log_prob = most_probable(prior, number, length, torch.arange(batch))
+    temperature = (0.5, 1.0, 2.0)[seed % 3]
+    plans, log_prob = most_probable(prior, number, length, torch.arange(batch), temperature=temperature)
     for own, (mine, log_probs) in enumerate(zip(plans, log_prob, strict=True)):
-        probs = distribution(prior, length, torch.tensor(own))
+        probs = distribution(prior, length, torch.tensor(own), temperature)
         assert len(mine.unique(dim=0)) == number
         assert torch.allclose(probs[plan_number(mine, actions)], log_probs.exp())
         assert torch.allclose(log_probs.exp(), probs.sort(descending=True).values[:number])

@@ -1,12 +1,13 @@
 """Training: what is learned where plans repeat, bad settings, interruption, and sampling past the training length."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior
-from neuroprior.training import PlansModule, PriorModule, Settings
+from neuroprior.training import PlansModule, PriorModule, Settings, make_trainer, run_training, train
 from neuroprior.training.batches import MOST_DISTINCT
 
 
@@ -48,6 +49,82 @@ def test_plans_of_other_lengths_are_not_merged() -> None:
 def test_bad_settings(setting: str, value: float) -> None:
     with pytest.raises(ValueError, match=setting):
         Settings(**{setting: value})
+
+
+def test_the_best_weights_are_kept_not_the_last() -> None:
+    """Noise is learned by heart: the loss on the plans held out rises again after the first steps."""
+    plans = Plans(torch.randint(3, (40, 8), generator=generator()), 3)
+    _, held_out = plans.split(0.3, generator(7))
+
+    prior = GRUPrior(3, 16)
+    how = Settings(50, learning_rate=0.05, validation=0.3, check_every=10, patience=1000, progress=False)
+    best = train(prior, plans, how, 7)
+    bits = -float(prior.log_prob(held_out).detach().mean()) / 8 / math.log(2)
+    assert bits == pytest.approx(best, abs=1e-5)
+
+
+def trained(prior: GRUPrior, plans: Plans, held_out: Plans, how: Settings, folder: Path) -> PriorModule:
+    """The module after a training on these plans, with its learning curve."""
+    data = PlansModule(plans, held_out, how, seed=0)
+    progress = {"enable_progress_bar": False, "logs": False}
+    trainer = make_trainer(str(folder), how.max_steps, how.patience, data.steps, "cpu", **progress)
+    module = PriorModule(prior, how.learning_rate, how.weight_decay)
+    run_training(trainer, module, data)
+    return module
+
+
+def test_the_learning_rate_rises_over_a_tenth_and_falls_with_half_a_cosine(tmp_path: Path) -> None:
+    plans = Plans(torch.randint(3, (40, 4), generator=generator()), 3)
+    how = Settings(20, learning_rate=0.01, check_every=1)
+    curve = trained(GRUPrior(3, 4, lags=1), plans, plans, how, tmp_path).curve
+    assert [entry["step"] for entry in curve] == list(range(1, 21))
+    due = [0.01 * min((k / 20 + 1e-3) / 0.1, (1 + math.cos(math.pi * k / 20)) / 2) for k in range(1, 21)]
+    assert [entry["learning_rate"] for entry in curve] == pytest.approx(due, abs=1e-9)
+
+
+def test_in_validation_each_action_counts_the_same(tmp_path: Path) -> None:
+    """Windows near the end hold the actions of few plans, and weigh less."""
+    lengths = torch.tensor([12, 9, 8, 5])
+    plans = Plans(torch.randint(3, (4, 12), generator=generator()), 3, lengths=lengths)
+    prior = GRUPrior(3, 8)
+    prior.prepare(plans, 4)
+    (entry,) = trained(prior, plans, plans, Settings(1, window=4, check_every=1), tmp_path).curve
+    bits = -float(prior.log_prob(plans).detach().sum()) / math.log(2) / 34
+    assert entry["validation_bits"] == pytest.approx(bits, rel=1e-5)
+
+
+def test_patience_is_counted_in_steps(tmp_path: Path) -> None:
+    """Hardly anything is learned at so low a rate: after the first validation two more, ten steps each, are awaited."""
+    plans = Plans(torch.randint(3, (40, 4), generator=generator()), 3)
+    how = Settings(100, learning_rate=1e-9, check_every=10, patience=20)
+    assert [one["step"] for one in trained(GRUPrior(3, 4), plans, plans, how, tmp_path).curve] == [10, 20, 30]
+
+
+def test_every_setting_changes_the_training() -> None:
+    plans = torch.randint(3, (60, 9), generator=generator())
+    same = {"max_steps": 6, "check_every": 6, "batch_size": 20, "progress": False}
+
+    def score(**settings: float) -> list[float]:
+        prior = GRUPrior(3, 8).fit(plans, generator=generator(), **(same | settings))
+        return prior.log_prob(plans).tolist()
+
+    base = score()
+    assert score() == base
+    others = {"max_steps": 4, "batch_size": 10, "window": 4, "learning_rate": 0.01, "validation": 0.5}
+    others |= {"weight_decay": 9.0, "gradient_clip": 0.01}
+    assert [name for name, value in others.items() if score(**{name: value}) == base] == []
+
+
+def test_the_last_checkpoint_is_written_after_each_validation(tmp_path: Path) -> None:
+    """Where noise is learned by heart the best one is the first; a training is resumed from the last."""
+    plans = Plans(torch.randint(3, (40, 8), generator=generator()), 3)
+    how = Settings(30, learning_rate=0.05, check_every=10, patience=1000)
+    module = trained(GRUPrior(3, 16), plans[:28], plans[28:], how, tmp_path)
+    bits = [entry["validation_bits"] for entry in module.curve]
+    assert bits == sorted(bits)
+    saved = {path.stem: torch.load(path, weights_only=True) for path in (tmp_path / "checkpoints").iterdir()}
+    assert {name: one["global_step"] for name, one in saved.items()} == {"best": 10, "last": 30}
+    assert len(saved["last"]["curve"]) == 3
 
 
 def test_a_training_that_diverges_is_said(recwarn: pytest.WarningsRecorder) -> None:

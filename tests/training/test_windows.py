@@ -152,3 +152,5 @@ def test_few_plans_are_validated_often():
     assert (data.steps, data.epochs) == (10, 100)
     data = PlansModule(plans, plans, Settings(check_every=40, max_steps=100), 0)
     assert (data.steps, data.epochs) == (34, 3)
+    # Two passes between two validations, but at least 10 steps and at most 100.
+    assert [Settings().epochs(steps) for steps in (2, 20, 200)] == [(100, 10), (25, 40), (10, 100)]

@@ -72,9 +72,9 @@ def test_what_is_not_eaten_stays_until_the_season_ends():
     assert world.regrow(state + torch.tensor([[0, 1, 0, 0, 0]]), seeded(0)).tolist() == [[1, 10, 3, 3, 3]]
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("table", [*TABLES, "partly legal"])
 def test_a_patch_is_what_can_be_reached(table):
-    table = TABLES[table]()
+    table = random_world(2, "S", legal=True, states=12) if table == "partly legal" else TABLES[table]()
     growth = patches(table, 4, 3, seeded(1))
     plans, place = every_plan(table.num_actions, 3), forage(table).place
     for season, middle in enumerate(table.reset(4, seeded(1))):

@@ -132,6 +132,14 @@ def test_a_plan_takes_as_many_steps_as_it_has_actions(monkeypatch):
     # Copies go on from the seven steps that two plans share.
     world.rollout(world.reset(1), left.index_fill(2, torch.tensor([7]), 1))
     assert len(taken) == 9
+    # Of few copies the latest are kept.
+    world = from_gymnasium(environments.Corridor(), method="step", horizon=10)
+    world.max_kept = 2
+    taken.clear()
+    state = world.reset(1)
+    states = [state := world.step(state, torch.zeros(1, dtype=torch.long))[0] for _ in range(8)]
+    world.step(states[-2], torch.ones(1, dtype=torch.long))
+    assert len(taken) == 9
 
 
 def test_a_stepped_minigrid_conforms():

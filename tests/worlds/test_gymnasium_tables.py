@@ -168,6 +168,17 @@ def test_an_episodic_world_is_checked():
         make(ended=good, starts=(0.0, 0.0))
     two = make(ended=good, reward=((0.0, 0.0), (0.0, 0.0)), starts=(0.0, 1.0))
     assert sorted(two.reset(100, seeded(0)).unique().tolist()) == [1, 3]
+    weights = torch.tensor([2.0, 6.0])
+    assert p_value(make(ended=good, starts=weights.tolist()).reset(4000, seeded(0)), weights) > FALSE_ALARM
+
+
+def test_what_cannot_occur_is_no_start():
+    """Three states in a row; the first action may lead back, with probability 0, to a fourth."""
+    after = torch.tensor([[[1, 3]], [[2, 3]], [[2, 2]], [[3, 3]]])
+    probability = torch.tensor([[[1.0, 0.0]]]).expand(4, 1, 2)
+    ended = torch.tensor([False, False, True, False])
+    world = EpisodicWorld(after, torch.zeros(4), None, torch.eye(4)[0], ended, probability=probability)
+    assert world.start_anywhere().starts.tolist() == [0.5, 0.5, 0, 0]
 
 
 def test_gymnasium_is_imported_only_where_it_is_needed(monkeypatch):

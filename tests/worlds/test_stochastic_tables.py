@@ -145,6 +145,10 @@ def test_what_cannot_occur_has_no_part_in_a_mean():
         torch.tensor([[[0, 1]], [[1, 0]]]), torch.tensor([1.0, -torch.inf]), probability=torch.tensor([[[1.0, 0]]] * 2)
     )
     assert world.mean_reward().tolist() == [[[1.0], [-torch.inf]]]
+    stays = torch.tensor([[[0, 0]], [[1, 1]]])
+    reward = torch.tensor([[[[0.0, 5.0]], [[5.0, 0.0]]]])
+    world = TabularWorld(stays, reward, probability=torch.tensor([[[1.0, 0.0]]] * 2))
+    assert world.terminated(torch.arange(2)).tolist() == [True, False]
 
 
 def test_values_are_those_of_the_mean():

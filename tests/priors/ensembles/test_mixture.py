@@ -97,6 +97,29 @@ def test_weights_are_learned():
     assert float(mixture.first.exp()[0]) == pytest.approx(0.5, abs=0.02)
 
 
+def test_weights_are_learned_on_plans_that_the_experts_did_not_see():
+    """A chain of order 5 knows each training plan by heart; in the end both chains count all plans."""
+    plans = Plans(torch.randint(A, (60, 8), generator=seeded(0)), A)
+    mixture = MixturePrior(A, [MarkovPrior(A, 0), MarkovPrior(A, 5)]).fit(plans, generator=seeded(1), validation=0.25)
+    learned, held_out = plans.split(0.25, seeded(1))
+    by_hand = MixturePrior(A, [MarkovPrior(A, k).fit(learned) for k in (0, 5)])
+    by_hand.learn_weights(held_out)
+    assert mixture.first.equal(by_hand.first)
+    assert mixture.share == by_hand.share
+    for expert, k in zip(mixture.experts, (0, 5), strict=True):
+        assert expert.log_prob(plans).equal(MarkovPrior(A, k).fit(plans).log_prob(plans))
+
+
+def test_the_same_seed_gives_the_same_mixture():
+    plans, found = some_plans(), []
+    for seed in (3, 3, 4):
+        mixture = MixturePrior(A, [GRUPrior(A, 4, dropout=0.5), MarkovPrior(A, 1)])
+        mixture.fit(plans, generator=seeded(seed), max_steps=3, batch_size=8, progress=False)
+        found.append(mixture.log_prob(plans))
+    assert found[0].equal(found[1])
+    assert not found[0].equal(found[2])
+
+
 def test_a_share_is_learned_where_the_best_expert_changes():
     one, two = (MarkovPrior(A, 0).fit(torch.full((4, 20), action)) for action in (0, 1))
     switching = (torch.arange(400).view(10, 40) // 10) % 2

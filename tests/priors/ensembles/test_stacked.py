@@ -81,6 +81,14 @@ def test_experts_forecast_plans_that_they_did_not_learn_from(grouped):
     assert float(prior.experts[1](plans.actions[:1])[0, 5].exp()[0]) > 0.5
 
 
+def test_in_the_end_the_experts_learn_from_all_plans():
+    plans = some_plans()
+    own = Plans(plans.actions, A, plans.lengths)
+    chain, *_ = fitted(plans, False).experts
+    again = MarkovPrior(A, 1, 4.0, backoff="witten-bell").fit(own)
+    assert chain.log_prob(own).equal(again.log_prob(own))
+
+
 def memories(num: int, seed: int) -> Plans:
     """In one of four rooms, visited at random, an action is never the one that was last taken in this room."""
     generator = seeded(seed)
