@@ -88,7 +88,8 @@ class PermutationDesign:
     def possible(self) -> int:
         """The number of labelings: ways to give the blocks their conditions."""
         if self.kind == "within":
-            return factorial(len(self.conditions)) ** len(self.units)
+            every: int = factorial(len(self.conditions)) ** len(self.units)
+            return every
         same: int = prod(map(factorial, self.sizes))
         return factorial(len(self.label)) // same
 
