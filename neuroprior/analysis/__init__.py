@@ -1,10 +1,16 @@
-"""Statistics of executed plans: how actions follow each other, how far back that reaches, and where it changes.
+"""Statistics of executed plans: how actions follow each other, how far back that reaches, what changes it.
 
 Priors are compared in `neuroprior.analysis.comparison`, intervals and tests are in `neuroprior.analysis.statistics`.
 """
 
 from neuroprior.analysis.calibration import Reliability, reliability
 from neuroprior.analysis.comparison import Baseline, Score, action_bits, baselines, score, score_bits, unit_name, units
+from neuroprior.analysis.conditions import (
+    ConditionComparison,
+    ConditionFamily,
+    ConditionPrediction,
+    compare_conditions,
+)
 from neuroprior.analysis.drift import (
     ActionDrift,
     GroupDrift,
@@ -18,6 +24,7 @@ from neuroprior.analysis.drift import (
 from neuroprior.analysis.lags import LagInformation, bits_by_position, mutual_information, pieces
 from neuroprior.analysis.motifs import Motif, motifs
 from neuroprior.analysis.orders import OrderFit, order_selection
+from neuroprior.analysis.permutation_design import PermutationDesign
 from neuroprior.analysis.statistics import (
     Difference,
     Interval,
@@ -37,12 +44,16 @@ from neuroprior.analysis.two_sample import TwoSampleTest, two_sample_tests
 __all__ = [
     "ActionDrift",
     "Baseline",
+    "ConditionComparison",
+    "ConditionFamily",
+    "ConditionPrediction",
     "Difference",
     "GroupDrift",
     "Interval",
     "LagInformation",
     "Motif",
     "OrderFit",
+    "PermutationDesign",
     "PlanDrift",
     "PositionDrift",
     "Reliability",
@@ -57,6 +68,7 @@ __all__ = [
     "by_group",
     "by_plan",
     "by_position",
+    "compare_conditions",
     "holm",
     "interquartile_mean",
     "mean_interval",
