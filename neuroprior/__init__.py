@@ -5,35 +5,38 @@ Here are the names that most programs need; everything else is in its room: `neu
 `neuroprior.testing`.
 """
 
+from neuroprior._interrupts import ending_at_interrupts
 from neuroprior._version import __version__
-from neuroprior.planners import (
-    ExhaustivePlanner,
-    FrontierPlanner,
-    MCTSPlanner,
-    Planner,
-    SamplingPlanner,
-    collect,
-    execute,
-    oracle,
-)
-from neuroprior.plans import Plans, read_plans, write_plans
-from neuroprior.priors import (
-    ContextTreePrior,
-    GRUPrior,
-    MacroPrior,
-    MarkovPrior,
-    MixturePrior,
-    Prior,
-    StackedPrior,
-    TransformerPrior,
-    UniformPrior,
-    fit,
-    load,
-    save,
-)
-from neuroprior.priors.scoring import score
-from neuroprior.sampling import sample
-from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
+
+with ending_at_interrupts():
+    from neuroprior.planners import (
+        ExhaustivePlanner,
+        FrontierPlanner,
+        MCTSPlanner,
+        Planner,
+        SamplingPlanner,
+        collect,
+        execute,
+        oracle,
+    )
+    from neuroprior.plans import Plans, read_plans, write_plans
+    from neuroprior.priors import (
+        ContextTreePrior,
+        GRUPrior,
+        MacroPrior,
+        MarkovPrior,
+        MixturePrior,
+        Prior,
+        StackedPrior,
+        TransformerPrior,
+        UniformPrior,
+        fit,
+        load,
+        save,
+    )
+    from neuroprior.priors.scoring import score
+    from neuroprior.sampling import sample
+    from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
 
 __all__ = [
     "ContextTreePrior",

@@ -1,5 +1,8 @@
 """Checks of arguments, each of which names the argument that is wrong."""
 
+import os
+from functools import cache
+
 import torch
 from torch import Tensor
 
@@ -38,3 +41,34 @@ def check_sizes(**sizes: object) -> None:
     for name, size in sizes.items():
         if not isinstance(size, int) or isinstance(size, bool) or size < 1:
             raise ValueError(f"{name}: an integer of at least 1 is expected, not {size!r}")
+
+
+def check_count(name: str, count: object, bytes_each: int = 8) -> None:
+    """Raise ValueError, naming the argument, unless it is an integer of at least 0 that fits in memory."""
+    if not isinstance(count, int) or isinstance(count, bool) or count < 0:
+        raise ValueError(f"{name}: an integer of at least 0 is expected, not {count!r}")
+    check_memory(bytes_each * count, **{name: count})
+
+
+def check_memory(needed: int, **arguments: object) -> None:
+    """Raise ValueError, naming the arguments, where they need more memory than the machine has.
+
+    Args:
+        needed: bytes, at least.
+        **arguments: those that decide it.
+    """
+    there = physical_memory()
+    if there is not None and needed > there:
+        names, values = " and ".join(arguments), " and ".join(map(str, arguments.values()))
+        raise ValueError(
+            f"{names}: {values} would need at least {needed:,} bytes of memory, and this machine has {there:,}"
+        )
+
+
+@cache
+def physical_memory() -> int | None:
+    """Bytes of memory of this machine; None where the system does not say."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # of Windows, and of systems without these names
+        return None

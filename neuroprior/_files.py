@@ -73,9 +73,9 @@ def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
             yield file
         os.replace(partial, path)
     except OSError as error:
-        # A full disk error does not name the file.
+        # A full disk error does not name the file, and that of an encoder has no number.
         if error.errno is None:
-            raise
+            raise OSError(f"{path}: {error}") from error
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._random import generator_on
-from neuroprior.worlds.tabular import TabularWorld
+from neuroprior.worlds.tabular import TabularWorld, check_tabular
 
 
 @torch.no_grad()
@@ -287,7 +287,7 @@ def _require(holds: bool, name: str, wanted: str, given: object) -> None:
 
 
 def _check_goal(world: TabularWorld, goal: int) -> int:
-    _require(isinstance(world, TabularWorld), "world", "a TabularWorld", type(world).__name__)
+    check_tabular(world)
     _require(goal in range(world.num_states), "goal", f"a cell from 0 to {world.num_states - 1}", goal)
     return int(goal)
 

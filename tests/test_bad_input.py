@@ -18,6 +18,8 @@ from neuroprior import (
     read_plans,
     save,
 )
+from neuroprior.planners import expected_score
+from neuroprior.report import report
 from neuroprior.values import q_learning
 from neuroprior.worlds import cube
 from tests.support.sources import refuses, seeded
@@ -69,6 +71,14 @@ def test_exact_solutions_need_a_table():
         oracle(world, world.reset(2, seeded(0)), 3)
     with refuses("world", "TabularWorld", "PocketCube"):
         q_learning(world, 0)
+    with refuses("world", "TabularWorld", "PocketCube"):
+        expected_score(world, world.reset(2, seeded(0)), torch.zeros(2, 1, 3, dtype=torch.long))
+
+
+@pytest.mark.parametrize("option", [{"max_gap": 0}, {"max_gap": 0.0}, {"num_actions": 0}, {"merge_repeats": True}])
+def test_options_of_files_are_not_for_plans_in_memory(option):
+    with refuses(next(iter(option)), "for files only"):
+        report(Plans(ACTIONS, 2), models=["counts"], **option)
 
 
 @pytest.mark.parametrize("number", [2.5, float("nan"), None, "3"])

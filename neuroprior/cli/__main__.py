@@ -21,6 +21,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError:
         print("error: the command needs more packages: pip install 'neuroprior[cli]'", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
     return run_commands("neuroprior", "Behavioural priors: statistical models of plans.", COMMANDS, arguments)
 
 

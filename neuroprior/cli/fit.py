@@ -128,6 +128,8 @@ class FitCLI(LightningCLI):
             self._check_checkpoints(model, datamodule)
         if self.trainer.is_global_zero:
             self._keep(datamodule)
+            for note in datamodule.source.notes:
+                print(f"note: {note}")
         if neural:
             self._train(model, datamodule)
         else:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+import yaml
 
 from neuroprior.planners import Planner, collect
 from neuroprior.plans import Columns, Missing, Plans, read_plans
@@ -33,12 +34,19 @@ def recipe_path(name: str) -> str:
     """The file of a recipe that is given by its path or its name.
 
     Raises:
-        ValueError: there is neither a file nor a recipe of this name.
+        ValueError: there is neither a file nor a recipe of this name, or the file is no YAML.
     """
     known = recipes()
     if not Path(name).is_file() and name not in known:
         raise ValueError(f"config: no file {name!r}, and no recipe of this name; the recipes are {', '.join(known)}")
-    return name if Path(name).is_file() else str(known[name])
+    path = Path(name) if Path(name).is_file() else known[name]
+    try:
+        whole = isinstance(yaml.safe_load(path.read_text(encoding="utf-8")), dict)
+    except (yaml.YAMLError, UnicodeDecodeError):
+        whole = False
+    if not whole:
+        raise ValueError(f"config: {name} is no recipe: YAML with sections model, data and trainer is expected")
+    return str(path)
 
 
 class PlansData(PlansModule):

@@ -78,6 +78,8 @@ def score(
             f"Training data: {sum(known):,} of {len(known):,} plans are the same as plans that it has learned from."
         )
     console = Console()
+    for note in plans.notes:
+        console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
     whole = score_bits(folder, "", bits, own).bits_per_action()
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_range, check_sizes
 from neuroprior.planners.planner import check_objective, value_of
-from neuroprior.worlds.tabular import TabularWorld
+from neuroprior.worlds.tabular import TabularWorld, check_tabular
 from neuroprior.worlds.world import check_plans
 
 
@@ -41,8 +41,7 @@ def oracle(
     """
     check_sizes(length=length)
     check_objective(objective, discount)
-    if not isinstance(world, TabularWorld):
-        raise ValueError(f"world: a TabularWorld is expected, not {type(world).__name__}")
+    check_tabular(world)
     world.check_state(state)
     maps, states, actions = world.num_maps, world.num_states, world.num_actions
     reward = world.mean_reward()
@@ -95,6 +94,7 @@ def expected_score(
         ValueError: an argument is out of range.
     """
     check_objective(objective, discount)
+    check_tabular(world)
     world.check_state(state)
     check_plans(plans, len(state), world.num_actions)
     batch, num_plans, length = plans.shape

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner
 from neuroprior.plans import Plans, is_per_step
@@ -104,6 +104,7 @@ def collect(
     if state is None:
         check_sizes(num_plans=num_plans)
         assert num_plans is not None
+        check_memory(8 * num_plans, num_plans=num_plans)
         state = world.reset(num_plans, generator)
     plan, score, _, _, lengths = planner.plan(world, state, generator)
     _, states = _step_through(world, state, plan, generator)

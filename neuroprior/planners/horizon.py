@@ -1,5 +1,6 @@
 """The horizon planner: how many actions a plan has, and so how many plans are tried, depends on their scores."""
 
+import warnings
 from typing import NamedTuple, Unpack
 
 import torch
@@ -30,6 +31,11 @@ class HorizonPlanner(SamplingPlanner):
     start, pooled a little with those from the other starts of the batch. Where no improvement is expected, plans have
     the greatest length.
 
+    Not for worlds in which actions only cost (a reward of -1 a step until the goal, say), with the objective "return":
+    as a plan may end after any action, and ends where its return is highest, the best plan is then the one that stops
+    at once. `plan` warns where it meets that. Give a `value` of the state in which a plan ends, such as minus the cost
+    still to come; or add a constant to the rewards; or take a planner of a fixed length, such as `SamplingPlanner`.
+
     Args:
         prior: proposes the candidates.
         length: the longest horizon, at least 1.
@@ -42,6 +48,9 @@ class HorizonPlanner(SamplingPlanner):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Warns:
+        UserWarning: of `plan`, where each further action of all plans that were tried first only cost.
     """
 
     def __init__(
@@ -92,6 +101,8 @@ class HorizonPlanner(SamplingPlanner):
             self.prior, depth, number, num_rollouts=rollouts, temperature=temperature, **self.goal
         )
         plans, score, ends = sampler.candidates(world, state, generator)
+        if depth == self.length:
+            self._warn_of_costs(score)
         best = decide(plans, score, ends, 0, generator)
         # At each horizon the score of a plan is that of its best prefix so far.
         so_far = score.double().cummax(2).values
@@ -100,6 +111,18 @@ class HorizonPlanner(SamplingPlanner):
         longer = self.length - depth
         steps = torch.full_like(ties, sampler.model_steps(world))
         return _Found(best._replace(plan=pad(best.plan, (0, longer))), ties, pad(moments, (0, 0, 0, longer)), steps)
+
+    def _warn_of_costs(self, score: Tensor) -> None:
+        """Warn where the `score [B, P, L]` of all prefixes only ever falls, so that each plan stops at once."""
+        if self.objective != "return" or self.value is not None or self.length == 1 or not score.numel():
+            return
+        if bool((score.diff(dim=2) <= 0).all()) and bool((score[..., -1] < score[..., 0]).any()):
+            warnings.warn(
+                "HorizonPlanner: each further action of all plans that were tried only costs, so that the best plan"
+                " stops after the first; give a value of the state in which a plan ends, or take a planner of a fixed"
+                " length",
+                stacklevel=5,
+            )
 
     def _best_horizon(self, found: "_Found", left: int) -> Tensor:
         """The horizon `[B]` with the greatest expected improvement for `left` more steps; of equals the longest."""

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, check_in_world
@@ -165,6 +165,7 @@ class PriorPlanner(Planner):
     ) -> None:
         super().__init__(**goal)
         check_sizes(length=length, num_plans=num_plans)
+        check_memory(num_plans * length, length=length, num_plans=num_plans)
         check_temperature(temperature)
         if not isinstance(prior, Steppable):
             raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")

@@ -21,6 +21,8 @@ LARGEST_INTEGER = 2**62
 BLOCK = 2**20
 """Entries that a column holds as Python's integers or texts before they become an array."""
 
+SHOWN = 8
+"""Names in a note; more are left out."""
 
 MISSING_LABELS = frozenset(("", "nan", "na", "n/a", "<na>", "null", "?", "-"))
 """What stands for no label in tables, in lower case."""
@@ -215,6 +217,20 @@ def named(values: Any, names: Sequence[str] | None) -> Any:
     if names is None:
         return values
     return [named(value, names) for value in values] if isinstance(values, list) else names[values]
+
+
+def never_notes(actions: Integers, num_actions: int) -> list[str]:
+    """A note where some of the action numbers below the largest never occur: codes from 1, say, or with gaps."""
+    never = np.setdiff1d(np.arange(num_actions), actions) if num_actions < 10**6 else np.zeros(0, np.int64)
+    if not never.size:
+        return []
+    verb = "occurs" if never.size == 1 else "occur"
+    return [f"actions are numbers from 0 to {num_actions - 1}, of which {listed(never)} never {verb}"]
+
+
+def listed(values: Sequence[Any] | NDArray[Any]) -> str:
+    """The first `SHOWN` of some values, and how many more there are."""
+    return ", ".join(map(str, values[:SHOWN])) + (f" and {len(values) - SHOWN} more" if len(values) > SHOWN else "")
 
 
 def check_distinct(what: str, names: Sequence[str] | None) -> None:

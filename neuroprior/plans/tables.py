@@ -15,7 +15,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior.plans.columns import Column, Floats, Integers, Names, check_names, is_missing, number_in, padded
+from neuroprior.plans.columns import (
+    Column,
+    Floats,
+    Integers,
+    Names,
+    check_names,
+    is_missing,
+    listed,
+    never_notes,
+    number_in,
+    padded,
+)
 
 Missing = Literal["gap", "label", "error"]
 MISSING: tuple[Missing, ...] = ("gap", "label", "error")
@@ -28,9 +39,6 @@ UNLABELLED = "missing"
 
 CLOCK, DATE = r"\s*(\d+:)?\d+:\d+([.,]\d*)?\s*", r"\s*\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([T ].*)?\s*"
 """Times that are no numbers: hours, minutes and seconds, or a date and perhaps a time of day."""
-
-SHOWN = 8
-"""Names in a note; more are left out."""
 
 
 @dataclass(frozen=True)
@@ -263,12 +271,7 @@ def fields_of(
     found: dict[str, Any] = {"action_names": action_found}
     if num_actions is None and action_found is None:
         num_actions = int(actions.max()) + 1
-        never = np.setdiff1d(np.arange(num_actions), actions) if num_actions < 10**6 else np.zeros(0)
-        if never.size:
-            notes.append(
-                f"actions are numbers from 0 to {num_actions - 1}, of which {_list(never)} never"
-                f" {'occurs' if never.size == 1 else 'occur'}"
-            )
+        notes += never_notes(actions, num_actions)
     found["num_actions"] = len(action_found) if action_found is not None else num_actions
     found["actions"] = torch.from_numpy(padded(actions, lengths, of))
     found["lengths"] = None if (lengths == lengths.max()).all() else torch.from_numpy(lengths)
@@ -291,7 +294,7 @@ def fields_of(
         found |= _named("group", group, tuple(plan_names[i] for i in kept_plans))
         notes.append("the parts of a plan form a group")
     if unused := table.unused():
-        notes.append(f"columns that are not used: {_list(unused)}")
+        notes.append(f"columns that are not used: {listed(unused)}")
     return found | {"notes": tuple(notes)}
 
 
@@ -498,7 +501,3 @@ def _alike(labels: list[str], what: str) -> list[str]:
         for key, names in alike.items()
         if key and len(names) > 1
     ]
-
-
-def _list(values: Sequence[Any] | NDArray[Any]) -> str:
-    return ", ".join(map(str, values[:SHOWN])) + (f" and {len(values) - SHOWN} more" if len(values) > SHOWN else "")

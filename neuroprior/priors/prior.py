@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_range, check_sizes, is_integer
+from neuroprior._checks import check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans import Plans, check_context, is_per_step
 from neuroprior.sampling import ancestral as sampling
 from neuroprior.sampling.draws import after_end
@@ -57,6 +57,7 @@ class Prior(nn.Module, ABC):
         sizes = {"num_actions": num_actions, "num_contexts": num_contexts, "context_size": context_size}
         required = {name: size for name, size in sizes.items() if size is not None or name == "num_actions"}
         check_sizes(**required)
+        check_memory(4 * num_actions, num_actions=num_actions)  # one row of logits
         if num_contexts is not None and context_size is not None:
             raise ValueError("num_contexts and context_size: a prior takes an index or features, not both")
         self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size

@@ -202,7 +202,7 @@ def _read(plans: Plans | str | Path, reading: Mapping[str, Any]) -> Plans:
     """The plans, without an end symbol; `reading`: further arguments of `read_plans`."""
     if not isinstance(plans, Plans):
         plans = read_plans(plans, **reading)
-    elif given := [name for name, value in reading.items() if value not in (None, False, "gap")]:
+    elif given := [name for name, value in reading.items() if not (value is None or value is False or value == "gap")]:
         raise ValueError(f"{', '.join(given)}: for files only; plans have their own")
     return plans if plans.end is None else plans.without_end()
 

@@ -5,9 +5,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import is_integer
+from neuroprior._checks import check_memory, is_integer
 from neuroprior._random import generator_on
 from neuroprior.plans import is_per_step
+from neuroprior.plans.plans import action_dtype
 from neuroprior.sampling.draws import Draw, check_temperature, levels_worth_splitting, shuffled_rows, worth_splitting
 from neuroprior.sampling.rows import rows_of
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
@@ -54,6 +55,9 @@ def sample(
         ValueError: an argument is out of range.
     """
     _check(num_plans, length, temperature, batch_size)
+    # The plans, and the uniform numbers of those that are drawn together.
+    each = action_dtype(prior.num_actions).itemsize
+    check_memory((each * num_plans + 4 * min(num_plans, batch_size)) * length, num_plans=num_plans, length=length)
     stepper = Stepper(prior)
     device = stepper.device
     context = None if context is None else torch.as_tensor(context, device=device)
@@ -115,6 +119,8 @@ def sample_in_world(
         ValueError: an argument is out of range, or prior and world differ in their number of actions.
     """
     _check(num_plans, length, temperature, 1)
+    # The plans and their rewards.
+    check_memory(5 * len(state) * num_plans * length, num_plans=num_plans, length=length)
     stepper = Stepper(prior)
     logits, hidden = stepper.start_in(world, state)
     generator, batch = generator_on(generator, logits.device), len(state)

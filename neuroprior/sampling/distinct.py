@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import generator_on, gumbel
 from neuroprior.plans import action_dtype, is_per_step
 from neuroprior.sampling.draws import check_temperature
@@ -310,6 +310,7 @@ def _start(prior: Steppable, context: Tensor | None, num_sets: int | None, tempe
 
 def _check(prior: Steppable, num_plans: int, length: int, temperature: float) -> None:
     check_sizes(num_plans=num_plans, length=length)
+    check_memory(num_plans * length, num_plans=num_plans, length=length)
     check_temperature(temperature)
     if prior.num_actions**length < num_plans:
         raise ValueError(

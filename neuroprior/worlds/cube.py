@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range
+from neuroprior._checks import check_count, check_range
 from neuroprior._random import generator_on
 from neuroprior.worlds.world import World
 
@@ -80,6 +80,7 @@ class PocketCube(World):
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`: the solved cube after `scramble` independent random moves."""
+        check_count("batch_size", batch_size)
         generator = generator_on(generator, self.device)
         state = torch.zeros(batch_size, dtype=torch.long, device=self.device)
         for _ in range(self.scramble):

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_count
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 
@@ -62,6 +63,7 @@ class EpisodicWorld(TabularWorld):
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`, drawn as episodes start; uniform over reward maps."""
+        check_count("batch_size", batch_size)
         generator = generator_on(generator, self.device)
         where = self.starts.nonzero()[:, 0]
         upper = self.starts[where].double().cumsum(0)

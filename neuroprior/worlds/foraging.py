@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, check_sizes
+from neuroprior._checks import check_count, check_range, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.worlds.grid import GridWorld
 from neuroprior.worlds.tabular import TabularWorld
@@ -57,6 +57,7 @@ class ForagingWorld(World):
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size, 2 + K]` at time 0: random cells, with food at random places of the first season."""
+        check_count("batch_size", batch_size, 8 * (2 + self.num_items))
         generator = generator_on(generator, self.table.device)
         cell = self.table.cell(self.table.reset(batch_size, generator))
         nowhere = cell.new_full((batch_size, self.num_items), self.num_places)

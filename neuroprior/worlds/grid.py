@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_count, check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 
@@ -86,6 +86,7 @@ class GridWorld(TabularWorld):
         """States `[batch_size]`, uniform over the squares that are no walls, headings and reward maps."""
         if self._free is None:
             return super().reset(batch_size, generator)
+        check_count("batch_size", batch_size)
         generator, free = generator_on(generator, self.device), len(self._free)
         draw = torch.randint(self.num_maps * free, (batch_size,), generator=generator, device=self.device)
         return self._free[draw % free] + draw.div(free, rounding_mode="floor") * self.num_states
@@ -141,6 +142,7 @@ def gridworld(
     if not 0 < reward_power < float("inf"):
         raise ValueError(f"gridworld: reward_power must be positive and finite, not {reward_power}")
     check_sizes(height=height, width=width, num_worlds=num_worlds)
+    check_memory(8 * height * width * num_worlds, height=height, width=width, num_worlds=num_worlds)
     if edges not in ("wall", "torus"):
         raise ValueError(f'gridworld: edges must be "wall" or "torus", not {edges!r}')
     uniform = torch.rand(num_worlds, height * width, generator=torch.Generator().manual_seed(seed))

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, is_integer
+from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior._random import generator_on
 from neuroprior.worlds.outcomes import Outcomes
 from neuroprior.worlds.world import Rollout, World, check_plans, join_states
@@ -129,6 +129,7 @@ class TabularWorld(World):
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`, uniform over cells and reward maps."""
+        check_count("batch_size", batch_size)
         generator = generator_on(generator, self.device)
         return torch.randint(self.num_maps * self.num_states, (batch_size,), generator=generator, device=self.device)
 
@@ -316,3 +317,9 @@ def _checked_legal(legal: Tensor, next_state: Tensor) -> Tensor:
     if len(stuck):
         raise ValueError(f"legal_actions[{int(stuck[0])}]: this state has no legal action; every state needs one")
     return legal.to(next_state.device)
+
+
+def check_tabular(world: object) -> None:
+    """Raise ValueError unless a world is a table, which exact solutions need."""
+    if not isinstance(world, TabularWorld):
+        raise ValueError(f"world: a TabularWorld is expected, not {type(world).__name__}")

@@ -1,12 +1,20 @@
 """What programs say and return when something goes wrong."""
 
+import errno
+import json
+import subprocess
 import sys
+from pathlib import Path
 from typing import Literal
 
 import pytest
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
+from neuroprior import load
+from neuroprior._interrupts import is_command
+from neuroprior.cli.__main__ import main as neuroprior_main
 from neuroprior.cli.program import Command, run_commands, run_program
+from train.__main__ import main as train_main
 
 
 @pytest.mark.parametrize(
@@ -127,3 +135,75 @@ def test_help_lists_commands_and_options(capsys):
     out = " ".join(capsys.readouterr().out.split())
     assert "usage: tool make" in out
     assert "In which worlds, one after another." in out
+
+
+@pytest.mark.parametrize("module", ["neuroprior.cli", "eval", "train"])
+@pytest.mark.parametrize("after", [0.15, 0.6])
+def test_ctrl_c_while_libraries_load(module, after):
+    """It takes about two seconds until a command runs: no traceback before that either."""
+    arguments = {"eval": ["plans", "none.csv"]}.get(module, ["fit", "--config", "none"])
+    line = [sys.executable, "-c", LATE_INTERRUPT.format(after), sys.executable, "-m", module, *arguments]
+    ended = subprocess.run(line, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout) == (130, ""), ended
+    assert ended.stderr.startswith("interrupted")
+    assert ended.stderr.count("\n") == 1
+
+
+LATE_INTERRUPT = """
+import signal, subprocess, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+running = subprocess.Popen(sys.argv[1:])
+time.sleep({})
+running.send_signal(signal.SIGINT)
+sys.exit(running.wait())
+"""
+"""Tests may run where Ctrl-C is ignored, which processes inherit."""
+
+
+@pytest.mark.parametrize(
+    ("line", "is_one"),
+    [
+        ("python -m neuroprior.cli fit", True),
+        ("python /usr/bin/neuroprior report x.csv", True),
+        ("python -W error -m eval paper", True),
+        ("python mine.py", False),
+        ("python", False),
+        ("python -m", False),
+        ("python -m pytest tests", False),
+        ("python -c pass neuroprior", False),
+    ],
+)
+def test_which_processes_end_at_once(line, is_one):
+    assert is_command(line.split()) == is_one
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", bytes(range(256)), b"a: [", b"just words", b""])
+def test_a_config_that_is_none(content, tmp_path, capsys):
+    path = tmp_path / "recipe.yaml"
+    path.write_bytes(content)
+    for program in (neuroprior_main, train_main):
+        assert program(["fit", "--config", str(path), "--out", str(tmp_path / "run")]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"error: config: {path} is no recipe")
+        assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), OSError("encoder error -2")])
+def test_no_room_for_the_last_figure(error, tmp_path, capsys, monkeypatch):
+    """The run fails with one line, and what was saved before stays."""
+    plans, out = tmp_path / "plans.jsonl", tmp_path / "run"
+    plans.write_text("\n".join('{"actions": [0, 1, 0, 1, 1]}' for _ in range(40)))
+
+    def full(self, *_, **__):
+        raise error
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", full)
+    options = ["--model.prior.hidden_size", "4", "--trainer.max_steps", "10", "--trainer.accelerator", "cpu"]
+    assert neuroprior_main(["fit", "--config", "gru", "--data.file", str(plans), "--out", str(out), *options]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert str(out / "learning_curve.png") in said
+    assert not (out / "learning_curve.png").exists()
+    assert json.loads((out / "metrics.json").read_text())["rows"]
+    assert load(out).num_actions == 2

@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 
 import pytest
 import torch
@@ -176,3 +177,26 @@ def test_bad_options(given, word, tmp_path, capsys):
     text = capsys.readouterr().err
     assert text.count("\n") == 1
     assert word in text
+
+
+def corridor(reward):
+    """Five cells in a row; the last is the goal, and ends the episode. `reward [5]`: on arrival."""
+    right = torch.tensor([1, 2, 3, 4, 4])
+    left = torch.tensor([0, 0, 1, 2, 4])
+    return TabularWorld(torch.stack([left, right], 1), torch.tensor([reward]))
+
+
+def test_where_actions_only_cost_it_warns():
+    """Of a return of costs the best prefix is the shortest; with the cost still to come as value it is the goal."""
+    world, start = corridor([-1.0, -1.0, -1.0, -1.0, 0.0]), torch.zeros(3, dtype=torch.long)
+    with pytest.warns(UserWarning, match="only costs.*give a value"):
+        stopped = HorizonPlanner(UniformPrior(2), 6, 400, objective="return").plan(world, start, seeded(0))
+    assert stopped.lengths.tolist() == [1] * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        to_go = torch.tensor([-4.0, -3.0, -2.0, -1.0, 0.0])
+        planner = HorizonPlanner(UniformPrior(2), 6, 400, objective="return", value=lambda state: to_go[state])
+        assert (planner.plan(world, start, seeded(0)).final_state == 4).all()
+        for reward in ([0.0] * 5, [0.0, 0.0, 0.0, 0.0, 1.0], [-1.0, 3.0, -1.0, -1.0, -1.0]):
+            HorizonPlanner(UniformPrior(2), 6, 400, objective="return").plan(corridor(reward), start, seeded(0))
+        HorizonPlanner(UniformPrior(2), 6, 400).plan(world, start, seeded(0))

@@ -287,3 +287,23 @@ def test_an_old_file_is_replaced_or_stays(tmp_path):
         write_plans(Plans(torch.tensor([[1]]), 2, action_names=["a", "\ud800"]), path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+CODES = Plans(torch.tensor([[1, 2, 3], [3, 1, 1]]), 4)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.tsv", "a.jsonl", "a.npz", "steps.csv"])
+def test_codes_from_1_are_noted(name, tmp_path):
+    """Action 0 never occurs: that there is one more action than the user thinks is said, unless the user said it."""
+    path = tmp_path / name
+    if name == "a.npz":
+        np.savez(path, actions=CODES.actions.numpy())
+    elif name == "a.jsonl":
+        path.write_text('{"actions": [1, 2, 3]}\n{"actions": [3, 1, 1]}\n')
+    else:
+        write_plans(CODES, path, layout="step" if name == "steps.csv" else None)
+    (note,) = read_plans(path).notes
+    assert note == "actions are numbers from 0 to 3, of which 0 never occurs"
+    assert read_plans(path).num_actions == 4
+    assert not read_plans(path, num_actions=4).notes
+    assert not read_plans(path, action_names=list("abcd")).notes

@@ -1,5 +1,7 @@
 """Stepped environments against the environments themselves: by copies, by replaying, and what is refused."""
 
+import warnings
+
 import gymnasium
 import pytest
 import torch
@@ -52,7 +54,7 @@ def test_rollouts_are_the_environments(name):
 
 
 def test_steps_continue_from_any_state():
-    world = from_gymnasium("CartPole-v1", horizon=40)
+    world = from_gymnasium("CartPole-v1", seeds=[0], horizon=40)
     plan = torch.randint(2, (1, 1, 16), generator=seeded(1))
     whole = world.rollout(world.reset(1), plan)
     half = world.rollout(world.reset(1), plan[:, :, :8]).final_state[:, 0]
@@ -60,12 +62,12 @@ def test_steps_continue_from_any_state():
     assert rest.final_state.equal(whole.final_state)
     assert rest.rewards[0, 0].equal(whole.rewards[0, 0, 8:])
     # Another world that never met these states knows them, too.
-    other = from_gymnasium("CartPole-v1", horizon=40)
+    other = from_gymnasium("CartPole-v1", seeds=[0], horizon=40)
     assert other.observe(whole.final_state[0]).equal(world.observe(whole.final_state[0]))
 
 
 def test_an_end_is_kept():
-    world = from_gymnasium("CartPole-v1", horizon=20)
+    world = from_gymnasium("CartPole-v1", seeds=[0], horizon=20)
     fallen = world.rollout(world.reset(1), torch.ones(1, 1, 15, dtype=torch.long)).final_state[:, 0]
     assert fallen[0, 1] < 15
     assert fallen[0, 2] == 1
@@ -77,7 +79,7 @@ def test_an_end_is_kept():
 @pytest.mark.parametrize("kept", [1, 5])
 def test_what_is_not_kept_is_found_again(kept):
     plans = every_plan(2, 6)[None]
-    first, second = (from_gymnasium("CartPole-v1", horizon=12) for _ in range(2))
+    first, second = (from_gymnasium("CartPole-v1", seeds=[0], horizon=12) for _ in range(2))
     one = first.rollout(first.reset(1), plans, keep_states=True)
     shown = first.observe(one.final_state[0])
     second.max_kept = kept
@@ -143,7 +145,7 @@ def test_a_plan_takes_as_many_steps_as_it_has_actions(monkeypatch):
 
 
 def test_a_stepped_minigrid_conforms():
-    check_world(from_gymnasium("MiniGrid-DoorKey-5x5-v0", method="step"), num_states=10)
+    check_world(from_gymnasium("MiniGrid-DoorKey-5x5-v0", method="step", seeds=[0]), num_states=10)
 
 
 def test_a_planner_finds_the_end_of_the_corridor():
@@ -180,3 +182,19 @@ def test_refusals():
     ):
         with refuses(words):
             world.check_state(wrong)
+
+
+def test_one_start_for_all_resets_is_said():
+    """CartPole draws its start: with one seed all resets are one state, and with more there are as many starts."""
+    with pytest.warns(UserWarning, match="seed 0 alone.*seeds=range"):
+        world = from_gymnasium("CartPole-v1", method="step")
+    assert len(world.reset(20, seeded(0)).unique(dim=0)) == 1
+    first = world.observe(world.reset(1, seeded(0)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        several = from_gymnasium("CartPole-v1", method="step", seeds=range(5))
+        from_gymnasium(environments.Corridor(), method="step")
+    starts = several.reset(60, seeded(0))
+    assert len(several.observe(starts).unique(dim=0)) == 5
+    zero = several.observe(starts[several.layout(starts) == 0][:1])
+    torch.testing.assert_close(zero, first)

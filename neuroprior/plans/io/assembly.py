@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from neuroprior.plans.columns import Floats, Integers, Names, padded
+from neuroprior.plans.columns import Floats, Integers, Names, never_notes, padded
 from neuroprior.plans.plans import Plans, action_dtype
 
 
@@ -46,7 +46,10 @@ def assembled(
         num_actions = len(action_names)
     if num_actions is None and not len(actions):
         raise ValueError(f"{source}: no plan has an action, so num_actions must be given")
-    num_actions = int(actions.max()) + 1 if num_actions is None else num_actions
+    notes: list[str] = []
+    if num_actions is None:
+        num_actions = int(actions.max()) + 1
+        notes = never_notes(actions, num_actions)
     dtype = torch.empty(0, dtype=action_dtype(num_actions)).numpy().dtype
     longest = int(lengths.max()) if len(lengths) else 0
     if context is not None:
@@ -63,6 +66,7 @@ def assembled(
             context_names,
             group_names,
             end,
+            notes=tuple(notes),
         )
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error

@@ -1,6 +1,7 @@
 """Plans in NumPy's `.npz`: the arrays of `Plans` by their names; nothing is pickled."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._files import written_whole
-from neuroprior.plans.columns import Names, check_file
+from neuroprior.plans.columns import Names, check_file, never_notes
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
 
@@ -32,9 +33,14 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
     if known is None and "action_names" in names:
         known = len(names["action_names"])
     try:
+        guessed = known is None and action_names is None
         if known is None:
-            known = len(action_names) if action_names is not None else _largest(numbers) + 1
-        return renamed(Plans(num_actions=known, end=end, **numbers, **names), action_names, str(path))
+            known = _largest(numbers) + 1 if action_names is None else len(action_names)
+        plans = Plans(num_actions=known, end=end, **numbers, **names)
+        if guessed:
+            notes = never_notes(plans.actions[plans.mask()].numpy(), known)
+            plans = replace(plans, notes=tuple(notes))
+        return renamed(plans, action_names, str(path))
     except (ValueError, TypeError, RuntimeError) as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise ValueError(f"{path}: {reason.splitlines()[0]}") from error

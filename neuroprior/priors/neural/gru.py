@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
 
 
@@ -37,6 +37,7 @@ class GRUPrior(NeuralPrior):
         seed: int = 0,
     ) -> None:
         check_sizes(hidden_size=hidden_size, num_layers=num_layers)
+        check_memory(24 * num_layers * hidden_size**2, num_layers=num_layers, hidden_size=hidden_size)
         self.hidden_size, self.num_layers = hidden_size, num_layers
         super().__init__(num_actions, window, lags, dropout, num_contexts, context_size, seed)
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.prior import Prior
@@ -295,6 +295,10 @@ class Embedding(nn.Module):
         self, num_actions: int, width: int, lags: int, num_contexts: int | None, context_size: int | None
     ) -> None:
         super().__init__()
+        check_memory(4 * (num_actions + 1) * width, num_actions=num_actions, width=width)
+        check_memory(4 * LAG_WIDTH * width * lags, lags=lags, width=width)
+        for name, number in (("num_contexts", num_contexts), ("context_size", context_size)):
+            check_memory(4 * width * (number or 0), **{name: number, "width": width})
         self.lags, self.nothing = lags, num_actions + 1
         self.action = nn.Embedding(num_actions + 1, width)
         self.past = nn.Embedding(num_actions + 2, LAG_WIDTH, padding_idx=self.nothing) if lags > 1 else None

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
 from neuroprior.sampling.rows import extended, states_with_room
 
@@ -47,6 +47,7 @@ class TransformerPrior(NeuralPrior):
         check_sizes(width=width, num_layers=num_layers, num_heads=num_heads)
         if width % (2 * num_heads):
             raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
+        check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
         self.width, self.num_layers, self.num_heads = width, num_layers, num_heads
         self.span: int | None = None
         super().__init__(num_actions, window, lags, dropout, num_contexts, context_size, seed)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, is_integer
+from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior._random import generator_on
 from neuroprior.worlds.gymnasium.environment import RUNNING, Episode, Transition, action_names, stacked
 from neuroprior.worlds.gymnasium.states import exact_copier, nondeterminism
@@ -66,11 +66,20 @@ class SteppedWorld(World):
         self._kept: OrderedDict[tuple[int, ...], _Kept] = OrderedDict()
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """States `[batch_size, 3 + horizon]` before the first action, with equal probability for each seed."""
+        """States `[batch_size, 3 + horizon]` before the first action, with equal probability for each seed.
+
+        Those of one seed are all the same: give `from_gymnasium` as many `seeds` as starts are wanted.
+        """
+        check_count("batch_size", batch_size, 8 * (_ACTIONS + self.horizon))
         generator = generator_on(generator, "cpu")
         state = torch.zeros(batch_size, _ACTIONS + self.horizon, dtype=torch.long)
         state[:, _SEED] = torch.randint(len(self.seeds), (batch_size,), generator=generator)
         return state
+
+    def starts_alike(self, seed: int) -> bool:
+        """Whether the first observation after a reset from another seed is that of this world's first seed."""
+        self._at, self._episode.env = (), self._env
+        return np.array_equal(self._episode.reset(seed), self._episode.reset(self.seeds[0]), equal_nan=True)
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """See `World.step`. `generator` draws nothing: what is random is determined by the seed.

@@ -1,5 +1,6 @@
 """`from_gymnasium`: Gymnasium environments as worlds."""
 
+import warnings
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -40,7 +41,8 @@ def from_gymnasium(
       states and of every tenth), and random walks are compared with the environment.
     - "step": any environment, by stepping copies of it, slowly. A state is the history of actions since the start,
       which is replayed where the environment cannot be copied; the result is a `SteppedWorld`. What is random is
-      determined by the seed: a plan that is executed gives what it gave when it was tried.
+      determined by the seed: a plan that is executed gives what it gave when it was tried. There are as many starts as
+      `seeds`, so that with one seed every `reset` is the same; where other seeds start otherwise, that is a warning.
 
     "auto" takes a table where there is one, steps where observations are real numbers, and enumerates otherwise.
 
@@ -69,6 +71,9 @@ def from_gymnasium(
         ImportError: Gymnasium, or the package of the environment, is not installed.
         ValueError: the environment cannot be made, its actions are not discrete, it does not do what the method needs
             (the message says what), or an argument is out of range.
+
+    Warns:
+        UserWarning: the method is "step", no `seeds` are given, and the environment starts otherwise with another seed.
     """
     if method not in METHODS:
         raise ValueError(f'method: "auto", "table", "enumerate" or "step" is expected, not {method!r}')
@@ -87,14 +92,21 @@ def from_gymnasium(
     if method == "step":
         if starts == "any":
             raise ValueError('starts: "any" needs a table of all states, which method="step" does not have')
-        return SteppedWorld(opened, chosen, horizon)
+        world = SteppedWorld(opened, chosen, horizon)
+        if seeds is None and not world.starts_alike(seed + 1):
+            warnings.warn(
+                f"env: it starts otherwise with another seed, but this world has seed {seed} alone: every reset is the"
+                " same state; for several starts give, for example, seeds=range(100)",
+                stacklevel=2,
+            )
+        return world
     if method == "table" and seeds is not None:
         raise ValueError('seeds: a table read from P has one layout; use method="enumerate"')
     if method == "table":
-        world = read_table(opened)
+        table = read_table(opened)
     else:
-        world = enumerate_states(opened, chosen, max_states, progress, observations)
-    return world.start_anywhere() if starts == "any" else world
+        table = enumerate_states(opened, chosen, max_states, progress, observations)
+    return table.start_anywhere() if starts == "any" else table
 
 
 def _has_real_numbers(space: Any) -> bool:
