@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from neuroprior.planners import Planner, collect
-from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.plans import Columns, Missing, PastDurations, Plans, read_plans
 from neuroprior.priors import Prior
 from neuroprior.priors.fitting import context_arguments, make_prior
 from neuroprior.training import PlansModule, PriorModule, Settings
@@ -66,6 +66,8 @@ class PlansData(PlansModule):
         planner: that chooses them, such as `ExhaustivePlanner`.
         num_plans: how many are collected.
         context: the world's observations as context: none, that at the start, or that before each action.
+        past_durations: how many of the last actions' durations are a context of each action (features, for gru and
+            transformer); 0 for none.
         end: close each plan with a symbol for its end, so that the prior learns how long plans are.
         validation: share of plans (of groups, where there are any) for early stopping and the choice of baselines.
         held_out: share of plans (or groups) for the table at the end; nothing is learned or chosen on them.
@@ -90,6 +92,7 @@ class PlansData(PlansModule):
         planner: Planner | None = None,
         num_plans: int = 10_000,
         context: Literal["plan", "step"] | None = None,
+        past_durations: int = 0,
         end: bool = False,
         validation: float = 0.1,
         held_out: float = 0.1,
@@ -104,6 +107,8 @@ class PlansData(PlansModule):
                 raise ValueError(f"data.{name}: a share between 0 and 1 is expected, not {share}")
         if validation + held_out >= 1:
             raise ValueError(f"data: validation and held_out leave nothing to learn from: {validation} + {held_out}")
+        if past_durations < 0:
+            raise ValueError(f"data.past_durations: at least 0 is expected, not {past_durations}")
         settings = Settings(max_steps, batch_size, window, check_every=check_every)
         if file is not None:
             self.source = read_plans(
@@ -133,6 +138,12 @@ class PlansData(PlansModule):
                 raise ValueError(
                     f"data.{name}: too few actions are left for it, {int(part.mask().sum())}; more plans are needed"
                 )
+        self.past_durations: PastDurations | None = None
+        if past_durations:
+            self.past_durations = past = PastDurations.of(self.learned_from, past_durations)
+            self.plans, self.held_out = past.added_to(self.plans), past.added_to(self.held_out)
+            self.learned_from, self.chosen_on = past.added_to(self.learned_from), past.added_to(self.chosen_on)
+            self.num_contexts = None
         super().__init__(self.learned_from, self.chosen_on, settings, seed)
         self.settings = replace(settings, validation=validation)
 
@@ -172,6 +183,12 @@ class PriorModel(PriorModule):
                 "model.prior: it cannot take the context of these plans; use --model.use_context false, or another"
                 f" prior ({error})"
             ) from error
+        if made.takes_context:
+            made.past_durations = data.past_durations
+        elif data.past_durations is not None and use_context:
+            raise ValueError(
+                f"data.past_durations: a {type(made).__name__} takes no features; take a neural prior, or leave it out"
+            )
         super().__init__(made, learning_rate, weight_decay, data.seed)
 
 

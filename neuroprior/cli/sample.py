@@ -1,6 +1,7 @@
 """`neuroprior sample`: new plans from a saved prior."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,7 +10,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from neuroprior.plans import Plans, write_plans
-from neuroprior.priors import Prior, load
+from neuroprior.priors import Prior, SemiMarkovPrior, load
 
 
 def sample(
@@ -21,7 +22,7 @@ def sample(
     seed: NonNegativeInt = 0,
     out: str | None = None,
 ) -> None:
-    """Sample new plans from a saved prior, with the names of its actions.
+    """Sample new plans from a saved prior, with the names of its actions; from a semi-Markov prior, with durations.
 
     Args:
         folder: a saved prior, as `neuroprior fit` writes it.
@@ -35,8 +36,12 @@ def sample(
     prior = load(folder)
     generator = torch.Generator().manual_seed(seed)
     given = _context(prior, context, folder, num_plans)
-    actions = prior.sample(num_plans, length, given, temperature=temperature, generator=generator)
-    plans = Plans(actions, prior.num_actions, action_names=prior.action_names, end=prior.end)
+    if isinstance(prior, SemiMarkovPrior):
+        plans = prior.sample_plans(num_plans, length, given, temperature=temperature, generator=generator)
+        plans = replace(plans, context=None, context_names=None)
+    else:
+        actions = prior.sample(num_plans, length, given, temperature=temperature, generator=generator)
+        plans = Plans(actions, prior.num_actions, action_names=prior.action_names, end=prior.end)
     if prior.end is not None:
         plans = plans.without_end()
     if out is not None:

@@ -9,6 +9,7 @@ from neuroprior.plans.io import (
     write_minari,
     write_plans,
 )
+from neuroprior.plans.past_durations import PastDurations
 from neuroprior.plans.plans import Plans, action_dtype, all_plans, check_context, is_per_step
 from neuroprior.plans.tables import Columns, Missing
 
@@ -17,6 +18,7 @@ __all__ = [
     "Columns",
     "Missing",
     "FEWEST_UNITS",
+    "PastDurations",
     "Plans",
     "action_dtype",
     "all_plans",

@@ -355,6 +355,15 @@ def check_context(context: Tensor, num_plans: int, length: int) -> None:
         raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
 
 
+def durations_of(plans: Plans) -> Tensor:
+    """The durations `[N, L]` of plans; ValueError where they have none."""
+    if plans.durations is None:
+        raise ValueError(
+            "durations: these plans have none; give Plans(durations=), or a file with start and stop times"
+        )
+    return plans.durations
+
+
 def is_per_step(context: Tensor | None) -> bool:
     """True for a context per step (`[N, L]`, `[N, L, C]`), False for none or one per plan (`[N]`, `[N, C]`)."""
     return context is not None and context.dim() == (2 if is_integer(context) else 3)

@@ -1,6 +1,7 @@
 """Priors: distributions over action sequences, learned from plans, that samplers step through."""
 
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
+from neuroprior.priors.durations import DurationLaw, DurationModel, SemiMarkovPrior
 from neuroprior.priors.ensembles import MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
@@ -12,6 +13,8 @@ from neuroprior.priors.uniform import UniformPrior
 
 __all__ = [
     "ContextTreePrior",
+    "DurationLaw",
+    "DurationModel",
     "GRUPrior",
     "Leaf",
     "Macro",
@@ -19,6 +22,7 @@ __all__ = [
     "MarkovPrior",
     "MixturePrior",
     "Prior",
+    "SemiMarkovPrior",
     "StackedPrior",
     "TransformerPrior",
     "UniformPrior",

@@ -1,6 +1,5 @@
 """Fitting in one call: a prior is made for the plans, and learns from them."""
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -9,9 +8,10 @@ from torch import Tensor
 
 from neuroprior.plans import Plans
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
+from neuroprior.priors.durations import SemiMarkovPrior
 from neuroprior.priors.ensembles import MixturePrior, StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
-from neuroprior.priors.prior import Prior, as_actions
+from neuroprior.priors.prior import Prior, as_actions, construct
 from neuroprior.priors.uniform import UniformPrior
 
 MakePrior = Callable[..., Prior]
@@ -59,10 +59,7 @@ def make_prior(plans: Plans, prior: MakePrior, use_context: bool = True) -> Prio
         prior: its class, or a function that makes it; see `fit`.
         use_context: False: the prior is made without context.
     """
-    contexts = context_arguments(plans) if use_context else {}
-    parameters = inspect.signature(prior).parameters
-    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    return prior(plans.num_actions, **{name: c for name, c in contexts.items() if takes_any or name in parameters})
+    return construct(prior, plans.num_actions, context_arguments(plans) if use_context else {})
 
 
 def context_arguments(plans: Plans) -> dict[str, int]:
@@ -93,5 +90,6 @@ NAMES: dict[str, MakePrior] = {
     "transformer": TransformerPrior,
     "stacked": StackedPrior,
     "mixture": _mixture,
+    "semi-markov": SemiMarkovPrior,
 }
 """Priors that `fit` knows by name."""

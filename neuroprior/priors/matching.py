@@ -14,7 +14,8 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
     """Plans as a prior that was fitted elsewhere can score them.
 
     Actions and contexts are renumbered by their names, where both the plans and the prior have names; the context is
-    left out for a prior without one, and an end symbol is added for a prior that has one.
+    left out for a prior without one, and an end symbol is added for a prior that has one. The durations of past actions
+    become features for a prior that was trained with them.
 
     Args:
         plans: N plans without an end symbol.
@@ -22,7 +23,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
         name: of the prior, for messages.
 
     Raises:
-        ValueError: the prior does not know one of the actions or contexts.
+        ValueError: the prior does not know one of the actions or contexts, or takes durations that plans do not have.
     """
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
@@ -30,7 +31,8 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
     plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
     if not prior.takes_context:
         plans = replace(plans, context=None, context_names=None)
-    return plans if prior.end is None else plans.with_end()
+    plans = plans if prior.end is None else plans.with_end()
+    return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
 
 
 def learned_names(prior: Prior) -> list[str] | None:

@@ -2,15 +2,15 @@
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, replace
 from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
 from neuroprior._checks import check_memory, check_range, check_sizes, is_integer
-from neuroprior.plans import Plans, check_context, is_per_step
+from neuroprior.plans import PastDurations, Plans, check_context, is_per_step
 from neuroprior.sampling import ancestral as sampling
 from neuroprior.sampling.draws import after_end
 
@@ -37,6 +37,8 @@ class Prior(nn.Module, ABC):
         end: the action that ends a plan, as it was in the plans that the prior learned from (see `Plans.with_end`), or
             None. After it, it has probability 1 in `log_prob` and in samples.
         action_names, context_names: names of the actions and contexts, as they were in these plans, or None.
+        past_durations: how the durations of the last actions were made features of its context, or None;
+            `neuroprior.priors.match_plans` does the same to other plans. Whoever trains the prior so sets it.
 
     Raises:
         ValueError: an argument is out of range.
@@ -65,6 +67,7 @@ class Prior(nn.Module, ABC):
         self.end: int | None = None
         self.action_names: tuple[str, ...] | None = None
         self.context_names: tuple[str, ...] | None = None
+        self.past_durations: PastDurations | None = None
         self.register_buffer("_anchor", torch.zeros(()), persistent=False)
 
     @property
@@ -93,7 +96,8 @@ class Prior(nn.Module, ABC):
     def learned(self) -> dict[str, Any]:
         """What `fit` found that is neither weights nor an argument (JSON values); saved with the prior."""
         names = {"action_names": self.action_names, "context_names": self.context_names}
-        return {"context_per": self.context_per, "end": self.end} | names
+        past = {} if self.past_durations is None else {"past_durations": asdict(self.past_durations)}
+        return {"context_per": self.context_per, "end": self.end} | names | past
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
@@ -116,6 +120,8 @@ class Prior(nn.Module, ABC):
         self.end = end
         self.action_names = _names("action_names", learned, self.num_actions)
         self.context_names = _names("context_names", learned, self.num_contexts or 0)
+        past = learned.get("past_durations")
+        self.past_durations = None if past is None else PastDurations(**past)
 
     @abstractmethod
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -333,6 +339,19 @@ class Prior(nn.Module, ABC):
                 raise ValueError(
                     f"{name}: not a setting of {type(self).__name__}.fit, which takes {', '.join(known) or 'none'}"
                 )
+
+
+def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[str, int]) -> Prior:
+    """A prior from its class, or a function that makes it.
+
+    Args:
+        make: called with the number of actions, and those of `contexts` that it takes.
+        num_actions: A.
+        contexts: `num_contexts` or `context_size`, or none.
+    """
+    parameters = inspect.signature(make).parameters
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    return make(num_actions, **{name: c for name, c in contexts.items() if takes_any or name in parameters})
 
 
 def as_actions(plans: Any) -> Tensor:

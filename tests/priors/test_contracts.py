@@ -15,6 +15,7 @@ from neuroprior.priors import (
     MarkovPrior,
     MixturePrior,
     Prior,
+    SemiMarkovPrior,
     StackedPrior,
     TransformerPrior,
     UniformPrior,
@@ -31,6 +32,8 @@ COUNTS = {
     "markov": lambda: MarkovPrior(A, 2, smoothing=0.3, initial="lower", backoff="dirichlet"),
     "markov context": lambda: MarkovPrior(A, 1, num_contexts=C),
     "tree": lambda: ContextTreePrior(A, 3, beta=0.25, alpha=0.5, base="uniform"),
+    "semi-markov": lambda: SemiMarkovPrior(A, MarkovPrior(A, 2), laws=["gamma", "weibull"], transitions=False),
+    "semi-markov context": lambda: SemiMarkovPrior(A, num_contexts=C),
     "macro of counts": lambda: MacroPrior(A, MarkovPrior(A + 2, 1), by="compression"),
 }
 NETWORKS = {
@@ -40,6 +43,7 @@ NETWORKS = {
     "stacked": lambda: StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C),
     "mixture": lambda: MixturePrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8), MacroPrior(A, GRUPrior(A + 1, 8))]),
     "nested mixture": lambda: MixturePrior(A, [MixturePrior(A, [StackedPrior(A, 8, depth=2)]), UniformPrior(A)]),
+    "semi-markov gru": lambda: SemiMarkovPrior(A, GRUPrior(A, 8, context_size=2)),
     "macro": lambda: MacroPrior(A, GRUPrior(A + 2, 8)),
 }
 ALL = COUNTS | NETWORKS
@@ -52,7 +56,7 @@ def plans_for(prior: Prior, num: int = 40) -> Plans:
         context = torch.randint(C, (num, 6), generator=seeded(1))
     elif prior.context_size is not None:
         context = torch.randn(num, 6, 2, generator=seeded(1))
-    return Plans(actions, A, context=context)
+    return Plans(actions, A, context=context, durations=torch.rand(num, 6, generator=seeded(2)))
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -1,6 +1,7 @@
 """The conformance suites: every prior and world of the library passes, and broken ones fail with a message."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -20,6 +21,7 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
+from neuroprior.priors import SemiMarkovPrior
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
 from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze
@@ -49,6 +51,7 @@ PRIORS = {
     "markov-3, dirichlet, context a step": lambda: MarkovPrior(
         3, 3, num_contexts=4, backoff="dirichlet", initial="lower"
     ).fit(random_plans(3, index_context(60, 5))),
+    "semi-markov": lambda: SemiMarkovPrior(4).fit(replace(random_plans(4), durations=torch.ones(60, 5))),
     "context tree untrained": lambda: ContextTreePrior(4),
     "context tree": lambda: ContextTreePrior(4, 3).fit(random_plans(4)),
     "context tree, one action": lambda: ContextTreePrior(1, 2).fit(random_plans(1)),

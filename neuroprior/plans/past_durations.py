@@ -1,0 +1,93 @@
+"""How long the last actions took, as a context of the next action."""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from neuroprior._checks import check_sizes
+from neuroprior.plans.plans import Plans, durations_of, is_per_step
+
+QUARTILES = 1.349
+"""Standard deviations between the quartiles of a normal distribution."""
+
+MOST = 4.0
+"""Standardised logarithms are between -MOST, which a duration of 0 has, too, and MOST."""
+
+
+@dataclass(frozen=True)
+class PastDurations:
+    """The durations of the last actions as features, so that a neural prior can predict the next action from them.
+
+    Before each action, for each of the last `number` actions, the last one first: the standardised logarithm of its
+    duration, and 1 where that is unknown or there was no such action (the logarithm is then 0), else 0. The duration of
+    the action that is to be predicted, and all later ones, are not among them.
+
+    Attributes:
+        number: k, how many of the last actions.
+        center, spread: of the logarithms of durations above 0; what is known of the plans that a prior learns from.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    number: int
+    center: float
+    spread: float
+
+    def __post_init__(self) -> None:
+        check_sizes(number=self.number)
+        if not -1e3 < self.center < 1e3 or not 0 < self.spread < 1e3:
+            raise ValueError(
+                f"center and spread: of logarithms of times are expected, not {self.center}, {self.spread}"
+            )
+
+    @classmethod
+    def of(cls, plans: Plans, number: int = 1) -> "PastDurations":
+        """With the median, and the standard deviation by the quartiles, of the logarithms of the known durations.
+
+        Args:
+            plans: those that a prior is to learn from.
+            number: k.
+
+        Raises:
+            ValueError: the plans have no durations, or none above 0 is known.
+        """
+        taken = plans.mask() if plans.end is None else plans.mask() & (plans.actions != plans.end)
+        times = durations_of(plans)[taken]
+        logs = times[times > 0].double().log().sort()[0]
+        if not len(logs):
+            raise ValueError("durations: none above 0 is known; at least one is expected")
+        # torch.quantile takes no more than 16 million numbers.
+        low, middle, high = (float(logs[round(share * (len(logs) - 1))]) for share in (0.25, 0.5, 0.75))
+        return cls(number, middle, (high - low) / QUARTILES or 1.0)
+
+    def added_to(self, plans: Plans) -> Plans:
+        """The plans with these features as their context, behind the features that they have already.
+
+        Args:
+            plans: N plans with durations; without a context, or with features `[N, C]` or `[N, L, C]`.
+
+        Returns:
+            Plans with the context `[N, L, C + 2k]`, float32.
+
+        Raises:
+            ValueError: the plans have no durations, or a context index.
+        """
+        own = plans.context
+        if own is not None and not own.is_floating_point():
+            raise ValueError(
+                "context: an index cannot stand beside past durations, which are features; write it as numbers with a"
+                " decimal point, one for each context, or leave it out"
+            )
+        times = durations_of(plans).masked_fill(~plans.mask(), torch.nan)
+        logs = ((times.log() - self.center) / self.spread).clamp(-MOST, MOST)
+        features = torch.stack([logs.nan_to_num(0.0), logs.isnan().float()], -1)
+        nothing = features.new_tensor([0.0, 1.0]).expand(len(plans), self.number, 2)
+        before = torch.cat([nothing, features], 1)
+        parts = [
+            before[:, self.number - lag : self.number - lag + plans.max_length] for lag in range(1, self.number + 1)
+        ]
+        if own is not None:
+            each = own if is_per_step(own) else own[:, None].expand(-1, plans.max_length, -1)
+            parts.insert(0, each.float())
+        return replace(plans, context=torch.cat(parts, -1), context_names=None)

@@ -1,0 +1,356 @@
+"""How long actions take: for each action, or each action and the next one, a law chosen by held-out likelihood."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neuroprior._checks import check_range, check_sizes
+from neuroprior._random import generator_on
+from neuroprior.plans import Plans
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
+from neuroprior.plans.plans import durations_of
+from neuroprior.priors.durations.laws import (
+    LAW_NAMES,
+    LAWS,
+    MOST_PARAMETERS,
+    LawName,
+    Sets,
+    by_law,
+    fit_laws,
+    resolution,
+)
+from neuroprior.priors.prior import as_actions
+
+FEWEST = 10
+"""Known durations above 0 that an action needs for a law of its own."""
+
+FEWEST_OF_TRANSITION = 30
+"""As many for an action with the one that follows it."""
+
+NATS_A_PARAMETER = 2.0
+"""Nats of held-out log-likelihood by which a law with a parameter more must be better than one without it.
+
+The held-out likelihood of a law that contains the true one is often a little higher by chance: with less than this, the
+true one is chosen in only about three of four cases.
+"""
+
+FOLDS = 5
+"""Parts of the plans, of which each is held out once."""
+
+_TABLES = ("pair", "law", "zero", "values", "number")
+
+
+class DurationLaw(NamedTuple):
+    """The law of the durations of an action."""
+
+    action: int
+    next_action: int | None  # the law holds where this one follows; None: wherever there is no other
+    law: LawName  # of durations above 0
+    parameters: dict[str, float]  # by name; logarithms are of the unit of the durations
+    zero: float  # probability of a duration of 0
+    number: int  # known durations above 0 that it was fitted to; 0: too few, it is that of all actions together
+
+
+class DurationModel(nn.Module):
+    """The distribution of how long each action takes, given the actions: the dwell times of a semi-Markov process.
+
+    Each action has a probability that it takes no time at all (point events), the share of such durations among the
+    known ones, and a law of its other durations: exponential, gamma, lognormal, Weibull, or a mixture of two lognormal
+    ones (Johnson, Kotz and Balakrishnan 1994, chapters 14, 17, 19 and 21). Each law is fitted without a part of the
+    plans and scored on it; the best is taken, where it gains `NATS_A_PARAMETER` for each parameter that it has more
+    than another one. In the same way it is decided whether the durations of an action depend on the action that follows
+    it: they then have a law for each next action that is frequent enough, all of one kind.
+    Parts are held out by group (by plan, where there are no two groups; by time, where there is one plan).
+
+    Unknown durations are left out. An action with fewer than `FEWEST` known ones has the law of all actions together.
+    The laws are continuous: where durations were rounded, to frames or seconds, no law is narrower than the rounding.
+
+    Args:
+        num_actions: A.
+        laws: names of the laws to choose from, of `LAW_NAMES`; all by default.
+        transitions: whether durations may depend on the next action.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    pair: Tensor  # int64 [T], ascending: action * A + next action, of the laws of transitions
+    law: Tensor  # int64 [A + T]: its number in LAW_NAMES
+    zero: Tensor  # float64 [A + T]
+    values: Tensor  # float64 [A + T, MOST_PARAMETERS]: of their parameters
+    number: Tensor  # int64 [A + T]
+
+    def __init__(self, num_actions: int, laws: Sequence[LawName] = LAW_NAMES, transitions: bool = True) -> None:
+        super().__init__()
+        check_sizes(num_actions=num_actions)
+        if isinstance(laws, str) or not laws or set(laws) - set(LAW_NAMES):
+            raise ValueError(f"laws: some of {', '.join(LAW_NAMES)} are expected, not {laws!r}")
+        self.num_actions, self.transitions = num_actions, transitions
+        self.laws = tuple(law for law in LAW_NAMES if law in laws)
+        whole = torch.zeros(num_actions, dtype=torch.long)
+        ones = torch.ones(num_actions, MOST_PARAMETERS, dtype=torch.double)
+        self._keep(whole[:0], whole, ones[:, 0] * 0, ones, whole)
+
+    def __repr__(self) -> str:
+        """The constructor's call."""
+        return f"DurationModel({self.num_actions}, laws={list(self.laws)}, transitions={self.transitions})"
+
+    def _keep(self, *tables: Tensor) -> None:
+        for name, table in zip(_TABLES, tables, strict=True):
+            self.register_buffer(name, table)
+
+    def table(self) -> list[DurationLaw]:
+        """The law of each action, then those of transitions."""
+        keys = [
+            *((a, None) for a in range(self.num_actions)),
+            *(divmod(p, self.num_actions) for p in self.pair.tolist()),
+        ]
+        found = []
+        for row, (action, after) in enumerate(keys):
+            name = LAW_NAMES[int(self.law[row])]
+            values = dict(zip(LAWS[name].names, self.values[row].tolist(), strict=False))
+            found.append(DurationLaw(action, after, name, values, float(self.zero[row]), int(self.number[row])))
+        return found
+
+    @torch.no_grad()
+    def fit(self, plans: Plans) -> Self:
+        """Fit and choose the laws anew; returns self. Nothing is drawn at random.
+
+        Args:
+            plans: with durations; an end symbol has none.
+
+        Raises:
+            ValueError: plans of other actions, without durations, or of which none is known.
+        """
+        self._check(plans)
+        known = self._known(plans)
+        if not bool(known.any()):
+            raise ValueError("durations: none of these plans is known; at least one is expected")
+        action, after = plans.actions[known].long().cpu(), self._next(plans)[known].cpu()
+        time, fold = durations_of(plans)[known].double().cpu(), _parts(plans, known)[known].cpu()
+        zeros = time == 0
+        count = action.bincount(minlength=self.num_actions)
+        pooled = zeros.double().mean()
+        zero = action[zeros].bincount(minlength=self.num_actions) / count.double()
+        zero = torch.where(count < FEWEST, pooled, zero)
+        action, after, time, fold = action[~zeros], after[~zeros], time[~zeros], fold[~zeros]
+        law, parameters, number, by_fold = self._of_actions(action, time, fold)
+        tables = [law, zero, parameters, number]
+        pair = after[:0]
+        if self.transitions:
+            pair, law, parameters, number = self._of_transitions(action, after, time, fold, law, by_fold)
+            more = [law, zero[pair // self.num_actions], parameters, number]
+            tables = [torch.cat(both) for both in zip(tables, more, strict=True)]
+        self._keep(*(table.to(self.law.device) for table in (pair, *tables)))
+        return self
+
+    def _of_actions(
+        self, action: Tensor, time: Tensor, fold: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, dict[int, Tensor]]:
+        """The laws of actions: their numbers, parameters and sizes; and their parameters without each fold."""
+        size, step = self.num_actions, resolution(time)
+        number = action.bincount(minlength=size)
+        if not len(time):  # they take no time at all, or none is known: the law is never used
+            ones = torch.ones(size, MOST_PARAMETERS, dtype=torch.double)
+            return torch.zeros(size, dtype=torch.long), ones, number, {}
+
+        def fitted(some: Tensor) -> Tensor:
+            """`[K, A + 1, ...]`: of each action, and of all together, which stands for those with too few."""
+            cell = torch.cat([action[some], torch.full_like(action[some], size)])
+            found = fit_laws(Sets(time[some].log().repeat(2), cell, size + 1, step), self.laws)
+            few = cell.bincount(minlength=size + 1) < FEWEST
+            few[size] = False
+            return torch.where(few[:, None], found[:, size:], found)
+
+        score = torch.zeros(len(self.laws), size + 1, dtype=torch.double)
+        by_fold = {}
+        for part in fold.unique().tolist():
+            held_out = fold == part
+            if bool(held_out.all()):
+                break
+            by_fold[part] = fitted(~held_out)
+            for place in range(len(self.laws)):
+                for cell in (action[held_out], torch.full_like(action[held_out], size)):
+                    density = LAWS[self.laws[place]].log_density(time[held_out], by_fold[part][place, cell])
+                    score[place].index_add_(0, cell, density)
+        price = NATS_A_PARAMETER * torch.tensor([float(len(LAWS[name].names)) for name in self.laws])
+        chosen = (score - price[:, None]).argmax(0)
+        chosen = torch.where(torch.cat([number < FEWEST, torch.tensor([False])]), chosen[size], chosen)[:size]
+        parameters = fitted(torch.ones_like(fold, dtype=torch.bool))[chosen, torch.arange(size)]
+        law = torch.tensor([LAW_NAMES.index(name) for name in self.laws])[chosen]
+        return law, parameters, number.masked_fill(number < FEWEST, 0), by_fold
+
+    def _of_transitions(
+        self, action: Tensor, after: Tensor, time: Tensor, fold: Tensor, law: Tensor, by_fold: dict[int, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The laws of transitions, of those actions that they predict better: pairs, numbers, parameters and sizes."""
+        size, laws = self.num_actions, len(self.laws)
+        code = action * size + after
+        pair, count = code[after >= 0].unique(return_counts=True)
+        pair = pair[count >= FEWEST_OF_TRANSITION]
+        own = (after >= 0) & torch.isin(code, pair)
+        action, time, fold = action[own], time[own], fold[own]
+        cell, step, doing = torch.searchsorted(pair, code[own]), resolution(time), pair // size
+
+        def fitted(some: Tensor, of_action: Tensor) -> Tensor:
+            """`[K, T, ...]`; of the action, where there are too few."""
+            found = fit_laws(Sets(time[some].log(), cell[some], len(pair), step), self.laws)
+            few = cell[some].bincount(minlength=len(pair)) < FEWEST
+            return torch.where(few[:, None], of_action[:, doing], found)
+
+        # The law of the action comes last.
+        score = torch.zeros(laws + 1, size, dtype=torch.double)
+        for part, of_action in by_fold.items():
+            out = fold == part
+            if not bool(out.any()) or bool(out.all()):
+                continue
+            each = fitted(~out, of_action)
+            for place, name in enumerate(self.laws):
+                score[place].index_add_(0, action[out], LAWS[name].log_density(time[out], each[place, cell[out]]))
+                same = out & (law[action] == LAW_NAMES.index(name))
+                density = LAWS[name].log_density(time[same], of_action[place, action[same]])
+                score[laws].index_add_(0, action[same], density)
+        prices = NATS_A_PARAMETER * torch.tensor([float(len(known.names)) for known in LAWS.values()]).double()
+        place_in_all = torch.tensor([LAW_NAMES.index(name) for name in self.laws])
+        # The law of the action is needed in either case: for rare transitions, and at the end of a plan.
+        score[:laws] -= prices[place_in_all][:, None] * doing.bincount(minlength=size)
+        best, chosen = score[:laws].max(0)
+        better = (best > score[laws])[doing]
+        if not bool(better.any()):
+            return pair[:0], pair[:0], score.new_zeros(0, MOST_PARAMETERS), pair[:0]
+        whole = fit_laws(Sets(time.log(), cell, len(pair), step), self.laws)
+        values = whole[chosen[doing], torch.arange(len(pair))]
+        number = cell.bincount(minlength=len(pair))
+        return pair[better], place_in_all[chosen[doing]][better], values[better], number[better]
+
+    def log_prob(self, plans: Plans) -> Tensor:
+        """The log-density of each known duration, given its action and the next one; of a 0, its log-probability.
+
+        Args:
+            plans: with durations.
+
+        Returns:
+            `[N, L]`, float64, nats, of durations in their unit; 0 where a duration is unknown, at an end symbol and
+            beyond a plan's end; -inf for a duration of 0 of an action that always took some time, and the reverse.
+
+        Raises:
+            ValueError: plans of other actions, or without durations.
+        """
+        self._check(plans)
+        known, row = self._known(plans), self._rows(plans)
+        time, row = durations_of(plans).double()[known], row[known]
+        some = time > 0
+        density = by_law("log_density", self.law[row[some]], time[some], self.values[row[some]])
+        found = self.zero[row].log()
+        found[some] = torch.log1p(-self.zero[row[some]]) + density
+        return torch.zeros(known.shape, dtype=torch.double, device=known.device).masked_scatter(known, found)
+
+    def cdf(self, action: int, times: Tensor) -> Tensor:
+        """The probability that an action takes at most so long, whatever follows it.
+
+        Args:
+            action: its number.
+            times: of any shape, at least 0.
+
+        Returns:
+            float64, of the same shape.
+
+        Raises:
+            ValueError: there is no such action.
+        """
+        check_range("action", torch.tensor([action]), self.num_actions, "actions")
+        time = times.double().flatten().clamp(min=torch.finfo(torch.double).tiny)
+        row = torch.full_like(time, action, dtype=torch.long)
+        above = by_law("cdf", self.law[row], time, self.values[row]).where(times.flatten() > 0, 0.0)
+        return (self.zero[action] + (1 - self.zero[action]) * above).view(times.shape)
+
+    def sample(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None) -> Tensor:
+        """How long the actions of plans take, drawn independently of each other.
+
+        Args:
+            plans: `Plans`, or integers `[N, L]`.
+            generator: source of randomness; one number is drawn for each of the `[N, L]` places.
+
+        Returns:
+            `[N, L]`, float32; 0 at an end symbol and beyond a plan's end.
+
+        Raises:
+            ValueError: plans of other actions.
+        """
+        plans = plans if isinstance(plans, Plans) else Plans(as_actions(plans), self.num_actions)
+        self._check(plans, durations=False)
+        row, device = self._rows(plans).flatten(), plans.actions.device
+        drawn = torch.rand(len(row), generator=generator_on(generator, device), device=device, dtype=torch.double)
+        zero = self.zero[row]
+        # What is left of the number above the probability of 0 is uniform again.
+        rest = ((drawn - zero) / (1 - zero)).clamp(2.0**-53, 1 - 2.0**-53).nan_to_num(0.5)
+        time = by_law("quantile", self.law[row], rest, self.values[row]).float()
+        limits = torch.finfo(torch.float32)
+        time = time.clamp(limits.tiny, limits.max).masked_fill(drawn < zero, 0).view(plans.actions.shape)
+        return time.masked_fill(~self._taken(plans), 0)
+
+    def _rows(self, plans: Plans) -> Tensor:
+        """`[N, L]`: the row of the tables for each action, given the next one."""
+        action, after = plans.actions.long(), self._next(plans)
+        if not len(self.pair):
+            return action
+        code = action * self.num_actions + after
+        at = torch.searchsorted(self.pair, code).clamp(max=len(self.pair) - 1)
+        return torch.where((after >= 0) & (self.pair[at] == code), self.num_actions + at, action)
+
+    def _next(self, plans: Plans) -> Tensor:
+        """`[N, L]`: the action after each, -1 after the last of a plan."""
+        after = plans.actions.long().masked_fill(~plans.mask(), -1)
+        return functional.pad(after[:, 1:], (0, min(plans.max_length, 1)), value=-1)
+
+    def _taken(self, plans: Plans) -> Tensor:
+        """`[N, L]` bool: the actions that take time; an end symbol takes none."""
+        return plans.mask() if plans.end is None else plans.mask() & (plans.actions != plans.end)
+
+    def _known(self, plans: Plans) -> Tensor:
+        return self._taken(plans) & ~durations_of(plans).isnan()
+
+    def _check(self, plans: Plans, durations: bool = True) -> None:
+        if plans.num_actions != self.num_actions:
+            raise ValueError(f"plans have {plans.num_actions} actions, this model {self.num_actions}")
+        if durations:
+            durations_of(plans)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
+        # How many transitions have a law of their own was learned, so sizes are taken from the file.
+        for name in _TABLES:
+            if prefix + name in state_dict:
+                self.register_buffer(name, torch.empty_like(state_dict[prefix + name], device=self.law.device))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        if not self._tables_fit():
+            raise RuntimeError("the tables of a DurationModel do not fit one another")
+
+    def _tables_fit(self) -> bool:
+        """Whether the tables are those of such a model; checks what was read from a file."""
+        rows = self.num_actions + len(self.pair)
+        return (
+            self.pair.dim() == 1
+            and not any(t.is_floating_point() for t in (self.pair, self.law, self.number))
+            and self.law.shape == self.zero.shape == self.number.shape == (rows,)
+            and self.values.shape == (rows, MOST_PARAMETERS)
+            and bool(((self.law >= 0) & (self.law < len(LAW_NAMES))).all())
+            and bool(((self.zero >= 0) & (self.zero <= 1)).all())
+            and bool((self.pair.diff() > 0).all())
+            and bool(((self.pair >= 0) & (self.pair < self.num_actions**2)).all())
+        )
+
+
+def _parts(plans: Plans, known: Tensor) -> Tensor:
+    """`[N, L]`: the part of the plans that each duration is held out with."""
+    plans = divisible(plans)
+    units = len(plans) if plans.group is None else len(plans.group.unique())
+    part = torch.zeros(plans.actions.shape, dtype=torch.long, device=known.device)
+    if units < FEWEST_UNITS:
+        place = known.flatten().cumsum(0).view(known.shape) - 1
+        return (place * FOLDS).div(max(int(known.sum()), 1), rounding_mode="floor")
+    for number, (_, held_out) in enumerate(folds(plans, min(FOLDS, units))):
+        part[held_out] = number
+    return part

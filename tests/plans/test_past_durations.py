@@ -1,0 +1,82 @@
+"""Durations of past actions as a context: their values, what they never hold, and priors that take them."""
+
+from math import exp, nan
+
+import pytest
+import torch
+
+from neuroprior.plans import PastDurations, Plans
+from neuroprior.priors import GRUPrior, load, match_plans, save
+from tests.support.sources import refuses, seeded
+
+ACTIONS = torch.tensor([[0, 1, 2, 1], [1, 0, 0, 0]])
+DURATIONS = torch.tensor([[1.0, exp(2), nan, 5.0], [0.0, 3.0, 9.0, 9.0]])
+PLANS = Plans(ACTIONS, 3, torch.tensor([4, 2]), durations=DURATIONS)
+
+
+def test_the_features_of_each_step():
+    """The standardised logarithm of the last duration and whether it is unknown; then those of the one before."""
+    found = PastDurations(2, center=1.0, spread=2.0).added_to(PLANS).context
+    assert found[0].tolist() == [
+        [0, 1, 0, 1],
+        [-0.5, 0, 0, 1],
+        pytest.approx([0.5, 0, -0.5, 0]),
+        pytest.approx([0, 1, 0.5, 0]),
+    ]
+    assert found[1, :2].tolist() == [[0, 1, 0, 1], [-4, 0, 0, 1]]  # 0 takes as long as the least that is told apart
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_no_duration_is_known_before_its_action_is_chosen(number):
+    """The context of step t is the same whatever the actions from t on take."""
+    durations = torch.rand(5, 8, generator=seeded(0))
+    plans = Plans(torch.zeros(5, 8, dtype=torch.long), 2, durations=durations)
+    past = PastDurations.of(plans, number)
+    for step in range(8):
+        other = durations.clone()
+        other[:, step:] = 100 * torch.rand(5, 8 - step, generator=seeded(step))
+        changed = past.added_to(Plans(plans.actions, 2, durations=other)).context
+        same = (changed == past.added_to(plans).context).all(2).all(0)
+        assert same.tolist() == [t <= step for t in range(8)]
+
+
+def test_the_constants_are_robust():
+    times = torch.exp(torch.linspace(-1, 3, 401))
+    times[-5:] = 1e9
+    plans = Plans(torch.zeros(1, 401, dtype=torch.long), 1, durations=times[None])
+    past = PastDurations.of(plans)
+    assert (past.center, past.spread) == pytest.approx((1, 2 / 1.349), abs=1e-3)
+    constant = Plans(ACTIONS, 3, durations=torch.full((2, 4), 7.0))
+    assert PastDurations.of(constant).spread == 1
+    assert PastDurations.of(constant.with_end()) == PastDurations.of(constant)
+
+
+def test_they_stand_behind_other_features():
+    past = PastDurations(1, 0.0, 1.0)
+    features = torch.tensor([[5.0, 6.0], [7.0, 8.0]])
+    once = past.added_to(Plans(ACTIONS, 3, durations=DURATIONS.nan_to_num(), context=features)).context
+    assert once.shape == (2, 4, 4)
+    assert once[:, :, :2].equal(features[:, None].expand(2, 4, 2))
+    each = past.added_to(Plans(ACTIONS, 3, durations=DURATIONS.nan_to_num(), context=features[:, None].repeat(1, 4, 1)))
+    assert each.context.equal(once)
+
+
+def test_a_prior_that_was_trained_with_them_makes_them_itself(tmp_path):
+    plans = Plans(ACTIONS.repeat(20, 1), 3, durations=DURATIONS.nan_to_num(1.0).repeat(20, 1))
+    past = PastDurations.of(plans.with_end())
+    prior = GRUPrior(4, 8, context_size=2)
+    prior.fit(past.added_to(plans.with_end()), generator=seeded(0), max_steps=2, progress=False)
+    prior.past_durations = past
+    again = load(save(prior, tmp_path))
+    assert again.past_durations == past
+    assert again.log_prob(match_plans(plans, again)).equal(prior.log_prob(past.added_to(plans.with_end())))
+    refuses("durations: these plans have none", lambda: match_plans(Plans(ACTIONS, 3), again))
+
+
+def test_what_is_refused():
+    refuses("number: an integer of at least 1", lambda: PastDurations.of(PLANS, 0))
+    refuses("durations: these plans have none", lambda: PastDurations.of(Plans(ACTIONS, 3)))
+    refuses("none above 0 is known", lambda: PastDurations.of(Plans(ACTIONS, 3, durations=torch.zeros(2, 4))))
+    index = Plans(ACTIONS, 3, durations=DURATIONS, context=torch.tensor([0, 1]))
+    refuses("an index cannot stand beside past durations", lambda: PastDurations(1, 0.0, 1.0).added_to(index))
+    refuses("center and spread", lambda: PastDurations(1, nan, 1.0))
