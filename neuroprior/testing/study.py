@@ -29,10 +29,10 @@ SPREAD = 0.6
 RITUAL, RITUAL_WEIGHT = ("eat", "drink", "groom"), 6.0
 """After the first two behaviours the third is so many times as frequent, in odds, as after the second alone."""
 
-MOVED = ("rear", "walk", "groom", 0.2)
+MOVED = ("rear", "walk", "groom", 0.25)
 """The treatment: after the first behaviour so much of the probability of the second goes to the third."""
 
-LONGER = ("rest", 1.8)
+LONGER = ("rest", 2.0)
 """The treatment: the median of this behaviour's durations is so many times as long."""
 
 ANIMALS, SESSIONS, ACTIONS = 12, 2, 300
@@ -41,7 +41,7 @@ UNLABELLED, PAUSES = 0.01, 0.005
 
 
 def simulated_study(
-    seed: int, *, effect: bool = True, within: bool = False, animal_effect: float = 0.3, alike: bool = False
+    seed: int, *, effect: bool = True, within: bool = False, animal_effect: float = 0.2, alike: bool = False
 ) -> Any:
     """The table of a study: 12 animals, 2 sessions each, 8 behaviours, start and stop of each, gaps, a treatment.
 

@@ -27,13 +27,13 @@ def test_the_treatment_changes_what_it_says() -> None:
     labels = study.behaviour.dropna()
     # Some 5,000 pairs under each treatment: a standard error of .01 at most, and 4.5 of them are a false alarm in
     # 150,000.
-    for second, control, change in (("walk", 7 / 20, -0.2), ("groom", 3 / 20, 0.2), ("sniff", 6 / 20, 0)):
+    for second, control, change in (("walk", 7 / 20, -0.25), ("groom", 3 / 20, 0.25), ("sniff", 6 / 20, 0)):
         assert followed(study, "rear", second, "saline") == pytest.approx(control, abs=0.045)
         assert followed(study, "rear", second, "drug") == pytest.approx(control + change, abs=0.045)
     assert followed(study, "walk", "sniff", "drug") == pytest.approx(7 / 21, abs=0.045)
     lasted = np.log(study.stop - study.start).groupby([study.behaviour, study.treatment]).mean().unstack()
     change = np.exp(lasted.drug - lasted.saline)
-    assert change["rest"] == pytest.approx(1.8, rel=0.15)
+    assert change["rest"] == pytest.approx(2, rel=0.15)
     assert change.drop("rest").to_numpy() == pytest.approx(1, rel=0.15)
     assert 0.005 < 1 - len(labels) / len(study) < 0.015
 

@@ -1,0 +1,31 @@
+"""`python -m eval study`, small."""
+
+import json
+
+from eval.__main__ import main
+
+
+def test_studies_with_and_without_an_effect(tmp_path, capsys):
+    out = tmp_path / "study"
+    arguments = ["study", "--studies", "2", "--with-effect", "2", "--seed", "0", "--processes", "1", "--out", str(out)]
+    assert main(arguments) == 0
+    found = json.loads((out / "results.json").read_text())
+    assert {row["design"] for row in found["rows"]} == {"between", "within"}
+    assert {row["sessions_alike"] for row in found["rows"]} == {True, False}
+    assert all(row["studies"] == 2 for row in found["rows"])
+    assert len(found["rows"]) == 4 * 7
+    by_feature = {(row["design"], row["feature"]): row for row in found["features"]}
+    # Both changed transitions and the changed duration are large enough to be found in both of these.
+    for feature in ("durations: rest", "transitions: rear groom"):
+        assert by_feature["within", feature]["found"] == 2
+    assert by_feature["within", "any other transition or duration"]["planted"] is False
+    assert "False alarms" in capsys.readouterr().out
+    (kept,) = (out / "jobs").iterdir()
+    changed = {path.name: path.stat().st_mtime_ns for path in kept.glob("*.json")}
+    assert main(arguments) == 0
+    assert changed == {path.name: path.stat().st_mtime_ns for path in kept.glob("*.json")}
+
+
+def test_bad_numbers(tmp_path, capsys):
+    assert main(["study", "--studies", "0", "--out", str(tmp_path)]) == 2
+    assert "studies: an integer of at least 1" in capsys.readouterr().err
