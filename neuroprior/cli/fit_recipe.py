@@ -185,10 +185,6 @@ class PriorModel(PriorModule):
             ) from error
         if made.takes_context:
             made.past_durations = data.past_durations
-        elif data.past_durations is not None and use_context:
-            raise ValueError(
-                f"data.past_durations: a {type(made).__name__} takes no features; take a neural prior, or leave it out"
-            )
         super().__init__(made, learning_rate, weight_decay, data.seed)
 
 

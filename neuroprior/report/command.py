@@ -17,7 +17,7 @@ def plans(
     test: str | None = None,
     folds: int | None = None,
     models: list[ModelName] = list(MODELS[:4]),  # noqa: B006
-    inputs: list[InputName] = list(INPUTS),  # noqa: B006
+    inputs: list[InputName] = list(INPUTS[:2]),  # noqa: B006
     skip: int = 0,
     max_steps: int = 1000,
     patience: float = 0.25,

@@ -128,6 +128,7 @@ def dot(
     color: str,
     hollow: bool = False,
     limits: tuple[float, float] = (-np.inf, np.inf),
+    shape: str = "o",
 ) -> None:
     """One estimate (mean, low, high) drawn across at height `at`; beyond the limits, an arrow at the edge."""
     mean, low, high = floats(estimate)
@@ -139,7 +140,7 @@ def dot(
             axes.plot(edge, at, marker, color=color, ms=8, clip_on=False, mfc=PAPER if hollow else color)
         return
     axes.plot(np.clip([low, high], *limits), [at, at], color=color, lw=2.2, solid_capstyle="butt")
-    axes.plot(mean, at, "o", color=color, mfc=PAPER if hollow else color, ms=6.5, mew=1.6)
+    axes.plot(mean, at, shape, color=color, mfc=PAPER if hollow else color, ms=6.5 if shape == "o" else 5, mew=1.6)
 
 
 def band(axes: Axes, rows: Iterable[Iterable[Any]], color: str, name: str, line: Any) -> None:
@@ -167,11 +168,10 @@ def whole_numbers(axes: Axes, across: str, up: str) -> None:
     axes.grid(axis="y")
 
 
-def marker(color: str, hollow: bool, name: str) -> Line2D:
+def marker(color: str, hollow: bool, name: str, shape: str = "o") -> Line2D:
     """A dot with a name for a legend."""
-    return Line2D(
-        [], [], marker="o", ls="none", color=color, mfc=PAPER if hollow else color, ms=6.5, mew=1.6, label=name
-    )
+    inner, size = PAPER if hollow else color, 6.5 if shape == "o" else 5
+    return Line2D([], [], marker=shape, ls="none", color=color, mfc=inner, ms=size, mew=1.6, label=name)
 
 
 def legend(figure: Figure, entries: Sequence[Artist]) -> None:

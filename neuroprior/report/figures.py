@@ -65,6 +65,9 @@ STRIPS = [
 
 OTHER = "#7d838c"
 
+INPUT_STYLES = {"actions": ("o", True), "actions and context": ("o", False), "actions and durations": ("D", False)}
+"""How a dot of a model with an input is drawn: its marker, and whether it is hollow."""
+
 DIGITS = FuncFormatter(lambda value, _: f"{value:g}")
 """Numbers on a logarithmic axis in plain digits: matplotlib's own are formulas."""
 
@@ -77,7 +80,8 @@ GAMMA = 0.7
 
 def model_names(frame: pd.DataFrame) -> pd.Series:
     """The names of models with their input, from the columns `model` and `context`."""
-    return frame["model"] + frame["context"].str.contains("context").map({True: ", with context", False: ""})
+    given = frame["context"].str.extract("(context|durations)")[0]
+    return frame["model"] + (", with " + given).fillna("")
 
 
 def lag_names(lags: pd.DataFrame) -> pd.Series:
@@ -89,34 +93,34 @@ def lag_names(lags: pd.DataFrame) -> pd.Series:
 def score_figure(scores: pd.DataFrame) -> Figure:
     """Bits per action of each model with its interval, the best at the top.
 
-    A model that is far worse than most is an arrow at the edge, so that the others can be compared; all values stand
-    at the right.
+    A model has a dot for each input, a hollow one for past actions alone. A model that is far worse than most is an
+    arrow at the edge, so that the others can be compared; all values stand at the right.
 
     Args:
-        scores: the table `plans` of a report: `model`, `context` (its input: "actions" or "actions and context"),
-            `bits_per_action`, `low`, `high`; a model may have a row for each input.
+        scores: the table `plans` of a report: `model`, `context` (its input: "actions", "actions and context"
+            or "actions and durations"), `bits_per_action`, `low`, `high`; a model may have a row for each input.
     """
     expect_some("scores", scores)
-    scores = scores.assign(with_context=scores["context"].str.contains("context"))
     best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
     models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
-    both = scores["with_context"].nunique() > 1
+    styles = {inputs: INPUT_STYLES[inputs] for inputs in INPUT_STYLES if inputs in set(scores["context"])}
+    many = len(styles) > 1
     limit = _edge(best.dropna().to_numpy())
     color = dict(zip(best.index, colors(list(best.index)), strict=True))
     for y, model in enumerate(models):
-        own = scores[scores["model"] == model].sort_values("with_context")
-        for row in own.itertuples():
-            at = y + (0 if len(own) < 2 else -0.17 if row.with_context else 0.17)
-            estimate = (row.bits_per_action, row.low, row.high)
-            dot(axes, at, estimate, color[model], hollow=both and not row.with_context, limits=(-np.inf, limit))
+        own = scores[scores["model"] == model].sort_values("context", key=lambda names: names.map([*styles].index))
+        reach = (0, 0.17, 0.26)[len(own) - 1]
+        for row, place in zip(own.itertuples(), np.linspace(reach, -reach, len(own)), strict=True):
+            estimate, (shape, hollow) = (row.bits_per_action, row.low, row.high), styles[row.context]
+            dot(axes, y + place, estimate, color[model], many and hollow, (-np.inf, limit), shape)
         values = ", ".join("" if np.isnan(bits) else f"{bits:.3f}" for bits in floats(own["bits_per_action"]))
         axes.text(1.03, y, values, transform=axes.get_yaxis_transform(), va="center")
     names_down(axes, [short(model, 36) for model in models])
     axes.set_xlabel("bits per action (less is better)")
     axes.set_xlim(right=limit if np.isfinite(limit) else None)
-    if both:
-        legend(figure, [marker(INK, True, "actions"), marker(INK, False, "actions and context")])
+    if many:
+        legend(figure, [marker(INK, hollow, inputs, shape) for inputs, (shape, hollow) in styles.items()])
     return figure
 
 
@@ -200,6 +204,51 @@ def chain_scores(scores: pd.DataFrame) -> pd.DataFrame:
     """The rows of Markov chains in the table `plans` of a report, with their `order`, ascending."""
     order = scores["model"].str.extract(r"^markov-(\d+)$")[0]
     return scores[order.notna()].assign(order=order.dropna().astype(int)).sort_values("order", kind="stable")
+
+
+@drawn
+def dwell_figure(dwell: pd.DataFrame) -> Figure:
+    """How long actions take, a panel an action: a histogram on a logarithmic axis with the law that was fitted.
+
+    At most `MOST_PANELS` actions are drawn, the commonest; the figure says so.
+
+    Args:
+        dwell: the table of a report, a row a bin: `action`, `number` (of its durations above 0), `zero` (the share of
+            durations of 0, which are not drawn), `law`, `low` and `high` (the edges), `density` and `fitted`: shares by
+            unit of the natural logarithm.
+    """
+    expect_some("dwell", dwell)
+    actions = list(dict(iter(dwell.groupby("action", sort=False))).items())
+    shown = sorted(actions, key=lambda item: -int(item[1]["number"].iloc[0]))[:MOST_PANELS]
+    across = min(len(shown), 3)
+    down = -(-len(shown) // across)
+    size = (WIDTH if across > 1 else 5, 1.9 * down + 0.5)
+    figure, cells = panels(down, across, size)
+    for axes, (name, own) in zip(cells, shown, strict=False):
+        low, high = floats(own["low"]), floats(own["high"])
+        axes.bar(low, floats(own["density"]), high - low, align="edge", color=PLAIN, alpha=0.45, lw=0)
+        axes.plot(np.sqrt(low * high), floats(own["fitted"]), color=MORE, lw=1.8)
+        zero = float(own["zero"].iloc[0])
+        at_zero = f", {100 * zero:.0f} % at 0" if zero else ""
+        axes.set_title(f"{short(str(name), 20)}\n{own['law'].iloc[0]}{at_zero}", fontsize=9)
+        axes.set_xscale("log")
+        _decades(axes, low.min(), high.max())
+        axes.set(yticks=[], ylim=(0, None))
+        axes.spines["left"].set_visible(False)
+    at_edges(cells, len(shown), across, "duration", "density")
+    if len(shown) < len(actions):
+        figure.suptitle(f"the {len(shown)} commonest of {len(actions)} actions", fontsize=10, x=0.01, ha="left")
+    return figure
+
+
+def _decades(axes: Axes, low: float, high: float) -> None:
+    """Three to six numbers on a logarithmic axis across, in plain digits."""
+    span = np.log10(high / low)
+    steps = (1, 2, 5) if span < 1.2 else (1, 3) if span < 2.2 else (1,)
+    axes.set_xlim(low, high)
+    axes.xaxis.set_major_locator(LogLocator(subs=steps, numticks=6))
+    axes.xaxis.set_major_formatter(DIGITS)
+    axes.minorticks_off()
 
 
 @drawn

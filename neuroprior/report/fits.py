@@ -13,7 +13,7 @@ from torch import Tensor
 from neuroprior._version import __version__
 from neuroprior.analysis import Reliability, pieces, reliability
 from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits, units
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import PastDurations, Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
 from neuroprior.priors import GRUPrior, MarkovPrior, MixturePrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.counts import TooLargeError
@@ -22,8 +22,14 @@ from neuroprior.worlds import TabularWorld
 
 Arrays = dict[str, np.ndarray[Any, Any]]
 
-ACTIONS, CONTEXT = "actions", "actions and context"
-"""The input of a model."""
+ACTIONS, CONTEXT, DURATIONS = "actions", "actions and context", "actions and durations"
+"""The input of a model; durations are those of past actions."""
+
+WITH = {ACTIONS: "", CONTEXT: ", with context", DURATIONS: ", with durations"}
+"""The inputs in the order of tables, and what names of models say of them."""
+
+OF_FEATURES = ("transformer", "gru", "gru-large")
+"""Jobs whose models can take features, such as past durations."""
 
 KINDS = ("mixture", "gru-large", "stacked", "transformer", "gru", "gru-lags", "lags", "counts")
 """What one job fits; the slowest first."""
@@ -80,14 +86,14 @@ class Design:
 
 @dataclass(frozen=True)
 class Job:
-    """A fold, one of `KINDS`, and the input of its models: `ACTIONS` or `CONTEXT`."""
+    """A fold, one of `KINDS`, and the input of its models: `ACTIONS`, `CONTEXT` or `DURATIONS`."""
 
     fold: int
     kind: str
     inputs: str
 
     def __str__(self) -> str:
-        return f"fold{self.fold}-{self.kind}{'-context' * (self.inputs == CONTEXT)}"
+        return f"fold{self.fold}-{self.kind}{WITH[self.inputs].replace(', with ', '-')}"
 
 
 def counted(plans: Plans, skip: int, cut: bool = False) -> Tensor:
@@ -121,8 +127,11 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     whole = plans if test is None else test
     mask = counted(whole, design.skip, design.cut)
     unit, scored = units(whole, mask)[index], whole[index]
-    if job.inputs == ACTIONS:
+    if job.inputs != CONTEXT:
         learned, scored = (replace(some, context=None, context_names=None) for some in (learned, scored))
+    if job.inputs == DURATIONS:
+        past = PastDurations.of(learned)
+        learned, scored = past.added_to(learned), past.added_to(scored)
     seed = design.seed * 1000 + job.fold
     if job.kind in LAGS:
         return _by_lag(job.kind, learned, scored, design, seed)

@@ -15,15 +15,15 @@ from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.priors.scoring import learned_from
 from neuroprior.report.document import Document, write_document
-from neuroprior.report.fits import ACTIONS, CONTEXT, LAGS, Design, counted
+from neuroprior.report.fits import ACTIONS, CONTEXT, DURATIONS, LAGS, OF_FEATURES, Design, counted
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.report.sections import SECTIONS, describe
 
 ModelName = Literal["counts", "gru", "transformer", "stacked", "gru-large", "mixture"]
-InputName = Literal["actions", "context"]
+InputName = Literal["actions", "context", "durations"]
 
 MODELS: tuple[ModelName, ...] = ("counts", "gru", "transformer", "stacked", "gru-large", "mixture")
-INPUTS: tuple[InputName, ...] = ("actions", "context")
+INPUTS: tuple[InputName, ...] = ("actions", "context", "durations")
 
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
@@ -43,7 +43,7 @@ def report(
     test: Plans | str | Path | None = None,
     folds: int | None = None,
     models: Sequence[ModelName] = MODELS[:4],
-    inputs: Sequence[InputName] = INPUTS,
+    inputs: Sequence[InputName] = INPUTS[:2],
     skip: int = 0,
     max_steps: int = 1000,
     patience: float = 0.25,
@@ -71,7 +71,9 @@ def report(
         models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
             weighs the forecasts of counts), gru-large (256 wide, with dropout), mixture (of stacked and gru-large);
             the last two are slow, and left out by default.
-        inputs: of the models: past actions alone, the context as well where the plans have one, or each in turn.
+        inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, gru-large and
+            transformer, durations: how long the last action took, beside the actions. Each in turn; durations, with
+            which these take as long again, are left out by default.
         skip: actions at the beginning of each plan that do not count in scores.
         max_steps: gradient steps of a neural prior.
         patience: share of these steps without improvement after which training stops; 1 trains to the end.
@@ -138,6 +140,12 @@ def report(
         if "lags" in sections:
             kinds += LAGS if set(models) != {"counts"} else LAGS[:1]
         given = [ACTIONS] * ("actions" in inputs) + [CONTEXT] * ("context" in inputs and learned.context is not None)
+        if "durations" in inputs:
+            if any(some.durations is None for some in (learned, other) if some is not None):
+                raise ValueError("inputs: the plans have no durations; leave durations out")
+            if not set(kinds) & set(OF_FEATURES):
+                raise ValueError(f"inputs: durations are an input of {', '.join(OF_FEATURES)}; add one to models")
+            given.append(DURATIONS)
         if not given:
             raise ValueError("inputs: the plans have no context; leave context out")
         left = int(counted(learned if other is None else other, skip, cut).sum())

@@ -22,7 +22,21 @@ from neuroprior.plans import Plans
 from neuroprior.priors import Prior
 from neuroprior.priors.matching import match_plans
 from neuroprior.report import fits
-from neuroprior.report.fits import ACTIONS, CONTEXT, COUNTED, KINDS, LAGS, Arrays, Design, Job, counted, split
+from neuroprior.report.fits import (
+    ACTIONS,
+    CONTEXT,
+    COUNTED,
+    DURATIONS,
+    KINDS,
+    LAGS,
+    OF_FEATURES,
+    WITH,
+    Arrays,
+    Design,
+    Job,
+    counted,
+    split,
+)
 
 ORDERED = ["uniform", *(f"markov-{order}" for order in ORDERS)]
 ORDERED += ["context tree", "gru", "transformer", "gru-large", "stacked", "mixture"]
@@ -34,7 +48,7 @@ class Model:
     """A model that was scored on held-out plans."""
 
     name: str  # such as "markov-3"
-    inputs: str  # `ACTIONS` or `CONTEXT`
+    inputs: str  # `ACTIONS`, `CONTEXT` or `DURATIONS`
     how: str  # its settings in each fold, the distinct ones
     bits: Tensor  # [N, L]: those of each held-out action (and of the ends, where it predicts these too)
     score: Score  # their sums by independent unit
@@ -44,7 +58,7 @@ class Model:
     @property
     def label(self) -> str:
         """Its name with its input, in figures and sentences."""
-        return self.name + ", with context" * (self.inputs == CONTEXT)
+        return self.name + WITH[self.inputs]
 
     @property
     def cost(self) -> float:
@@ -116,6 +130,7 @@ def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Jo
         if kind in kinds
         for fold in range(1 if kind in LAGS else design.folds)
         for each in reversed(inputs)
+        if each != DURATIONS or kind in OF_FEATURES
     ]
 
 
@@ -138,7 +153,7 @@ def evaluate(plans: Plans, test: Plans | None, design: Design, todo: Sequence[Jo
             if all("how" in part for part in parts):
                 how = ", ".join(filter(None, dict.fromkeys(str(part["how"]) for part in parts)))
                 models.append(_model(name, inputs, how, parts, held_out, scored, mask))
-    models.sort(key=lambda model: (model.inputs == CONTEXT, ORDERED.index(model.name)))
+    models.sort(key=lambda model: ([*WITH].index(model.inputs), ORDERED.index(model.name)))
     best = min(models, key=lambda model: model.cost)
     gains.sort(key=lambda row: (row["context"] == CONTEXT, row["model"] != COUNTED))
     table = pd.DataFrame(gains)
@@ -184,6 +199,7 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Eval
     for name, prior in priors.items():
         own = match_plans(plans, prior, name)
         mask, inputs = counted(own, skip), CONTEXT if prior.takes_context else ACTIONS
+        inputs = inputs if prior.past_durations is None else DURATIONS
         try:
             arrays = fits.score_arrays(prior, own, mask, units(own, mask))
             models.append(_model(name, inputs, type(prior).__name__, [arrays], [torch.arange(len(own))], own, mask))

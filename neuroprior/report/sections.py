@@ -25,6 +25,7 @@ from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors import learn_macros
 from neuroprior.report import figures
 from neuroprior.report.document import Column, table
+from neuroprior.report.durations import duration_section
 from neuroprior.report.fits import ACTIONS, CONTEXT
 from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
@@ -500,6 +501,7 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "transitions": transition_section,
     "motifs": motif_section,
     "macros": macro_section,
+    "durations": duration_section,
     "likeness": likeness_section,
     "drift": drift_section,
 }

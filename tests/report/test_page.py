@@ -23,6 +23,7 @@ from neuroprior.report.figures import (
     calibration_figure,
     distribution_figure,
     drift_figure,
+    dwell_figure,
     group_transition_figure,
     lag_figure,
     motif_figure,
@@ -114,6 +115,14 @@ def sequences(names: list[str], number: int, length: int) -> np.ndarray:
     return actions
 
 
+def dwell(names: list[str]) -> pd.DataFrame:
+    """Two bins an action, of times from a thousandth to days."""
+    rows = [(name, n, n / 99, "gamma", 10.0**k, 10.0 ** (k + n % 5 + 1), 1 / (n + 1), None if n == 2 else 0.5)
+            for n, name in enumerate(names) for k in (-3, n % 5 - 2)]  # fmt: skip
+    columns = ["action", "number", "zero", "law", "low", "high", "density", "fitted"]
+    return pd.DataFrame(rows, columns=columns)
+
+
 def figures(names: list[str], models: list[str], groups: list[str], context: bool) -> dict[str, Figure]:
     """Every figure, with values missing here and there."""
     by_group = np.stack([matrix(names, seed) for seed in range(len(groups))])
@@ -141,6 +150,7 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
         ),
         "transition": transition_figure(matrix(names), names, names[0]),
         "group": group_transition_figure(by_group, matrix(names), names, groups, by_group > 0.9),
+        "dwell": dwell_figure(dwell(names)),
         "raster": raster_figure(sequences(names, 4, 30), sequences(names, 2, 500), names),
     }
 

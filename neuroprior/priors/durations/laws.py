@@ -21,9 +21,9 @@ MOST_PARAMETERS = 5
 LEAST_SPREAD = 0.01
 """Least standard deviation of the logarithm of a duration: durations that are all the same vary by this much."""
 
-NEWTON_STEPS, EM_STEPS = 30, 60
+NEWTON_STEPS, EM_STEPS = 20, 50
 
-MOST_VALUES = 400
+MOST_VALUES = 150
 """Values of a set from which a mixture is fitted; of more durations, means of neighbours."""
 
 ROUNDED = 1 / sqrt(12)

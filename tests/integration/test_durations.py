@@ -1,0 +1,89 @@
+"""Durations on the command line: a semi-Markov prior fitted and sampled, and networks that know the last durations."""
+
+import json
+import math
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from neuroprior.cli.__main__ import main
+from neuroprior.plans import Plans, read_plans, write_plans
+from neuroprior.priors import GRUPrior, MarkovPrior, SemiMarkovPrior, load, match_plans
+from tests.support.sources import seeded
+
+QUICK = ["--trainer.max_steps", "40", "--trainer.accelerator", "cpu", "--data.check_every", "10"]
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Actions that follow from whether the last one took long."""
+    durations = torch.empty(60, 20).exponential_(generator=seeded(0))
+    actions = torch.randint(3, (60, 20), generator=seeded(1))
+    actions[:, 1:] = torch.where(durations[:, :-1] > 0.7, 0, actions[:, 1:])
+    place = tmp_path_factory.mktemp("plans") / "plans.jsonl"
+    write_plans(Plans(actions, 3, durations=durations, action_names=("a", "b", "c")), place)
+    return str(place)
+
+
+def test_the_recipe_and_its_samples(file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = str(tmp_path / "run")
+    assert main(["fit", "--config", "semi-markov", "--data.file", file, "--data.end", "true", "--out", out]) == 0
+    prior = load(out)
+    assert isinstance(prior, SemiMarkovPrior)
+    assert isinstance(prior.actions, MarkovPrior)
+    assert prior.actions.order == 2
+    capsys.readouterr()
+    for suffix in ("jsonl", "csv", "npz"):
+        assert main(["sample", out, "--num-plans", "30", "--length", "9", "--out", f"{out}.{suffix}"]) == 0
+        sampled = read_plans(f"{out}.{suffix}")
+        assert bool((sampled.durations[sampled.mask()] > 0).all())
+    capsys.readouterr()
+    assert main(["sample", out, "--num-plans", "30", "--length", "9"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()[1:]]
+    assert all(len(row["actions"]) == len(row["durations"]) for row in rows)
+
+
+def test_a_network_as_its_action_prior(file: str, tmp_path: Path):
+    actions = ["--model.prior.actions", "neuroprior.priors.GRUPrior", "--model.prior.actions.hidden_size", "8"]
+    run = ["--config", "semi-markov", *actions, "--data.file", file, *QUICK, "--out", str(tmp_path / "run")]
+    assert main(["fit", *run]) == 0
+    assert load(tmp_path / "run").actions.hidden_size == 8
+
+
+def test_a_network_that_knows_the_last_durations(file: str, tmp_path: Path):
+    """It is better than one that does not; score and report make the same context; a resumed run keeps it."""
+    out, gru = str(tmp_path / "run"), ["--config", "gru", "--model.prior.hidden_size", "16"]
+    assert main(["fit", *gru, "--data.file", file, "--data.past_durations", "1", *QUICK, "--out", out]) == 0
+    prior = load(out)
+    assert isinstance(prior, GRUPrior)
+    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
+    assert rows[-1]["bits_per_action"] < min(row["bits_per_action"] for row in rows[:-1]) - 0.1
+    plans = read_plans(file)
+    nats = -prior.log_prob(match_plans(plans, prior)).detach().sum().item()
+    expected = nats / math.log(2) / plans.actions.numel()
+    assert main(["score", out, file, "--out", str(tmp_path / "score")]) == 0
+    scored = pd.read_csv(tmp_path / "score" / "plans.csv")
+    assert scored["log_likelihood"].sum() == pytest.approx(-nats, rel=1e-5)
+    assert main(["report", file, "--priors", out, "--out", str(tmp_path / "report")]) == 0
+    (row,) = json.loads((tmp_path / "report" / "results.json").read_text())["rows"]
+    assert row["bits_per_action"] == pytest.approx(expected, abs=1e-4)
+    assert row["context"] == "actions and durations"
+    assert main(["fit", "--resume", out, "--trainer.max_steps", "60"]) == 0
+    assert load(out).past_durations == prior.past_durations
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["markov", "--data.past_durations", "1"], ["cannot take the context"]),
+        (["gru", "--data.past_durations", "-1"], ["past_durations: at least 0"]),
+        (["semi-markov", "--data.past_durations", "1"], ["cannot take the context", "context_size"]),
+    ],
+)
+def test_faults_are_one_line(arguments, words, file, tmp_path, capsys):
+    assert main(["fit", "--config", *arguments, "--data.file", file, "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert all(word in said for word in words), said

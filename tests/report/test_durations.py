@@ -1,0 +1,177 @@
+"""The report's section on durations: tables, figure, and whether durations predict the next action."""
+
+from dataclasses import replace
+from math import log, nan
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from neuroprior.analysis.comparison import score_bits
+from neuroprior.plans import Plans, write_plans
+from neuroprior.priors import UniformPrior
+from neuroprior.report import Document, dwell_figure, report
+from neuroprior.report.durations import chain_bits
+from neuroprior.report.figures import MOST_PANELS
+from neuroprior.report.part import Part
+from neuroprior.report.scores import evaluate_saved
+from neuroprior.report.sections import SECTIONS
+from tests.support.reports import QUICK
+from tests.support.sources import refuses, seeded
+
+ONLY = {"models": ["counts"], "folds": 2, "processes": 1, "sections": ["durations"]}
+
+
+def timed(telling: bool, num_plans: int = 24, length: int = 60, seed: int = 0, num_actions: int = 3) -> Plans:
+    """Actions at random; where `telling`, action 0 follows each that took longer than the median."""
+    durations = torch.empty(num_plans, length).exponential_(generator=seeded(seed)) * 2
+    actions = torch.randint(num_actions, (num_plans, length), generator=seeded(seed + 1))
+    for t in range(1, length):
+        long = durations[:, t - 1] > 2 * 0.6931
+        actions[:, t] = torch.where(long & telling, 0, actions[:, t])
+    names = tuple("abcdefghijklmnop")[:num_actions]
+    return Plans(actions, num_actions, durations=durations, group=torch.arange(num_plans) % 8, action_names=names)
+
+
+def tables(plans: Plans) -> dict[str, pd.DataFrame]:
+    """Those of the section alone."""
+    return section(plans).frames
+
+
+def section(plans: Plans) -> Part | None:
+    return SECTIONS["durations"](evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, plans, 0))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Document, Path]:
+    folder = tmp_path_factory.mktemp("made")
+    plans = timed(True)
+    durations = plans.durations.clone()
+    durations[:, ::10] = nan
+    durations[plans.actions == 2] = 0
+    write_plans(replace(plans, durations=durations), folder / "plans.csv")
+    return report(folder / "plans.csv", out=folder, **ONLY), folder
+
+
+def test_the_section_of_a_file(made):
+    document, folder = made
+    names = ["durations", "duration_laws", "next_by_duration", "dwell"]
+    assert list(document.tables) == names
+    assert all((folder / f"{name}.csv").exists() for name in names)
+    frame = document.tables["durations"].set_index("action")
+    assert frame["law"].to_dict() == {"a": "exponential", "b": "exponential", "c": "of all"}
+    assert frame["zero"].to_dict() == {"a": 0, "b": 0, "c": 1}
+    assert (frame["known"] + frame["unknown"]).sum() == 24 * 60
+    assert frame["unknown"].sum() > 0
+    assert frame.loc["a", "median"] == pytest.approx(2 * 0.6931, rel=0.2)
+    assert "dwell" in document.figures
+    assert len(document.figures["dwell"].axes) == 2  # c takes no time
+
+
+def test_the_histogram_and_the_law_are_densities(made):
+    dwell = made[0].tables["dwell"]
+    width = (dwell["high"] / dwell["low"]).map(log)
+    for what, least in (("density", 1 - 1e-9), ("fitted", 0.97)):
+        total = (dwell[what] * width).groupby(dwell["action"]).sum()
+        assert total.between(least, 1 + 1e-9).all()
+
+
+def test_gains_of_laws_are_held_out():
+    """Of a Weibull law over an exponential one: what the densities say of many durations; of the latter itself, 0."""
+    plans = timed(False)
+    times = plans.durations.clone()
+    times[plans.actions == 1] = times[plans.actions == 1].sqrt()  # Weibull with shape 2
+    frame = tables(replace(plans, durations=times))["durations"].set_index("action")
+    assert frame["law"].to_dict() == {"a": "exponential", "b": "weibull", "c": "exponential"}
+    assert frame.loc["a", "gain"] == pytest.approx(0, abs=0.01)
+    # log 2 + E log x - E x^2 + (log mean + 1) of a Weibull variable with shape 2 and scale 1, whatever its scale
+    expected = 0.6931 - 0.5772 / 2 - 1 + (1 + torch.tensor(torch.pi).sqrt().div(2).log().item())
+    assert frame.loc["b", "low"] < expected < frame.loc["b", "high"]
+    assert frame.loc["b", "units"] == 8
+
+
+def test_durations_that_predict_the_next_action():
+    """Half of the actions are followed by action 0, the others by any: the bits are known."""
+    gained = tables(timed(True))["next_by_duration"].iloc[0]
+    assert gained["low"] > 0.2
+    # the classes are terciles, and what predicts is the median: the middle class is uncertain
+    share = torch.tensor([[1, 1, 1], [2, 0.5, 0.5], [3, 0, 0]]).double() / 3
+    expected = float(-torch.special.xlogy(share, share).sum(1).mean() / torch.tensor(2.0).log())
+    assert gained["with"] == pytest.approx(expected, abs=0.04)
+    assert gained["p_value"] < 1e-4
+
+
+def test_durations_that_do_not():
+    """Of 5 files the interval is above 0 in at most one: in more with a probability of 0.006, were it so in 2.5 %."""
+    rows = []
+    for seed in range(5):
+        plans = timed(False, seed=10 * seed)
+        (without, knowing), mask = chain_bits(plans, plans.mask())
+        rows.append(score_bits("", "", without, plans, mask).minus(score_bits("", "", knowing, plans, mask)))
+    assert sum(row.low > 0 for row in rows) <= 1
+    assert max(abs(row.mean) for row in rows) < 0.01
+
+
+def test_classes_are_learned_on_training_plans_and_of_past_durations_only():
+    """The bits of an action do not change with its own duration, or a later one, or one of the held-out plans."""
+    plans = timed(True, num_plans=10)
+    known = plans.mask()
+    (_, before), mask = chain_bits(plans, known)
+    assert mask[:, 0].sum() == 0
+    assert bool(mask[:, 1:].all())
+    last = plans.durations.clone()
+    last[:, -1] = 1e6 * torch.rand(10, generator=seeded(0))
+    # The last durations move the terciles of their actions, so that they are put where these do not lie.
+    (_, after), _ = chain_bits(replace(plans, durations=last.where(last < plans.durations, plans.durations)), known)
+    assert before[:, 1:].equal(after[:, 1:])
+
+
+def test_few_units_give_no_verdict():
+    plans = replace(timed(True), group=torch.arange(24) % 3)
+    made = section(plans).section
+    assert "fewer than 5 groups" in " ".join(made.text)
+    assert "*" not in "".join(cell for table in made.tables for row in table.rows for cell in row)
+
+
+def test_one_plan_is_cut_in_time():
+    plans = timed(True, 1, 600)
+    frame = tables(replace(plans, group=None))["next_by_duration"]
+    assert frame.iloc[0]["low"] > 0
+
+
+def test_without_durations_there_is_no_section():
+    plans = timed(False)
+    for durations in (None, torch.full_like(plans.durations, nan), torch.zeros_like(plans.durations)):
+        assert section(replace(plans, durations=durations)) is None
+
+
+def test_networks_with_durations():
+    """They know more than those without, and the table says so."""
+    plans = timed(True, 64, 12)
+    quick = QUICK | {"models": ["gru"], "inputs": ["actions", "durations"], "max_steps": 60, "patience": 1.0}
+    made = report(plans, folds=2, **quick, sections=["scores", "durations"])
+    bits = made.tables["plans"].set_index("context")["bits_per_action"]
+    assert bits["actions and durations"] < bits["actions"] - 0.1
+    row = made.tables["next_by_duration"].set_index("model").loc["gru"]
+    assert row["gain"] == pytest.approx(bits["actions"] - bits["actions and durations"])
+    refuses("no durations", lambda: report(replace(plans, durations=None), inputs=["durations"], **ONLY))
+    refuses("durations are an input of transformer, gru", lambda: report(plans, inputs=["durations"], **ONLY))
+
+
+def test_at_most_some_panels_are_drawn():
+    plans = timed(False, num_actions=16)
+    dwell = tables(plans)["dwell"]
+    figure = dwell_figure(dwell)
+    assert len(figure.axes) == MOST_PANELS
+    assert figure.get_suptitle() == f"the {MOST_PANELS} commonest of 16 actions"
+    assert len(dwell_figure(dwell[dwell["action"] == "a"]).axes) == 1
+    refuses("dwell", lambda: dwell_figure(dwell[:0]))
+
+
+def test_rounded_durations_have_no_empty_bins():
+    """Edges lie between the values that durations are rounded to."""
+    plans = timed(False)
+    frames = (plans.durations * 5).ceil() / 5
+    dwell = tables(replace(plans, durations=frames))["dwell"]
+    assert (dwell["density"].groupby(dwell["action"]).apply(lambda own: (own[:8] > 0).all())).all()
