@@ -24,6 +24,7 @@ from neuroprior.analysis.statistics import ENOUGH_UNITS
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors import learn_macros
 from neuroprior.report import figures
+from neuroprior.report.conditions import condition_section
 from neuroprior.report.document import Column, table
 from neuroprior.report.fits import ACTIONS, CONTEXT
 from neuroprior.report.page import FigureBox, Section, Table
@@ -494,6 +495,7 @@ def _action_drift(plans: Plans) -> pd.DataFrame:
 SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "file": file_section,
     "scores": score_section,
+    "conditions": condition_section,
     "lags": lag_section,
     "orders": order_section,
     "calibration": calibration_section,
