@@ -9,6 +9,7 @@ Needs pandas, matplotlib, jinja2, joblib and rich (`pip install 'neuroprior[repo
 from neuroprior.report.document import Document, publish, table
 from neuroprior.report.figures import (
     calibration_figure,
+    condition_figure,
     distribution_figure,
     drift_figure,
     dwell_figure,
@@ -29,6 +30,7 @@ __all__ = [
     "Section",
     "Table",
     "calibration_figure",
+    "condition_figure",
     "distribution_figure",
     "drift_figure",
     "dwell_figure",

@@ -20,6 +20,7 @@ from neuroprior.report.drawing import (
     FEWER,
     MORE,
     PLAIN,
+    SPARE,
     WIDTH,
     Array,
     Number,
@@ -42,6 +43,7 @@ from neuroprior.report.page import INK, clean
 
 MOST_PLANS = 1000  # drawn as points; of more, evenly spaced ones
 MOST_GROUPS = 40  # drawn as a row each; of more, evenly spaced ones between the lowest and the highest
+MOST_DOTS = 200  # units drawn as a dot for each condition; of more, evenly spaced ones
 MOST_PANELS = 12  # groups drawn as a panel each; of more, those that differ most
 MOST_STEPS = 400  # actions of a sequence that are drawn, from its first
 NUMBERED = 8  # actions up to which the cells of a matrix hold their numbers
@@ -345,6 +347,42 @@ def group_transition_figure(
     if len(chosen) < len(gaps):
         figure.suptitle(f"{len(chosen)} of {len(gaps)} groups: those that differ most", fontsize=10, x=0.01, ha="left")
     _scale(cells[: len(chosen)], -top, top, MORE, "difference in probability")
+    return figure
+
+
+@drawn
+def condition_figure(means: pd.DataFrame, values: pd.DataFrame, paired: bool = False) -> Figure:
+    """Features of behaviour under each condition: a panel a feature, a dot a unit, and means with their intervals.
+
+    At most `MOST_DOTS` dots of each condition are drawn.
+
+    Args:
+        means: `feature` (text), `condition`, `mean`, `low`, `high`; features from the top down, conditions in order.
+        values: `feature`, `unit`, `condition`, `value`; missing values are left out.
+        paired: each unit is under every condition: lines join its dots.
+    """
+    expect_some("means", means)
+    conditions = list(means["condition"].unique())
+    features = list(means["feature"].unique())
+    height = 0.62 + (0.36 if paired else 0.26) * len(conditions)
+    figure, cells = panels(len(features), 1, (WIDTH, height * len(features) + 0.5))
+    hues = dict(zip(conditions, (SPARE * len(conditions))[: len(conditions)], strict=True))
+    for axes, feature in zip(cells, features, strict=True):
+        own, mean = values[values["feature"] == feature], means[means["feature"] == feature]
+        wide = own.pivot(index="unit", columns="condition", values="value").reindex(columns=conditions)
+        wide = wide.iloc[_evenly(len(wide), MOST_DOTS * (1 if paired else len(conditions)))]
+        places = -np.arange(len(conditions), dtype=np.float64)
+        if paired:
+            axes.plot(wide.to_numpy().T, places, color=INK, lw=0.7, alpha=0.3)
+        for place, condition in zip(places, conditions, strict=True):
+            dots = floats(wide[condition])
+            axes.plot(dots, np.full(len(dots), place), "o", ms=5, mew=0, color=hues[condition], alpha=0.55)
+            estimate = floats(mean.loc[mean["condition"] == condition, ["mean", "low", "high"]].to_numpy()[0])
+            axes.plot(estimate[1:], [place - 0.32] * 2, color=hues[condition], lw=2.4, solid_capstyle="butt")
+            axes.plot(estimate[0], place - 0.32, "|", ms=9, mew=2.4, color=hues[condition])
+        names_down(axes, [short(condition, 20) for condition in conditions], places)
+        axes.set_ylim(places.min() - 0.6, 0.4)
+        axes.set_title(short(feature, 70), fontsize=9.5)
     return figure
 
 

@@ -24,6 +24,7 @@ from neuroprior.analysis.statistics import ENOUGH_UNITS
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors import learn_macros
 from neuroprior.report import figures
+from neuroprior.report.conditions import condition_section
 from neuroprior.report.document import Column, table
 from neuroprior.report.durations import duration_section
 from neuroprior.report.fits import ACTIONS, CONTEXT
@@ -495,6 +496,7 @@ def _action_drift(plans: Plans) -> pd.DataFrame:
 SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "file": file_section,
     "scores": score_section,
+    "conditions": condition_section,
     "lags": lag_section,
     "orders": order_section,
     "calibration": calibration_section,

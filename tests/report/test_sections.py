@@ -72,7 +72,7 @@ def test_a_report_has_its_tables_and_figures(made):
     assert all(isinstance(figure, Figure) for figure in made.figures.values())
     boxes = [box for section in made.sections for box in section.figures]
     assert all(isinstance(box, FigureBox) and box.caption and box.alt and box.name for box in boxes)
-    assert len(made.sections) >= len(SECTIONS) - 2
+    assert len(made.sections) >= len(SECTIONS) - 3  # of macro-actions, motifs and conditions there may be none
 
 
 def test_what_is_asked_for_is_done(made):
