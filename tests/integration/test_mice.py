@@ -11,11 +11,12 @@ from scipy import stats
 
 from eval.__main__ import main
 from eval.mice.command import DATA
-from eval.mice.experiment import MiceSettings, collected, shares_reached
+from eval.mice.experiment import MiceSettings, PriorName, _count_based, collected, shares_reached
 from eval.mice.figures import ENTRANCE, coordinates, far_from_water, left_turns, passages
-from neuroprior import Plans, SamplingPlanner, UniformPrior, oracle, read_plans
+from neuroprior import MarkovPrior, Plans, SamplingPlanner, UniformPrior, oracle, read_plans
 from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import WATER
+from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import FALSE_ALARM, every_plan, in_world_distribution, seeded
 
 INNER = range(63)
@@ -157,6 +158,18 @@ def test_what_is_learned_from():
     far = oracle(world, sources["planner"].context[:, 0], 6, objective="return") == 0
     ends = world.next_state[sources["planner"].context[:, -1], sources["planner"].actions[:, -1].long()]
     assert torch.equal((sources["planner"].lengths == 6) & (ends != WATER), far)
+
+
+def test_orders_are_chosen_on_some_plans_and_then_all_are_counted():
+    actions = markov_plans(markov_probs(4, 2, 0, 3.0), 300, 12, 1).actions
+    plans = Plans(actions, 4, context=torch.randint(127, (300, 12), generator=seeded(2)))
+    priors, learned = _count_based({"mice": plans}, seeded(0))
+    training, validation = (Plans(part.actions, 4) for part in plans.split(0.1, seeded(0)))
+    costs = [-float(MarkovPrior(4, order).fit(training).log_prob(validation).sum()) for order in range(9)]
+    best = costs.index(min(costs))
+    assert learned["markov_order_moves"].tolist() == [best]
+    moves, chosen = Plans(actions, 4), priors[PriorName("markov", "mice", "moves")]
+    assert torch.equal(chosen.log_prob(moves), MarkovPrior(4, best).fit(moves).log_prob(moves))
 
 
 OPTIONS = ["--seeds=2", "--starts=6", "--training-plans=200", "--steps=5"]

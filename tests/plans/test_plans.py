@@ -111,6 +111,16 @@ def test_split_keeps_groups_together(group, share, seed):
     assert abs(held_out - share * len(set(group))) <= 1
 
 
+@pytest.mark.parametrize(("units", "share", "held_out"), [(18, 0.1, 2), (14, 0.1, 1), (3, 0.01, 1), (3, 0.99, 2)])
+def test_the_nearest_number_of_units_is_held_out(units, share, held_out):
+    for group in (None, torch.arange(2 * units) % units):
+        plans = Plans(torch.zeros(units if group is None else 2 * units, 3, dtype=torch.long), 2, group=group)
+        training, validation = plans.split(share, seeded(0))
+        number = len(validation) if group is None else len(validation.group.unique())
+        assert number == held_out
+        assert len(training) + len(validation) == len(plans)
+
+
 def test_split_is_random():
     plans = Plans(torch.arange(5)[:, None], 5)
     generator = seeded(0)

@@ -122,7 +122,13 @@ def test_a_single_seed_has_no_interval():
 
 def test_aggregates_over_worlds():
     made = list(results(0.2, worlds=("maze", "grid", "cube")))
-    across = planner_document(made, {}, "").frames["across"]
+    frames = planner_document(made, {}, "").frames
+    # Corrected for the tests in the same world alone.
+    assert (
+        frames["paired"]["p_holm"].tolist()
+        == planner_document(made[:4], {}, "").frames["paired"]["p_holm"].tolist() * 3
+    )
+    across = frames["across"]
     assert across["num_plans"].tolist() == [4, 16]
     assert across[["worlds", "seeds"]].to_numpy().tolist() == [[3, 4], [3, 4]]
     for planner, side in (("mcts", "first"), ("sampling", "second")):
@@ -130,3 +136,5 @@ def test_aggregates_over_worlds():
         assert across.loc[0, [side, f"{side}_low", f"{side}_high"]].tolist() == pytest.approx(list(due))
     assert across["improvement"].tolist() == [1, 0.5]
     assert planner_document(list(results(0.2)), {}, "").frames["across"].empty
+    # Seeds that one of the worlds lacks are left out.
+    assert planner_document(made[:-1], {}, "").frames["across"]["seeds"].tolist() == [3, 3]

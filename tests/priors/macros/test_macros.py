@@ -183,6 +183,9 @@ def test_of_too_many_ways_the_most_probable_are_kept(monkeypatch):
     assert not torch.equal(near, exact)
     assert (near - exact).abs().mean() < 0.1
     assert float(near.double().exp().sum()) == pytest.approx(1, abs=1e-4)
+    # One way alone must not be within a macro: nothing else could follow.
+    monkeypatch.setattr(MacroPrior, "MOST", 1)
+    assert prior.log_prob(plans).isfinite().all()
 
 
 def test_actions_of_any_integer_dtype():
