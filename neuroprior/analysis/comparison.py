@@ -7,7 +7,7 @@ from math import inf, log
 import torch
 from torch import Tensor
 
-from neuroprior.analysis.statistics import Difference, ratio_difference
+from neuroprior.analysis.statistics import ENOUGH_UNITS, Difference, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.priors import ContextTreePrior, MarkovPrior, Prior, UniformPrior
@@ -124,6 +124,26 @@ def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
     if plans.group is not None and int(taken.sum()) >= FEWEST_UNITS:
         return "plans of one group"
     return "plans" if int(taken.sum()) >= FEWEST_UNITS else "parts of the plan"
+
+
+def too_few(plans: Plans, mask: Tensor | None = None, cut: bool = False) -> str:
+    """Why no verdict is drawn from plans, such as "3 groups are too few for a verdict"; "" where one may be.
+
+    Independent are groups; where there are none, plans. Plans of one group, and parts of one plan, are not.
+
+    Args:
+        plans: the plans.
+        mask: `[N, L]` bool: the actions that count; None: all.
+        cut: they are parts of a single plan.
+    """
+    taken = (plans.mask() if mask is None else mask).any(1)
+    if plans.group is not None:
+        what, number = "group", len(plans.group.to(taken.device)[taken].unique())
+    else:
+        what, number = "plan", 1 if cut else int(taken.sum())
+    if number >= ENOUGH_UNITS:
+        return ""
+    return f"{number} {what}{'s' * (number != 1)} {'is' if number == 1 else 'are'} too few for a verdict"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from neuroprior._files import versions, write_json
-from neuroprior.analysis.comparison import Score, baselines, score, unit_name
+from neuroprior.analysis.comparison import Score, baselines, score, too_few, unit_name
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
 from neuroprior.priors import save
 from neuroprior.priors.scoring import keep_learned
@@ -78,20 +78,18 @@ def _row(one: Score, trained: Score) -> dict[str, Any]:
 def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
     """The table for the terminal; the best baseline is marked."""
     actions, unit = int(data.held_out.mask().sum()), unit_name(data.held_out)
-    trained = frame.index[-1]
+    trained, few = frame.index[-1], too_few(data.held_out)
 
     def plus_minus(row: Any, mean: str, high: str, sign: str = "") -> str:
         return "" if pd.isna(row[mean]) else f"{row[mean]:{sign}.4f} ± {row[high] - row[mean]:.4f}"
 
     columns = {
-        "model": lambda row: row.model + "*" * (row.model == chosen),
+        "model": lambda row: row.model + "*" * (row.model == chosen and not few),
         "settings": lambda row: ", ".join(filter(None, (row.how, "context" * ("context" in str(row.context))))),
         "bits per action": lambda row: plus_minus(row, "bits_per_action", "high"),
         "difference": lambda row: "" if row.name == trained else plus_minus(row, "more_than_trained", "more_high", "+"),
     }
-    caption = (
-        f"±: 95 % interval over {unit}. difference: from the last row.\n"
-        "*: best on the validation plans, which chose the settings."
-    )
+    best = f"{few}." if few else "*: best on the validation plans, which chose the settings."
+    caption = f"±: 95 % interval over {unit}. difference: from the last row.\n{best}"
     title = f"Bits per action on {len(data.held_out):,} held-out plans ({actions:,} actions)"
     return printed(title, table(frame, columns, caption, align="llrr"))

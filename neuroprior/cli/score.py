@@ -4,7 +4,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neuroprior.analysis.comparison import action_bits, score_bits, unit_name
+from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
 from neuroprior.plans import Columns, Missing, read_plans
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans
@@ -83,7 +83,8 @@ def score(
     console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
     whole = score_bits(folder, "", bits, own).bits_per_action()
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
-    console.print(f"{whole.mean:.4f} bits per action, {interval}", highlight=False)
+    few = too_few(plans)
+    console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)
     place = Path(out)
     place.mkdir(parents=True, exist_ok=True)
     write_frames(place, frames)

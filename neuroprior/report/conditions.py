@@ -27,7 +27,7 @@ TESTS = {
     "sequences": "shares of sequences of three",
     "durations": "durations of actions",
     "bits": "bits saved by knowing the condition",
-    "classifier": "condition told from sequences",
+    "classifier": "condition predicted from sequences",
 }
 
 
@@ -173,13 +173,13 @@ def _block_table(result: ConditionComparison, prediction: ConditionPrediction, b
     names, item = result.condition_names, result.design.item
     counts = pd.crosstab(blocks["condition"], blocks["classified"]).reindex(index=names, columns=names, fill_value=0)
     columns: dict[str, Column] = {"condition": lambda row: str(row.name)}
-    columns |= {f"told as\n{name}": _cell_of(name, "") for name in names}
+    columns |= {f"predicted\n{name}": _cell_of(name, "") for name in names}
     caption = (
         f"Held-out {item}, under the condition in which their sequences are most likely (Markov chains):"
         f" {100 * prediction.accuracy:.0f} % are right on average over conditions, {100 * prediction.expected:.0f} % in"
         f" permutations (p = {prediction.p_value:.2g}, not corrected)."
     )
-    return table(counts, columns, caption, "Condition told from sequences")
+    return table(counts, columns, caption, "Condition predicted from sequences")
 
 
 def _sequences(result: ConditionComparison, prediction: ConditionPrediction, actions: list[str]) -> pd.DataFrame:
@@ -198,7 +198,7 @@ def _sequence_table(sequences: pd.DataFrame) -> Table:
         f"The first {len(shown)} of {len(sequences)}. What each adds to the held-out log odds of the right condition;"
         " below 0 it misleads."
     )
-    return table(shown, columns, caption, "Transitions that tell the condition", "llr")
+    return table(shown, columns, caption, "Transitions that predict the condition", "llr")
 
 
 def _figure_box(result: ConditionComparison, features: pd.DataFrame, units: list[str]) -> FigureBox:

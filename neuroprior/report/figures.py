@@ -168,13 +168,14 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
 
 
 @drawn
-def order_figure(orders: pd.DataFrame, scores: pd.DataFrame) -> Figure:
+def order_figure(orders: pd.DataFrame, scores: pd.DataFrame, ringed: bool = True) -> Figure:
     """Information criteria and held-out bits against the order of the chain; the least of each is ringed.
 
     Args:
         orders: the table `orders` of a report: `order`, `context`, `bic_bits`, `aic_bits`: half the criterion in bits
             per action, on the scale of the held-out bits.
         scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
+        ringed: False where there are too few independent units for a verdict.
     """
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     styles = iter(("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1))))
@@ -190,7 +191,8 @@ def order_figure(orders: pd.DataFrame, scores: pd.DataFrame) -> Figure:
     for curve in [curve for curve in axes.lines if np.isfinite(curve.get_ydata()).any()]:
         order, bits = np.asarray(curve.get_data(), dtype=np.float64)
         least = int(np.nanargmin(bits))
-        axes.plot(order[least], bits[least], "o", ms=13, mfc="none", mec=curve.get_color(), mew=1.3)
+        if ringed:
+            axes.plot(order[least], bits[least], "o", ms=13, mfc="none", mec=curve.get_color(), mew=1.3)
         lows.append(bits[least])
         tops.append(max(np.nanmax(bits[: least + 1]), 1.05 * bits[least]))
     if lows:

@@ -174,11 +174,9 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
             made += [] if part is None else [part]
             progress.advance(name)
     facts = describe(found.plans)
-    bits, low, high, _ = found.best.score.bits_per_action()
     return Document(
         title=f"Plans in {Path(file).name}" if file else "Plans",
-        lead=f"The best model, {found.best.label}, takes {bits:.3f} bits per action"
-        f" (95 % interval {low:.3f} to {high:.3f} over {found.unit}).",
+        lead=_lead(found),
         sections=[part.section for part in made],
         frames={name: frame for part in made for name, frame in part.frames.items()},
         settings=found.settings,
@@ -191,6 +189,16 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
         keys={"plans": "rows"},
         former_names={"context": "sees"},
     )
+
+
+def _lead(found: Evaluation) -> str:
+    """The finding: the model that takes the fewest bits, which is called the best where there are enough units."""
+    bits, low, high, _ = found.best.score.bits_per_action()
+    interval = f"(95 % interval {low:.3f} to {high:.3f} over {found.unit})"
+    if not found.too_few:
+        return f"The best model, {found.best.label}, takes {bits:.3f} bits per action {interval}."
+    fewest = "the fewest bits per action of all models, " if len(found.models) > 1 else "bits per action: "
+    return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
 
 
 def _check(skip: int, max_steps: int, patience: float, seed: int, processes: int | None) -> None:

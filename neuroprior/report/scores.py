@@ -17,7 +17,7 @@ from torch import Tensor
 from neuroprior._files import written_whole
 from neuroprior._jobs import JobRun
 from neuroprior.analysis import Reliability
-from neuroprior.analysis.comparison import ORDERS, Score, score_bits, unit_name, units
+from neuroprior.analysis.comparison import ORDERS, Score, score_bits, too_few, unit_name, units
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior
 from neuroprior.priors.matching import match_plans
@@ -82,7 +82,12 @@ class Evaluation:
     @property
     def unit(self) -> str:
         """What intervals go over."""
-        return unit_name(self.scored, self.mask)
+        return "parts of the plan" if self.settings.get("cut") else unit_name(self.scored, self.mask)
+
+    @property
+    def too_few(self) -> str:
+        """Why no model is called better than another; "" where there are enough independent units."""
+        return too_few(self.scored, self.mask, bool(self.settings.get("cut")))
 
     @property
     def best(self) -> Model:

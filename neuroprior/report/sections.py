@@ -19,7 +19,7 @@ from neuroprior.analysis import (
     transitions,
     two_sample_tests,
 )
-from neuroprior.analysis.comparison import unit_name
+from neuroprior.analysis.comparison import too_few, unit_name
 from neuroprior.analysis.statistics import ENOUGH_UNITS
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors import learn_macros
@@ -129,17 +129,19 @@ def score_section(found: Evaluation) -> Part:
     text = [
         f"The bits of each model{held_out}: the fewer, the more of the structure it predicts; a nat is 1.44 bits."
         " Perplexity (perpl.) is the number of equally likely actions that would take as many bits.",
-        "Order, back-off and smoothing of count-based models were chosen within the training plans. A difference whose"
-        " interval holds 0 is not significant. The reference is the best of all models on the same plans, which favours"
-        " it a little; differences are not corrected for the number of models.",
+        "Order, back-off and smoothing of count-based models were chosen within the training plans. The reference is"
+        " the model with the fewest bits on the same plans, which favours it a little; differences are not corrected"
+        " for the number of models.",
     ]
+    text = text[:1] if saved else text
+    text.append(_no_verdict(found.too_few) or "A difference whose interval holds 0 is not significant.")
     caption_of_figure = f"Bits per {'' if saved else 'held-out '}action, 95 % intervals over {found.unit}."
     best = found.best
     alt = f"Bits per action of each model, the fewest {best.cost:.3f} of {best.label}."
     box = FigureBox(figures.score_figure(scores), caption_of_figure, alt, "scores")
     title = "Scores" if saved else "Held-out scores"
     shown = table(scores, columns, caption, align="llrrrr")
-    return Part(Section(title, text[:1] if saved else text, [shown], [box]), {"plans": scores})
+    return Part(Section(title, text, [shown], [box]), {"plans": scores})
 
 
 def lag_section(found: Evaluation) -> Part | None:
@@ -156,7 +158,8 @@ def lag_section(found: Evaluation) -> Part | None:
     if not len(lags):
         return None
     lags = lags.assign(units=lags["units"].astype("Int64"))
-    above = (lags["units"].fillna(ENOUGH_UNITS) >= ENOUGH_UNITS) & (lags["low"] >= LEAST)
+    few = too_few(found.plans)
+    above = (lags["units"].fillna(ENOUGH_UNITS) >= ENOUGH_UNITS) & (lags["low"] >= LEAST) & (not few)
     cells = lags["bits"].map("{:.4f}".format) + above.map({True: "*", False: " "})
     names = figures.lag_names(lags)
     wide = lags.assign(cell=cells, curve=names).pivot(index="lag", columns="curve", values="cell")[names.unique()]
@@ -171,12 +174,13 @@ def lag_section(found: Evaluation) -> Part | None:
         "Where the gain of the chain ends before that of the GRU, longer histories matter but occur too seldom to be"
         " counted; below 0, splitting the counts loses more than the older action adds.",
     ]
+    text += [_no_verdict(few)] if few else []
     caption = (
         "Bits that the action k steps back adds. Dashed: the 95 % quantile of the mutual information of independent"
         " actions."
     )
     box = FigureBox(figures.lag_figure(lags), caption, "Information by lag.", "lags")
-    shown = table(wide, columns, f"Bits. *: above 0, by the 95 % interval of that lag over {over}.")
+    shown = table(wide, columns, "Bits." if few else f"Bits. *: above 0, by the 95 % interval of that lag over {over}.")
     return Part(Section("Information by lag", text, [shown], [box]), {"lags": lags})
 
 
@@ -202,20 +206,20 @@ def order_section(found: Evaluation) -> Part | None:
     criteria = {"BIC": "bic_bits", "AIC": "aic_bits", "held out": "bits_per_action"}
     columns: dict[str, Column] = {"order": "order", "input": _input, "parameters": "num_parameters:,"}
     for heading, name in criteria.items():
-        least = both[name] == both.groupby("context")[name].transform("min")
+        least = (both[name] == both.groupby("context")[name].transform("min")) & (not found.too_few)
         both[heading] = both[name].map("{:.4f}".format, na_action="ignore") + least.map({True: "*", False: " "})
         columns[heading] = heading
-    caption = (
-        "Bits per action, the least of each input with a star; the information criteria are halved, so that they stand"
-        " on the same scale."
-    )
+    star = "" if found.too_few else ", the least of each input with a star"
+    caption = f"Bits per action{star}; the information criteria are halved, so that they stand on the same scale."
     text = [
         "The information criteria judge plans that were learned from, and count a parameter for each action after each"
         " history that occurred. Held-out chains back off to shorter histories where a history is rare."
     ]
+    text += [_no_verdict(found.too_few)] if found.too_few else []
     shown = table(both, columns, caption, align="llrrrr")
-    figure = figures.order_figure(orders, scores)
-    box = FigureBox(figure, "The least of each curve is ringed.", "Order selection.", "orders")
+    figure = figures.order_figure(orders, scores, not found.too_few)
+    caption = "" if found.too_few else "The least of each curve is ringed."
+    box = FigureBox(figure, caption or "Bits per action by order.", "Order selection.", "orders")
     return Part(Section("Markov order", text, [shown], [box]), {"orders": orders})
 
 
@@ -266,15 +270,14 @@ def transition_section(found: Evaluation) -> Part | None:
     if len(groups) > 1:
         row = {"groups": len(groups), "test": result.test, "permutations": result.permutations}
         test = pd.DataFrame([row | {"statistic": result.statistic, "p_value": result.p_value if tested else None}])
-        text.append(
-            "That groups have the same transitions is tested by permuting plans between them, where they have enough."
-            " Marked cells differ at p < 0.05, corrected for all."
-        )
+        few = too_few(plans)
+        tested_by = "That groups have the same transitions is tested by permuting plans between them, where they have"
+        text.append(_no_verdict(few) or f"{tested_by} enough. Marked cells differ at p < 0.05, corrected for all.")
         columns = {"groups": "groups", "permutations": "permutations:,", "p": "p_value:.2g"}
-        tables.append(
-            table(test, columns, "Whether groups have the same transitions (p: blank if not tested).", align="rrr")
-        )
-        significant = (result.cell_p_values < SIGNIFICANT) & tested
+        if not few:
+            caption = "Whether groups have the same transitions (p: blank if not tested)."
+            tables.append(table(test, columns, caption, align="rrr"))
+        significant = (result.cell_p_values < SIGNIFICANT) & tested & (not few)
         figure = figures.group_transition_figure(each, probs, names, groups, significant)
         caption = "Each group's transition probabilities less those of all."
         boxes.append(FigureBox(figure, caption, "Differences of the groups' transitions.", "group_transitions"))
@@ -302,11 +305,13 @@ def motif_section(found: Evaluation) -> Part | None:
         "95 % interval": lambda row: f"{row.low:.2f} to {row.high:.2f}",
         "p": lambda row: p_text(row.corrected),
     }
+    few = too_few(plans)
     tables, boxes = [], []
     for repeats, own in frame.groupby("repeats", sort=False) if rows else []:
         merged = ", repeats of an action merged" * (repeats == "merged")
-        caption = f"Against a chain of order n - 2{merged}. p: Fisher's exact test, corrected for all sequences (Holm)."
-        tables.append(table(own, columns, caption))
+        p = "Listed by" if few else "p:"
+        caption = f"Against a chain of order n - 2{merged}. {p} Fisher's exact test, corrected for all (Holm)."
+        tables.append(table(own, _without_p(columns, few), caption))
         alt = "Over-represented sequences: " + "; ".join(own["sequence"][:5])
         figure = figures.motif_figure(own)
         boxes.append(
@@ -318,6 +323,7 @@ def motif_section(found: Evaluation) -> Part | None:
         " to be of one chain: where groups differ, sequences of some of them are over-represented, too. One such"
         " sequence makes others over-represented that share its beginning.",
         *([] if rows else ["There are none (p < 0.05, corrected for all sequences)."]),
+        *([_no_verdict(few)] if few else []),
     ]
     return Part(Section("Over-represented sequences", text, tables, boxes), {"motifs": frame})
 
@@ -354,7 +360,9 @@ def likeness_section(found: Evaluation) -> Part | None:
     """Sequences sampled from the models beside real ones."""
     # Where plans come in groups there is no test: plans of one subject are more alike than those of a model of all
     # subjects, however good, and the first fold holds too few groups to shuffle these.
-    tested = unit_name(found.scored) != "groups"
+    cut = bool(found.settings.get("cut"))
+    few = too_few(found.sampled, cut=cut)
+    tested = found.scored.group is None and not few
     rows: list[dict[str, Any]] = []
     shown: tuple[Model, Plans, list[Any]] | None = None
     for model in sorted(found.leading(CONTEXT) + found.leading(ACTIONS), key=lambda model: model.cost):
@@ -384,11 +392,10 @@ def likeness_section(found: Evaluation) -> Part | None:
     wide.loc[len(wide)] = {"model": "same source", "context": ""} | {
         one.statistic: f"{one.null_distance:.3f}" for one in results
     }
-    test = (
-        "*: p < 0.05, permutation test over plans, corrected."
-        if tested
-        else "Not tested: plans of one group are not independent."
-    )
+    test = "*: p < 0.05, permutation test over plans, corrected."
+    if not tested:
+        grouped = found.scored.group is not None
+        test = "Not tested: plans of one group are not independent." if grouped else f"Not tested: {few}."
     caption = (
         f"Total variation between the distributions in generated and in held-out real plans (0: the same). {test}"
         " same source: the distance of two such sets from one source, were all plans independent."
@@ -449,6 +456,7 @@ def drift_section(found: Evaluation) -> Part | None:
     text = [
         "Bits per held-out action of the best model: where behaviour changes, plans get harder (or easier) to predict.",
         *(["The only plan was cut into consecutive parts, which stand for plans."] * bool(found.settings.get("cut"))),
+        *([_no_verdict(found.too_few)] if found.too_few else []),
     ]
     tables = []
     if tests:
@@ -458,7 +466,11 @@ def drift_section(found: Evaluation) -> Part | None:
             "95 % interval": lambda row: "" if pd.isna(row["mean"]) else f"{row.low:+.3f} to {row.high:+.3f}",
             "p": "p_value:.2g",
         }
-        tables.append(table(tests_frame, columns, f"Bits of {model.label}; intervals over {found.unit}."))
+        tables.append(
+            table(
+                tests_frame, _without_p(columns, found.too_few), f"Bits of {model.label}; intervals over {found.unit}."
+            )
+        )
     caption = f"Bits per action of {model.label}. 95 % intervals over {found.unit}; of groups, over the plans of each."
     box = FigureBox(figures.drift_figure(drift, own), caption, "Bits per action by place, plan and group.", "drift")
     actions = _action_drift(found.plans)
@@ -471,8 +483,9 @@ def drift_section(found: Evaluation) -> Part | None:
             "change": lambda row: f"{100 * row.change:+.2f} ± {100 * (row.high - row.change):.2f}",
             "p": lambda row: p_text(row.corrected),
         }
-        caption = "Share of all actions, %, in the first and in the second half of the plans. p: corrected (Holm)."
-        tables.append(table(most, columns, caption))
+        caption = "Share of all actions, %, in the first and in the second half of the plans."
+        caption += "" if found.too_few else " p: corrected (Holm)."
+        tables.append(table(most, _without_p(columns, found.too_few), caption))
     frames = {"drift": drift, "drift_tests": tests_frame, "action_drift": actions}
     return Part(Section("Drift", text, tables, [box]), frames)
 
@@ -508,6 +521,16 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "drift": drift_section,
 }
 """By name, in the order of the page."""
+
+
+def _no_verdict(few: str) -> str:
+    """What a section says where there are too few independent units; "" where there are enough."""
+    return few and f"{few}: here are numbers and intervals, and no more is claimed."
+
+
+def _without_p(columns: Mapping[str, Column], few: str) -> Mapping[str, Column]:
+    """The columns of a table, without p-values where there are too few independent units."""
+    return {name: column for name, column in columns.items() if name != "p" or not few}
 
 
 def _num_contexts(plans: Plans) -> int | None:

@@ -19,6 +19,7 @@ from neuroprior.analysis.comparison import (
     baselines,
     score,
     score_bits,
+    too_few,
     unit_name,
 )
 from neuroprior.analysis.statistics import mean_interval, paired_difference, ratio_difference
@@ -349,3 +350,26 @@ def test_baselines_of_closed_plans_know_the_end():
     for baseline in baselines(training, validation):
         assert baseline.prior.end == 3
         assert baseline.prior.log_prob(torch.tensor([[0, 3, 0]])).isneginf().all()
+
+
+@pytest.mark.parametrize(
+    ("number", "group", "cut", "says"),
+    [
+        (5, None, False, ""),
+        (4, None, False, "4 plans are too few for a verdict"),
+        (20, torch.arange(20) % 4, False, "4 groups are too few for a verdict"),
+        (20, torch.arange(20) % 5 * 7, False, ""),
+        (20, torch.zeros(20, dtype=torch.long), False, "1 group is too few for a verdict"),
+        (40, None, True, "1 plan is too few for a verdict"),
+    ],
+)
+def test_how_many_are_too_few(number, group, cut, says):
+    plans = Plans(torch.zeros(number, 3, dtype=torch.long), 2, group=group)
+    assert too_few(plans, cut=cut) == says
+
+
+def test_only_units_that_count_are_counted():
+    plans = Plans(torch.zeros(20, 3, dtype=torch.long), 2, group=torch.arange(20) // 4)
+    mask = plans.mask()
+    mask[:4] = False
+    assert too_few(plans, mask) == "4 groups are too few for a verdict"

@@ -56,7 +56,7 @@ ASKED: dict[str, Any] = {"folds": 2, "skip": 1, "patience": 0.125, "seed": 5} | 
 
 @pytest.fixture(scope="module")
 def made() -> Document:
-    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 3)
+    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 6)
     return report(plans, **ASKED)
 
 
@@ -101,7 +101,7 @@ def test_the_lead_names_the_best_model(made):
 def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     from neuroprior.plans import write_plans
 
-    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 3)
+    plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1, group=torch.arange(24) % 6)
     write_plans(plans, tmp_path / "plans.npz")
     again = report(tmp_path / "plans.npz", sections=["scores"], out=tmp_path / "out", **ASKED)
     pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
@@ -134,3 +134,53 @@ def test_priors_by_name_are_scored():
 def test_what_cannot_be_reported_is_refused(options, words):
     with refuses(*words):
         report(markov_plans(markov_probs(3, 1, 0), 8, 5, 1), **options)
+
+
+def verdicts(document: Document) -> str:
+    """All that a report says in words, and all cells of its tables."""
+    texts = [document.lead]
+    for section in document.sections:
+        texts += [*section.text, *(box.caption for box in section.figures)]
+        for table in section.tables:
+            texts += [table.caption, *table.headings, *(cell for row in table.rows for cell in row)]
+    return "\n".join(texts)
+
+
+def marks(figure: Figure) -> int:
+    """Rings around points, and dots in the cells of matrices."""
+    curves = [line for axes in figure.axes for line in axes.lines]
+    return sum(len(line.get_xdata()) for line in curves if line.get_markersize() == 13 or line.get_ls() == "None")
+
+
+def animals(number: int, sessions: int = 8) -> Plans:
+    """Animals that differ: each half repeats its last action more often than the other half."""
+    probs = [markov_probs(3, 1, seed, 3) for seed in (0, 1)]
+    parts = [markov_plans(probs[animal % 2], sessions, 40, animal) for animal in range(number)]
+    group = torch.arange(number).repeat_interleave(sessions)
+    return Plans(torch.cat([part.actions for part in parts]), 3, group=group)
+
+
+@pytest.mark.parametrize(("number", "enough"), [(3, False), (4, False), (5, True)])
+def test_few_groups_bear_no_verdict(number, enough):
+    """Below five animals nothing is starred, ringed, dotted or called best; the numbers stand."""
+    whole = report(animals(number), folds=2, **QUICK)
+    said, few = verdicts(whole), f"{number} groups are too few for a verdict"
+    assert (few in whole.lead) != enough
+    assert ("The best model" in whole.lead) == enough
+    assert ("*" in said) == enough
+    assert ("significant" in said) == enough
+    assert ("p" in said.split("\n")) == enough  # the heading of a column
+    assert (marks(whole.figures["orders"]) > 0) == enough
+    assert (marks(whole.figures["group_transitions"]) > 0) == enough
+    assert said.count(few) == (0 if enough else 7)  # the lead, and each section that would draw one
+    assert whole.tables["plans"]["low"].notna().all()
+    assert "over groups" in whole.lead
+
+
+def test_parts_of_a_plan_are_not_plans():
+    """A single long session is one: its parts have intervals, and bear no verdict."""
+    (plan,) = markov_plans(markov_probs(3, 1, 0, 1.5), 1, 400, 1).actions
+    found = report(Plans(plan[None], 3), folds=2, **QUICK)
+    assert "over parts of the plan" in found.lead
+    assert "1 plan is too few for a verdict" in found.lead
+    assert "*" not in verdicts(found)
