@@ -195,6 +195,18 @@ def test_a_pause_changes_nothing(kind, at, tmp_path):
     assert len(again.replay) == len(through.replay)
 
 
+def test_what_a_prior_has_learned_beside_its_weights_is_restored(tmp_path):
+    first = MarkovPrior(4, 1, num_contexts=36)
+    first.context_per = "plan"
+    one = agent(first, retention=1.0)
+    one.run(12)
+    save_agent(one, tmp_path)
+    again = restore_agent(agent(MarkovPrior(4, 1, num_contexts=36), retention=1.0), tmp_path)
+    assert again.prior.learned == first.learned
+    assert torch.equal(again.run(12).actions, one.run(12).actions)
+    assert again.replay.plans.context.shape == (20,)
+
+
 def test_networks_are_trained_from_its_generator():
     """Whatever torch's own generator is at."""
     runs = []

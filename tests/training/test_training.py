@@ -15,7 +15,7 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.mark.parametrize("length", [4, 5, 6])
+@pytest.mark.parametrize("length", [4, 6])
 def test_frequent_plans_keep_their_probability(length: int) -> None:
     # Half of all plans are one and the same; the others are one of 4**length, below and above MOST_DISTINCT.
     same = torch.zeros(4000, length, dtype=torch.long)
