@@ -187,7 +187,7 @@ def test_pieces_may_end():
 
 
 def test_pieces_are_drawn_uniformly_and_without_replacement():
-    """9 of 17 starts, 3,000 times: each is drawn as often, pieces differ and are in order, and a seed determines them."""
+    """9 of 17 starts, 3,000 times: each as often, pieces differ and are in order, and a seed determines them."""
     plans = numbered()
     generator, times = seeded(2), torch.zeros(50)
     for _ in range(3000):
