@@ -106,6 +106,10 @@ def test_it_learns_only_so_often(monkeypatch):
     monkeypatch.setattr(one.prior, "fit", lambda plans, **_: sizes.append(len(plans)))
     one.run(36)
     assert sizes == [10, 20, 30]
+    alone = agent(number=1, learn_every=6, retention=1.0)
+    monkeypatch.setattr(alone.prior, "fit", lambda plans, **_: sizes.append(len(plans)))
+    alone.run(18)
+    assert sizes[3:] == [2, 3]  # a single plan is not learned from
 
 
 @pytest.mark.parametrize("per", ["plan", "step"])
