@@ -106,6 +106,10 @@ def test_it_learns_only_so_often(monkeypatch):
     monkeypatch.setattr(one.prior, "fit", lambda plans, **_: sizes.append(len(plans)))
     one.run(36)
     assert sizes == [10, 20, 30]
+    alone = agent(number=1, learn_every=6, retention=1.0)
+    monkeypatch.setattr(alone.prior, "fit", lambda plans, **_: sizes.append(len(plans)))
+    alone.run(18)
+    assert sizes[3:] == [2, 3]  # a single plan is not learned from
 
 
 @pytest.mark.parametrize("per", ["plan", "step"])
@@ -193,6 +197,18 @@ def test_a_pause_changes_nothing(kind, at, tmp_path):
         assert torch.equal(torch.cat([getattr(before, name), getattr(after, name)], 1), getattr(whole, name))
     assert torch.equal(again.generator.get_state(), through.generator.get_state())
     assert len(again.replay) == len(through.replay)
+
+
+def test_what_a_prior_has_learned_beside_its_weights_is_restored(tmp_path):
+    first = MarkovPrior(4, 1, num_contexts=36)
+    first.context_per = "plan"
+    one = agent(first, retention=1.0)
+    one.run(12)
+    save_agent(one, tmp_path)
+    again = restore_agent(agent(MarkovPrior(4, 1, num_contexts=36), retention=1.0), tmp_path)
+    assert again.prior.learned == first.learned
+    assert torch.equal(again.run(12).actions, one.run(12).actions)
+    assert again.replay.plans.context.shape == (20,)
 
 
 def test_networks_are_trained_from_its_generator():

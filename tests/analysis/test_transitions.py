@@ -120,8 +120,12 @@ def test_ties_count():
     ],
 )
 def test_which_test(plans_of_groups, test):
+    """Plans of a single action, three in each group, count for nothing."""
     group = torch.arange(len(plans_of_groups)).repeat_interleave(torch.tensor(plans_of_groups))
-    found = transitions(Plans(torch.randint(2, (len(group), 20), generator=seeded(0)), 2, group=group), 19, seeded(0))
+    lengths = torch.cat([torch.full_like(group, 20), torch.ones(3 * len(group.unique()), dtype=torch.long)])
+    group = torch.cat([group, group.unique().repeat(3)])
+    actions = torch.randint(2, (len(group), 20), generator=seeded(0))
+    found = transitions(Plans(actions, 2, lengths, group=group), 19, seeded(0))
     assert found.test == test
     assert found.permutations == (19 if test == "permutation" else 0)
     assert (found.p_value != found.p_value) == (test == "none")

@@ -57,6 +57,15 @@ def test_round_trip(kind, arguments, fitted, tmp_path):
         assert torch.equal(again.log_prob(longer), prior.eval().log_prob(longer))
 
 
+@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
+def test_priors_trained_in_windows_read_as_before(kind, tmp_path):
+    prior = kind(A)
+    prior.set_training_window(4)
+    plans = torch.randint(A, (10, 30), generator=seeded(0))
+    with torch.no_grad():
+        assert torch.equal(load(save(prior, tmp_path)).log_prob(plans), prior.log_prob(plans))
+
+
 @pytest.fixture(params=["markov", "gru"])
 def folder(request, tmp_path):
     prior = GRUPrior(A, hidden_size=8)

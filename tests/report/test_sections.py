@@ -1,5 +1,6 @@
 """The sections of a report on plans, and the report as a function."""
 
+import math
 from typing import Any
 
 import pandas as pd
@@ -88,6 +89,14 @@ def test_actions_are_counted_by_plan():
         ["0", 2, 1, 6.0],
         ["1", 1, 1, 2.0],
     ]
+
+
+def test_bits_are_shown_as_nats_and_perplexities_too(made):
+    table = made.tables["plans"]
+    for bits, end in (("bits_per_action", ""), ("low", "_low"), ("high", "_high")):
+        assert table["nats" + (end or "_per_action")].tolist() == pytest.approx((table[bits] * math.log(2)).tolist())
+        assert table[f"perplexity{end}"].tolist() == pytest.approx((2 ** table[bits]).tolist())
+    assert table["perplexity"][0] == pytest.approx(3)  # of the uniform prior
 
 
 def test_the_lead_names_the_best_model(made):

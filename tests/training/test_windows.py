@@ -113,7 +113,13 @@ def test_the_hidden_state_is_learned_to_be_used():
     bit = torch.randint(2, (400, 1), generator=seeded(0))
     actions = torch.where(torch.arange(24) % 4 == 0, bit, 2)
     prior = GRUPrior(3, 16, lags=1).fit(
-        Plans(actions, 3), window=12, batch_size=100, max_steps=300, progress=False, learning_rate=0.01
+        Plans(actions, 3),
+        generator=seeded(1),
+        window=12,
+        batch_size=100,
+        max_steps=300,
+        progress=False,
+        learning_rate=0.01,
     )
     assert prior.window is None
     again = prior.action_log_probs(Plans(actions, 3))[:, 12].detach()

@@ -266,6 +266,11 @@ def test_headlines_are_corrected_for_the_number_of_worlds():
     first = answer([*alone, *others])
     assert first["better"] is None
     assert first["p_value"] < 0.05 < first["p_holm"] == pytest.approx(11 * first["p_value"])
+    # Before and after the curriculum, and with each context, another question is asked.
+    words = Results(worlds(["maze", "taxi", "grid"], 6, context=("none", "initial"), rounds=2), ASKED).words
+    for _, own in words.groupby(["context", "rounds"]):
+        assert len(own) == 3
+        assert own["p_holm"].tolist() == pytest.approx(holm(own["p_value"]).tolist())
 
 
 def test_aggregates_over_worlds():

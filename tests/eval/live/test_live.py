@@ -5,11 +5,15 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from eval.__main__ import main
+from eval.live import run as live
 from eval.live.report import live_document
-from eval.live.run import PARTS, conditions
+from eval.live.run import PARTS, LiveSettings, conditions
+from eval.worlds.runs import Run
 from neuroprior.analysis.statistics import paired_difference
+from neuroprior.planners import Execution, SamplingPlanner
 from tests.support.reports import FROM_ELSEWHERE
 
 SMALL = ["live", "--worlds", "forage_grid", "--kinds", "markov", "--seeds", "2", "--seasons", "2", "--period", "64"]
@@ -41,6 +45,28 @@ def test_a_small_comparison(tmp_path, capsys):
     assert [path.stat().st_mtime_ns for path in kept] == times
     assert len(times) == 2
     assert capsys.readouterr().out == printed
+
+
+def test_half_of_what_was_done_is_forgotten_after_a_half_life(monkeypatch):
+    """However often a prior learns; and without a warm start there is one candidate more."""
+    made, settings = [], LiveSettings(("markov", "gru"), 64, 1, 2, 2, 4, 8, 0)
+
+    class Idle:
+        def __init__(self, world, planner, prior, state, **how):
+            made.append((planner, how))
+            self.state = state
+
+        def run(self, steps):
+            return Execution(*torch.zeros(3, len(self.state), steps), 0)
+
+    monkeypatch.setattr(live, "Agent", Idle)
+    live.run_live(Run("forage_grid", 0), settings)
+    assert {how["learn_every"] for _, how in made} == {None, 16, 64}
+    for planner, how in made:
+        if how["learn_every"]:
+            assert how["retention"] ** (live.HALF_LIFE / how["learn_every"]) == pytest.approx(0.5)
+        if isinstance(planner, SamplingPlanner):
+            assert planner.num_plans == (4 if how["warm_start"] else 5)
 
 
 def made_up(seeds=6, seasons=2, worlds=("forage_grid",)):
