@@ -4,7 +4,7 @@ from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.ensembles import MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
-from neuroprior.priors.matching import match_plans
+from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
@@ -22,6 +22,7 @@ __all__ = [
     "StackedPrior",
     "TransformerPrior",
     "UniformPrior",
+    "decode",
     "fit",
     "learn_macros",
     "load",
