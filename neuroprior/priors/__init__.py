@@ -5,7 +5,7 @@ from neuroprior.priors.durations import DurationLaw, DurationModel, SemiMarkovPr
 from neuroprior.priors.ensembles import MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
-from neuroprior.priors.matching import match_plans
+from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
@@ -26,6 +26,7 @@ __all__ = [
     "StackedPrior",
     "TransformerPrior",
     "UniformPrior",
+    "decode",
     "fit",
     "learn_macros",
     "load",

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, as_actions
 
 
 def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
@@ -33,6 +33,31 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
         plans = replace(plans, context=None, context_names=None)
     plans = plans if prior.end is None else plans.with_end()
     return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
+
+
+def decode(plans: Plans | Tensor, prior: Prior | None = None) -> list[list[str]]:
+    """The names of the actions of each plan, up to its end.
+
+    Args:
+        plans: `Plans`; or integers `[N, L]`, such as a prior's samples.
+        prior: of samples: its names, and its end symbol, before which each plan is cut. None for `Plans`, which have
+            their own.
+
+    Returns:
+        N lists, each of up to L names; of actions without names, their numbers as text.
+
+    Raises:
+        ValueError: integers without a prior, a prior for `Plans`, or integers that are none of its actions.
+    """
+    if isinstance(plans, Plans) != (prior is None):
+        raise ValueError("decode: Plans, or samples and the prior that they are from, are expected")
+    if not isinstance(plans, Plans):
+        assert prior is not None
+        plans = Plans(as_actions(plans), prior.num_actions, action_names=prior.action_names, end=prior.end)
+    names = plans.action_names or [str(action) for action in range(plans.num_actions)]
+    kept = plans.mask() if plans.end is None else plans.mask() & (plans.actions != plans.end)
+    taken = zip(plans.actions.tolist(), kept.sum(1).tolist(), strict=True)
+    return [[names[action] for action in actions[:length]] for actions, length in taken]
 
 
 def learned_names(prior: Prior) -> list[str] | None:

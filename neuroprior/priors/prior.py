@@ -280,6 +280,8 @@ class Prior(nn.Module, ABC):
     ) -> Tensor:
         """Independent plans `[num_plans, length]`; see `neuroprior.sampling.ancestral.sample`.
 
+        `neuroprior.decode(plans, prior)` gives their names.
+
         Raises:
             ValueError: an argument is out of range, or the context does not fit.
         """

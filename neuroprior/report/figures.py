@@ -5,17 +5,20 @@ Where there is nothing to draw, it is a ValueError.
 
 from collections.abc import Mapping, Sequence
 from textwrap import wrap
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.ticker import FuncFormatter, LogLocator
-from numpy.typing import ArrayLike
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+from numpy.typing import ArrayLike, NDArray
 
+from neuroprior.plans import Plans
 from neuroprior.report.drawing import (
     FEWER,
     MORE,
@@ -46,6 +49,8 @@ MOST_GROUPS = 40  # drawn as a row each; of more, evenly spaced ones between the
 MOST_DOTS = 200  # units drawn as a dot for each condition; of more, evenly spaced ones
 MOST_PANELS = 12  # groups drawn as a panel each; of more, those that differ most
 MOST_STEPS = 400  # actions of a sequence that are drawn, from its first
+MOST_ROWS = 60  # plans of an ethogram
+MOST_BINS = 1600  # parts of the longest plan of an ethogram, each of which has the colour of one action
 NUMBERED = 8  # actions up to which the cells of a matrix hold their numbers
 MOST_NAMES = 60  # actions up to which each has its name beside the matrix; of more, every second or third one
 
@@ -431,14 +436,7 @@ def raster_figure(real: ArrayLike, generated: ArrayLike, names: Sequence[str]) -
     """
     both = [np.asarray(actions, dtype=np.int64)[:, :MOST_STEPS] for actions in (real, generated)]
     count = sum(np.bincount(actions[actions >= 0], minlength=len(names)) for actions in both)
-    most = len(STRIPS) if len(names) <= len(STRIPS) else len(STRIPS) - 1
-    kept = np.sort(np.argsort(-count, kind="stable")[:most])
-    palette = np.array([(*to_rgb(OTHER), 0.45)] * len(names) + [(0, 0, 0, 0)])
-    palette[kept, :3], palette[kept, 3] = [to_rgb(color) for color in STRIPS[: len(kept)]], 1
-    keys = [Patch(color=STRIPS[place], label=short(names[action])) for place, action in enumerate(kept)]
-    if len(kept) < len(names):
-        keys.append(Patch(color=OTHER, alpha=0.45, lw=0, label=f"{len(names) - len(kept)} other actions"))
-    columns = 6 if max(len(str(key.get_label())) for key in keys) <= 10 else 3
+    palette, keys, columns = _strip_colors(count, names)
     heights = [0.16 * max(len(actions), 1) + 0.25 for actions in both]
     size = (WIDTH, sum(heights) + 0.7 + 0.22 * -(-len(keys) // columns))
     longest = max(actions.shape[1] for actions in both)
@@ -456,6 +454,92 @@ def raster_figure(real: ArrayLike, generated: ArrayLike, names: Sequence[str]) -
     cells[1].set_xlabel("action of the sequence" + f" (the first {MOST_STEPS})" * cut)
     figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
     return figure
+
+
+@drawn
+def ethogram_figure(plans: Plans) -> Figure:
+    """Plans as rows of coloured strips over time, one colour an action, by condition and group.
+
+    Time is the sum of the durations, in their unit, where plans have them; else a step is an action. A duration that is
+    not known is left blank, as long as the median one. Of actions shorter than one of `MOST_BINS` parts of the longest
+    plan some are not seen. At most `MOST_ROWS` plans are drawn, evenly spaced; the figure says so.
+
+    Args:
+        plans: with names, groups, conditions and durations where there are any.
+
+    Raises:
+        ValueError: no plan has an action.
+    """
+    plans = plans if plans.end is None else plans.without_end()
+    mask = plans.mask().cpu().numpy()
+    if not mask.any():
+        raise ValueError("plans: at least one action is expected; without any there is no figure")
+    names = list(plans.action_names or map(str, range(plans.num_actions)))
+    count = plans.actions.cpu()[torch.from_numpy(mask)].long().bincount(minlength=len(names)).numpy()
+    palette, keys, columns = _strip_colors(count, names)
+    whole = np.flatnonzero(mask.any(1))
+    some = whole[_evenly(len(whole), MOST_ROWS)]
+    group, condition = (
+        np.zeros(len(some), int) if values is None else values.cpu().numpy()[some]
+        for values in (plans.group, plans.condition)
+    )
+    order = np.lexsort((group, condition))
+    some, group, condition = some[order], group[order], condition[order]
+    first = np.arange(len(some)) == 0
+    new_condition = first | (np.diff(condition, prepend=0) != 0)
+    new_group = new_condition | (np.diff(group, prepend=0) != 0)
+    # Strips of five lines, the last of them blank; more blank lines before a group, and still more before a condition.
+    tops = 5 * np.arange(len(some)) + np.cumsum(3 * new_group + 10 * new_condition * (plans.condition is not None))
+    lines = int(tops[-1]) + 5
+    shown, longest = _over_time(plans[torch.tensor(some)])
+    image = np.zeros((lines, shown.shape[1], 4))
+    image[np.add.outer(tops, range(4))] = palette[shown][:, None]
+    figure, (axes,) = panels(1, 1, (WIDTH, 0.034 * lines + 0.7 + 0.22 * -(-len(keys) // columns)))
+    axes.imshow(image, aspect="auto", interpolation="none", extent=(0, longest, lines, 0))
+    starts = np.flatnonzero(new_group)
+    middle = (tops[starts] + tops[np.append(starts[1:], len(some)) - 1]) / 2 + 2
+    called = [plans.group_names[g] if plans.group_names else f"group {g}" for g in group[starts]]
+    axes.set_yticks([], []) if plans.group is None else axes.set_yticks(middle, [short(c, 18) for c in called])
+    axes.tick_params(axis="y", length=0, labelsize=8)
+    for row in np.flatnonzero(new_condition) if plans.condition is not None else []:
+        name = plans.condition_names[condition[row]] if plans.condition_names else f"condition {condition[row]}"
+        axes.text(0, tops[row] - 2, short(name, 40), va="bottom", fontsize=9, weight="bold")
+    axes.spines[["left", "top", "right"]].set_visible(False)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=plans.durations is None, min_n_ticks=1))
+    across = "action of the plan" if plans.durations is None else "time, in the unit of the durations"
+    axes.set_xlabel(across + (f"; {len(some)} of {len(whole)} plans" if len(some) < len(whole) else ""))
+    figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
+    return figure
+
+
+def _over_time(plans: Plans) -> tuple[NDArray[np.int64], float]:
+    """The action `[N, bins]` of plans at evenly spaced times, A for none, and how long the longest plan takes."""
+    actions, taken = plans.actions.cpu().numpy().astype(np.int64), plans.mask().cpu().numpy()
+    times, bins = taken.astype(np.float64), min(actions.shape[1], MOST_BINS)
+    if plans.durations is not None:
+        times, bins = plans.durations.cpu().double().numpy() * taken, MOST_BINS
+    unknown = np.isnan(times)
+    known = times[taken & ~unknown]
+    ends = np.where(unknown, np.median(known) if known.size else 1.0, times).cumsum(1)
+    longest = float(ends.max()) or 1.0
+    at = (np.arange(bins) + 0.5) * longest / bins
+    shown = np.where(unknown | ~taken, plans.num_actions, actions)
+    shown = np.pad(shown, ((0, 0), (0, 1)), constant_values=plans.num_actions)
+    return np.stack(
+        [own[np.searchsorted(end, at, side="right")] for own, end in zip(shown, ends, strict=True)]
+    ), longest
+
+
+def _strip_colors(count: Any, names: Sequence[str]) -> tuple[Array, list[Patch], int]:
+    """Colours `[A + 1, 4]` of actions in strips, the last of no action; the entries of the legend, and its columns."""
+    most = len(STRIPS) if len(names) <= len(STRIPS) else len(STRIPS) - 1
+    kept = np.sort(np.argsort(-count, kind="stable")[:most])
+    palette = np.array([(*to_rgb(OTHER), 0.45)] * len(names) + [(0, 0, 0, 0)])
+    palette[kept, :3], palette[kept, 3] = [to_rgb(color) for color in STRIPS[: len(kept)]], 1
+    keys = [Patch(color=STRIPS[place], label=short(names[action])) for place, action in enumerate(kept)]
+    if len(kept) < len(names):
+        keys.append(Patch(color=OTHER, alpha=0.45, lw=0, label=f"{len(names) - len(kept)} other actions"))
+    return palette, keys, 6 if max(len(str(key.get_label())) for key in keys) <= 10 else 3
 
 
 @drawn

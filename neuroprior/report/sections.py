@@ -42,7 +42,13 @@ LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
 def file_section(found: Evaluation) -> Part:
     """What is in the file."""
     frame = action_frame(found.plans)
-    return Part(Section("Plans", tables=plans_tables(found.plans, frame)), {"actions": frame})
+    tables, boxes = plans_tables(found.plans, frame), []
+    if len(frame):
+        caption = "Each row a plan, each colour an action" + (", by group" if found.plans.group is not None else "")
+        caption += (" and condition" if found.plans.condition is not None else "") + "."
+        alt = "The plans as rows of coloured strips over time."
+        boxes = [FigureBox(figures.ethogram_figure(found.plans), caption, alt, "ethogram")]
+    return Part(Section("Plans", tables=tables, figures=boxes), {"actions": frame})
 
 
 def plans_tables(plans: Plans, frame: pd.DataFrame) -> list[Table]:

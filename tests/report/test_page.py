@@ -9,13 +9,16 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
+from neuroprior.plans import Plans
 from neuroprior.report.drawing import FEWER, KINDS, MARKOV, MORE, SPARE, colors, drawn, lines, short
 from neuroprior.report.figures import (
+    MOST_BINS,
     MOST_PLANS,
     MOST_STEPS,
     OTHER,
@@ -24,6 +27,7 @@ from neuroprior.report.figures import (
     distribution_figure,
     drift_figure,
     dwell_figure,
+    ethogram_figure,
     group_transition_figure,
     lag_figure,
     motif_figure,
@@ -34,6 +38,7 @@ from neuroprior.report.figures import (
 )
 from neuroprior.report.page import INK, PAPER, FigureBox, Section, Table, clean, svg, write_page
 from tests.support.browser import check_in_browser
+from tests.support.sources import refuses
 
 HOSTILE = ["<b>\"&'", "</svg><script>alert(1)</script>", "$x$ $\\frac{$", "\x00\x1b\ud800", "http://evil.org", "_x"]
 MANY = [f"groom left forepaw while rearing {n}" for n in range(57)]
@@ -151,6 +156,7 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
         "transition": transition_figure(matrix(names), names, names[0]),
         "group": group_transition_figure(by_group, matrix(names), names, groups, by_group > 0.9),
         "dwell": dwell_figure(dwell(names)),
+        "ethogram": ethogram_figure(sessions(names)),
         "raster": raster_figure(sequences(names, 4, 30), sequences(names, 2, 500), names),
     }
 
@@ -414,3 +420,63 @@ def test_nothing_to_draw_is_an_error(make):
 
 def test_a_browser_shows_the_page_on_a_phone_and_a_desktop(page, tmp_path):
     check_in_browser(page, tmp_path)
+
+
+def sessions(names: list[str], num: int = 6, length: int = 20, **more) -> Plans:
+    """Two sessions each of animals in two conditions, which have these names, too."""
+    generator = torch.Generator().manual_seed(0)
+    actions = torch.randint(len(names), (num, length), generator=generator)
+    group, called = torch.arange(num) // 2, [f"{names[0]} {i}" for i in range(num // 2)]
+    own = {"group": group, "group_names": called, "condition": group % 2, "condition_names": ["x", names[-1]]}
+    return Plans(actions, len(names), torch.arange(num) % 3 + length - 2, names, **own | more)
+
+
+def strips(figure: Figure) -> tuple[np.ndarray, list[int]]:
+    """The colours of the rows of an ethogram, one line of each, and how many blank lines are before each."""
+    image = np.asarray(figure.axes[0].images[0].get_array())
+    lines = np.flatnonzero(image[:, :, 3].any(1))
+    tops = lines[np.diff(lines, prepend=-9) > 1]
+    return image[tops], np.diff(np.append(-5, tops)).tolist()
+
+
+def test_an_ethogram_has_the_actions_in_their_colours_by_condition_and_group():
+    plans = sessions(["rest", "walk", "eat"])
+    figure = ethogram_figure(plans)
+    rows, before = strips(figure)
+    order = [0, 1, 4, 5, 2, 3]  # animals 0 and 2 are in the first condition, animal 1 in the second
+    assert len(rows) == 6
+    for row, plan in zip(rows, order, strict=True):
+        length = int(plans.lengths[plan])
+        want = [to_hex(STRIPS[action]) for action in plans.actions[plan, :length]]
+        assert [to_hex(color) for color in row[:length]] == want
+        assert not row[length:, 3].any()
+    assert before == [18, 5, 8, 5, 18, 5]
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["rest 0", "rest 2", "rest 1"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["x", "eat"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["rest", "walk", "eat"]
+
+
+def test_an_ethogram_of_durations_is_in_time():
+    """Of durations 1, 3, unknown and 4, the third is blank for the median of the known ones, 3."""
+    times = torch.tensor([[1.0, 3.0, float("nan"), 4.0]])
+    plans = Plans(torch.tensor([[0, 1, 0, 2]]), 3, action_names=("a", "b", "c"), durations=times)
+    (row,), _ = strips(ethogram_figure(plans))
+    assert len(row) == MOST_BINS
+    at = (np.arange(MOST_BINS) + 0.5) * 11 / MOST_BINS
+    for low, high, action in ((0, 1, 0), (1, 4, 1), (4, 7, None), (7, 11, 2)):
+        here = row[(at > low) & (at < high)]
+        assert {to_hex(color) for color in here} == {"#000000" if action is None else STRIPS[action]}
+        assert (here[:, 3] == (action is not None)).all()
+
+
+def test_ethograms_of_much_and_of_little():
+    many = ethogram_figure(sessions(MANY, 200, 3000))
+    assert len(strips(many)[0]) == 60
+    assert "60 of 200 plans" in many.axes[0].get_xlabel()
+    assert many.axes[0].images[0].get_array().shape[1] == MOST_BINS
+    assert many.legends[0].get_texts()[-1].get_text() == f"{len(MANY) - len(STRIPS) + 1} other actions"
+    assert many.get_figheight() < 30
+    ends = Plans(torch.tensor([[0, 1], [1, 1]]), 2, torch.tensor([0, 2])).with_end()
+    assert len(strips(ethogram_figure(ends))[0]) == 1
+    with refuses("plans", "no figure"):
+        ethogram_figure(Plans(torch.zeros(2, 0, dtype=torch.long), 2))
