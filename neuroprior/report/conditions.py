@@ -136,7 +136,10 @@ def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table
     for name in result.condition_names:
         columns[f"mean,\n{name}"] = _cell_of(f"mean, {name}", ".3g")
     if len(result.condition_names) == 2:
-        columns["difference"] = lambda row: f"{row.difference:{_sign(row)}.3g}" + "-fold" * (not _sign(row))
+        first, second = result.condition_names
+        columns[f"{second}\nagainst {first}"] = lambda row: (
+            f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row))
+        )
         columns["95 % interval"] = lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}"
     columns["p"] = lambda row: p_text(row.corrected) + "*" * row.significant
     shown = features[:LISTED]

@@ -36,6 +36,9 @@ MOST_ACTIONS = 500
 
 MOST_BINS = 30
 
+LEAST = 5e-4
+"""Gains below this are 0 in three digits, and not starred."""
+
 
 def duration_section(found: Evaluation) -> Part | None:
     """How long actions take, and whether that predicts the next action; None where no plan has durations."""
@@ -295,7 +298,7 @@ def _gain(row: Any) -> str:
     """A gain with its interval; starred where it is above 0, if there are enough units."""
     if pd.isna(row["gain"]):
         return ""
-    star = "*" if row["units"] >= ENOUGH_UNITS and row["low"] > 0 else " "
+    star = "*" if row["units"] >= ENOUGH_UNITS and row["low"] >= LEAST else " "
     return f"{row['gain']:+.3f}±{row['high'] - row['gain']:.3f}{star}"
 
 

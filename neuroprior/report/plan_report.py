@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._jobs import Progress
+from neuroprior._threads import one_thread
 from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
@@ -168,7 +169,8 @@ def report(
 
 def _document(found: Evaluation, sections: Sequence[str], file: str, command: str) -> Document:
     made = []
-    with Progress("report", len(sections), len(sections)) as progress:
+    # Its steps are small: on a busy machine several threads would wait for one another.
+    with Progress("report", len(sections), len(sections)) as progress, one_thread():
         for name in [name for name in SECTIONS if name in sections]:
             part = SECTIONS[name](found)
             made += [] if part is None else [part]

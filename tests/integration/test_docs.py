@@ -17,6 +17,9 @@ from pathlib import Path
 
 import pytest
 
+from neuroprior.cli.example import example
+from neuroprior.testing import study
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "train/README.md", *sorted((ROOT / "docs").glob("*.md"))]
 OWN_DATA = ROOT / "docs/your-own-data.md"
@@ -48,8 +51,9 @@ def test_example(page: Path, number: int, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report that the page on one's own data makes on the data that it makes up."""
+    """The report that the page on one's own data makes on the example study."""
     folder = tmp_path_factory.mktemp("docs")
+    example(str(folder / "study.csv"))
     run("".join(blocks(OWN_DATA, "python")), folder)
     return folder / "runs/counts"
 
@@ -61,21 +65,23 @@ def rows(folder: Path, name: str) -> list[dict[str, str]]:
 
 def test_the_order_that_was_put_in(report: Path) -> None:
     scores = json.loads((report / "results.json").read_text())["rows"]
-    chains = {row["model"]: row["bits_per_action"] for row in scores if row["model"].startswith("markov")}
-    assert min(chains, key=chains.__getitem__) == "markov-2"
+    bits = {row["model"]: row["bits_per_action"] for row in scores}
+    assert min(bits, key=bits.__getitem__) == "context tree"
+    assert min((name for name in bits if name.startswith("markov")), key=bits.__getitem__) == "markov-1"
 
 
 def test_the_sequence_that_was_put_in(report: Path) -> None:
     first = rows(report, "motifs")[0]
-    assert first["sequence"] == "sniff rear groom"
+    assert first["sequence"] == " ".join(study.RITUAL)
     assert float(first["low"]) > 1
 
 
-def test_the_difference_that_was_put_in(report: Path) -> None:
-    """Only what follows walking differs between animals."""
-    marked = [row for row in rows(report, "transitions") if row["p_value"] and float(row["p_value"]) < 0.05]
-    assert marked
-    assert {row["from"] for row in marked} == {"walk"}
+def test_the_effects_that_were_put_in(report: Path) -> None:
+    """Exactly the two transitions and the duration that the treatment changes are significant."""
+    found = [row for row in rows(report, "conditions") if row["significant"] == "True"]
+    before, loser, winner, _ = study.MOVED
+    planted = {f"{before} → {loser}", f"{before} → {winner}", f"duration of {study.LONGER[0]}"}
+    assert {row["feature"] for row in found if row["family"] in ("transitions", "durations")} == planted
 
 
 def test_readme_is_short() -> None:
@@ -162,6 +168,8 @@ def test_commands_have_these_options() -> None:
             option = word[2:].partition("=")[0].replace("-", "_")
             # what a class in a recipe takes, such as --model.prior.dropout, is listed under the class alone
             parents = {option, option.rpartition(".")[0]} - {""}
+            # of fit, --columns.action is short for --data.columns.action
+            parents |= {f"data.{parent}" for parent in parents if parent.startswith("columns")}
             assert parents & options, f"{page}: {program} {command} has no option --{option}"
 
 

@@ -108,7 +108,7 @@ def test_plans_without_groups_or_names_that_are_those_of_columns():
     assert section.tables[1].headings == [
         "feature",
         *(f"mean,\n{name}" for name in names),
-        *("difference", "95 % interval", "p"),
+        *("condition: feature\nagainst p", "95 % interval", "p"),
     ]
     assert [row[0] for row in section.tables[2].rows] == names
 
