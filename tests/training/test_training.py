@@ -103,6 +103,15 @@ def test_patience_is_counted_in_steps(tmp_path: Path) -> None:
     assert [one["step"] for one in trained(GRUPrior(3, 4), plans, plans, how, tmp_path).curve] == [10, 20, 30]
 
 
+def test_small_gains_are_worth_going_on_for(tmp_path: Path) -> None:
+    how = Settings(40, learning_rate=5e-4, check_every=5, patience=5)
+    plans = Plans(torch.randint(3, (40, 4), generator=generator()).clamp(max=1), 3)
+    curve = trained(GRUPrior(3, 8), plans, plans, how, tmp_path).curve
+    gains = -torch.tensor([entry["validation_bits"] for entry in curve]).diff()
+    assert 0 < float(gains.max()) < 0.1
+    assert len(curve) > 4
+
+
 def test_every_setting_changes_the_training() -> None:
     plans = torch.randint(3, (60, 9), generator=generator())
     same = {"max_steps": 6, "check_every": 6, "batch_size": 20, "progress": False}

@@ -73,7 +73,14 @@ def test_an_epoch_depends_on_its_number_and_the_seed_alone():
 
     assert epoch(3) == epoch(3) != epoch(4)
     assert epoch(3) != epoch(3, seed=1)
-    assert not epoch(3)[0][2], "an epoch begins without a hidden state, so that it can be begun anywhere"
+    # An epoch begins without a hidden state, in the middle of pieces too, so that it can be begun anywhere.
+    first = [epoch(k)[0] for k in range(8)]
+    assert {number for _, number, _ in first} > {0}
+    assert not any(continues for _, _, continues in first)
+    # No pass of one seed is a pass of the next.
+    walks = [Walk(windows, 6 * windows.steps, seed, (0, 1)) for seed in (0, 1)]
+    pieces = [torch.cat([step.pieces for step in walk if step.number == 0]).view(6, -1).tolist() for walk in walks]
+    assert not any(order in pieces[1] for order in pieces[0])
 
 
 @pytest.mark.parametrize("prior", SMALL)

@@ -57,10 +57,11 @@ def test_half_of_what_was_done_is_forgotten_after_a_half_life(monkeypatch):
             self.state = state
 
         def run(self, steps):
-            return Execution(*torch.zeros(3, len(self.state), steps), 0)
+            return Execution(*torch.ones(3, len(self.state), steps), 0)
 
     monkeypatch.setattr(live, "Agent", Idle)
-    live.run_live(Run("forage_grid", 0), settings)
+    entries = live.run_live(Run("forage_grid", 0), settings)["entries"]
+    assert all(entry["rewards"] == [1.0] * PARTS for entry in entries)  # a step
     assert {how["learn_every"] for _, how in made} == {None, 16, 64}
     for planner, how in made:
         if how["learn_every"]:

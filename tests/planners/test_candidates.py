@@ -1,0 +1,66 @@
+"""What planners try, and how many steps they say that it took: by hand, and against the prior."""
+
+import pytest
+import torch
+
+from neuroprior import FrontierPlanner, MarkovPrior, MCTSPlanner, TabularWorld
+from neuroprior.planners import DistinctPlanner, HorizonPlanner
+from tests.support.sources import FALSE_ALARM, p_value, seeded
+
+SHARES = torch.tensor([0.6, 0.4])
+
+
+class Recorded(TabularWorld):
+    """Two ways from cell 0, to 1 and 2, and on to 3; keeps which actions were taken in cell 0, and all steps."""
+
+    def __init__(self):
+        super().__init__(torch.tensor([[1, 2], [3, 3], [3, 3], [3, 3]]), torch.zeros(1, 4))
+        self.first, self.steps = [], 0
+
+    def step(self, state, action, generator=None):
+        self.first += action[state == 0].tolist()
+        self.steps += len(state)
+        return super().step(state, action, generator)
+
+    def rollout(self, state, plans, generator=None, keep_states=False):
+        self.first += plans[:, :, 0].flatten().tolist()
+        return super().rollout(state, plans, generator, keep_states)
+
+
+def chain() -> MarkovPrior:
+    """Takes actions 0 and 1 with the probabilities `SHARES`, but for a thousandth."""
+    return MarkovPrior(2, 0, backoff="dirichlet").fit(torch.tensor([[0]] * 600 + [[1]] * 400))
+
+
+def tried(planner, starts: int) -> torch.Tensor:
+    world = Recorded()
+    planner.plan(world, torch.zeros(starts, dtype=torch.long), seeded(0))
+    return torch.tensor(world.first)
+
+
+def test_the_horizon_planner_draws_at_its_temperature():
+    sharp = SHARES**4 / (SHARES**4).sum()
+    assert p_value(tried(HorizonPlanner(chain(), 1, 4000, pilot=1.0, temperature=0.25), 1), sharp) > FALSE_ALARM
+
+
+def test_without_noise_the_frontier_planner_takes_the_most_probable():
+    assert tried(FrontierPlanner(chain(), 1, 1, noise=False), 100).unique().tolist() == [0]
+    assert p_value(tried(FrontierPlanner(chain(), 1, 1), 4000), SHARES) > FALSE_ALARM
+
+
+@pytest.mark.parametrize(("temperature", "actions"), [(1.0, [0, 1]), (0.5, [0])])
+def test_tree_search_weighs_the_prior_at_its_temperature(temperature, actions):
+    """After one try of action 0 nothing is known of scores: next is the greater of p(0) / 2 and p(1)."""
+    assert tried(MCTSPlanner(chain(), 2, 2, temperature=temperature), 50).unique().tolist() == actions
+
+
+def test_without_exploration_tree_search_does_not_heed_the_prior():
+    assert tried(MCTSPlanner(chain(), 1, 1), 50).unique().tolist() == [0]
+    assert p_value(tried(MCTSPlanner(chain(), 1, 1, exploration=0.0), 4000), torch.ones(2)) > FALSE_ALARM
+
+
+@pytest.mark.parametrize(("num_plans", "length", "steps"), [(5, 4, 2 + 4 + 5 + 5), (1, 3, 3), (100, 2, 2 + 4)])
+def test_distinct_plans_share_the_steps_of_their_beginnings(num_plans, length, steps):
+    world = Recorded()
+    decision = DistinctPlanner(chain(), length, num_plans).plan(world, torch.zeros(7, dtype=torch.long), seeded(0))
+    assert decision.model_steps == world.steps / 7 == steps
