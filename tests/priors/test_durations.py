@@ -1,5 +1,6 @@
 """Durations: laws fitted and chosen, likelihoods in closed form, samples, and priors whose plans have them."""
 
+from dataclasses import replace
 from math import inf, log, nan
 
 import numpy as np
@@ -34,12 +35,12 @@ def of_one_action(times: Tensor | list[float], num_plans: int = 10, **more: obje
     return Plans(torch.zeros(times.shape, dtype=torch.long), 1, durations=times, **more)
 
 
-def transitions(num_plans: int = 40, times: float = 2.0, seed: int = 0) -> Plans:
+def transitions(num_plans: int = 40, times: float = 2.0, seed: int = 0, num_actions: int = 3) -> Plans:
     """Actions at random; action 0 takes `times` as long where action 1 follows it."""
     actions = torch.randint(3, (num_plans, 60), generator=seeded(seed))
     durations = draw("gamma", num_plans * 60, seed).view(num_plans, 60)
     durations[:, :-1] *= 1 + (times - 1) * ((actions[:, :-1] == 0) & (actions[:, 1:] == 1))
-    return Plans(actions, 3, durations=durations)
+    return Plans(actions, num_actions, durations=durations)
 
 
 def test_the_likelihood_of_an_exponential_in_closed_form():
@@ -157,10 +158,11 @@ def test_constant_durations_vary_by_a_hundredth():
 def test_no_law_is_narrower_than_the_rounding():
     """Counts of frames hold each value many times, on which a narrow law would be infinitely likely."""
     frames = draw("gamma", 5000).mul(2).ceil() / 25
-    (row,) = DurationModel(1).fit(of_one_action(frames)).table()
+    frames[torch.rand(5000, generator=seeded(0)) < 0.5] = 1 / 25
+    (row,) = DurationModel(1, ["two-lognormal"]).fit(of_one_action(frames)).table()
+    assert row.parameters["log_mean"] == pytest.approx(log(1 / 25), abs=0.1)
     for mean, spread in (("log_mean", "log_sd"), ("log_mean_2", "log_sd_2")):
-        if mean in row.parameters:
-            assert row.parameters[spread] >= 0.99 * 12**-0.5 / 25 / np.exp(row.parameters[mean])
+        assert row.parameters[spread] >= 0.95 * 12**-0.5 / 25 / np.exp(row.parameters[mean])
 
 
 def test_actions_with_few_durations_have_the_law_of_all():
@@ -194,14 +196,19 @@ def test_laws_are_held_out_by_group():
 
 
 def test_the_end_symbol_takes_no_time():
-    plans = transitions()
-    model = SemiMarkovPrior(4).fit(plans.with_end())
-    assert model.durations.table()[3].number == 0
-    longer = plans.with_end()
-    assert bool((model.durations.log_prob(longer)[:, -1] == 0).all())
-    sampled = model.sample_plans(50, 20, generator=seeded(0))
-    assert sampled.end == 3
-    assert bool((sampled.durations[sampled.actions == 3] == 0).all())
+    """Whatever stands in its place; and it is no point event that others would be taken to be like."""
+    plans = transitions(num_actions=4).with_end()
+    for there in (0.0, 5.0, nan):
+        durations = plans.durations.clone()
+        durations[:, -1] = there
+        same = replace(plans, durations=durations)
+        prior = SemiMarkovPrior(5).fit(same)
+        rows = prior.durations.table()
+        assert [(row.number > 0, row.zero) for row in rows[:5]] == [(True, 0)] * 3 + [(False, 0)] * 2
+        assert bool((prior.durations.log_prob(same)[:, -1] == 0).all())
+        sampled = prior.sample_plans(50, 20, generator=seeded(0))
+        assert sampled.end == 4
+        assert bool(((sampled.durations == 0) == ~(sampled.mask() & (sampled.actions != 4))).all())
 
 
 def test_a_semi_markov_prior_is_its_action_prior_with_durations():
@@ -223,7 +230,7 @@ def test_saved_and_loaded_bit_for_bit(tmp_path):
     first, second = (one.sample_plans(40, 9, generator=seeded(5)) for one in (prior, again))
     assert first.durations.equal(second.durations)
     assert first.actions.equal(second.actions)
-    assert first.action_names == ("a", "b", "c")
+    assert first.action_names == again.actions.action_names == ("a", "b", "c")
 
 
 def test_a_network_chooses_the_actions():

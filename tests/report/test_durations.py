@@ -113,18 +113,42 @@ def test_durations_that_do_not():
     assert max(abs(row.mean) for row in rows) < 0.01
 
 
-def test_classes_are_learned_on_training_plans_and_of_past_durations_only():
-    """The bits of an action do not change with its own duration, or a later one, or one of the held-out plans."""
-    plans = timed(True, num_plans=10)
-    known = plans.mask()
-    (_, before), mask = chain_bits(plans, known)
-    assert mask[:, 0].sum() == 0
-    assert bool(mask[:, 1:].all())
-    last = plans.durations.clone()
-    last[:, -1] = 1e6 * torch.rand(10, generator=seeded(0))
-    # The last durations move the terciles of their actions, so that they are put where these do not lie.
-    (_, after), _ = chain_bits(replace(plans, durations=last.where(last < plans.durations, plans.durations)), known)
-    assert before[:, 1:].equal(after[:, 1:])
+def test_classes_are_learned_on_training_plans():
+    """Where all durations of held-out plans are short, they are of the class that the short ones were in before."""
+    plans = replace(timed(True), group=torch.arange(24) % 2)
+    (_, bits), _ = chain_bits(plans, plans.mask())
+    for group in (0, 1):
+        held_out = plans.group == group
+        short = plans.durations.masked_fill(held_out[:, None], 1e-9)
+        (_, found), _ = chain_bits(replace(plans, durations=short), plans.mask())
+        pair = plans.actions[:, :-1].long() * 3 + plans.actions[:, 1:]
+        for each in range(9):
+            mine = (pair == each) & held_out[:, None]
+            shortest = torch.where(mine, plans.durations[:, :-1], torch.inf).flatten().argmin()
+            assert found[:, 1:][mine].unique().tolist() == [bits[:, 1:].flatten()[shortest]]
+
+
+def test_laws_are_scored_on_other_animals():
+    """Durations are all but constant within each of two animals: the law of one is of no use to the other."""
+    plans = replace(timed(False), group=torch.arange(24) % 2)
+    times = (1 + 30 * plans.group[:, None]) * (1 + 0.1 * plans.durations.tanh())
+    frame = tables(replace(plans, durations=times))["durations"]
+    assert (frame["gain"] < -1).all()
+
+
+def test_no_duration_of_the_action_itself_or_later_is_used():
+    """The bits of an action do not change with how long it takes; nor has the first action of a plan any."""
+    plans = replace(timed(True), group=torch.arange(24) % 2)
+    (_, before), mask = chain_bits(plans, plans.mask())
+    assert (mask.sum(1) == 59).all()
+    assert not bool(mask[:, 0].any())
+    mine = plans.group == 0  # learned from the other group, which stays as it is
+    for step in (1, 30, 59):
+        durations = plans.durations.clone()
+        durations[:, step:] = durations[:, step:].flip(0).where(mine[:, None], durations[:, step:])
+        (_, after), _ = chain_bits(replace(plans, durations=durations), plans.mask())
+        assert after[mine, : step + 1].equal(before[mine, : step + 1])
+        assert step == 59 or not after[mine].equal(before[mine])
 
 
 def test_few_units_give_no_verdict():

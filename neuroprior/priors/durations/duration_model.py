@@ -33,8 +33,8 @@ FEWEST_OF_TRANSITION = 30
 NATS_A_PARAMETER = 2.0
 """Nats of held-out log-likelihood by which a law with a parameter more must be better than one without it.
 
-The held-out likelihood of a law that contains the true one is often a little higher by chance: with less than this, the
-true one is chosen in only about three of four cases.
+The held-out likelihood of a law that contains the true one is often a little higher by chance. Of 60 sets of 500
+exponential durations, the exponential law was chosen for 45 without this, and for 59 with it.
 """
 
 FOLDS = 5
