@@ -178,7 +178,7 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
     facts = describe(found.plans)
     return Document(
         title=f"Plans in {Path(file).name}" if file else "Plans",
-        lead=_lead(found),
+        lead=" ".join([_lead(found), *(part.section.text[0] for part in made if part.section.title == "Conditions")]),
         sections=[part.section for part in made],
         frames={name: frame for part in made for name, frame in part.frames.items()},
         settings=found.settings,

@@ -85,6 +85,7 @@ def test_stars_and_limits_of_the_printed_tables():
 
 def test_a_report_has_the_section(tmp_path):
     made = report(changed(between(12)), folds=2, out=tmp_path, sections=["file", "conditions"], **QUICK)
+    assert made.lead.endswith(compare_conditions(changed(between(12)), generator=seeded(0)).verdict)
     names = ["condition_tests", "conditions", "condition_blocks", "condition_sequences"]
     assert {*names} <= {*made.tables}
     assert all((tmp_path / f"{name}.csv").exists() for name in names)
