@@ -1,6 +1,9 @@
 """The command `fit`: trains a prior as a recipe says, by LightningCLI's conventions, and compares it with baselines."""
 
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
 from pickle import UnpicklingError
@@ -122,8 +125,9 @@ class FitCLI(LightningCLI):
 
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
-        neural = isinstance(model.prior, NeuralPrior)
-        settings = {} if neural else self._settings(model, datamodule)
+        neural, many = isinstance(model.prior, NeuralPrior), datamodule.folds > 1
+        settings = {} if neural and not many else self._settings(model, datamodule)
+        fresh = deepcopy(model.prior) if many else None
         if neural:
             self._check_checkpoints(model, datamodule)
         if self.trainer.is_global_zero:
@@ -134,18 +138,21 @@ class FitCLI(LightningCLI):
             self._train(model, datamodule)
         else:
             generator = torch.Generator().manual_seed(datamodule.seed)
-            model.prior.fit(datamodule.learned_from, generator=generator, **settings)
+            model.prior.fit(datamodule.plans if many else datamodule.learned_from, generator=generator, **settings)
         if self.trainer.is_global_zero:
-            report(self.folder, model, datamodule)
+            with self._saying_how_to_go_on(lambda: "the prior is saved"):
+                report(self.folder, model, datamodule, fresh, settings | {"progress": False} if settings else {})
 
     def _settings(self, model: PriorModel, data: PlansData) -> dict[str, Any]:
         """The settings of the recipe that the `fit` of a prior takes which trains networks inside, or none."""
         prior, trainer = model.prior, self.config.fit.trainer
         if not prior.fit_settings:
             return {}
+        neural = isinstance(prior, NeuralPrior)
         for name, default in NETWORKS_ALONE.items():
             if trainer[name] != default:
-                raise ValueError(f"trainer.{name}: a {type(prior).__name__} is trained with {default} alone")
+                hint = " in cross-validation; --data.folds 1 holds out a share of the plans instead" if neural else ""
+                raise ValueError(f"trainer.{name}: a {type(prior).__name__} is trained with {default} alone{hint}")
         prior.to(self.trainer.strategy.root_device)
         settings = asdict(data.settings) | {
             "learning_rate": model.learning_rate,
@@ -182,12 +189,18 @@ class FitCLI(LightningCLI):
         assert isinstance(model.prior, NeuralPrior)
         model.prior.prepare(data.learned_from, data.settings.window)
         last = self.folder / LAST
-        try:
+        with self._saying_how_to_go_on(lambda: f"saved up to step {model.curve[-1]['step']}" if model.curve else ""):
             run_training(self.trainer, model, data, last if last.exists() else None)
+
+    @contextmanager
+    def _saying_how_to_go_on(self, saved: Callable[[], str]) -> Iterator[None]:
+        """Ctrl-C within says what is saved and how to go on."""
+        try:
+            yield
         except KeyboardInterrupt as interrupted:
-            saved = f"saved up to step {model.curve[-1]['step']}" if model.curve else "nothing to save yet"
             raise KeyboardInterrupt(
-                f"interrupted; {saved}; go on with: {self.program} fit --resume {self.folder}"
+                f"interrupted; {saved() or 'nothing to save yet'}; go on with: {self.program} fit --resume"
+                f" {self.folder}"
             ) from interrupted
 
 

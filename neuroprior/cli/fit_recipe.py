@@ -19,6 +19,9 @@ from neuroprior.worlds import World
 PARTS, LEAST_ACTIONS = 3, 2
 """Parts that plans are split into, and the fewest actions of each."""
 
+FEW_GROUPS, FOLDS = 15, 5
+"""Groups below which the comparison is a cross-validation, as a tenth of them would be one; and its folds."""
+
 MOST_INDICES = 2**20
 """Actions or contexts beyond which indices are taken for names that look like numbers."""
 
@@ -71,6 +74,9 @@ class PlansData(PlansModule):
         end: close each plan with a symbol for its end, so that the prior learns how long plans are.
         validation: share of plans (of groups, where there are any) for early stopping and the choice of baselines.
         held_out: share of plans (or groups) for the table at the end; nothing is learned or chosen on them.
+        folds: of a cross-validation over groups (over plans without groups), in place of a held-out share: the prior
+            and the baselines are fitted once more for each fold, for the table alone, and the prior that is saved
+            learns from all plans. null: 5 with fewer than 15 groups, else 1, which holds out a share.
         batch_size: plans a step (pieces of plans, where they are longer than a window).
         window: actions that a step reads of a plan; longer plans are read in windows, the hidden state carried over.
         check_every: steps between two validations; null for two passes through the plans, but at least 10 and at most
@@ -96,6 +102,7 @@ class PlansData(PlansModule):
         end: bool = False,
         validation: float = 0.1,
         held_out: float = 0.1,
+        folds: int | None = None,
         batch_size: int = 64,
         window: int = 128,
         check_every: int | None = None,
@@ -131,8 +138,13 @@ class PlansData(PlansModule):
         _check_indices("context", self.num_contexts or 0)
         # Seeded anew, so that collected plans are split in the same way when they come from the run's own copy.
         generator = torch.Generator().manual_seed(seed)
-        rest, self.held_out = self.plans.split(held_out, generator)
-        self.learned_from, self.chosen_on = rest.split(validation / (1 - held_out), generator)
+        self.folds = _folds(self.plans, folds)
+        rest, share = self.plans, validation
+        self.held_out = self.plans
+        if self.folds == 1:
+            rest, self.held_out = self.plans.split(held_out, generator)
+            share = validation / (1 - held_out)
+        self.learned_from, self.chosen_on = rest.split(share, generator)
         for name, part in (("validation", self.chosen_on), ("held_out", self.held_out)):
             if int(part.mask().sum()) < LEAST_ACTIONS:
                 raise ValueError(
@@ -204,6 +216,16 @@ def _in_parts(plans: Plans) -> Plans:
             f" at least {PARTS} {what} are needed"
         )
     return plans
+
+
+def _folds(plans: Plans, wanted: int | None) -> int:
+    """How many folds; 1: a share of the plans is held out."""
+    units, what = (len(plans), "plans") if plans.group is None else (len(plans.group.unique()), "groups")
+    if wanted is None:
+        return min(FOLDS, units) if plans.group is not None and units < FEW_GROUPS else 1
+    if not 1 <= wanted <= units:
+        raise ValueError(f"data.folds: from 1 to the number of {what}, {units}, is expected, not {wanted}")
+    return wanted
 
 
 def _check_indices(what: str, number: int) -> None:

@@ -1,5 +1,7 @@
 """The end of a run of `fit`: the prior is saved, and compared with baselines on the held-out plans."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,29 +11,49 @@ from rich.console import Console
 
 from neuroprior._files import versions, write_json
 from neuroprior.analysis.comparison import Score, baselines, score, too_few, unit_name
+from neuroprior.cli.fit_folds import TRAINED, cross_validated
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
-from neuroprior.priors import save
+from neuroprior.priors import Prior, save
 from neuroprior.priors.scoring import keep_learned
 from neuroprior.report.document import printed, records, table, write_figures, write_frames
 
 
-def report(folder: Path, model: PriorModel, data: PlansData) -> None:
+def report(
+    folder: Path, model: PriorModel, data: PlansData, fresh: Prior | None = None, settings: Mapping[str, Any] = {}
+) -> None:
     """Save the prior, compare it with baselines, and print the table.
 
     Writes the prior's files, `metrics.json`, `metrics.csv` and, for a network, the learning curve.
+
+    Args:
+        folder: of the run.
+        model: trained.
+        data: the plans.
+        fresh: the prior before training, for a cross-validation.
+        settings: of its `fit` there.
     """
     console = Console()
     prior, name = model.prior.cpu().eval(), type(model.prior).__name__
     save(prior, folder)
     keep_learned(folder, data.learned_from, data.chosen_on)
-    trained = score(name, prior, data.held_out)
-    rows = []
     contexts = data.num_contexts if prior.takes_context else None
+    scores: dict[str, Score] = {}
+    if fresh is not None:
+        console.print(
+            f"cross-validation: {name} and the baselines are fitted {data.folds} times more, each time without some of"
+            f" the {unit_name(data.plans)}; with --data.folds 1 a share of them is held out instead",
+            highlight=False,
+        )
+        scores = cross_validated(folder, fresh, settings, data, contexts)
+    trained = replace(scores.pop(TRAINED), model=name) if fresh else score(name, prior, data.held_out)
+    rows = []
     with console.status("fitting baselines") as status:
         show = lambda what: status.update(f"fitting {what}")  # noqa: E731
         for baseline in baselines(data.learned_from, data.chosen_on, contexts, show):
             # There is no prior where its tables would be too large.
-            one = baseline.prior and score(baseline.model, baseline.prior, data.held_out)
+            if fresh is None and baseline.prior is not None:
+                scores[baseline.model] = score(baseline.model, baseline.prior, data.held_out)
+            one = scores.get(baseline.model)
             row = _row(one, trained) if one else {"model": baseline.model}
             rows.append(row | {"how": baseline.how, "validation_bits": baseline.validation_bits})
     last = _row(trained, trained) | {"how": "", "validation_bits": None}
@@ -40,7 +62,7 @@ def report(folder: Path, model: PriorModel, data: PlansData) -> None:
     console.print(_table(frame, best.model, data))
     parts = {"training": data.learned_from, "validation": data.chosen_on, "held_out": data.held_out}
     written = frame.assign(sees=frame.context)  # its former name
-    results = {"rows": records(written), "chosen": best.model, "unit": unit_name(data.held_out)}
+    results = {"rows": records(written), "chosen": best.model, "unit": unit_name(data.held_out), "folds": data.folds}
     results |= {"plans": {part: len(plans) for part, plans in parts.items()}, "curve": model.curve}
     write_json(folder / "metrics.json", results | {"versions": versions()})
     write_frames(folder, {"metrics": written})
@@ -92,4 +114,5 @@ def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
     best = f"{few}." if few else "*: best on the validation plans, which chose the settings."
     caption = f"±: 95 % interval over {unit}. difference: from the last row.\n{best}"
     title = f"Bits per action on {len(data.held_out):,} held-out plans ({actions:,} actions)"
+    title += f", {data.folds} folds" if data.folds > 1 else ""
     return printed(title, table(frame, columns, caption, align="llrr"))

@@ -41,6 +41,16 @@ def check_file(path: Path) -> None:
         raise ValueError(f"{path}: an empty file; plans are expected")
 
 
+def check_plain(path: Path) -> None:
+    """Raise ValueError for a file whose beginning is not that of a text in UTF-8, or is that of a web page."""
+    with open(path, "rb") as file:
+        begin = file.read(1024)
+    if b"\0" in begin[:4]:  # of UTF-16 the first letter shows it
+        raise ValueError(f"{path}, line 1: not UTF-8 (UTF-16, or no text at all); save the file as UTF-8")
+    if begin.lstrip().lower().startswith((b"<!doctype", b"<html", b"<?xml")):
+        raise ValueError(f"{path}: a web page or XML; plans are expected")
+
+
 @contextmanager
 def open_text(path: Path) -> Iterator[IO[str]]:
     """A UTF-8 file, with or without a byte order mark, opened for reading; line ends are left as they are.
@@ -50,6 +60,7 @@ def open_text(path: Path) -> Iterator[IO[str]]:
         ValueError: a directory, an empty file or one that is not UTF-8; the message names the line and the byte.
     """
     check_file(path)
+    check_plain(path)
     try:
         with open(path, encoding="utf-8-sig", newline="") as file:
             yield file
@@ -221,16 +232,19 @@ def named(values: Any, names: Sequence[str] | None) -> Any:
 
 def never_notes(actions: Integers, num_actions: int) -> list[str]:
     """A note where some of the action numbers below the largest never occur: codes from 1, say, or with gaps."""
-    never = np.setdiff1d(np.arange(num_actions), actions) if num_actions < 10**6 else np.zeros(0, np.int64)
-    if not never.size:
+    occur = np.unique(actions)
+    number = num_actions - len(occur)
+    if not number:
         return []
-    verb = "occurs" if never.size == 1 else "occur"
-    return [f"actions are numbers from 0 to {num_actions - 1}, of which {listed(never)} never {verb}"]
+    first = np.setdiff1d(np.arange(min(num_actions, len(occur) + SHOWN)), occur)  # at least `SHOWN`, or all
+    verb = "occurs" if number == 1 else "occur"
+    return [f"actions are numbers from 0 to {num_actions - 1}, of which {listed(first, number)} never {verb}"]
 
 
-def listed(values: Sequence[Any] | NDArray[Any]) -> str:
-    """The first `SHOWN` of some values, and how many more there are."""
-    return ", ".join(map(str, values[:SHOWN])) + (f" and {len(values) - SHOWN} more" if len(values) > SHOWN else "")
+def listed(values: Sequence[Any] | NDArray[Any], number: int | None = None) -> str:
+    """The first `SHOWN` of some values, and how many more there are; `number` of them in all."""
+    more = (len(values) if number is None else number) - SHOWN
+    return ", ".join(map(str, values[:SHOWN])) + (f" and {more:,} more" if more > 0 else "")
 
 
 def check_distinct(what: str, names: Sequence[str] | None) -> None:

@@ -5,7 +5,7 @@ Needs pandas (`pip install 'neuroprior[report]'`), which holds the table.
 
 import contextlib
 import re
-import warnings
+import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
@@ -37,8 +37,13 @@ EVENT_TYPES = ("START", "STOP", "POINT")
 UNLABELLED = "missing"
 """The action of rows without a label, where these are to count as one."""
 
-CLOCK, DATE = r"\s*(\d+:)?\d+:\d+([.,]\d*)?\s*", r"\s*\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}([T ].*)?\s*"
+CLOCK, DATE = r"\s*(\d+:)?\d+:\d+([.,]\d*)?\s*", r"\s*\d{4}[-/.]\d{1,2}[-/.]\d{1,2}([T ].*)?\s*"
 """Times that are no numbers: hours, minutes and seconds, or a date and perhaps a time of day."""
+
+DAY = r"\s*\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}([T ].*)?\s*"
+"""A date of which nobody knows whether its day or its month is first."""
+
+HALF_A_DAY = 12 * 3600
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,10 @@ class Table:
         self, frame: Any, columns: Columns | Mapping[str, Any] | None, place: Callable[[int], str], of: str = "table"
     ) -> None:
         self.frame, self.place, self.of = frame, place, of
+        if not hasattr(frame, "columns") or not hasattr(frame, "iloc"):
+            raise ValueError(f"{of}: a pandas frame is expected, not {type(frame).__name__}")
+        if not isinstance(columns, Columns | Mapping | None):
+            raise ValueError(f"columns: what each holds is expected, as in {{'action': 'behaviour'}}, not {columns!r}")
         try:
             given = asdict(columns if isinstance(columns, Columns) else Columns(**(columns or {})))
         except TypeError as error:
@@ -118,9 +127,9 @@ class Table:
     def _uses(self, name: str) -> list[str]:
         return [what for what, i in self.at.items() if self.frame.columns[i] == name]
 
-    def _find(self, what: str, name: str) -> int:
+    def _find(self, what: str, name: Any) -> int:
         """The position of a column by its name; by its name in lower case where that is the only one."""
-        names = list(map(str, self.frame.columns))
+        name, names = str(name), list(map(str, self.frame.columns))
         found = [i for i, known in enumerate(names) if known == name]
         found = found or [i for i, known in enumerate(names) if known.strip().lower() == name.strip().lower()]
         if len(found) != 1:
@@ -148,37 +157,53 @@ class Table:
         import pandas as pd
 
         column = self.frame.iloc[:, position]
-        if isinstance(column.dtype, np.dtype) and column.dtype.kind in "Mm":
+        if pd.api.types.is_datetime64_any_dtype(column) or pd.api.types.is_timedelta64_dtype(column):
             return _seconds(column)
         missing = column.isna() | column.map(lambda value: isinstance(value, str) and is_missing(value))
         values = pd.to_numeric(column.where(~missing), errors="coerce")
         if times and values[~missing].isna().any():
             texts = column.where(~missing).astype(object)
-            for form, parse in ((CLOCK, pd.to_timedelta), (DATE, pd.to_datetime)):
+            for form, parse in ((CLOCK, pd.to_timedelta), (DATE, _dates)):
                 if texts[~missing].astype(str).str.fullmatch(form).all():
-                    with contextlib.suppress(ValueError, TypeError), warnings.catch_warnings():
-                        warnings.simplefilter("ignore", UserWarning)  # of formats that differ from row to row
+                    with contextlib.suppress(ValueError, TypeError):
                         values = pd.Series(_seconds(parse(texts)))
         found: NDArray[np.float64] = values.to_numpy(np.float64, na_value=np.nan)
         wrong = np.flatnonzero(~np.isfinite(found) & ~missing.to_numpy())
         if wrong.size:
-            kind = "a number or a time" if times else "a finite number"
-            raise ValueError(f"{self.place(wrong[0])}: {what} {str(column.iloc[wrong[0]])!r} is not {kind}")
+            text, kind = str(column.iloc[wrong[0]]), "a number or a time" if times else "a finite number"
+            if times and re.fullmatch(f"{DATE}|{DAY}", text):
+                kind = "a date that can be read with the others; all as year-month-day are expected"
+            elif re.fullmatch(r"\s*-?\d+,\d+\s*", text):
+                kind += " (a decimal point is expected, no comma)"
+            raise ValueError(f"{self.place(wrong[0])}: {what} {text!r} is not {kind}")
         return found
 
     def unused(self) -> list[str]:
         """The names of the columns that hold nothing."""
         used = {*self.at.values(), *self.context}
-        return [str(name) for i, name in enumerate(self.frame.columns) if i not in used]
+        names = [str(name).strip() or f"(without a name, column {i + 1})" for i, name in enumerate(self.frame.columns)]
+        return [name for i, name in enumerate(names) if i not in used]
 
 
 def _text(value: Any) -> str:
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
+def _dates(texts: Any) -> Any:
+    """Dates with the year first, with or without time and zone; those without are taken to be in one zone."""
+    import pandas as pd
+
+    padded_day = texts.str.strip().str.replace(
+        r"^(\d{4})[-/.](\d{1,2})[-/.](\d{1,2})", lambda m: f"{m[1]}-{m[2]:0>2}-{m[3]:0>2}", regex=True
+    )
+    return pd.to_datetime(padded_day, format="ISO8601", utc=True)
+
+
 def _seconds(column: Any) -> NDArray[np.float64]:
-    """Times in seconds; dates from the first of them."""
-    since = column - column.min() if "datetime" in str(column.dtype) else column
+    """Times in seconds; dates since 1970, so that those of two columns can be compared."""
+    since = column
+    if "datetime" in str(column.dtype):
+        since = column - type(column.min())(0, tz=column.dt.tz) if column.notna().any() else column - column
     found: NDArray[np.float64] = since.dt.total_seconds().to_numpy(np.float64)
     return found
 
@@ -207,8 +232,10 @@ def fields_of(
     """
     if missing not in MISSING:
         raise ValueError(f"missing: one of {', '.join(MISSING)} is expected, not {missing!r}")
-    if max_gap is not None and not 0 <= max_gap < np.inf:
-        raise ValueError(f"max_gap: a time of at least 0 is expected, not {max_gap}")
+    if max_gap is not None and (not isinstance(max_gap, int | float) or not 0 <= max_gap < np.inf):
+        raise ValueError(f"max_gap: a time of at least 0 is expected, not {max_gap!r}")
+    if not isinstance(merge_repeats, bool | np.bool_):
+        raise ValueError(f"merge_repeats: True or False is expected, not {merge_repeats!r}")
     names = check_names(num_actions, action_names)
     table = Table(frame, columns, place, of)
     if not len(frame):
@@ -237,6 +264,10 @@ def fields_of(
     plan, codes, without = plan[row], codes[row], without[row]
     begin = np.diff(plan, prepend=-1) != 0
     seconds, ends = _durations(table, start, row, begin)
+    if "stop" in table.at and ends is not None and start is not None:
+        early = ~begin[1:] & (start[row][1:] < ends[:-1])
+        if early.any():
+            notes.append(f"{int(early.sum()):,} actions begin before the one before them ended")
     pause = np.zeros(len(row), bool)
     if max_gap is not None:
         if start is None or ends is None:
@@ -387,7 +418,14 @@ def _order(
         raise ValueError(f"{table.place(row)}: start: an empty cell; a time is expected")
     order = np.lexsort((start, plan))
     moved = bool((np.diff(order) < 0).any())
-    return order, ["rows are put in the order of their start"] * moved
+    notes = ["rows are put in the order of their start"] * moved
+    texts = table.frame.iloc[:, table.at["start"]].astype(str)
+    back = (np.diff(start) < -HALF_A_DAY) & (np.diff(plan) == 0)
+    if back.any() and texts.str.fullmatch(CLOCK).all():
+        row = int(back.argmax())
+        times = f"from {texts.iloc[row]} to {texts.iloc[row + 1]} ({table.place(row + 1)})"
+        notes.append(f"times of day go back {times}; past midnight they need a date")
+    return order, notes
 
 
 def _durations(
@@ -495,7 +533,8 @@ def _alike(labels: list[str], what: str) -> list[str]:
     alike: dict[str, list[str]] = {}
     for label in labels:
         if number_in(label) is None:
-            alike.setdefault(re.sub(r"[\s_-]", "", label.casefold()), []).append(label)
+            plain = unicodedata.normalize("NFC", label.casefold())  # a letter may be written as one character or as two
+            alike.setdefault(re.sub(r"[\s_-]", "", plain), []).append(label)
     return [
         f"{what}s {' and '.join(map(repr, names))} are nearly the same; rename them if they mean the same"
         for key, names in alike.items()

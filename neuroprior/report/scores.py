@@ -121,9 +121,9 @@ class Evaluation:
 
 def cross_validation(folder: Path, plans: Plans, test: Plans | None, design: Design) -> JobRun[Job, Arrays]:
     """The jobs of a cross-validation, whose results are kept below `folder` by the plans and the design."""
-    asked = {"plans": _digest(plans), "test": None if test is None else _digest(test), **asdict(design)}
+    asked = {"plans": plans_digest(plans), "test": None if test is None else plans_digest(test), **asdict(design)}
     run = partial(fits.fit_and_score, plans, test, design)
-    return JobRun(run, folder / "folds", asked, save=_save, load=_load, suffix=".npz")
+    return JobRun(run, folder / "folds", asked, save=save_arrays, load=load_arrays, suffix=".npz")
 
 
 def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Job]:
@@ -215,7 +215,7 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Eval
     return Evaluation(plans, plans, mask, models, (models[0], models[0].name), plans, pd.DataFrame(), settings)
 
 
-def _digest(plans: Plans) -> str:
+def plans_digest(plans: Plans) -> str:
     """A digest of all that plans hold."""
     digest = hashlib.sha256()
     for name, value in vars(plans).items():
@@ -227,12 +227,14 @@ def _digest(plans: Plans) -> str:
     return digest.hexdigest()
 
 
-def _save(path: Path, arrays: Arrays) -> None:
+def save_arrays(path: Path, arrays: Arrays) -> None:
+    """Write the result of a job."""
     with written_whole(path, "wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def _load(path: Path) -> Arrays:
+def load_arrays(path: Path) -> Arrays:
+    """Read the result of a job; ValueError for a damaged file."""
     try:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)

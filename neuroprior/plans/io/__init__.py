@@ -81,10 +81,14 @@ def read_plans(
         ValueError: an argument or the file is wrong; the message names the file and the line or the array.
         ImportError: a file with one action a row needs pandas, and it is not installed.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path: the name of a file is expected, not {type(path).__name__}")
+    if not isinstance(columns, Columns | Mapping | None):
+        raise ValueError(f"columns: what each holds is expected, as in {{'action': 'behaviour'}}, not {columns!r}")
     given = columns if isinstance(columns, Columns | None) else {k: v for k, v in columns.items() if v is not None}
     table: dict[str, Any] = {"columns": given} if given not in (None, {}, Columns()) else {}
     table |= {"missing": missing} if missing != "gap" else {}
-    table |= {"merge_repeats": True} if merge_repeats else {}
+    table |= {"merge_repeats": merge_repeats} if merge_repeats is not False else {}
     table |= {} if max_gap is None else {"max_gap": max_gap}
     is_dataset = isinstance(path, str) and path.startswith(MINARI)
     if table and (is_dataset or FILES[_suffix(Path(path))].read is not read_csv):
