@@ -54,7 +54,7 @@ def run(installed: Path, folder: Path, *words: str, code: int = 0) -> subprocess
 def test_the_four_commands(installed: Path, tmp_path: Path) -> None:
     run(installed, tmp_path, "example", "study.csv")
     study = ["study.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
-    quick = ["--trainer.max_steps", "20", "--trainer.accelerator", "cpu"]
+    quick = ["--trainer.max_steps", "20", "--trainer.accelerator", "cpu", "--data.folds", "1"]
     fitted = run(installed, tmp_path, "fit", "--config", "gru", "--data.file", *study, "--out", "gru", *quick)
     assert "bits per action" in fitted.stdout
     report = ["--models", "counts", "--processes", "1", "--out", "report"]
