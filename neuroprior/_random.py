@@ -14,12 +14,19 @@ def generator_on(generator: torch.Generator | None, device: torch.device | str) 
     Returns:
         `generator` itself where it is on the same kind of device; else one on `device` that is seeded by a draw from
         it, so that a CPU generator makes a GPU's draws reproducible too.
+
+    Raises:
+        ValueError: it is no generator, but a seed, say.
     """
     device = torch.device(device)
     if generator is None:
         fresh = torch.Generator(device)
         fresh.seed()
         return fresh
+    if not isinstance(generator, torch.Generator):
+        raise ValueError(
+            f"generator: a torch.Generator is expected, such as torch.Generator().manual_seed(0), not {generator!r}"
+        )
     if generator.device.type == device.type:
         return generator
     return torch.Generator(device).manual_seed(draw_seed(generator))

@@ -17,9 +17,12 @@ from neuroprior import (
     oracle,
     read_plans,
     save,
+    score,
+    write_plans,
 )
+from neuroprior.cli.__main__ import main
 from neuroprior.planners import expected_score
-from neuroprior.report import report
+from neuroprior.report import ethogram_figure, report
 from neuroprior.values import q_learning
 from neuroprior.worlds import cube
 from tests.support.sources import refuses, seeded
@@ -87,3 +90,57 @@ def test_numbers_of_samples_are_integers(number):
         UniformPrior(3).sample(number, 4)
     with refuses("length", "integer"):
         UniformPrior(3).sample(4, number)
+
+
+PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: Plans([[0, 1], [1]], 2), ["actions", "one length"]),
+        (lambda: Plans([["a", "b"]], 2), ["actions", "action_names"]),
+        (lambda: Plans(ACTIONS, 2, group=["m1"]), ["group", "group_names"]),
+        (lambda: fit(PLANS, MarkovPrior(2, 1)), ["prior", "MarkovPrior", "fit(plans)"]),
+        (lambda: UniformPrior(2).sample(2, 3, generator=0), ["generator", "manual_seed"]),
+        (lambda: UniformPrior(2).sample(2, 3, temperature="hot"), ["temperature", "'hot'"]),
+        (lambda: score(UniformPrior(2), PLANS.actions), ["plans", "Tensor"]),
+        (lambda: write_plans(PLANS.actions, "a.npz"), ["plans", "Tensor"]),
+        (lambda: ethogram_figure(PLANS.actions), ["plans", "Tensor"]),
+        (lambda: load(None), ["folder", "NoneType"]),
+        (lambda: save(3, "prior"), ["prior", "int"]),
+        (lambda: report(PLANS, models="counts"), ["models", "a list", "['counts']"]),
+        (lambda: report(PLANS, priors=UniformPrior(2)), ["priors", "a dict"]),
+        (lambda: report(PLANS, priors=[UniformPrior(2)]), ["priors", "a dict"]),
+        (lambda: report(PLANS, models=["counts"], folds=3), ["folds: at most 2", "not 3"]),
+    ],
+)
+def test_arguments_of_other_kinds(call, words):
+    with refuses(*words):
+        call()
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert UniformPrior(2).sample(2, 3, temperature=np.float32(1)).shape == (2, 3)
+    assert len(PLANS.split(np.float32(0.5))[0]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["report", "FILE", "--columns.acton", "x"], ["columns", "no option 'acton'"]),
+        (["fit", "--config", "markov", "--data.file", "FILE", "--model.prior.hidden", "8"], ["prior", "'hidden'"]),
+        (["sample", "PRIOR", "--seed", str(2**70)], ["seed", "2**63"]),
+        (["score", "PRIOR", "FILE", "--out", "OUT"], ["at least two held-out actions"]),
+    ],
+)
+def test_options_that_cannot_be(arguments, words, tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("plan,action\n1,0\n")
+    save(MarkovPrior(2, 1).fit(PLANS), tmp_path / "prior")
+    places = {"FILE": str(tmp_path / "a.csv"), "PRIOR": str(tmp_path / "prior"), "OUT": str(tmp_path / "out")}
+    assert main([places.get(argument, argument) for argument in arguments]) == 2
+    out, said = capsys.readouterr()
+    assert not out
+    assert said.startswith("error: ")
+    assert len(said) < 200
+    assert all(word in said for word in words), said

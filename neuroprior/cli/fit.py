@@ -20,6 +20,7 @@ from lightning_utilities.core.rank_zero import rank_zero_only
 from neuroprior._files import write_whole
 from neuroprior.cli.fit_recipe import PlansData, PriorModel, recipe_path, recipes
 from neuroprior.cli.fit_report import report
+from neuroprior.cli.program import one_line
 from neuroprior.plans import write_plans
 from neuroprior.priors.neural import NeuralPrior
 from neuroprior.training import make_trainer, quiet, run_training
@@ -54,7 +55,7 @@ def run(arguments: list[str], program: str = "neuroprior") -> None:
         try:
             FitCLI(arguments, program)
         except (ArgumentError, MisconfigurationException) as error:
-            raise ValueError(str(error)) from error
+            raise ValueError(one_line(str(error), {})) from error
 
 
 class FitCLI(LightningCLI):

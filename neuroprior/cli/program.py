@@ -116,7 +116,7 @@ def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -
     try:
         settings = parser.parse_args(list(arguments))
     except ArgumentError as error:
-        raise ValueError(_one_line(str(error), hints)) from error
+        raise ValueError(one_line(str(error), hints)) from error
     return function(**{name: _plain(value) for name, value in settings.as_dict().items()})
 
 
@@ -135,9 +135,11 @@ def _item_of(hint: Any) -> Any:
     return get_args(hint)[0] if get_origin(hint) in (list, Sequence) else None
 
 
-def _one_line(message: str, hints: Mapping[str, Any]) -> str:
+def one_line(message: str, hints: Mapping[str, Any]) -> str:
     """What the parser objects to, in one line that begins with the option."""
     line = " ".join(message.split())
+    if unknown := re.search(r"""(?:Parser )?key "([^"]+)".*Option '([^']*)' is not accepted""", line):
+        return f"{unknown[1]}: it has no option {unknown[2]!r}"
     if nested := re.search(r"NestedArg\(key='([^']*)'", line):
         return f"{nested[1]}: there is no such option ({line.partition('NestedArg')[0].strip()})"
     found = re.match(r'Parser key "([^"]+)"(?: element \d+)?: (.*)', line)

@@ -33,6 +33,8 @@ def sample(
         seed: of the random numbers: the same seed gives the same plans.
         out: file to write, `.jsonl`, `.csv` or `.npz`; JSON lines on standard output by default.
     """
+    if seed >= 2**63:
+        raise ValueError(f"seed: an integer from 0 to 2**63 - 1 is expected, not {seed}")
     prior = load(folder)
     generator = torch.Generator().manual_seed(seed)
     given = _context(prior, context, folder, num_plans)

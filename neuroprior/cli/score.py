@@ -57,6 +57,7 @@ def score(
     plans = plans if plans.end is None else plans.without_end()
     own = match_plans(plans, prior, folder)
     bits = action_bits(prior, own)
+    whole = score_bits(folder, "", bits, own).bits_per_action()
     scores = scores_by(bits, plans, "plan")
     known = learned_from(Path(folder), plans)
     scores.insert(1, "training_data", known)
@@ -81,7 +82,6 @@ def score(
     for note in plans.notes:
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
-    whole = score_bits(folder, "", bits, own).bits_per_action()
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     few = too_few(plans)
     console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)

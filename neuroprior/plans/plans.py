@@ -62,14 +62,14 @@ class Plans:
         check_sizes(num_actions=self.num_actions)
         if self.num_actions > MOST_ACTIONS:
             raise ValueError(f"num_actions: at most {MOST_ACTIONS}, not {self.num_actions}; number the actions from 0")
-        actions = torch.as_tensor(self.actions)
+        actions = _tensor("actions", self.actions)
         if actions.dim() != 2:
             raise ValueError(f"actions: shape [N, L] is expected, not {list(actions.shape)}")
         if self.end is not None:
             self._check_end(actions)
         num, length = actions.shape
         if self.lengths is not None:
-            lengths = torch.as_tensor(self.lengths)
+            lengths = _tensor("lengths", self.lengths)
             _check_shape("lengths", lengths, (num,))
             check_range("lengths", lengths, length + 1, "possible lengths")
             object.__setattr__(self, "lengths", lengths.long())
@@ -80,13 +80,13 @@ class Plans:
             raise ValueError(f"action_names: {self.num_actions} are expected, not {len(self.action_names)}")
         for what in ("group", "condition"):
             if getattr(self, what) is not None:
-                values = torch.as_tensor(getattr(self, what))
+                values = _tensor(what, getattr(self, what))
                 object.__setattr__(self, what, values)
                 if not is_integer(values):
                     raise ValueError(f"{what}: integers are expected, not {str(values.dtype).removeprefix('torch.')}")
                 _check_shape(what, values, (num,))
         if self.durations is not None:
-            durations = torch.as_tensor(self.durations)
+            durations = _tensor("durations", self.durations)
             _check_shape("durations", durations, (num, length))
             if not durations.is_floating_point():
                 durations = durations.float()
@@ -98,7 +98,7 @@ class Plans:
                 )
             object.__setattr__(self, "durations", durations.float().masked_fill(~self.mask(), 0))
         if self.context is not None:
-            object.__setattr__(self, "context", torch.as_tensor(self.context))
+            object.__setattr__(self, "context", _tensor("context", self.context))
             check_context(self.context, num, length)
         for what in ("action", "context", "group", "condition"):
             _check_texts(f"{what}_names", getattr(self, f"{what}_names"))
@@ -324,6 +324,12 @@ class Plans:
         )
 
 
+def check_are_plans(plans: object) -> None:
+    """Raise ValueError for what is not `Plans`."""
+    if not isinstance(plans, Plans):
+        raise ValueError(f"plans: Plans are expected, as in Plans(actions, num_actions), not {type(plans).__name__}")
+
+
 def all_plans(num_actions: int, length: int) -> Tensor:
     """All A**L plans `[A**L, L]`, int64; row n is n written in base A."""
     base = num_actions ** torch.arange(length - 1, -1, -1)
@@ -367,6 +373,17 @@ def durations_of(plans: Plans) -> Tensor:
 def is_per_step(context: Tensor | None) -> bool:
     """True for a context per step (`[N, L]`, `[N, L, C]`), False for none or one per plan (`[N]`, `[N, C]`)."""
     return context is not None and context.dim() == (2 if is_integer(context) else 3)
+
+
+def _tensor(name: str, values: Any) -> Tensor:
+    """Numbers as a tensor; ValueError for names, and for rows of unequal lengths."""
+    try:
+        return torch.as_tensor(values)
+    except (RuntimeError, TypeError, ValueError):
+        raise ValueError(
+            f"{name}: numbers in rows of one length are expected (names go into {name.removesuffix('s')}_names, and how"
+            " long each plan is into lengths)"
+        ) from None
 
 
 def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:

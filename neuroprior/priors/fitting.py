@@ -41,6 +41,11 @@ def fit(
     Raises:
         ValueError: an unknown name, plans that the prior cannot learn from, or a setting that it does not have.
     """
+    if isinstance(prior, Prior):
+        raise ValueError(
+            f"prior: a class, a function or a name is expected, not a {type(prior).__name__} that is made already; use"
+            " its own fit(plans)"
+        )
     if not isinstance(plans, Plans):
         actions = as_actions(plans)
         plans = Plans(actions, int(actions.max()) + 1 if actions.numel() else 1)

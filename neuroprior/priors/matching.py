@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors.prior import Prior, as_actions
 
 
@@ -25,6 +26,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
     Raises:
         ValueError: the prior does not know one of the actions or contexts, or takes durations that plans do not have.
     """
+    check_are_plans(plans)
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
         raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")

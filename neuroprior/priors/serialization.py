@@ -37,7 +37,10 @@ def save(prior: Prior, folder: str | os.PathLike[str]) -> Path:
 
     Raises:
         OSError: the folder cannot be written.
+        ValueError: it is no prior.
     """
+    if not isinstance(prior, Prior):
+        raise ValueError(f"prior: a Prior is expected, not {type(prior).__name__}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     data = write_tensors({name: value.detach().cpu().clone() for name, value in prior.state_dict().items()})
@@ -69,6 +72,8 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
         ValueError: a file is damaged or not of this kind, the prior's class is not known (import it first), or there is
             no such device.
     """
+    if not isinstance(folder, str | os.PathLike):
+        raise ValueError(f"folder: the name of a folder is expected, not {type(folder).__name__}")
     folder = Path(folder)
     config = _read_config(folder / "config.json")
     data = (folder / "model.safetensors").read_bytes()

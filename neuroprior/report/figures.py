@@ -19,6 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.report.drawing import (
     FEWER,
     MORE,
@@ -470,6 +471,7 @@ def ethogram_figure(plans: Plans) -> Figure:
     Raises:
         ValueError: no plan has an action.
     """
+    check_are_plans(plans)
     plans = plans if plans.end is None else plans.without_end()
     mask = plans.mask().cpu().numpy()
     if not mask.any():

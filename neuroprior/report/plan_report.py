@@ -104,6 +104,8 @@ def report(
         ("inputs", inputs, INPUTS),
         ("sections", sections, SECTIONS),
     ):
+        if isinstance(given, str):
+            raise ValueError(f"{name}: a list is expected, such as [{given!r}], not a text")
         if not given or set(given) - set(known):
             raise ValueError(f"{name}: some of {', '.join(known)} are expected, not {', '.join(given) or 'none'}")
     _check(skip, max_steps, patience, seed, processes)
@@ -113,6 +115,8 @@ def report(
     if priors is not None:
         if test is not None or folds is not None:
             raise ValueError("priors: they are scored on the plans as they are; leave test and folds out")
+        if isinstance(priors, Prior | str) or any(isinstance(one, Prior) for one in priors):
+            raise ValueError("priors: a dict of fitted priors by name, or a list of folders, is expected")
         if not priors:
             raise ValueError("priors: at least one is expected")
         loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
@@ -252,6 +256,8 @@ def _folds(name: str, plans: Plans, folds: int | None) -> int:
     if units < 2:
         raise ValueError(f"{name}: at least two plans, or a single long one, are needed for cross-validation")
     number = min(FOLDS, units) if folds is None else folds
+    if number > units:
+        raise ValueError(f"folds: at most {units}, as many as there are groups or plans, are expected, not {number}")
     if number < 2:  # which a `Design` takes for test plans
         raise ValueError(f"folds: at least 2 are expected, not {number}")
     return number

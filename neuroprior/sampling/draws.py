@@ -1,5 +1,7 @@
 """Drawing actions: from logits one by one, or by splitting the plans that share a prefix over its next actions."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -7,10 +9,10 @@ from neuroprior.plans import action_dtype
 from neuroprior.sampling.rows import rows_of
 
 
-def check_temperature(temperature: float) -> None:
+def check_temperature(temperature: Any) -> None:
     """Raise ValueError unless logits can be divided by it."""
-    if not 0 < temperature < float("inf"):
-        raise ValueError(f"temperature: a positive finite number is expected, not {temperature}")
+    if isinstance(temperature, str | None) or not 0 < temperature < float("inf"):
+        raise ValueError(f"temperature: a positive finite number is expected, not {temperature!r}")
 
 
 def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:

@@ -11,7 +11,7 @@ from neuroprior.plans.io.jsonl import read_jsonl, write_jsonl
 from neuroprior.plans.io.minari import read_minari, write_minari
 from neuroprior.plans.io.npz import read_npz, write_npz
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
-from neuroprior.plans.plans import Plans
+from neuroprior.plans.plans import Plans, check_are_plans
 from neuroprior.plans.tables import Columns, Missing
 
 __all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
@@ -117,6 +117,7 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
         ValueError: the file cannot hold these plans; the message says why.
         OSError: the file cannot be written.
     """
+    check_are_plans(plans)
     place = Path(path)
     suffix = _suffix(place)
     if layout is not None and FILES[suffix].read is not read_csv:

@@ -11,6 +11,9 @@ from neuroprior._checks import check_sizes
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
 
+MOST_DEPTH = 10_000
+"""Actions of a history; more take too long to walk through."""
+
 _PAIRS = ("pair_row", "pair_action", "pair_count")
 
 
@@ -91,6 +94,8 @@ class ContextTreePrior(HistoryPrior):
     ) -> None:
         if not isinstance(depth, int) or isinstance(depth, bool) or depth < 0:
             raise ValueError(f"depth: an integer of at least 0 is expected, not {depth!r}")
+        if depth > MOST_DEPTH:
+            raise ValueError(f"depth: at most {MOST_DEPTH} is expected, not {depth}")
         if beta is not None and not 0 < beta < 1:
             raise ValueError(f"beta: a number between 0 and 1 is expected, not {beta!r}")
         if alpha is not None and not 0 < alpha < float("inf"):

@@ -286,7 +286,7 @@ def test_tables_that_do_not_fit_are_refused(name):
 
 WRONG = {
     "num_actions": [0, "4"],
-    "depth": [-1, 2.5, True],
+    "depth": [-1, 2.5, True, 10**9],
     "beta": [0, 1.0],
     "alpha": [0, float("inf")],
     "base": ["prior"],
