@@ -87,6 +87,7 @@ class Table:
         self, frame: Any, columns: Columns | Mapping[str, Any] | None, place: Callable[[int], str], of: str = "table"
     ) -> None:
         self.frame, self.place, self.of = frame, place, of
+        self.since: Any = None  # the first of the dates that are read first: all dates count from it
         try:
             given = asdict(columns if isinstance(columns, Columns) else Columns(**(columns or {})))
         except TypeError as error:
@@ -148,8 +149,8 @@ class Table:
         import pandas as pd
 
         column = self.frame.iloc[:, position]
-        if isinstance(column.dtype, np.dtype) and column.dtype.kind in "Mm":
-            return _seconds(column)
+        if getattr(column.dtype, "kind", "") in ("M", "m"):  # with a time zone or without
+            return self._seconds(what, column)
         missing = column.isna() | column.map(lambda value: isinstance(value, str) and is_missing(value))
         values = pd.to_numeric(column.where(~missing), errors="coerce")
         if times and values[~missing].isna().any():
@@ -158,12 +159,22 @@ class Table:
                 if texts[~missing].astype(str).str.fullmatch(form).all():
                     with contextlib.suppress(ValueError, TypeError), warnings.catch_warnings():
                         warnings.simplefilter("ignore", UserWarning)  # of formats that differ from row to row
-                        values = pd.Series(_seconds(parse(texts)))
+                        values = pd.Series(self._seconds(what, parse(texts)))
         found: NDArray[np.float64] = values.to_numpy(np.float64, na_value=np.nan)
         wrong = np.flatnonzero(~np.isfinite(found) & ~missing.to_numpy())
         if wrong.size:
             kind = "a number or a time" if times else "a finite number"
             raise ValueError(f"{self.place(wrong[0])}: {what} {str(column.iloc[wrong[0]])!r} is not {kind}")
+        return found
+
+    def _seconds(self, what: str, column: Any) -> NDArray[np.float64]:
+        """Times in seconds; dates from `since`."""
+        if "datetime" in str(column.dtype):
+            self.since = column.min() if self.since is None else self.since
+            if (column.dt.tz is None) != (self.since.tzinfo is None):
+                raise ValueError(f"{self.of}: {what}: dates in all columns with a time zone, or in none, are expected")
+            column = column - self.since
+        found: NDArray[np.float64] = column.dt.total_seconds().to_numpy(np.float64)
         return found
 
     def unused(self) -> list[str]:
@@ -174,13 +185,6 @@ class Table:
 
 def _text(value: Any) -> str:
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
-
-
-def _seconds(column: Any) -> NDArray[np.float64]:
-    """Times in seconds; dates from the first of them."""
-    since = column - column.min() if "datetime" in str(column.dtype) else column
-    found: NDArray[np.float64] = since.dt.total_seconds().to_numpy(np.float64)
-    return found
 
 
 def fields_of(

@@ -116,6 +116,22 @@ def test_times_are_numbers_clocks_or_dates(times):
         assert stamps.durations[0, :2].tolist() == [1.5, 60]
 
 
+@pytest.mark.parametrize("convert", [list, pd.to_datetime])
+def test_dates_of_starts_and_stops_count_from_the_same_one(convert):
+    def days(*numbers):
+        return convert([f"2020-01-0{number} 23:59:59.5" for number in numbers])
+
+    frame = pd.DataFrame({"action": ["b", "a"], "start": days(2, 1), "stop": days(4, 2)})
+    assert Plans.from_dataframe(frame).durations.tolist() == [[86400, 2 * 86400]]
+    assert listed(Plans.from_dataframe(frame, max_gap=0)) == [["a", "b"]]
+    frame["stop"] = pd.to_datetime(frame["stop"]).dt.tz_localize("UTC")
+    frame["start"] = pd.to_datetime(frame["start"])
+    with refuses("stop", "time zone"):
+        Plans.from_dataframe(frame)
+    frame["start"] = frame["start"].dt.tz_localize("Europe/Helsinki")
+    assert Plans.from_dataframe(frame).durations.tolist() == [[86400 + 7200, 2 * 86400 + 7200]]
+
+
 def test_frames_are_merged_to_actions():
     frame = pd.DataFrame({"name": list("xxxxxxyy"), "syllable": [3, 3, 0, 0, 0, 3, 3, 3]})
     plans = Plans.from_dataframe(frame, plan="name", action="syllable", merge_repeats=True)
