@@ -142,6 +142,14 @@ def test_frames_are_merged_to_actions():
     assert timed.durations.tolist() == [[1, 1.5, 0.5], [1, 0, 0]]
 
 
+def test_what_a_gap_parts_is_not_merged():
+    frame = pd.DataFrame({"plan": [1, 1, 1, 1, 1, 2], "action": ["a", "a", None, "a", "b", "b"]})
+    plans = Plans.from_dataframe(frame, merge_repeats=True)
+    assert listed(plans) == [["a"], ["a", "b"], ["b"]]
+    assert plans.durations.tolist() == [[2, 0], [1, 1], [1, 0]]
+    assert plans.group.tolist() == [0, 0, 1]
+
+
 def test_features_of_several_columns():
     frame = pd.DataFrame({"action": list("ab"), "speed": [1, 2.5], "turn": ["0", "-1"]})
     plans = Plans.from_dataframe(frame, context=["speed", "turn"])
