@@ -7,10 +7,12 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from neuroprior._jobs import JobRun, code_version
+from neuroprior import _files
+from neuroprior._jobs import JobRun, Progress, code_version
 from tests.support import jobs
 
 ROOT = Path(__file__).parents[1]
@@ -58,6 +60,38 @@ def test_other_code_does_not_find_old_results(tmp_path: Path, monkeypatch: pytes
     assert found() == "1"
     (tmp_path / "eval_of_test.py").write_text("def run(job):\n    return {'found': 2}\n")
     assert found() == "2"
+
+
+def test_numbers_that_json_does_not_have_are_null(tmp_path: Path) -> None:
+    content = {"a": (1.0, float("nan"), [float("inf"), {"b": -float("inf")}]), "c": None, "d": 2}
+    _files.write_json(tmp_path / "x.json", content)
+    assert _files.read_json(tmp_path / "x.json") == {"a": [1.0, None, [None, {"b": None}]], "c": None, "d": 2}
+
+
+def test_versions_of_packages_decide_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def folders() -> list[Path]:
+        return [JobRun(jobs.square, tmp_path, {}, packages=names).folder for names in ((), ("pytest",))]
+
+    (plain, more), version = folders(), _files.version
+    assert plain != more
+    monkeypatch.setattr(_files, "version", lambda name: "0" if name == "pytest" else version(name))
+    assert folders()[0] == plain
+    assert folders()[1] not in (plain, more)
+
+
+def test_progress_says_what_is_done_and_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = iter([100.0, 100.0 + 3661, 100.0 + 2 * 3661])
+    monkeypatch.setattr("neuroprior._jobs.time", SimpleNamespace(monotonic=lambda: next(times)))
+    with Progress("t", 10, 4) as progress:
+        progress.advance("a")
+        progress.advance("b")
+    assert capsys.readouterr().err.splitlines() == [
+        "t: 6/10 were finished before",
+        "t: 7/10 a (1:01:01, 3:03:03 left)",
+        "t: 8/10 b (2:02:02, 2:02:02 left)",
+    ]
 
 
 def test_the_version_of_code_counts_what_it_imports() -> None:

@@ -40,6 +40,9 @@ UNLABELLED = "missing"
 CLOCK, DATE = r"\s*(\d+:)?\d+:\d+([.,]\d*)?\s*", r"\s*\d{4}[-/.]\d{1,2}[-/.]\d{1,2}([T ].*)?\s*"
 """Times that are no numbers: hours, minutes and seconds, or a date and perhaps a time of day."""
 
+ZONED = r".*[T ].*(Z|[+-]\d{2}:?\d{2})\s*"
+"""A date and time with a time zone."""
+
 DAY = r"\s*\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}([T ].*)?\s*"
 """A date of which nobody knows whether its day or its month is first."""
 
@@ -92,6 +95,7 @@ class Table:
         self, frame: Any, columns: Columns | Mapping[str, Any] | None, place: Callable[[int], str], of: str = "table"
     ) -> None:
         self.frame, self.place, self.of = frame, place, of
+        self.zoned: bool | None = None  # whether the dates that were read have a time zone
         if not hasattr(frame, "columns") or not hasattr(frame, "iloc"):
             raise ValueError(f"{of}: a pandas frame is expected, not {type(frame).__name__}")
         if not isinstance(columns, Columns | Mapping | None):
@@ -158,6 +162,8 @@ class Table:
 
         column = self.frame.iloc[:, position]
         if pd.api.types.is_datetime64_any_dtype(column) or pd.api.types.is_timedelta64_dtype(column):
+            if pd.api.types.is_datetime64_any_dtype(column):
+                self._check_zone(what, column.dt.tz is not None)
             return _seconds(column)
         missing = column.isna() | column.map(lambda value: isinstance(value, str) and is_missing(value))
         values = pd.to_numeric(column.where(~missing), errors="coerce")
@@ -165,6 +171,8 @@ class Table:
             texts = column.where(~missing).astype(object)
             for form, parse in ((CLOCK, pd.to_timedelta), (DATE, _dates)):
                 if texts[~missing].astype(str).str.fullmatch(form).all():
+                    if form == DATE:
+                        self._check_zone(what, bool(texts[~missing].astype(str).str.fullmatch(ZONED).any()))
                     with contextlib.suppress(ValueError, TypeError):
                         values = pd.Series(_seconds(parse(texts)))
         found: NDArray[np.float64] = values.to_numpy(np.float64, na_value=np.nan)
@@ -177,6 +185,11 @@ class Table:
                 kind += " (a decimal point is expected, no comma)"
             raise ValueError(f"{self.place(wrong[0])}: {what} {text!r} is not {kind}")
         return found
+
+    def _check_zone(self, what: str, zoned: bool) -> None:
+        if self.zoned not in (None, zoned):
+            raise ValueError(f"{self.of}: {what}: dates with a time zone in all columns, or in none, are expected")
+        self.zoned = zoned
 
     def unused(self) -> list[str]:
         """The names of the columns that hold nothing."""

@@ -23,7 +23,7 @@ class Steppable(Protocol):
       a context that does not fit.
     - `end`: the action that ends a plan.
     - `advance(action, state, context, room)`: as `step`, but may overwrite the state; `room` more steps will follow.
-    - `device`: where the prior computes.
+    - `device`: where the prior computes; a prior that takes a context computes on the CPU without it.
 
     Attributes:
         num_actions: A.
@@ -63,7 +63,9 @@ class Stepper:
     def device(self) -> torch.device:
         """Where the prior computes."""
         device = getattr(self._prior, "device", None)
-        return self._prior.start(1)[0].device if device is None else torch.device(device)
+        if device is None:  # no context is known yet that could be given to `start`
+            device = "cpu" if self.context_per is not None else self._prior.start(1)[0].device
+        return torch.device(device)
 
     def check_context(self, context: Tensor | None, num_plans: int = 0, length: int = 0) -> None:
         """Raise ValueError unless the prior takes such a context for so many plans of this length."""

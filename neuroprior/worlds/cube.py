@@ -93,9 +93,9 @@ class PocketCube(World):
         if self.absorbing:
             ended = state == 0
             after = after.masked_fill(ended, 0)
-            gained = (after == 0) & ~ended if self.reward_kind == "solved" else -self._distances[after]
-            return after, gained.float()
-        if self.reward_kind == "solved":
+            if self.reward_kind == "solved":
+                return after, ((after == 0) & ~ended).float()
+        elif self.reward_kind == "solved":
             return after, (after == 0).float()
         return after, -self._distances[after].float()
 

@@ -153,7 +153,7 @@ def refitted(plans: Plans) -> dict[tuple[int, int], list[float]]:
     ids=["between", "within", "three within"],
 )
 def test_the_prediction_is_that_of_chains_refitted_without_the_unit(conditions):
-    plans = study(4, conditions, length=12, num_actions=3)
+    plans = study(9, conditions, length=12, num_actions=3)
     plans = replace(plans, lengths=torch.randint(4, 13, (len(plans),), generator=seeded(0)))
     by_hand = refitted(plans)
     blocks, actions = sorted(by_hand), int(plans.lengths.sum())
@@ -166,6 +166,7 @@ def test_the_prediction_is_that_of_chains_refitted_without_the_unit(conditions):
     odds = logs[:, 1:] - (logs[:, 1:].sum(1, keepdims=True) - logs[:, 1:]) / (num - 1)
     np.testing.assert_allclose(found.log_odds, odds, atol=1e-9)
     correct = logs[:, 1:].argmax(1) == labels
+    assert {*correct} == {False, True}
     assert found.accuracy == pytest.approx(np.mean([correct[np.array(labels) == k].mean() for k in range(num)]))
     # What each transition carries adds up to the log odds of the right conditions.
     assert float(found.carried.sum()) == pytest.approx(odds[range(len(blocks)), labels].sum() / actions)

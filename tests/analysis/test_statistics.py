@@ -51,6 +51,8 @@ def test_paired_difference() -> None:
     # t = 1 / (sqrt(2/3) / 2) with 3 degrees of freedom.
     assert found.p_value == pytest.approx(0.0917, abs=1e-3)
     assert paired_difference([1, 2], [1, 2]).p_value == 1
+    # Without spread, a sign test: five of five the same way, or the other.
+    assert paired_difference([3.0] * 5, [1.0] * 5) == (2, 2, 2, 2 * 0.5**5)
 
 
 @pytest.mark.parametrize("call", [lambda: mean_interval([1.0]), lambda: paired_difference([1, 2], [1, 2, 3])])

@@ -126,6 +126,15 @@ def test_pieces_of_one_long_plan_each():
     assert found["1-grams"].corrected > 0.05
 
 
+def test_single_plans_are_cut_into_about_forty_pieces_of_the_shorter():
+    """Of 810 and 2,000 actions pieces have 20, but the last; a piece of one action has one run, and returns after 1."""
+    plans = [Plans(torch.zeros(1, length, dtype=torch.long), 2) for length in (810, 2000)]
+    found = {one.statistic: one for one in two_sample_tests(*plans, 99, seeded(0))}
+    assert {k + 1: float(found["run lengths"].real[k]) for k in (9, 19)} == pytest.approx({10: 1 / 41, 20: 40 / 41})
+    assert found["run lengths"].generated[19] == 1
+    assert found["return times"].real[0] == 1
+
+
 def test_order_0_against_order_1():
     """Bigrams differ, by the known distance of 0.2, and unigrams do not."""
     real, generated = chain(300, 50, 0.7, 1), chain(300, 50, 0.5, 2)

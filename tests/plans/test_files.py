@@ -289,7 +289,7 @@ def test_an_old_file_is_replaced_or_stays(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-CODES = Plans(torch.tensor([[1, 2, 3], [3, 1, 1]]), 4)
+CODES = Plans(torch.tensor([[1, 2, 3], [3, 1, 0]]), 4, torch.tensor([3, 2]))
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.tsv", "a.jsonl", "a.npz", "steps.csv"])
@@ -297,9 +297,9 @@ def test_codes_from_1_are_noted(name, tmp_path):
     """Action 0 never occurs: that there is one more action than the user thinks is said, unless the user said it."""
     path = tmp_path / name
     if name == "a.npz":
-        np.savez(path, actions=CODES.actions.numpy())
+        np.savez(path, actions=CODES.actions.numpy(), lengths=CODES.lengths.numpy())
     elif name == "a.jsonl":
-        path.write_text('{"actions": [1, 2, 3]}\n{"actions": [3, 1, 1]}\n')
+        path.write_text('{"actions": [1, 2, 3]}\n{"actions": [3, 1]}\n')
     else:
         write_plans(CODES, path, layout="step" if name == "steps.csv" else None)
     (note,) = read_plans(path).notes

@@ -116,6 +116,25 @@ def test_times_are_numbers_clocks_or_dates(times):
         assert stamps.durations[0, :2].tolist() == [1.5, 60]
 
 
+@pytest.mark.parametrize("convert", [list, pd.to_datetime])
+def test_dates_of_starts_and_stops_count_from_the_same_one(convert):
+    def days(*numbers):
+        return convert([f"2020-01-0{number} 23:59:59.5" for number in numbers])
+
+    frame = pd.DataFrame({"action": ["b", "a"], "start": days(2, 1), "stop": days(4, 2)})
+    assert Plans.from_dataframe(frame).durations.tolist() == [[86400, 2 * 86400]]
+    assert listed(Plans.from_dataframe(frame, max_gap=0)) == [["a", "b"]]
+    frame["stop"] = pd.to_datetime(frame["stop"]).dt.tz_localize("UTC")
+    frame["start"] = pd.to_datetime(frame["start"])
+    with refuses("stop", "time zone"):
+        Plans.from_dataframe(frame)
+    texts = frame.assign(start=frame["start"].astype(str), stop=[f"2020-01-0{day}T23:59:59.5+02:00" for day in (4, 2)])
+    with refuses("stop", "time zone"):
+        Plans.from_dataframe(texts)
+    frame["start"] = frame["start"].dt.tz_localize("Europe/Helsinki")
+    assert Plans.from_dataframe(frame).durations.tolist() == [[86400 + 7200, 2 * 86400 + 7200]]
+
+
 def test_frames_are_merged_to_actions():
     frame = pd.DataFrame({"name": list("xxxxxxyy"), "syllable": [3, 3, 0, 0, 0, 3, 3, 3]})
     plans = Plans.from_dataframe(frame, plan="name", action="syllable", merge_repeats=True)
@@ -124,6 +143,14 @@ def test_frames_are_merged_to_actions():
     assert "actions are numbers from 0 to 3, of which 1, 2 never occur" in plans.notes
     timed = Plans.from_dataframe(frame.assign(duration=0.5), plan="name", action="syllable", merge_repeats=True)
     assert timed.durations.tolist() == [[1, 1.5, 0.5], [1, 0, 0]]
+
+
+def test_what_a_gap_parts_is_not_merged():
+    frame = pd.DataFrame({"plan": [1, 1, 1, 1, 1, 2], "action": ["a", "a", None, "a", "b", "b"]})
+    plans = Plans.from_dataframe(frame, merge_repeats=True)
+    assert listed(plans) == [["a"], ["a", "b"], ["b"]]
+    assert plans.durations.tolist() == [[2, 0], [1, 1], [1, 0]]
+    assert plans.group.tolist() == [0, 0, 1]
 
 
 def test_features_of_several_columns():

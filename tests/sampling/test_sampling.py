@@ -150,6 +150,31 @@ def test_contexts_known_beforehand(kind, per, features):
         assert not fits(plans[which == row], distribution(prior, 3, table[1 - row]), A)
 
 
+class Echo:
+    """A prior of three actions that does what its context says: an action, `[N]`, or one for each step."""
+
+    num_actions = 3
+
+    def __init__(self, per):
+        self.context_per = per
+
+    def start(self, number, context):
+        return torch.nn.functional.one_hot(context, 3).log(), context[:, None]
+
+    def step(self, action, state, context=None):
+        return self.start(len(action), state[:, 0] if self.context_per == "plan" else context)
+
+
+@pytest.mark.parametrize("batch_size", [7, 900, 65_536])
+@pytest.mark.parametrize("per", ["plan", "step"])
+@pytest.mark.parametrize("method", METHODS)
+def test_each_plan_follows_its_own_context(per, method, batch_size):
+    """In whatever batches plans are drawn, and however those of one context are drawn together."""
+    context = torch.randint(3, (2000, 4) if per == "step" else (2000,), generator=seeded(0))
+    plans = sample(Echo(per), 2000, 4, context, generator=seeded(1), method=method, batch_size=batch_size)
+    assert torch.equal(plans.long(), context if per == "step" else context[:, None].expand(-1, 4))
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("size", [(0, 4), (5, 0), (0, 0), (1, 1), (1, 4)])
 @pytest.mark.parametrize("contexts", [None, 2])

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import pytest
@@ -206,9 +206,14 @@ def says(error: Exception, *words: str) -> bool:
     return True
 
 
-@contextmanager
-def refuses(*words: str, error: type[Exception] = ValueError) -> Iterator[None]:
+def refuses(*words: str, error: type[Exception] = ValueError) -> AbstractContextManager[None]:
     """What is done within must raise `error` with a message that `says` the words."""
+    assert all(isinstance(word, str) for word in words), "with refuses(...): nothing else is done by it"
+    return _refusing(words, error)
+
+
+@contextmanager
+def _refusing(words: tuple[str, ...], error: type[Exception]) -> Iterator[None]:
     with pytest.raises(error) as caught:
         yield
     assert says(caught.value, *words)

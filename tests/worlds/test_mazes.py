@@ -31,7 +31,7 @@ def num_edges(free):
     return sum((row + 1, column) in free for row, column in free) + sum((r, c + 1) in free for r, c in free)
 
 
-@pytest.mark.parametrize(("height", "width"), [(3, 3), (3, 9), (15, 15), (7, 21)])
+@pytest.mark.parametrize(("height", "width"), [(3, 3), (3, 9), (9, 3), (15, 15), (7, 21)])
 @pytest.mark.parametrize("loops", [0.0, 0.3, 1.0])
 def test_mazes_are_trees_and_loops(height, width, loops):
     world = maze(height, width, loops=loops, num_layouts=20)
