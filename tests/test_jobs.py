@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from neuroprior import _files
-from neuroprior._jobs import JobRun, Progress, code_version
+from neuroprior._jobs import JobRun, Progress, _digest, code_version
 from tests.support import jobs
 
 ROOT = Path(__file__).parents[1]
@@ -101,6 +101,32 @@ def test_the_version_of_code_counts_what_it_imports() -> None:
 
     assert code_version(MarkovPrior) != code_version(one_thread)
     assert code_version(partial(jobs.square, 1)) == code_version(jobs.dies)
+
+
+@pytest.mark.parametrize("line", ["import made.part", "from made import part", "from made.part import x as y"])
+def test_the_version_of_code_follows_every_import(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "made"
+    folder.mkdir()
+    for name, text in {
+        "__init__": "",
+        "run": f"def run(job):\n    {line}\n",
+        "part": "x = 1",
+        "other": "x = 1",
+    }.items():
+        (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr("neuroprior._jobs.PACKAGES", ("made",))
+
+    def digest() -> str:
+        _digest.cache_clear()
+        return code_version(SimpleNamespace(__module__="made.run"))
+
+    first = digest()
+    (folder / "other.py").write_text("x = 2")
+    assert digest() == first
+    (folder / "part.py").write_text("x = 2")
+    assert digest() != first
+    _digest.cache_clear()
 
 
 @pytest.mark.parametrize("processes", [1, 2])

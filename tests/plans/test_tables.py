@@ -89,6 +89,13 @@ def test_a_pause_ends_a_plan(tmp_path):
     text = "action,start,stop\na,0,5\nb,1,2\nc,6,7\nd,9,10\n"
     assert listed(read(tmp_path, text, max_gap=1.5)) == [["a", "b", "c"], ["d"]]
     assert listed(read(tmp_path, text, max_gap=2)) == [["a", "b", "c", "d"]]
+    # The end of an action of another plan does not count, and of unknown ends the latest known one does.
+    assert listed(read(tmp_path, "plan,action,start,stop\n1,a,0,99\n2,b,0,1\n2,c,5,6\n", max_gap=1)) == [
+        ["a"],
+        ["b"],
+        ["c"],
+    ]
+    assert listed(read(tmp_path, "action,start,stop\na,0,1\nb,2,\nc,10,11\n", max_gap=5)) == [["a", "b"], ["c"]]
     with refuses("max_gap", "start"):
         read(tmp_path, "plan,action\n1,a\n", max_gap=1)
 
@@ -138,6 +145,8 @@ def test_frames_are_merged_to_actions():
     assert listed(plans) == [[3, 0, 3], [3]]
     assert plans.durations.tolist() == [[2, 3, 1], [2, 0, 0]]
     assert "actions are numbers from 0 to 3, of which 1, 2 never occur" in plans.notes
+    notes = Plans.from_dataframe(pd.DataFrame({"action": [0, 10]})).notes
+    assert "actions are numbers from 0 to 10, of which 1, 2, 3, 4, 5, 6, 7, 8 and 1 more never occur" in notes
     timed = Plans.from_dataframe(frame.assign(duration=0.5), plan="name", action="syllable", merge_repeats=True)
     assert timed.durations.tolist() == [[1, 1.5, 0.5], [1, 0, 0]]
 
