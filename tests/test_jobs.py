@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from neuroprior import _files
-from neuroprior._jobs import JobRun, Progress, _digest, code_version
+from neuroprior._jobs import Failure, JobRun, Progress, _digest, code_version
 from tests.support import jobs
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +60,31 @@ def test_other_code_does_not_find_old_results(tmp_path: Path, monkeypatch: pytes
     assert found() == "1"
     (tmp_path / "eval_of_test.py").write_text("def run(job):\n    return {'found': 2}\n")
     assert found() == "2"
+
+
+def test_what_was_asked_is_kept_in_any_order(tmp_path: Path) -> None:
+    one, other = JobRun(jobs.square, tmp_path, {"a": 1, "b": 2}), JobRun(jobs.square, tmp_path, {"b": 2, "a": 1})
+    assert one.folder == other.folder
+    one.do([1])
+    assert _files.read_json(one.folder / "asked.json") == {"a": 1, "b": 2}
+
+
+@pytest.mark.parametrize(
+    ("raised", "error", "message"),
+    [
+        (FileNotFoundError("x is not there"), ValueError, "job: x is not there"),
+        (ImportError("no pandas"), ValueError, "job: no pandas"),
+        (ValueError(), ValueError, "job: ValueError"),
+        (MemoryError(), MemoryError, "job: out of memory; a smaller run may fit"),
+        (RuntimeError("CUDA out of memory"), MemoryError, "job: out of memory; a smaller run may fit"),
+        (KeyError("k"), RuntimeError, "job: KeyError: 'k'"),
+    ],
+)
+def test_errors_of_jobs(raised: Exception, error: type[Exception], message: str) -> None:
+    """Those that are expected are one line; of others the traceback is told."""
+    found = Failure(raised).error("job")
+    assert type(found) is error
+    assert str(found).strip() == message
 
 
 def test_numbers_that_json_does_not_have_are_null(tmp_path: Path) -> None:

@@ -288,6 +288,12 @@ def test_four_against_four():
     assert "With 4 against 4 groups the smallest possible p is 0.029" in found.verdict
 
 
+@pytest.mark.parametrize(("permutations", "labelings", "smallest"), [(69, 70, 2 / 70), (68, 69, 1 / 69)])
+def test_all_labelings_are_compared_where_they_are_no_more(permutations, labelings, smallest):
+    found = compare_conditions(study(0, between(8)), permutations, seeded(0))
+    assert (found.labelings, found.exact, found.smallest_p) == (labelings, labelings == 70, pytest.approx(smallest))
+
+
 def test_four_against_four_can_show_that_behaviour_differs_but_not_in_what():
     """Corrected for six tests no p-value is below .17: no feature is significant, whatever its own family says."""
     plans = study(1, between(8), length=200, num_actions=6, habit=0.3, change=move, slower={3: 2.0})
@@ -440,6 +446,17 @@ def test_animals_that_are_not_under_every_condition_are_left_out():
     assert found.design.units.tolist() == list(range(8))
     alone = compare_conditions(plans[plans.group < 8])
     assert alone.tests == found.tests
+
+
+def test_conditions_are_named_by_their_numbers():
+    plans = study(10, between(8))
+    found = compare_conditions(plans)
+    other = replace(plans, condition=2 * plans.condition + 1, condition_names=["w", "x", "y", "z"])
+    renamed = compare_conditions(other)
+    assert renamed.condition_names == ["x", "z"]
+    assert compare_conditions(replace(other, condition_names=None)).condition_names == ["condition 1", "condition 3"]
+    assert renamed.design.conditions.tolist() == [1, 3]
+    assert renamed.tests == found.tests
 
 
 def test_without_groups_plans_are_the_units():
