@@ -35,6 +35,12 @@ def test_fractions_count():
     assert len(row_hashes(torch.arange(8) / 8).unique()) == 8
 
 
+def test_the_last_bits_count():
+    for rows in (torch.tensor([[1.0], [1 + 2.0**-52]], dtype=torch.double), torch.tensor([[2**60], [2**60 + 1]])):
+        for some in (rows, torch.cat([rows, rows * 0], 1)):
+            assert len(row_hashes(some).unique()) == 2
+
+
 def test_no_rows():
     for shape in ((0,), (0, 3), (0, 2, 3)):
         assert row_hashes(torch.zeros(shape)).shape == (0,)

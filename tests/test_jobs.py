@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from neuroprior import _files
-from neuroprior._jobs import JobRun, Progress, code_version
+from neuroprior._jobs import Failure, JobRun, Progress, _digest, code_version
 from tests.support import jobs
 
 ROOT = Path(__file__).parents[1]
@@ -62,6 +62,31 @@ def test_other_code_does_not_find_old_results(tmp_path: Path, monkeypatch: pytes
     assert found() == "2"
 
 
+def test_what_was_asked_is_kept_in_any_order(tmp_path: Path) -> None:
+    one, other = JobRun(jobs.square, tmp_path, {"a": 1, "b": 2}), JobRun(jobs.square, tmp_path, {"b": 2, "a": 1})
+    assert one.folder == other.folder
+    one.do([1])
+    assert _files.read_json(one.folder / "asked.json") == {"a": 1, "b": 2}
+
+
+@pytest.mark.parametrize(
+    ("raised", "error", "message"),
+    [
+        (FileNotFoundError("x is not there"), ValueError, "job: x is not there"),
+        (ImportError("no pandas"), ValueError, "job: no pandas"),
+        (ValueError(), ValueError, "job: ValueError"),
+        (MemoryError(), MemoryError, "job: out of memory; a smaller run may fit"),
+        (RuntimeError("CUDA out of memory"), MemoryError, "job: out of memory; a smaller run may fit"),
+        (KeyError("k"), RuntimeError, "job: KeyError: 'k'"),
+    ],
+)
+def test_errors_of_jobs(raised: Exception, error: type[Exception], message: str) -> None:
+    """Those that are expected are one line; of others the traceback is told."""
+    found = Failure(raised).error("job")
+    assert type(found) is error
+    assert str(found).strip() == message
+
+
 def test_numbers_that_json_does_not_have_are_null(tmp_path: Path) -> None:
     content = {"a": (1.0, float("nan"), [float("inf"), {"b": -float("inf")}]), "c": None, "d": 2}
     _files.write_json(tmp_path / "x.json", content)
@@ -101,6 +126,32 @@ def test_the_version_of_code_counts_what_it_imports() -> None:
 
     assert code_version(MarkovPrior) != code_version(one_thread)
     assert code_version(partial(jobs.square, 1)) == code_version(jobs.dies)
+
+
+@pytest.mark.parametrize("line", ["import made.part", "from made import part", "from made.part import x as y"])
+def test_the_version_of_code_follows_every_import(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "made"
+    folder.mkdir()
+    for name, text in {
+        "__init__": "",
+        "run": f"def run(job):\n    {line}\n",
+        "part": "x = 1",
+        "other": "x = 1",
+    }.items():
+        (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr("neuroprior._jobs.PACKAGES", ("made",))
+
+    def digest() -> str:
+        _digest.cache_clear()
+        return code_version(SimpleNamespace(__module__="made.run"))
+
+    first = digest()
+    (folder / "other.py").write_text("x = 2")
+    assert digest() == first
+    (folder / "part.py").write_text("x = 2")
+    assert digest() != first
+    _digest.cache_clear()
 
 
 @pytest.mark.parametrize("processes", [1, 2])

@@ -21,7 +21,7 @@ from neuroprior import (
 )
 from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
 from neuroprior.worlds import ForagingWorld, patches
-from tests.support.sources import corridor, every_plan, refuses, seeded
+from tests.support.sources import corridor, every_plan, refuses, seeded, stochastic_world
 
 TRAINING = {"max_steps": 4, "progress": False}
 
@@ -57,6 +57,15 @@ def test_without_learning_and_warm_starts_it_executes():
 
 def test_warm_starts_are_counted():
     assert agent(learn_every=None).run(10).model_steps == 5 * 48 + 4 * 6
+
+
+@pytest.mark.parametrize("num_rollouts", [1, 3])
+def test_in_a_stochastic_world_both_are_rolled_out_so_often(num_rollouts):
+    world, prior = stochastic_world(0), UniformPrior(3)
+    planner = SamplingPlanner(prior, 4, 5)
+    one = Agent(world, planner, prior, replan_every=2, learn_every=None, num_rollouts=num_rollouts, generator=seeded(0))
+    alone = planner.plan(world, one.state, seeded(0)).model_steps
+    assert one.run(6).model_steps == 3 * alone + 2 * (4 + 2 * num_rollouts * 4)
 
 
 def rhythm():
@@ -294,6 +303,14 @@ def test_damaged_checkpoints(tmp_path):
         (agent(replan_every=1), "replan_every"),
         (agent(MarkovPrior(4, 1)), "config"),
         (agent(number=3), "agents"),
+        (agent(retention=0.5), "retention"),
+        (agent(warm_start=False), "warm_start"),
+        (agent(num_rollouts=2), "num_rollouts"),
+        (agent(learn_every=24), "learn_every"),
+        (agent(plan_length=2), "plan_length"),
+        (agent(min_score=0.0), "min_score"),
+        (agent(planner=ExhaustivePlanner(3)), "planner"),
+        (agent(UniformPrior(4)), "prior"),
     ):
         with refuses(word):
             restore_agent(other, tmp_path)

@@ -142,5 +142,6 @@ def test_many_places_of_many_actions():
 )
 def test_bad_input(change, words):
     given = {"log_probs": HAND.log(), "actions": torch.zeros(5).long(), "unit": torch.arange(5)} | change
-    with refuses(*words):
-        reliability(**given)
+    for chunk_size in (2**22, 4):  # of two places
+        with refuses(*words):
+            reliability(**given, chunk_size=chunk_size)

@@ -288,6 +288,12 @@ def test_four_against_four():
     assert "With 4 against 4 groups the smallest possible p is 0.029" in found.verdict
 
 
+@pytest.mark.parametrize(("permutations", "labelings", "smallest"), [(69, 70, 2 / 70), (68, 69, 1 / 69)])
+def test_all_labelings_are_compared_where_they_are_no_more(permutations, labelings, smallest):
+    found = compare_conditions(study(0, between(8)), permutations, seeded(0))
+    assert (found.labelings, found.exact, found.smallest_p) == (labelings, labelings == 70, pytest.approx(smallest))
+
+
 def test_four_against_four_can_show_that_behaviour_differs_but_not_in_what():
     """Corrected for six tests no p-value is below .17: no feature is significant, whatever its own family says."""
     plans = study(1, between(8), length=200, num_actions=6, habit=0.3, change=move, slower={3: 2.0})
@@ -369,7 +375,7 @@ def test_all_labelings_are_distinct_and_the_observed_one_is_first():
         label = label[torch.randperm(len(label), generator=seeded(0))]
         plans = Plans(torch.zeros(len(label), 1, dtype=torch.long), 2, condition=label)
         design = PermutationDesign.of(plans)
-        found = [tuple(own) for own in design.labelings(10**4).T.tolist()]
+        found = [tuple(own) for own in design.labelings(design.possible - 1).T.tolist()]
         assert found[0] == tuple(label.tolist())
         assert {*found} == {*itertools.permutations(label.tolist())}
         assert len(found) == len({*found}) == design.possible
@@ -390,8 +396,46 @@ def test_random_permutations_give_the_exact_p_value():
 
 
 def test_work_is_bounded():
-    found = compare_conditions(study(8, between(14)), generator=seeded(0), max_work=1)
-    assert found.labelings == 1000
+    plans = study(8, between(14, 1), length=20, num_actions=3)
+
+    def drawn(max_work):
+        return compare_conditions(plans, generator=seeded(0), max_work=max_work).labelings - 1
+
+    assert drawn(1) == drawn(300_000) == 999
+    assert 999 < drawn(10**6) < 3431
+    assert drawn(800_000) / drawn(10**6) == pytest.approx(0.8, abs=0.001)
+
+
+@pytest.mark.parametrize("conditions", [between(8), within(6)], ids=["between", "within"])
+def test_parts_that_fit_the_memory_change_nothing(conditions, monkeypatch):
+    plans = study(3, conditions, num_actions=3)
+    whole = compare_conditions(plans, 63, seeded(0))
+    design = PermutationDesign.of(plans)
+    monkeypatch.setattr("neuroprior.analysis.conditions.NUMBERS_AT_ONCE", 60)
+    monkeypatch.setattr("neuroprior.analysis.condition_chains.CELLS_AT_ONCE", 1000)
+    parts = compare_conditions(plans, 63, seeded(0))
+    assert parts.tests == whole.tests
+    assert parts.prediction.log_odds.equal(whole.prediction.log_odds)
+    for one, other in zip(parts.families, whole.families, strict=True):
+        for what in ("statistic", "p_values", "corrected"):
+            assert getattr(one, what).equal(getattr(other, what))
+    monkeypatch.setattr("neuroprior.analysis.permutation_design.DRAWN_AT_ONCE", 7 * len(design.label))
+    drawn = design.labelings(20, seeded(0))
+    assert drawn.shape == (len(design.label), 21)
+    assert drawn[:, 0].equal(design.label.short())
+    shape = (-1, 2, 21) if design.kind == "within" else (1, -1, 21)
+    assert drawn.view(shape).sum(1).eq(len(design.label) // drawn.view(shape).shape[0] // 2).all()
+
+
+@pytest.mark.parametrize(("length", "number"), [(60, 71), (300, 100)])
+def test_the_commonest_sequences_are_tested(length, number):
+    """The 100 commonest at most, that occurred as often as there are animals; of equally common ones the first."""
+    plans = study(0, between(8), num_actions=6, length=length)
+    counts = Counter(tuple(row[t : t + 3]) for row in plans.actions.tolist() for t in range(length - 2))
+    common = [one for one in sorted(counts, key=lambda one: (-counts[one], one))[:100] if counts[one] >= 8]
+    assert len(common) == number
+    family = family_of(compare_conditions(plans, 10), "sequences")
+    assert [*map(tuple, family.features.tolist())] == sorted(common)
 
 
 def test_animals_that_are_not_under_every_condition_are_left_out():
@@ -402,6 +446,17 @@ def test_animals_that_are_not_under_every_condition_are_left_out():
     assert found.design.units.tolist() == list(range(8))
     alone = compare_conditions(plans[plans.group < 8])
     assert alone.tests == found.tests
+
+
+def test_conditions_are_named_by_their_numbers():
+    plans = study(10, between(8))
+    found = compare_conditions(plans)
+    other = replace(plans, condition=2 * plans.condition + 1, condition_names=["w", "x", "y", "z"])
+    renamed = compare_conditions(other)
+    assert renamed.condition_names == ["x", "z"]
+    assert compare_conditions(replace(other, condition_names=None)).condition_names == ["condition 1", "condition 3"]
+    assert renamed.design.conditions.tolist() == [1, 3]
+    assert renamed.tests == found.tests
 
 
 def test_without_groups_plans_are_the_units():

@@ -109,6 +109,16 @@ def test_intervals_cover_at_about_their_level(num, length):
     assert (hits >= stats.binom.ppf(FALSE_ALARM, 200, 0.9)).all()
 
 
+@pytest.mark.parametrize(("pairs", "few"), [(319, True), (320, False)])
+def test_few_pairs_are_shuffled(pairs, few):
+    """Fewer than 20 for each of the 4 x 4 degrees of freedom of five actions."""
+    actions = torch.randint(5, (1, pairs + 1), generator=seeded(0))
+    generator = seeded(1)
+    found = mutual_information(Plans(actions, 5), 1, generator=generator)[0]
+    assert found.pairs == pairs
+    assert (not generator.get_state().equal(seeded(1).get_state())) == few
+
+
 def test_lags_end_where_pairs_end():
     plans = Plans(torch.randint(2, (3, 6), generator=seeded(0)), 2, torch.tensor([6, 4, 1]))
     assert [one.pairs for one in mutual_information(plans)] == [8, 6, 4, 2]

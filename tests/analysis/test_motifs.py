@@ -2,7 +2,9 @@
 
 import itertools
 import math
+import sys
 from collections import Counter
+from dataclasses import astuple
 
 import pytest
 import torch
@@ -271,9 +273,18 @@ def test_the_order_of_the_list():
     assert motifs(planted(4, (0, 1, 2, 3, 0), 0), top=7) == found[:7]
 
 
-def test_chunks_change_nothing():
+def test_chunks_change_nothing(monkeypatch):
     plans = planted(4, (2, 2, 0, 1), 1)
     assert motifs(plans, chunk_size=7) == motifs(plans)
+    plans = plans[:30]
+    whole, module = motifs(plans), sys.modules[fisher_two_sided.__module__]
+    monkeypatch.setattr(module, "COUNTS_AT_ONCE", 1)  # one unit at a time
+    monkeypatch.setattr(module, "TAILS_AT_ONCE", 100)
+    parts = motifs(plans)
+    assert len(parts) == len(whole) > 0
+    for one, other in zip(parts, whole, strict=True):
+        assert one.actions == other.actions
+        assert astuple(one)[1:] == pytest.approx(astuple(other)[1:], rel=1e-9)
 
 
 @pytest.mark.parametrize(

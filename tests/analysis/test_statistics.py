@@ -1,5 +1,6 @@
 """Shares of best, intervals and paired differences, against hand-computed cases and simulated coverage."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -15,6 +16,7 @@ from neuroprior.analysis.statistics import (
     mean_intervals,
     paired_difference,
     probability_of_improvement,
+    ratio_difference,
     share_interval,
 )
 
@@ -31,10 +33,38 @@ def test_mean_interval_is_students() -> None:
     assert mean_interval([1, 2, 3, 4]) == pytest.approx((2.5, 2.5 - half, 2.5 + half))
 
 
+HIGH, LOW = np.array([[3.0, 5, 8, 4], [1.0, 2, 9, 4], [0.0, 7, 1, 2]]), np.array([[2.0, 6, 6, 3]] * 3)
+
+
+@pytest.mark.parametrize(
+    "interval",
+    [
+        lambda level: mean_interval(HIGH[0], level),
+        lambda level: interquartile_mean(HIGH, level),
+        lambda level: probability_of_improvement(HIGH, LOW, level),
+        lambda level: paired_difference(HIGH[0], LOW[0], level),
+        lambda level: ratio_difference(HIGH[0], LOW[0], level),
+    ],
+)
+def test_widths_are_those_of_the_level(interval: Callable[[float], tuple[float, ...]]) -> None:
+    """With four units, quantiles of Student's t of three degrees of freedom; none of these intervals is cut."""
+    wide, narrow = interval(0.5), interval(0.2)
+    assert wide[0] == narrow[0]
+    assert wide[3:] == narrow[3:]  # the p-value
+    for k, sign in ((1, -1), (2, 1)):
+        assert sign * (narrow[k] - narrow[0]) > 0
+        assert (wide[k] - wide[0]) / (narrow[k] - narrow[0]) == pytest.approx(
+            stats.t.ppf(0.75, 3) / stats.t.ppf(0.6, 3)
+        )
+
+
 def test_share_interval_is_wilsons() -> None:
     z, n = 1.959964, 10
     centre, half = (0.2 + z**2 / 2 / n) / (1 + z**2 / n), z / (1 + z**2 / n) * (0.16 / n + z**2 / 4 / n**2) ** 0.5
     assert share_interval(2, 10) == pytest.approx((0.2, centre - half, centre + half), abs=1e-6)
+    sure = math.erf(1 / math.sqrt(2))  # of one standard deviation: z = 1
+    centre, half = 0.25 / 1.1, (0.016 + 1 / 400) ** 0.5 / 1.1
+    assert share_interval(2, 10, sure) == pytest.approx((0.2, centre - half, centre + half))
 
 
 def test_intervals_cover_at_their_level() -> None:

@@ -289,6 +289,20 @@ def test_an_old_file_is_replaced_or_stays(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("name", ["a.csv", "a.jsonl"])
+def test_what_belongs_to_plans_stays_with_them_in_long_files(name, tmp_path):
+    """Files are written in blocks of 16,384 plans."""
+    number = torch.arange(2**14 + 3)
+    times = number[:, None] / 4
+    plans = Plans(
+        number[:, None] % 3, 3, context=number[:, None] % 7, group=number, durations=times, condition=number % 5
+    )
+    write_plans(plans, tmp_path / name)
+    found = read_plans(tmp_path / name)
+    for what in ("actions", "context", "group", "durations", "condition"):
+        assert torch.equal(getattr(found, what), getattr(plans, what)), what
+
+
 CODES = Plans(torch.tensor([[1, 2, 3], [3, 1, 0]]), 4, torch.tensor([3, 2]))
 
 

@@ -65,6 +65,40 @@ def test_a_frame_is_read_as_its_file(tmp_path):
     assert frame.notes == file.notes
 
 
+@pytest.mark.parametrize(
+    ("options", "actions", "num_actions"),
+    [
+        ({}, [["a", "b"], ["c", "c"]], 3),
+        ({"max_gap": 0}, [["a", "b"], ["c"], ["c"]], 3),
+        ({"merge_repeats": True}, [["a", "b"], ["c"]], 3),
+        ({"missing": "label"}, [["a", "b"], ["c", "missing", "c"]], 4),
+        ({"missing": "label", "merge_repeats": True, "max_gap": 2}, [["a", "b"], ["c", "missing", "c"]], 4),
+        ({"action_names": ["z", "c", "b", "a"]}, [["a", "b"], ["c", "c"]], 4),
+    ],
+)
+def test_options_mean_the_same_for_files_and_frames(tmp_path, options, actions, num_actions):
+    text = "plan,action,start,stop\n1,a,0,1\n1,b,1,2\n2,c,0,1\n2,,1,1.5\n2,c,1.5,2\n"
+    if "missing" not in options:
+        text = text.replace("2,,1,1.5\n", "")
+    file = read(tmp_path, text, **options)
+    frame = Plans.from_dataframe(pd.read_csv(tmp_path / "lab.csv"), **options)
+    for plans in (file, frame):
+        assert listed(plans) == actions
+        assert plans.num_actions == num_actions
+        assert list(plans.action_names) == options.get("action_names", sorted({a for row in actions for a in row}))
+
+
+def test_numbers_are_read_as_pandas_writes_them():
+    """Whole numbers become floating point where one of them is missing; a context of them is an index."""
+    frame = pd.DataFrame({"action": [2.0, np.nan, 0.0], "context": [1.0, 3.0, 0.0], "group": [7.0, 7.0, 7.0]})
+    plans = Plans.from_dataframe(frame)
+    assert listed(plans) == [[2], [0]]
+    assert plans.context.tolist() == [[1], [0]]
+    assert plans.group.tolist() == [7, 7]
+    numbers = Plans.from_dataframe(pd.DataFrame({"action": [0, 1]}), num_actions=5)
+    assert (numbers.num_actions, numbers.notes) == (5, ())
+
+
 @pytest.mark.parametrize("word", ["", "NaN", "NA", "N/A", "null", "?", "-", " nan "])
 def test_a_missing_label_is_no_behaviour(tmp_path, word):
     text = f"plan,action\n1,a\n1,{word}\n1,{word}\n1,b\n2,b\n2,{word}\n"
@@ -89,6 +123,13 @@ def test_a_pause_ends_a_plan(tmp_path):
     text = "action,start,stop\na,0,5\nb,1,2\nc,6,7\nd,9,10\n"
     assert listed(read(tmp_path, text, max_gap=1.5)) == [["a", "b", "c"], ["d"]]
     assert listed(read(tmp_path, text, max_gap=2)) == [["a", "b", "c", "d"]]
+    # The end of an action of another plan does not count, and of unknown ends the latest known one does.
+    assert listed(read(tmp_path, "plan,action,start,stop\n1,a,0,99\n2,b,0,1\n2,c,5,6\n", max_gap=1)) == [
+        ["a"],
+        ["b"],
+        ["c"],
+    ]
+    assert listed(read(tmp_path, "action,start,stop\na,0,1\nb,2,\nc,10,11\n", max_gap=5)) == [["a", "b"], ["c"]]
     with refuses("max_gap", "start"):
         read(tmp_path, "plan,action\n1,a\n", max_gap=1)
 
@@ -141,6 +182,8 @@ def test_frames_are_merged_to_actions():
     assert listed(plans) == [[3, 0, 3], [3]]
     assert plans.durations.tolist() == [[2, 3, 1], [2, 0, 0]]
     assert "actions are numbers from 0 to 3, of which 1, 2 never occur" in plans.notes
+    notes = Plans.from_dataframe(pd.DataFrame({"action": [0, 10]})).notes
+    assert "actions are numbers from 0 to 10, of which 1, 2, 3, 4, 5, 6, 7, 8 and 1 more never occur" in notes
     timed = Plans.from_dataframe(frame.assign(duration=0.5), plan="name", action="syllable", merge_repeats=True)
     assert timed.durations.tolist() == [[1, 1.5, 0.5], [1, 0, 0]]
 
@@ -158,6 +201,12 @@ def test_features_of_several_columns():
     plans = Plans.from_dataframe(frame, context=["speed", "turn"])
     assert plans.context.tolist() == [[[1, 0], [2.5, -1]]]
     assert Plans.from_dataframe(frame, context="speed").context.tolist() == [[[1], [2.5]]]
+
+
+def test_commas_in_a_header_do_not_part_it(tmp_path):
+    plans = read(tmp_path, "plan;action;what, when, where, how\n1;x;0\n1;y;0\n")
+    assert listed(plans) == [["x", "y"]]
+    assert "columns that are not used: what, when, where, how" in plans.notes
 
 
 def test_the_same_plan_name_in_two_groups_is_two_plans(tmp_path):

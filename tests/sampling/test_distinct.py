@@ -102,8 +102,8 @@ def test_what_is_impossible_is_told():
 
 
 @pytest.mark.parametrize("legal", [False, True])
-@pytest.mark.parametrize("per", [None, "plan", "step"])
-def test_along_with_a_world(legal, per):
+@pytest.mark.parametrize(("per", "temperature"), [(None, 1.0), ("plan", 1.0), ("step", 2.0)])
+def test_along_with_a_world(legal, per, temperature):
     world = random_world(3, "WSA", legal)
     prior = MarkovPrior(3, 1, num_contexts=None if per is None else 6)
     plans = torch.randint(3, (200, 4), generator=seeded(2))
@@ -111,8 +111,9 @@ def test_along_with_a_world(legal, per):
     prior.fit(Plans(plans, 3, context=context))
     start = 7
     state = torch.full((MANY // 4,), start)
-    found, rollout = sample_distinct_in_world(prior, world, state, 3, 3, generator=seeded(0), keep_states=True)
-    probs = in_world_distribution(prior, world, start, 3)
+    settings = {"temperature": temperature, "generator": seeded(0)}
+    found, rollout = sample_distinct_in_world(prior, world, state, 3, 3, keep_states=True, **settings)
+    probs = in_world_distribution(prior, world, start, 3, temperature)
     there = found.log_prob > -torch.inf
     assert fits(found.plans[:, 0], probs, 3)
     number = plan_number(found.plans, 3)

@@ -20,6 +20,7 @@ from tests.support.sources import (
     random_world,
     refuses,
     seeded,
+    stochastic_world,
 )
 
 A = 3
@@ -323,6 +324,16 @@ def test_in_world_same_seed_and_sizes():
         assert plans.shape == rollout.rewards.shape == (batch, num_plans, length)
         assert rollout.final_state.shape == (batch, num_plans)
         assert plans.dtype == torch.uint8
+
+
+def test_steps_of_a_stochastic_world_are_drawn_by_the_generator():
+    world, found = stochastic_world(0), []
+    for seed in (1, 1, 2):
+        torch.manual_seed(len(found))
+        _, rollout = sample_in_world(UniformPrior(3), world, torch.zeros(50).long(), 4, 5, generator=seeded(seed))
+        found.append(rollout.rewards)
+    assert torch.equal(found[0], found[1])
+    assert not torch.equal(found[0], found[2])
 
 
 class Line(World):

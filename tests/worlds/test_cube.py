@@ -109,6 +109,16 @@ def test_distances(turns, known):
     assert lost.tolist() == [*(-world.distance(after[:5])).tolist(), 0]
 
 
+def test_of_an_absorbing_cube_only_arriving_is_rewarded():
+    for absorbing, after, reward in ((True, [0, 0], [0, 1]), (False, None, [0, 1])):
+        world = cube("quarter", absorbing=absorbing)
+        turned, nothing = cube("quarter").step(torch.tensor([0]), torch.tensor([0]))
+        there, gained = world.step(torch.tensor([0, int(turned)]), torch.tensor([0, 1]))
+        assert there.tolist() == (after or [int(turned), 0])
+        assert (gained.tolist(), nothing.tolist()) == (reward, [0])
+        assert world.terminated(there).tolist() == ([True, True] if absorbing else [False, False])
+
+
 def test_reset():
     assert cube(scramble=0).reset(5).tolist() == [0] * 5
     one = cube("quarter", scramble=1).reset(6000, seeded(2))

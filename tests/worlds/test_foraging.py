@@ -173,6 +173,10 @@ def test_priors_see_the_cell_and_samplers_plan_there():
     state = world.reset(6, seeded(0))
     prior = MarkovPrior(4, 1, num_contexts=25)
     assert torch.equal(world.observe(state), state[:, 0])
+    seeing = ForagingWorld(maze(5, 5, view=1), torch.ones(1, 25), 10, 2)
+    there = seeing.reset(20, seeded(0))
+    assert torch.equal(seeing.observe(there), seeing.table.observe(there[:, 0]))
+    assert seeing.observe(there).shape == (20, 8)
     plans, _ = sample_in_world(prior, world, state, 5, 4, generator=seeded(0))
     assert plans.shape == (6, 5, 4)
     score = SamplingPlanner(UniformPrior(4), 6, 40, objective="return").plan(world, state, seeded(0)).score

@@ -140,7 +140,7 @@ def test_rollout_is_stepping(kind, layout, size, by):
                 assert torch.equal(one, other)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])  # seven share the seven plans of each start
 def test_each_thread_follows_plans_of_its_own(monkeypatch, threads):
     pytest.importorskip("numba")
     world = random_world(1, "WS")
