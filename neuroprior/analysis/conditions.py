@@ -18,6 +18,7 @@ from neuroprior.analysis.flat import FlatPlans, ranks
 from neuroprior.analysis.permutation_design import PermutationDesign
 from neuroprior.analysis.statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
 from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
 
 LEVEL = 0.05
 """P-values below this are significant."""
@@ -178,6 +179,7 @@ def compare_conditions(
     Raises:
         ValueError: the plans have no condition, or `permutations` or `max_work` is below 1.
     """
+    check_are_plans(plans)
     check_sizes(permutations=permutations, max_work=max_work)
     design = PermutationDesign.of(plans)
     names = [

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
+from neuroprior.plans.columns import listed
 
 Kind = Literal["between", "within"]
 
@@ -75,6 +76,12 @@ class PermutationDesign:
         names = plans.condition_names
         named = [names[c] if names else f"condition {c}" for c in conditions.tolist()]
         reason = _reason(kind, item, under[kept], named)
+        if reason and kind == "within":
+            several = numbers[under.sum(1) > 1].tolist()
+            several = [
+                str(n) if plans.group_names is None or item == "plans" else plans.group_names[n] for n in several
+            ]
+            reason += f" (under several: {listed(several)}; the other {len(numbers) - len(several)} under one)"
         return PermutationDesign(
             kind, item, conditions, numbers[kept], left, block, of_block[:, 0], of_block[:, 1], reason
         )

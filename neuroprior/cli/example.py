@@ -17,6 +17,8 @@ def example(file: str) -> None:
         file: where to write it (CSV); a file that is there already is left alone.
     """
     place = Path(file)
+    if place.suffix.lower() != ".csv":
+        raise ValueError(f"{place}: a name that ends in .csv is expected")
     if place.exists():
         raise ValueError(f"{place}: is there already; give another name")
     with written_whole(place) as stream:

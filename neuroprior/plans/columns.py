@@ -24,8 +24,14 @@ BLOCK = 2**20
 SHOWN = 8
 """Names in a note; more are left out."""
 
-MISSING_LABELS = frozenset(("", "nan", "na", "n/a", "<na>", "null", "?", "-"))
+MISSING_LABELS = frozenset(
+    ("", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!", "#num!")
+)
 """What stands for no label in tables, in lower case."""
+
+
+NAMED = ("group", "condition")
+"""What may be a name beside numbers, or a number that is not whole, such as a dose: all are names then."""
 
 
 def is_missing(text: str) -> bool:
@@ -124,7 +130,7 @@ class Column(dict[str, int]):
             return
         if not label:
             raise ValueError(f"{self.what}: an empty cell; a number or a name is expected")
-        if isinstance(number_in(label, self.what), float):
+        if self.what not in NAMED and isinstance(number_in(label, self.what), float):
             hint = "features go into columns context_1, context_2, ..." if self.what == "context" else "or a name"
             raise ValueError(f"{self.what} {label!r} is not a whole number ({hint})")
 
@@ -168,7 +174,8 @@ class Column(dict[str, int]):
         labels = list(self.labels)
         numbers = [number_in(label, self.what) if self.untyped else None for label in labels]
         named = self.names is not None and all(label in self.names for label in labels)
-        if not named and all(number is not None for number in numbers):
+        whole = all(isinstance(number, int) or (number is not None and self.what not in NAMED) for number in numbers)
+        if not named and whole:
             return self._in_range(np.array(numbers, np.int64)[values], place), self.names
         names = self.names if self.names is not None else tuple(sorted(labels))
         wrong = self._wrong_label(labels, numbers)
@@ -189,7 +196,7 @@ class Column(dict[str, int]):
         # One subject called 12b makes names of the other subjects' numbers; a name among numbers of actions or contexts
         # is rather a slip, and would renumber them all.
         is_number = [number is not None for number in numbers]
-        if self.what != "group" and any(is_number):
+        if self.what not in NAMED and any(is_number):
             wrong = is_number.index(not is_number[0])
             kinds = ("a name where others are numbers", "a number where others are names")
             hint = "; give action_names if all are names, or name the columns of a header action_1, ..."

@@ -46,6 +46,9 @@ ZONED = r".*[T ].*(Z|[+-]\d{2}:?\d{2})\s*"
 DAY = r"\s*\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}([T ].*)?\s*"
 """A date of which nobody knows whether its day or its month is first."""
 
+COMMA = re.compile(r"^(\s*-?\d+),(\d+\s*)$")
+"""A number with a decimal comma."""
+
 HALF_A_DAY = 12 * 3600
 
 
@@ -86,14 +89,21 @@ class Table:
         columns: where they are, or a dict of the same.
         place: what messages call a row, by its number in the frame.
         of: the table itself in messages, such as the name of its file.
+        decimal: "," where numbers may be written so.
 
     Raises:
         ValueError: a column is not there, twice, or the action's is not known.
     """
 
     def __init__(
-        self, frame: Any, columns: Columns | Mapping[str, Any] | None, place: Callable[[int], str], of: str = "table"
+        self,
+        frame: Any,
+        columns: Columns | Mapping[str, Any] | None,
+        place: Callable[[int], str],
+        of: str = "table",
+        decimal: str = ".",
     ) -> None:
+        self.decimal = decimal
         self.frame, self.place, self.of = frame, place, of
         self.zoned: bool | None = None  # whether the dates that were read have a time zone
         if not hasattr(frame, "columns") or not hasattr(frame, "iloc"):
@@ -110,10 +120,12 @@ class Table:
         self.context = [self._find("context", name) for name in features]
         taken = {*self.at.values(), *self.context}
         usual = {str(name).strip().lower(): i for i, name in reversed(list(enumerate(frame.columns))) if i not in taken}
+        self.by_name: list[str] = []  # what was not given, and found by its name
         for what in given:
             # Under the name event_type tables have anything.
             if what not in self.at and what in usual and what != "event_type":
                 self.at[what] = usual[what]
+                self.by_name += [what] if any(given.values()) else []
         if not self.context:
             numbered = [f"context_{i}" for i in range(1, 1 + len(frame.columns))]
             self.context = [usual[name] for name in ("context", *numbered) if name in usual]
@@ -121,7 +133,13 @@ class Table:
             raise ValueError(
                 f"{of}: no column 'action'; say which holds the actions (columns.action) of {self._names()}"
             )
-        twice = [name for i, name in enumerate(frame.columns) if list(self.at.values()).count(i) > 1]
+        # Days, say, may be plans and conditions.
+        once = [
+            i
+            for what, i in self.at.items()
+            if what != "condition" or i not in (self.at.get("plan"), self.at.get("group"))
+        ]
+        twice = [name for i, name in enumerate(frame.columns) if once.count(i) > 1]
         if twice:
             raise ValueError(f"columns: {twice[0]!r} is given for {' and '.join(self._uses(twice[0]))}")
 
@@ -165,6 +183,8 @@ class Table:
             if pd.api.types.is_datetime64_any_dtype(column):
                 self._check_zone(what, column.dt.tz is not None)
             return _seconds(column)
+        if self.decimal == ",":
+            column = column.map(lambda value: COMMA.sub(r"\1.\2", value) if isinstance(value, str) else value)
         missing = column.isna() | column.map(lambda value: isinstance(value, str) and is_missing(value))
         values = pd.to_numeric(column.where(~missing), errors="coerce")
         if times and values[~missing].isna().any():
@@ -232,6 +252,7 @@ def fields_of(
     action_names: Sequence[str] | None = None,
     place: Callable[[int], str] = "row {}".format,
     of: str = "table",
+    decimal: str = ".",
 ) -> dict[str, Any]:
     """What `Plans` are made of, by name; see `Plans.from_dataframe`.
 
@@ -239,6 +260,7 @@ def fields_of(
         frame, columns, missing, merge_repeats, max_gap, num_actions, action_names: see there.
         place: what messages call a row, by its number.
         of: the table itself in messages.
+        decimal: "," where numbers may be written so.
 
     Raises:
         ValueError: the table holds no plans, or an argument is wrong.
@@ -250,7 +272,7 @@ def fields_of(
     if not isinstance(merge_repeats, bool | np.bool_):
         raise ValueError(f"merge_repeats: True or False is expected, not {merge_repeats!r}")
     names = check_names(num_actions, action_names)
-    table = Table(frame, columns, place, of)
+    table = Table(frame, columns, place, of, decimal)
     if not len(frame):
         raise ValueError(f"{of}: a header and no row below it")
     noted: list[str] = []
@@ -283,7 +305,7 @@ def fields_of(
             notes.append(f"{int(early.sum()):,} actions begin before the one before them ended")
     pause = np.zeros(len(row), bool)
     if max_gap is not None:
-        if start is None or ends is None:
+        if start is None or ends is None or not {"stop", "duration"} & table.at.keys():
             raise ValueError("max_gap: the columns start, and stop or duration, are expected with it")
         latest = _running_maximum(ends, plan)
         pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap)
@@ -337,6 +359,14 @@ def fields_of(
         kept_plans, group = np.unique(plan[starts], return_inverse=True)
         found |= _named("group", group, tuple(plan_names[i] for i in kept_plans))
         notes.append("the parts of a plan form a group")
+    if "group" in table.by_name:
+        notes.append("the column 'group' is taken for what is independent, such as the animal")
+    for name in table.unused():
+        words = set(frame[name].dropna().astype(str).str.strip().str.upper().unique()[:4]) if name in frame else set()
+        if {"START", "STOP"} <= words <= set(EVENT_TYPES):
+            notes.append(
+                f"the column {name!r} holds START and STOP, and is not used (columns.event_type): each is an action"
+            )
     if unused := table.unused():
         notes.append(f"columns that are not used: {listed(unused)}")
     return found | {"notes": tuple(notes)}

@@ -36,6 +36,10 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
     Raises:
         ValueError: the prior does not know the actions or contexts, or plans have no groups or conditions.
     """
+    if not isinstance(prior, Prior):
+        raise ValueError(
+            f"prior: a fitted prior is expected (neuroprior.load gives that of a folder), not {type(prior).__name__}"
+        )
     with torch.no_grad():
         log_probs = prior.action_log_probs(match_plans(plans, prior))
     return scores_by(-log_probs.cpu().double() / log(2), plans, by)

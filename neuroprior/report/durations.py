@@ -70,7 +70,8 @@ def duration_section(found: Evaluation) -> Part | None:
         "gain": _gain,
     }
     caption = (
-        "Dwell times in the unit of the file. law: of durations above 0, chosen by held-out likelihood. gain: of this"
+        "Dwell times in the unit of the file. law: of durations above 0, chosen by held-out likelihood (of all: too few"
+        " for a law of its own). gain: of this"
         f" over an exponential law, nats per held-out duration. {star}{of_all}"
     )
     tables = [table(frame[:LISTED], columns, caption, "Durations", "lrrrrrrlr")]

@@ -94,7 +94,7 @@ BAD = {
     "one fold": (FEW, ["--folds", "1"], ("folds", "at least 2", "not 1")),
     "no folds": (FEW, ["--folds", "0"], ("folds", "not 0")),
     "more folds than plans": (FEW, ["--folds", "21"], ("folds", "20", "not 21")),
-    "more folds than groups": (replace(FEW, group=torch.arange(20) % 4), ["--folds", "5"], ("groups, 4", "not 5")),
+    "more folds than groups": (replace(FEW, group=torch.arange(20) % 4), ["--folds", "5"], ("at most 4", "not 5")),
     "nothing left to score": (FEW, ["--skip", "5"], ("skip", "first 5")),
     "a negative skip": (FEW, ["--skip=-1"], ("skip", "-1")),
     "no steps": (FEW, ["--max-steps", "0"], ("max_steps", "0")),

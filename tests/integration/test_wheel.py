@@ -86,7 +86,7 @@ def test_bad_input_is_one_line(installed: Path, tmp_path: Path) -> None:
         (["sample", "nowhere"], "nowhere"),
         (["fit", "--config", "gruu", "--data.file", "x.csv"], "gru"),
         (["report", "nowhere.csv"], "nowhere.csv"),
-        (["example", "."], "is there already"),
+        (["example", "."], "ends in .csv"),
         (["paint"], "there are fit, report, score, sample"),
     ],
 )

@@ -119,7 +119,6 @@ def test_bad_context_in_jsonl(tmp_path, contexts, words):
         ("plan,action\n1,0\n2,1\n1,1\n", ["line 4", "plan '1' goes on", "sort"]),
         ("plan,action,condition\n1,0,a\n1,0,b\n", ["line 3", "another condition"]),
         ("plan,action,condition\n1,0,a\n2,0,\n", ["line 3", "condition: an empty cell"]),
-        ("plan,action,condition\n1,0,1\n1,0,1\n2,0,b\n", ["line 4", "condition 'b' is a name"]),
         ("action,action_1\n1,0\n", ["line 1", "one of them"]),
         ('plan,action,note\n1,0,"a\nb"\n1,x,c\n', ["line 4", "'x' is a name"]),
         ("plan,behavior\n1,0\n", ["line 1", "'plan' and 'action'", "--columns.action"]),

@@ -360,6 +360,48 @@ def test_missing_labels_with_one_plan_a_row(tmp_path):
     assert listed(read(tmp_path, "NA,b\nb,NA\n", action_names=["NA", "b"])) == [["NA", "b"], ["b", "NA"]]
 
 
+def test_starts_and_stops_that_are_not_used_are_noted(tmp_path):
+    plans = read(tmp_path, TABULAR, columns=OF_TABULAR | {"event_type": None})
+    assert any("'Behavior type' holds START and STOP" in note for note in plans.notes)
+
+
+def test_decimal_commas_where_semicolons_part_columns(tmp_path):
+    text = "plan;action;start;stop\n1;a;0,0;1,5\n1;b;1,5;4\n"
+    assert read(tmp_path, text).durations.tolist() == [[1.5, 2.5]]
+    with refuses("line 2", "'0,0'", "decimal point"):
+        read(tmp_path, 'plan,action,start\n1,a,"0,0"\n1,b,"1,5"\n')
+
+
+def test_doses_and_days_are_conditions(tmp_path):
+    plans = read(tmp_path, "plan,action,condition\n1,a,0\n2,b,0.5\n3,b,10\n")
+    assert [plans.condition_names[c] for c in plans.condition] == ["0", "0.5", "10"]
+    days = read(tmp_path, "day,action\n1,a\n2,b\n", columns={"plan": "day", "condition": "day", "action": "action"})
+    assert days.condition.tolist() == [1, 2]
+    with refuses("columns", "'day'", "plan and group"):
+        read(tmp_path, "day,action\n1,a\n", columns={"plan": "day", "group": "day", "action": "action"})
+
+
+def test_errors_of_spreadsheets_are_no_behaviour(tmp_path):
+    plans = read(tmp_path, "plan,action\n1,a\n1,#N/A\n1,#VALUE!\n1,b\n")
+    assert listed(plans) == [["a"], ["b"]]
+
+
+def test_columns_that_are_taken_by_their_name(tmp_path):
+    text = "name,syllable,group\nx,1,drug\ny,1,saline\n"
+    found = read(tmp_path, text, columns={"action": "syllable", "plan": "name"})
+    assert "the column 'group' is taken for what is independent, such as the animal" in found.notes
+    named = read(tmp_path, text, columns={"action": "syllable", "plan": "name", "condition": "group"})
+    assert named.group is None
+    assert not any("independent" in note for note in named.notes)
+    # without plans each group is one
+    assert len(read(tmp_path, "group,action\nann,a\nann,b\nben,a\n")) == 2
+
+
+def test_a_pause_needs_ends(tmp_path):
+    with refuses("max_gap", "stop or duration"):
+        read(tmp_path, "plan,action,start\n1,a,0\n1,b,500\n", max_gap=1)
+
+
 def test_frames_of_keypoint_moseq(tmp_path):
     columns = {"plan": "name", "action": "syllable", "condition": "group"}
     plans = read(tmp_path, MOSEQ, columns=columns, merge_repeats=True)

@@ -63,7 +63,7 @@ def test_nothing_is_noted_of_plain_tables(tmp_path):
     [
         ("plan,action\n1,a\n".encode("utf-16-le"), ["line 1", "UTF-16"]),
         ("<!DOCTYPE html><html><body>Not found</body></html>", ["a web page"]),
-        ("action;duration\na;1,5\n", ["line 2", "'1,5'", "a decimal point"]),
+        ('action,duration\na,"1,5"\n', ["line 2", "'1,5'", "a decimal point"]),
     ],
 )
 def test_what_is_refused(text, words, tmp_path):

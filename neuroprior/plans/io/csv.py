@@ -99,13 +99,17 @@ def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
     blocks = list(sheet.blocks())
     lines = np.concatenate([lines for lines, _ in blocks])
     frame = pd.DataFrame([row for _, rows in blocks for row in rows], columns=sheet.header, dtype=object)
-    if not table.keys() - {"num_actions", "action_names"} and not {"plan", "action"} <= sheet.columns.keys():
+    usual = "action" in sheet.columns and bool({"plan", "group"} & sheet.columns.keys())
+    if not table.keys() - {"num_actions", "action_names"} and not usual:
         raise ValueError(
             f"{sheet.path}, line 1: both columns 'plan' and 'action', or 'action_1', are expected; or say which"
             " columns they are (--columns.action, --columns.plan)"
         )
     try:
-        return Plans(**fields_of(frame, place=lambda i: f"{sheet.path}, line {lines[i]}", of=str(sheet.path), **table))
+        # Where semicolons part the columns, commas are decimal: so spreadsheets write in much of Europe.
+        decimal = "," if sheet.delimiter == ";" else "."
+        place = lambda i: f"{sheet.path}, line {lines[i]}"  # noqa: E731
+        return Plans(**fields_of(frame, place=place, of=str(sheet.path), decimal=decimal, **table))
     except ValueError as error:
         named = str(sheet.path) in str(error)
         raise error if named else ValueError(f"{sheet.path}: {error}") from None
