@@ -70,13 +70,19 @@ def test_a_prior_that_was_trained_with_them_makes_them_itself(tmp_path):
     again = load(save(prior, tmp_path))
     assert again.past_durations == past
     assert again.log_prob(match_plans(plans, again)).equal(prior.log_prob(past.added_to(plans.with_end())))
-    refuses("durations: these plans have none", lambda: match_plans(Plans(ACTIONS, 3), again))
+    with refuses("durations: these plans have none"):
+        match_plans(Plans(ACTIONS, 3), again)
 
 
 def test_what_is_refused():
-    refuses("number: an integer of at least 1", lambda: PastDurations.of(PLANS, 0))
-    refuses("durations: these plans have none", lambda: PastDurations.of(Plans(ACTIONS, 3)))
-    refuses("none above 0 is known", lambda: PastDurations.of(Plans(ACTIONS, 3, durations=torch.zeros(2, 4))))
+    with refuses("number: an integer of at least 1"):
+        PastDurations.of(PLANS, 0)
+    with refuses("durations: these plans have none"):
+        PastDurations.of(Plans(ACTIONS, 3))
+    with refuses("none above 0 is known"):
+        PastDurations.of(Plans(ACTIONS, 3, durations=torch.zeros(2, 4)))
     index = Plans(ACTIONS, 3, durations=DURATIONS, context=torch.tensor([0, 1]))
-    refuses("an index cannot stand beside past durations", lambda: PastDurations(1, 0.0, 1.0).added_to(index))
-    refuses("center and spread", lambda: PastDurations(1, nan, 1.0))
+    with refuses("an index cannot stand beside past durations"):
+        PastDurations(1, 0.0, 1.0).added_to(index)
+    with refuses("center and spread"):
+        PastDurations(1, nan, 1.0)

@@ -244,11 +244,19 @@ def test_a_network_chooses_the_actions():
 def test_what_is_refused():
     plans = transitions(4)
     bare, unknown = Plans(plans.actions, 3), Plans(plans.actions, 3, durations=torch.full((4, 60), nan))
-    refuses("durations: these plans have none", lambda: SemiMarkovPrior(3).fit(bare))
-    refuses("none of these plans is known", lambda: DurationModel(3).fit(unknown))
-    refuses("3 actions", lambda: DurationModel(2).fit(plans))
-    refuses("max_steps: not a setting", lambda: SemiMarkovPrior(3).fit(plans, max_steps=3))
-    refuses("laws: some of exponential", lambda: DurationModel(3, ["normal"]))
-    refuses("laws: some of exponential", lambda: DurationModel(3, []))
-    refuses("actions: a prior of 3 actions", lambda: SemiMarkovPrior(3, MarkovPrior(4)))
-    refuses("out of range", lambda: DurationModel(3).cdf(3, torch.ones(1)))
+    with refuses("durations: these plans have none"):
+        SemiMarkovPrior(3).fit(bare)
+    with refuses("none of these plans is known"):
+        DurationModel(3).fit(unknown)
+    with refuses("3 actions"):
+        DurationModel(2).fit(plans)
+    with refuses("max_steps: not a setting"):
+        SemiMarkovPrior(3).fit(plans, max_steps=3)
+    with refuses("laws: some of exponential"):
+        DurationModel(3, ["normal"])
+    with refuses("laws: some of exponential"):
+        DurationModel(3, [])
+    with refuses("actions: a prior of 3 actions"):
+        SemiMarkovPrior(3, MarkovPrior(4))
+    with refuses("out of range"):
+        DurationModel(3).cdf(3, torch.ones(1))

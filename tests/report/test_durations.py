@@ -179,8 +179,10 @@ def test_networks_with_durations():
     assert bits["actions and durations"] < bits["actions"] - 0.1
     row = made.tables["next_by_duration"].set_index("model").loc["gru"]
     assert row["gain"] == pytest.approx(bits["actions"] - bits["actions and durations"])
-    refuses("no durations", lambda: report(replace(plans, durations=None), inputs=["durations"], **ONLY))
-    refuses("durations are an input of transformer, gru", lambda: report(plans, inputs=["durations"], **ONLY))
+    with refuses("no durations"):
+        report(replace(plans, durations=None), inputs=["durations"], **ONLY)
+    with refuses("durations are an input of transformer, gru"):
+        report(plans, inputs=["durations"], **ONLY)
 
 
 def test_at_most_some_panels_are_drawn():
@@ -190,7 +192,8 @@ def test_at_most_some_panels_are_drawn():
     assert len(figure.axes) == MOST_PANELS
     assert figure.get_suptitle() == f"the {MOST_PANELS} commonest of 16 actions"
     assert len(dwell_figure(dwell[dwell["action"] == "a"]).axes) == 1
-    refuses("dwell", lambda: dwell_figure(dwell[:0]))
+    with refuses("dwell"):
+        dwell_figure(dwell[:0])
 
 
 def test_rounded_durations_have_no_empty_bins():
