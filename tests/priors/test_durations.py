@@ -9,7 +9,7 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, folds
 from neuroprior.priors import DurationModel, GRUPrior, MarkovPrior, SemiMarkovPrior, fit, load, save
 from neuroprior.testing import check_prior
 from tests.support.sources import FALSE_ALARM, refuses, seeded
@@ -177,6 +177,64 @@ def test_actions_with_few_durations_have_the_law_of_all():
     assert rows[0].law == "weibull"
     one = DurationModel(1).fit(of_one_action([3.0], 1))
     assert one.table()[0].parameters == pytest.approx({"scale": 3})
+
+
+def test_few_durations_of_an_action_say_little_of_how_many_are_0():
+    """Fewer than ten: their share is that of all actions together."""
+    actions = torch.tensor([0] * 20 + [1] * 9 + [2] * 10).view(3, 13)
+    durations = draw("gamma", 39).view(3, 13)
+    durations[(torch.arange(39).view(3, 13) % 4 == 0) & (actions != 2)] = 0
+    zeros = int((durations == 0).sum())
+    rows = DurationModel(4).fit(Plans(actions, 4, durations=durations)).table()
+    assert [row.zero for row in rows] == pytest.approx([0.25, zeros / 39, 0, zeros / 39])
+
+
+KNOWN = {"exponential": 1, "gamma": 2, "lognormal": 2, "weibull": 2}
+"""Laws and their parameters; mixtures take long to fit."""
+
+
+def held_out(law: str, plans: Plans) -> Tensor:
+    """`[N, L]`: the log-densities of durations under a law of each action, fitted without their part of the plans."""
+    found = torch.zeros(plans.actions.shape, dtype=torch.double)
+    for training, out in folds(plans, 5):
+        model = DurationModel(plans.num_actions, [law], transitions=False).fit(plans[training])
+        found[out] = model.log_prob(plans[out])
+    return found
+
+
+def test_a_law_is_worth_its_parameters():
+    """Of 30 actions, the law with the greatest held-out likelihood less 2 nats a parameter is that of each."""
+    actions = torch.arange(30).repeat(10, 5)
+    shape = 0.8 + actions.double() / 50
+    gamma = torch.distributions.Gamma(shape, torch.ones_like(shape))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        plans = Plans(actions, 30, durations=gamma.sample())
+    scores = torch.stack([held_out(law, plans) for law in KNOWN]).flatten(1)
+    sums = torch.zeros(len(KNOWN), 30, dtype=torch.double).index_add_(1, actions.flatten(), scores)
+    best = (sums - 2 * torch.tensor([*KNOWN.values()])[:, None]).argmax(0)
+    assert not best.equal(sums.argmax(0))
+    assert 5 < (best == 0).sum() < 30
+    rows = DurationModel(30, [*KNOWN], transitions=False).fit(plans).table()
+    assert [row.law for row in rows] == [[*KNOWN][k] for k in best.tolist()]
+
+
+def test_transitions_are_worth_their_parameters():
+    """An action has laws of its transitions where these gain more than 2 nats for each parameter of each of them."""
+    decided = []
+    for seed, times in enumerate((1.0, 1.1, 1.2, 1.25, 1.3, 1.35, 1.4, 1.5)):
+        plans = transitions(20, times, seed)
+        plans = replace(plans, actions=plans.actions[:, :21], durations=plans.durations[:, :21])
+        pair = plans.actions[:, :-1] * 3 + plans.actions[:, 1:]
+        each = held_out("gamma", Plans(pair, 9, durations=plans.durations[:, :-1]))
+        gain = each - held_out("gamma", plans)[:, :-1]
+        price = 2 * 2 * 3
+        own = [float(gain[plans.actions[:, :-1] == action].sum()) for action in range(3)]
+        rows = DurationModel(3, ["gamma"]).fit(plans).table()[3:]
+        assert {row.action for row in rows} == {action for action in range(3) if own[action] > price}
+        decided += own
+    assert min(abs(value - price) for value in decided) > 0.01
+    assert any(price / 3 < value < price for value in decided)
 
 
 def test_one_plan_is_held_out_by_time():

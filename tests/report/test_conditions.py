@@ -145,8 +145,24 @@ def test_the_figure_has_a_dot_for_each_unit_and_joins_those_of_one(num):
 
 
 def test_the_figure_shows_the_features_that_differ_most():
-    section, frames = section_of(changed(within(8)))
-    titles = [axes.get_title(loc="left").rstrip("*") for axes in section.figures[0].figure.axes]
-    assert titles == frames["conditions"]["feature"][:DRAWN].tolist()
+    """With the values of units, those of durations as geometric means, and the means of the table."""
+    plans = changed(within(8))
+    section, frames = section_of(plans)
+    cells, features = section.figures[0].figure.axes, frames["conditions"][:DRAWN]
+    assert [axes.get_title(loc="left").rstrip("*") for axes in cells] == features["feature"].tolist()
+    found = compare_conditions(plans, generator=seeded(0))
+    families = {family.name: family for family in found.families}
+    spelled = {"durations": "duration of {}", "actions": "share of {}"}
+    for axes, (_, row) in zip(cells, features.iterrows(), strict=True):
+        family, joint = families[row["family"]], " → " if row["family"] == "transitions" else " "
+        names = [spelled.get(family.name, "{}").format(joint.join(NAMES[a] for a in own)) for own in family.features]
+        values = family.values[:, names.index(row["feature"])]
+        values = values.exp() if family.name == "durations" else values
+        dots = [line.get_xdata() for line in axes.lines if line.get_marker() == "o"]
+        bars = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "|"]
+        for k, name in enumerate(found.condition_names):
+            assert sorted(dots[k]) == pytest.approx(sorted(values[found.design.label == k].tolist()))
+            assert bars[k] == row[f"mean, {name}"]
+    assert "durations" in set(features["family"])
     with refuses("means"):
         condition_figure(*(frame[:0] for frame in figure_tables(2, 3)))

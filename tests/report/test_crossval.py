@@ -170,6 +170,19 @@ def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
     assert one.taken.mean == pytest.approx(1 / 3)
 
 
+def test_samples_in_contexts_that_follow_from_actions(tmp_path):
+    """In a ring of four places; what is written beyond the ends of plans says nothing of where actions lead."""
+    actions = torch.randint(3, (24, 7), generator=seeded(0))
+    place = torch.arange(24)[:, None] % 4 + torch.nn.functional.pad((actions - 1).cumsum(1), (1, 0))[:, :-1]
+    plans = chain(context=place % 4)
+    plans = replace(plans, actions=actions, context=plans.context.where(plans.mask(), 3))
+    found = evaluated(plans, tmp_path, inputs=(CONTEXT,))
+    assert all(model.generated.shape == (12, 7) for model in found.models)
+    # Where a context leads to two others by the same action, samples have none.
+    other = replace(plans, context=context_of("index a step"))
+    assert all(model.generated is None for model in evaluated(other, tmp_path, inputs=(CONTEXT,)).models)
+
+
 @pytest.mark.parametrize("skip", [0, 2])
 def test_units_of_folds_are_those_of_the_whole(skip):
     """What is scored fold by fold has the interval of all plans together: a score of bits all 1 has no spread."""

@@ -77,6 +77,24 @@ def test_the_histogram_and_the_law_are_densities(made):
         assert total.between(least, 1 + 1e-9).all()
 
 
+def test_the_law_is_that_of_durations_above_0():
+    """Where a quarter take no time, the law and the histogram of the others are still whole."""
+    plans = timed(False)
+    durations = plans.durations.where(torch.arange(60) % 4 > 0, 0.0)
+    dwell = tables(replace(plans, durations=durations))["dwell"]
+    width = (dwell["high"] / dwell["low"]).map(log)
+    for what in ("density", "fitted"):
+        assert (dwell[what] * width).groupby(dwell["action"]).sum().between(0.97, 1 + 1e-9).all()
+    for name, own in dwell.groupby("action"):
+        mine = durations[plans.actions == "abc".index(name)]
+        assert own["zero"].unique().tolist() == [pytest.approx(float((mine == 0).double().mean()))]
+        assert own["number"].unique().tolist() == [int((mine > 0).sum())]
+        inside = (mine[:, None] > torch.tensor(own["low"].values)) & (mine[:, None] <= torch.tensor(own["high"].values))
+        assert (own["density"] * width[own.index] * (mine > 0).sum().item()).tolist() == pytest.approx(
+            inside.sum(0).tolist()
+        )
+
+
 def test_gains_of_laws_are_held_out():
     """Of a Weibull law over an exponential one: what the densities say of many durations; of the latter itself, 0."""
     plans = timed(False)
@@ -126,6 +144,17 @@ def test_classes_are_learned_on_training_plans():
             mine = (pair == each) & held_out[:, None]
             shortest = torch.where(mine, plans.durations[:, :-1], torch.inf).flatten().argmin()
             assert found[:, 1:][mine].unique().tolist() == [bits[:, 1:].flatten()[shortest]]
+
+
+def test_durations_are_long_or_short_for_their_own_action():
+    """In whatever unit the durations of an action are, the classes are the same."""
+    plans = timed(True)
+    unit = torch.tensor([1.0, 256.0, 1 / 1024])[plans.actions.long()]
+    (without, knowing), mask = chain_bits(plans, plans.mask())
+    (same, again), _ = chain_bits(replace(plans, durations=plans.durations * unit), plans.mask())
+    assert same.equal(without)
+    torch.testing.assert_close(again, knowing)
+    assert float((without - knowing)[mask].mean()) > 0.2
 
 
 def test_laws_are_scored_on_other_animals():

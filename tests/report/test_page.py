@@ -247,6 +247,20 @@ def test_the_same_results_give_the_same_bytes(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize(("size", "share"), [(10, 9.5 / (10 * 4 / 3)), (6, 1.0)])
+def test_a_figure_shrinks_until_its_smallest_text_is_hard_to_read(size, share):
+    @drawn
+    def figure() -> Figure:
+        made = Figure(figsize=(4, 2))
+        made.subplots().set_title("large", fontsize=20)
+        for axes in made.axes:
+            axes.tick_params(labelsize=size)
+        return made
+
+    least, most = (float(re.search(rf"{end}-width:(\d+)px", svg(figure()))[1]) for end in ("min", "max"))
+    assert least / most == pytest.approx(share, abs=0.005)
+
+
 def test_a_page_leaves_the_settings_of_other_figures_alone():
     before = dict(mpl.rcParams)
     svg(score_figure(scores(["gru"], False)))

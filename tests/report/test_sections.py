@@ -1,6 +1,7 @@
 """The sections of a report on plans, and the report as a function."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pandas as pd
@@ -13,7 +14,15 @@ from neuroprior.priors import MarkovPrior, UniformPrior, learn_macros
 from neuroprior.report import Document, FigureBox, report
 from neuroprior.report.fits import counted
 from neuroprior.report.scores import evaluate_saved
-from neuroprior.report.sections import SECTIONS, action_frame, macro_section
+from neuroprior.report.sections import (
+    SECTIONS,
+    action_frame,
+    drift_section,
+    lag_section,
+    macro_section,
+    motif_section,
+    order_section,
+)
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICK
 from tests.support.sources import refuses, seeded
@@ -50,6 +59,71 @@ def test_macro_actions_have_the_bits_that_they_save():
 def test_where_nothing_repeats_there_is_no_section():
     plans = Plans(torch.randint(20, (10, 4), generator=seeded(0)), 20)
     assert macro_section(found_in(plans)) is None
+
+
+@pytest.mark.parametrize(("often", "beyond", "repeats"), [(4, 0, {"kept"}), (2, 1, {"kept", "merged"})])
+def test_repeats_are_of_actions_that_were_taken(often, beyond, repeats):
+    """Every so-many-th word has a repeat: 18 or 21 % of all pairs; what stands beyond the ends is none of them."""
+    word = (torch.arange(800).view(400, 2) * 7 // 3 % often == 0).long()
+    actions = torch.tensor([[0, 1, 2, 0], [3, 2, 2, 0]])[word].flatten(1)
+    plans = Plans(torch.nn.functional.pad(actions, (0, 3), value=beyond), 4, torch.full((400,), 8))
+    assert set(motif_section(found_in(plans)).frames["motifs"]["repeats"]) == repeats
+
+
+def test_gains_are_starred_where_their_interval_is_above_0():
+    """And where there are enough units; a gain of 0 but for rounding is none."""
+    rows = [(1, 0.3, 0.1, 0.5, 5), (2, 0.3, -0.1, 0.7, 5), (3, 0.3, 0.1, 0.5, 4), (4, 1e-9, 1e-10, 1e-8, 9)]
+    rows.append((6, 0.2, 0.01, 0.3, 9))
+    gains = pd.DataFrame(rows, columns=["lag", "bits", "low", "high", "units"])
+    gains = gains.assign(what="gain", model="markov", context="actions", chance=None)
+    plans = Plans(torch.randint(3, (12, 8), generator=seeded(0)), 3)
+    (table,) = lag_section(replace(found_in(plans), gains=gains)).section.tables
+    place = [heading.replace("\n", " ") for heading in table.headings].index("gain, markov".replace(", ", " "))
+    shown = {row[0]: row[place] for row in table.rows if row[place]}
+    want = {"1": "0.3000*", "2": "0.3000", "3": "0.3000", "4": "0.0000", "6": "0.2000*"}
+    assert {lag: cell.strip() for lag, cell in shown.items()} == want
+
+
+def test_the_least_of_each_input_is_starred():
+    plans = markov_plans(markov_probs(3, 2, 0, 1.5), 40, 12, 1, context=torch.arange(40) % 2)
+    chains = {f"markov-{k}": MarkovPrior(3, k).fit(replace(plans, context=None)) for k in (0, 2)}
+    part = order_section(evaluate_saved(chains, plans, 0))
+    (table,), frame = part.section.tables, part.frames["orders"]
+    bits = {name: -float(prior.log_prob(plans.actions).sum()) / math.log(2) / 480 for name, prior in chains.items()}
+    want = []
+    for row in frame.itertuples():
+        own = frame[frame["context"] == row.context]
+        cells = [f"{row.bic_bits:.4f}" + "*" * bool(row.bic_bits == own["bic_bits"].min())]
+        cells.append(f"{row.aic_bits:.4f}" + "*" * bool(row.aic_bits == own["aic_bits"].min()))
+        held = bits.get(f"markov-{row.order}") if row.context == "actions" else None
+        cells.append("" if held is None else f"{held:.4f}" + "*" * (held == min(bits.values())))
+        want.append([str(row.order), row.context.replace(" and ", ", "), f"{row.num_parameters:,}", *cells])
+    assert [[cell.strip() for cell in row] for row in table.rows] == want
+    assert sum(row[3].endswith("*") for row in want) == 2
+
+
+def test_actions_whose_share_changes_most_come_first():
+    """Of equally significant ones, whether they become more or less frequent."""
+    plans = Plans(torch.randint(6, (40, 12), generator=seeded(0)), 6, action_names=list("abcdef"))
+    part = drift_section(found_in(plans))
+    frame = part.frames["action_drift"]
+    assert (frame["corrected"] == 1).sum() > 3
+    order = sorted(frame.itertuples(), key=lambda row: (row.corrected, -abs(row.change)))
+    table = part.section.tables[-1]
+    assert [row[:4] for row in table.rows] == [
+        [
+            row.action,
+            f"{100 * row.first_half:.2f}",
+            f"{100 * row.second_half:.2f}",
+            f"{100 * row.change:+.2f} ± {100 * (row.high - row.change):.2f}",
+        ]
+        for row in order
+    ]
+    halves = [plans.actions[:, :6], plans.actions[:, 6:]]
+    for row in order:
+        own = [float((half == "abcdef".index(row.action)).double().mean()) for half in halves]
+        assert (row.first_half, row.second_half) == pytest.approx(own)
+        assert row.change == pytest.approx(own[1] - own[0])
 
 
 ASKED: dict[str, Any] = {"folds": 2, "skip": 1, "patience": 0.125, "seed": 5} | QUICK
@@ -117,12 +191,14 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
 
 
-def test_priors_by_name_are_scored():
+@pytest.mark.parametrize("skip", [0, 3])
+def test_priors_by_name_are_scored(skip):
     plans = markov_plans(markov_probs(3, 1, 0, 1.5), 24, 8, 1)
     chain = MarkovPrior(3, 1).fit(plans)
-    scores = report(plans, priors={"mine": chain, "none": UniformPrior(3)}, sections=["scores"]).tables["plans"]
+    made = report(plans, priors={"mine": chain, "none": UniformPrior(3)}, skip=skip, sections=["scores"])
+    scores = made.tables["plans"]
     assert scores["model"].tolist() == ["mine", "none"]
-    bits = -chain.log_prob(plans.actions).sum() / torch.tensor(2.0).log() / counted(plans, 0).sum()
+    bits = -chain.action_log_probs(plans)[:, skip:].sum() / torch.tensor(2.0).log() / counted(plans, skip).sum()
     assert scores["bits_per_action"][0] == pytest.approx(float(bits), abs=1e-5)
 
 

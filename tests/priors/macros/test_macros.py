@@ -186,6 +186,11 @@ def test_of_too_many_ways_the_most_probable_are_kept(monkeypatch):
     # One way alone must not be within a macro: nothing else could follow.
     monkeypatch.setattr(MacroPrior, "MOST", 1)
     assert prior.log_prob(plans).isfinite().all()
+    # Of a macro and the actions that it is made of it is always these: each action is as probable as the first.
+    alone = MacroPrior(2, MarkovPrior(3, 0)).fit(torch.tensor([[0, 1, 1], [0, 1, 0]]).repeat(5, 1))
+    assert [macro.actions for macro in alone.macros] == [(0, 1)]
+    first, pairs = alone.start(4)[0].log_softmax(-1), every_plan(2, 3)
+    torch.testing.assert_close(alone.action_log_probs(pairs), first[0][pairs])
 
 
 def test_actions_of_any_integer_dtype():
