@@ -6,6 +6,7 @@ import torch
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.cli.__main__ import main
 from neuroprior.plans import read_plans
+from neuroprior.priors import SemiMarkovPrior
 from tests.support.sources import seeded
 
 OPTIONS = ["--num-plans", "50", "--length", "4", "--temperature", "3", "--seed", "7"]
@@ -25,6 +26,18 @@ def test_samples_are_those_of_the_library(tmp_path, capsys):
     for name in ("said.jsonl", "new.csv"):
         plans = read_plans(tmp_path / name, action_names=("a", "b", "c"))
         assert torch.equal(plans.actions, prior.sample(50, 4, temperature=3.0, generator=seeded(7)))
+
+
+def test_samples_with_durations_are_those_of_the_library(tmp_path):
+    actions = torch.randint(3, (40, 6), generator=seeded(0))
+    times = torch.rand(40, 6, generator=seeded(1)) + 0.5
+    prior = SemiMarkovPrior(3).fit(Plans(actions, 3, action_names=("a", "b", "c"), durations=times))
+    save(prior, tmp_path / "prior")
+    assert main(["sample", str(tmp_path / "prior"), *OPTIONS, "--out", str(tmp_path / "new.npz")]) == 0
+    plans, due = read_plans(tmp_path / "new.npz"), prior.sample_plans(50, 4, temperature=3.0, generator=seeded(7))
+    assert plans.actions.equal(due.actions)
+    assert plans.durations.equal(due.durations)
+    assert plans.action_names == ("a", "b", "c")
 
 
 @pytest.mark.parametrize(("given", "index"), [("wet", 1), ("dry", 0)])

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, execute, gridworld
-from tests.support.sources import random_world, refuses, seeded, stochastic_world
+from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, execute, gridworld
+from tests.support.sources import corridor, random_world, refuses, seeded, stochastic_world
 
 
 def test_an_open_loop_is_the_plan():
@@ -32,6 +32,19 @@ def test_it_replans_after_so_many_steps(every, decisions):
         now, reward = world.step(now, done.actions[:, t])
         assert torch.equal(now, done.states[:, t])
         assert torch.equal(reward, done.rewards[:, t])
+
+
+def test_what_is_recorded_with_plans_was_seen_before_the_actions():
+    """From the first and the second of four cells there is one best plan of three actions, to the right."""
+    world, state = corridor((0.0, 0.0, 0.0, 1.0)), torch.tensor([0, 1])
+    planner = ExhaustivePlanner(3, objective="return")
+    for context, seen in ((None, None), ("plan", [0, 1]), ("step", [[0, 1, 2], [1, 2, 3]])):
+        plans = collect(planner, world, state=state, context=context)
+        assert plans.actions.tolist() == [[1, 1, 1]] * 2
+        assert (None if plans.context is None else plans.context.tolist()) == seen
+        assert plans.lengths is None
+    best = collect(planner, world, state=state, context="step", min_score=1.0)
+    assert best.context.tolist() == [[1, 2, 3]]
 
 
 def test_a_closed_loop_responds_to_random_outcomes():

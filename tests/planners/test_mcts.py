@@ -1,5 +1,7 @@
 """Tree search: nothing is tried twice, everything in the end; the prior and the scores steer it."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -80,6 +82,76 @@ def test_scores_are_scaled_to_their_range():
         found.append(planner.plan(changed, state, seeded(1)))
         assert torch.equal(found[-1].plan, found[0].plan)
         assert torch.equal(found[-1].score, found[0].score * scale + rise)
+
+
+class Logged(TabularWorld):
+    """A table that writes down from where steps are taken."""
+
+    def step(self, state, action, generator=None):
+        self.log += state.tolist()
+        return super().step(state, action, generator)
+
+
+class Fixed:
+    """A prior that gives each action the same probability throughout."""
+
+    device = "cpu"
+
+    def __init__(self, probs):
+        self.num_actions, self.probs = len(probs), torch.tensor(probs)
+
+    def start(self, batch_size):
+        return self.step(None, torch.zeros(batch_size, 1))
+
+    def step(self, action, state):
+        return self.probs.log().expand(len(state), -1), state
+
+
+def by_hand(scores: list[float], probs: list[float], exploration: float, num_plans: int) -> list[int]:
+    """The first actions of all simulations of PUCT, where the score of a plan of two depends on the first alone."""
+    number, total, taken, left = [0] * len(probs), [0.0] * len(probs), [], 2 * num_plans
+    low, high = math.inf, -math.inf
+    while True:
+        tries, merit = max(sum(number), 1), []
+        for own, n, prob in zip(total, number, probs, strict=True):
+            value = ((own / n if n else sum(total) / tries) - low) / (high - low) if high > low else 0.5
+            # The first plan adds a node; after it each of its actions is tried once.
+            merit.append(value + exploration * prob * math.sqrt(tries) / (1 + n) if n <= len(probs) else -math.inf)
+        best = merit.index(max(merit)) if max(merit) > -math.inf else None
+        cost = 2 if best is None or not number[best] else 1
+        if best is None or left < cost:
+            return taken
+        left -= cost
+        score = scores[best]
+        if math.isfinite(score):
+            low, high = min(low, score), max(high, score)
+        else:  # counts as the lowest, or highest, so far
+            score = (high if score > 0 else low) if math.isfinite(low) else 0.0
+        number[best] += 1
+        total[best] += score
+        taken.append(best)
+
+
+@pytest.mark.parametrize("exploration", [0.001, 0.5, 1.25, 4.0])
+@pytest.mark.parametrize(
+    "scores",
+    [[0, 10, 100, 5, 3], [3, -math.inf, 7, 1, -math.inf], [2, math.inf, 1, 3, -math.inf], [-math.inf, 4, 4, 5, 4.5]],
+    ids=str,
+)
+def test_the_tree_grows_as_puct_says(scores, exploration):
+    """Each simulation takes the action that PUCT does, worked out here; infinite scores count as finite extremes."""
+    probs = [0.31, 0.27, 0.21, 0.13, 0.08]
+    table = torch.cat([torch.arange(1, 6)[None], *(torch.full((1, 5), 6 + a) for a in (0, 1, 2, 3, 4))])
+    table = torch.cat([table, torch.arange(6, 11)[:, None].expand(5, 5)])
+    world = Logged(table, torch.tensor([0.0] * 6 + scores))
+    for num_plans in (1, 3, 6, 12):
+        world.log = []
+        planner = MCTSPlanner(Fixed(probs), 2, num_plans, exploration=exploration)
+        decision = planner.plan(world, torch.tensor([0]), seeded(0))
+        taken = by_hand(scores, probs, exploration, num_plans)
+        assert [state - 1 for state in world.log if 1 <= state <= 5] == taken
+        assert float(decision.score[0]) == max(scores[a] for a in taken)
+        assert len(taken) + len(set(taken)) <= decision.model_steps <= 2 * num_plans
 
 
 def test_other_states_than_numbers_and_priors_that_see():

@@ -47,12 +47,22 @@ def test_sums_are_those_of_the_plans(by):
     frame = score(PRIOR, NEW, by)
     assert frame["log_likelihood"].sum() == pytest.approx(sum(by_hand()))
     assert frame["actions"].sum() == 5
-    if by == "group":
-        assert dict(zip(frame["group"], frame["log_likelihood"], strict=True)) == pytest.approx(
-            {"m1": by_hand()[0], "m2": by_hand()[1]}
-        )
-    if by == "action":
-        assert frame[["action", "plans", "actions"]].to_numpy().tolist() == [["rear", 2, 2], ["walk", 2, 3]]
+    rows = {
+        "group": [["m1", 2, 3], ["m2", 1, 2]],
+        "condition": [["saline", 2, 5], ["drug", 1, 0]],  # in the order of the plans
+        "action": [["rear", 2, 2], ["walk", 2, 3]],
+    }[by]
+    assert list(frame.columns) == [by, "plans", "actions", "log_likelihood", "bits_per_action"]
+    assert frame[[by, "plans", "actions"]].to_numpy().tolist() == rows
+    each = PRIOR.action_log_probs(match_plans(NEW, PRIOR))
+    sums = {
+        "group": by_hand()[:2],
+        "condition": [sum(by_hand()), 0.0],
+        "action": [float(each[NEW.mask() & (NEW.actions == action)].sum()) for action in (0, 1)],
+    }[by]
+    assert frame["log_likelihood"].tolist() == pytest.approx(sums)
+    bits = [-total / log(2) / row[2] if row[2] else float("nan") for total, row in zip(sums, rows, strict=True)]
+    assert frame["bits_per_action"].tolist() == pytest.approx(bits, nan_ok=True)
 
 
 def test_other_numbers_are_never_taken_for_the_same():

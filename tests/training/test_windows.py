@@ -138,6 +138,16 @@ def test_a_window_of_its_own_does_not_go_with_long_plans():
         GRUPrior(3, 8, window=4).fit(torch.randint(3, (9, 30), generator=seeded(0)), window=10, progress=False)
 
 
+def test_the_seed_draws_what_is_validated():
+    """As few plans as have enough actions: two of eight, the same for one seed, others for other seeds."""
+    actions = torch.randint(2, (8, MOST_VALIDATION * 3 // 4), generator=seeded(0), dtype=torch.uint8)
+    some = Plans(actions[:, :9], 2)
+    drawn = [PlansModule(some, Plans(actions, 2), Settings(), seed).validation.plans.actions for seed in range(6)]
+    assert all(len(plans) == 2 for plans in drawn)
+    assert PlansModule(some, Plans(actions, 2), Settings(), 3).validation.plans.actions.equal(drawn[3])
+    assert sum(not plans.equal(drawn[0]) for plans in drawn) > 2
+
+
 def test_validation_reads_no_more_than_it_must():
     actions = torch.randint(2, (3, MOST_VALIDATION), generator=seeded(0))
     data = PlansModule(Plans(actions[:, :9], 2), Plans(actions, 2), Settings(), 0)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from eval.compare import curves
 from eval.compare import run as run_module
 from eval.compare.curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
 from eval.compare.run import Contest, Settings, compare_run, curriculum_run
@@ -114,6 +115,20 @@ def test_the_best_temperature():
     assert best_temperature(starts, sure, 8, seeded(1)) == max(TEMPERATURES)
     right = MarkovPrior(2, 0).fit(torch.tensor([[0]] * 97 + [[1]] * 3))
     assert best_temperature(starts, right, 1, seeded(1)) == 1.0
+
+
+def test_every_temperature_is_tried_with_as_many_plans(monkeypatch):
+    asked = []
+
+    def share(starts, prior, generator, temperature, budgets):
+        asked.append((temperature, budgets))
+        return {"share": [-abs(temperature - 1.5)]}
+
+    monkeypatch.setattr(curves, "curve", share)
+    world = bandit(2)
+    starts = starts_of(one_step(world), world, 4, 1, seeded(0))
+    assert best_temperature(starts, MarkovPrior(2, 0), 8, seeded(1)) == 1.5
+    assert asked == [(temperature, [8]) for temperature in TEMPERATURES]
 
 
 def test_a_decision_is_timed_at_some_of_the_starts():

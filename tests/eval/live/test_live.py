@@ -9,8 +9,8 @@ import torch
 
 from eval.__main__ import main
 from eval.live import run as live
-from eval.live.report import live_document
-from eval.live.run import PARTS, LiveSettings, conditions
+from eval.live.report import live_document, live_frame, live_pairs
+from eval.live.run import PARTS, RANDOM, Condition, LiveSettings, conditions
 from eval.worlds.runs import Run
 from neuroprior.analysis.statistics import paired_difference
 from neuroprior.planners import Execution, SamplingPlanner
@@ -121,6 +121,32 @@ def test_what_is_reported():
     assert float(found["uniform", "none", "never", "no warm start"][-1]) > 0.05
     significant, tests = sum(gap["p_holm"] < 0.05 for gap in gaps), len(gaps)
     assert f"{significant} of {tests} differences are significant" in document.lead
+
+
+def test_parts_of_seasons():
+    """`after` and `late`: the first and the last quarter of all seasons but the first; in 100 steps."""
+    (result, *_) = made_up(1, seasons=3)
+    for number, entry in enumerate(result["entries"]):
+        entry["rewards"] = [0.01 * (number + place) for place in range(3 * PARTS)]
+    rows = live_document([result], {}, "").frames["rows"]
+    second, third = range(PARTS, 2 * PARTS), range(2 * PARTS, 3 * PARTS)
+    quarter = PARTS // 4
+    for number, row in enumerate(rows.itertuples()):
+        assert row.reward == pytest.approx(number + np.mean(range(3 * PARTS)))
+        assert row.after == pytest.approx(number + np.mean([*second[:quarter], *third[:quarter]]))
+        assert row.late == pytest.approx(number + np.mean([*second[-quarter:], *third[-quarter:]]))
+    reward = dict(zip(conditions(("markov",)), rows["reward"], strict=True))
+    other = {
+        "learned before": lambda own: own._replace(learns="before"),
+        "random": lambda own: RANDOM,
+        "no warm start": lambda own: own._replace(warm=False),
+    }
+    pairs = live_pairs(live_frame([result]))
+    assert pairs["against"].value_counts().to_dict() == {"learned before": 2, "random": 4, "no warm start": 2}
+    for row in pairs.itertuples():
+        own = Condition(row.prior, row.context, row.learns, row.warm_start)
+        assert own.warm
+        assert (row.first, row.second) == pytest.approx((reward[own], reward[other[row.against](own)]))
 
 
 def test_a_single_seed_and_season():

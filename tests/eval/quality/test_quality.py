@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 
 from eval.__main__ import main
-from eval.quality.command import LAG, LENGTH, REPEAT, sources
+from eval.quality.command import LAG, LENGTH, REPEAT, _fit, sources
 from neuroprior import MarkovPrior, Plans, UniformPrior, save
 from neuroprior.plans import write_plans
 from tests.support.sources import FALSE_ALARM, p_value, seeded
@@ -63,6 +63,23 @@ def test_markov_of_the_right_order_costs_what_estimation_costs(source):
     free = source.table[..., 0].numel() * (source.num_actions - 1)
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], free)
     assert low < 2 * float(divergence.sum()) < high
+
+
+@pytest.mark.parametrize("number", [1, 3, 4])
+def test_excess_is_of_actions_that_depend_on_the_past(number):
+    source = SOURCES[number]
+    (training, _), (test, true) = (source.draw(num, seeded(num)) for num in (500, 200))
+    row = _fit(source, MarkovPrior, training, test, true, 0)
+    prior = MarkovPrior(4, source.order, num_contexts=source.contexts).fit(training)
+    first = max(source.order, source.lag)
+    rate = -float(true[:, first:].mean()) / math.log(2)
+    bits = -float(prior.action_log_probs(test)[:, first:].double().mean()) / math.log(2)
+    assert (row["source"], row["model"]) == (source.name, "markov")
+    assert (row["entropy_rate"], row["bits_per_action"]) == pytest.approx((rate, bits))
+    assert row["excess_percent"] == pytest.approx(100 * (bits / rate - 1))
+    free = {1: 64 * 3, 4: 8 * 4 * 3}.get(number)
+    cost = free and 100 * free / (2 * math.log(2) * 500 * (LENGTH - first)) / rate
+    assert row["expected_percent"] == (cost and pytest.approx(cost))
 
 
 def context_at(source, plans: Plans, t: int) -> torch.Tensor | int:

@@ -1,8 +1,12 @@
 """`python -m eval study`, small."""
 
 import json
+from types import SimpleNamespace
+
+import pytest
 
 from eval.__main__ import main
+from eval.study import command
 
 
 def test_studies_with_and_without_an_effect(tmp_path, capsys):
@@ -24,6 +28,20 @@ def test_studies_with_and_without_an_effect(tmp_path, capsys):
     changed = {path.name: path.stat().st_mtime_ns for path in kept.glob("*.json")}
     assert main(arguments) == 0
     assert changed == {path.name: path.stat().st_mtime_ns for path in kept.glob("*.json")}
+
+
+@pytest.mark.parametrize(("effect", "number", "seeds"), [(True, 0, [5, 6]), (False, 0, range(5, 15)), (False, 1, [15])])
+def test_each_study_has_a_seed_of_its_own(effect, number, seeds, monkeypatch):
+    """Eleven studies without an effect, two with one, from seed 5."""
+    done = SimpleNamespace(tests={"actions": (0.1, 0.2)}, p_value=0.3, families=[])
+    drawn = []
+    monkeypatch.setattr(
+        command, "compare_conditions", lambda plans, generator: drawn.append(generator.initial_seed()) or done
+    )
+    rows = command.compared({"studies": 11, "with_effect": 2, "seed": 5}, command.Batch(effect, True, False, number))
+    assert drawn == list(seeds)
+    both = [("actions", 0.1, 0.2), ("all together", 0.3, 0.3)]
+    assert [tuple(row.values()) for row in rows] == [("test", seed, *one) for seed in seeds for one in both]
 
 
 def test_bad_numbers(tmp_path, capsys):

@@ -128,6 +128,19 @@ def test_a_share_is_learned_where_the_best_expert_changes():
     assert 0 < mixture.share < 0.5
 
 
+def test_what_is_beyond_the_ends_of_plans_has_no_weight():
+    one, two = (MarkovPrior(A, 0).fit(torch.full((4, 20), action)) for action in (0, 1))
+    switching = (torch.arange(80).view(5, 16) // 4) % 2
+    lengths = torch.arange(5) * 2 + 7
+    mixture, learned = MixturePrior(A, [one, two]), []
+    for beyond in (0, 1):
+        actions = switching.where(torch.arange(16) < lengths[:, None], beyond)
+        mixture.learn_weights(Plans(actions, A, lengths))
+        learned.append((mixture.share, mixture.first.tolist()))
+    assert learned[0] == learned[1]
+    assert learned[0][0] > 0
+
+
 def test_it_is_saved_and_loaded(tmp_path):
     plans = some_plans(contexts=4)
     made = [MarkovPrior(A, 2, num_contexts=4), GRUPrior(A, 8, num_contexts=4), StackedPrior(A, 8, num_contexts=4)]
