@@ -252,7 +252,7 @@ def _counted(plans: Plans, flat: FlatPlans, block: Tensor, num: int) -> Iterator
             below = rows[:, torch.searchsorted(first, features[:, 0].contiguous())]
         yield name, features, counts, below
     if plans.durations is not None:
-        times = plans.durations.flatten()[FlatPlans.of(plans).place].cpu().double()
+        times = plans.durations.flatten().cpu()[flat.place].double()
         at = (times > 0).nonzero()[:, 0]
         features, logs, counts = _sums(flat, at, 1, block, num, "durations", times.log())
         if len(features):

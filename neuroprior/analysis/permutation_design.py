@@ -102,7 +102,7 @@ class PermutationDesign:
 
     @property
     def equivalent(self) -> int:
-        """How many labelings are one and the same division, with conditions renamed: no statistic tells them apart."""
+        """How many labelings are one and the same division, with conditions renamed: their statistics are equal."""
         return prod(map(factorial, Counter(self.sizes).values()))
 
     def smallest_p(self, drawn: int) -> float:

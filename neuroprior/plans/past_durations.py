@@ -52,8 +52,7 @@ class PastDurations:
         Raises:
             ValueError: the plans have no durations, or none above 0 is known.
         """
-        taken = plans.mask() if plans.end is None else plans.mask() & (plans.actions != plans.end)
-        times = durations_of(plans)[taken]
+        times = durations_of(plans)[plans.mask(end=False)]
         logs = times[times > 0].double().log().sort()[0]
         if not len(logs):
             raise ValueError("durations: none above 0 is known; at least one is expected")

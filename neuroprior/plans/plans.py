@@ -127,8 +127,10 @@ class Plans:
         """The number of columns of `actions`, L."""
         return self.actions.shape[1]
 
-    def mask(self) -> Tensor:
-        """`[N, L]` bool: True where a plan has an action."""
+    def mask(self, end: bool = True) -> Tensor:
+        """`[N, L]` bool: True where a plan has an action; with `end` False, one that is not the end symbol."""
+        if not end and self.end is not None:
+            return self.mask() & (self.actions != self.end)
         steps = torch.arange(torch.as_tensor(self.actions).shape[1], device=torch.as_tensor(self.actions).device)
         if self.lengths is None:
             return torch.ones_like(torch.as_tensor(self.actions), dtype=torch.bool)
@@ -253,7 +255,7 @@ class Plans:
         """
         if self.end is None or self.end != self.num_actions - 1:
             raise ValueError(f"end: the last action, {self.num_actions - 1}, is expected, not {self.end!r}")
-        taken = self.mask() & (self.actions != self.end)
+        taken = self.mask(end=False)
         lengths = taken.sum(1)
         opened = replace(
             self,

@@ -211,11 +211,11 @@ class Table:
             raise ValueError(f"{self.of}: {what}: dates with a time zone in all columns, or in none, are expected")
         self.zoned = zoned
 
-    def unused(self) -> list[str]:
-        """The names of the columns that hold nothing."""
+    def unused(self) -> dict[int, str]:
+        """The names of the columns that hold nothing, by their positions."""
         used = {*self.at.values(), *self.context}
         names = [str(name).strip() or f"(without a name, column {i + 1})" for i, name in enumerate(self.frame.columns)]
-        return [name for i, name in enumerate(names) if i not in used]
+        return {i: name for i, name in enumerate(names) if i not in used}
 
 
 def _text(value: Any) -> str:
@@ -361,14 +361,15 @@ def fields_of(
         notes.append("the parts of a plan form a group")
     if "group" in table.by_name:
         notes.append("the column 'group' is taken for what is independent, such as the animal")
-    for name in table.unused():
-        words = set(frame[name].dropna().astype(str).str.strip().str.upper().unique()[:4]) if name in frame else set()
+    unused = table.unused()
+    for position, name in unused.items():
+        words = {word.upper() for word in table.texts(position)[1]}
         if {"START", "STOP"} <= words <= set(EVENT_TYPES):
             notes.append(
                 f"the column {name!r} holds START and STOP, and is not used (columns.event_type): each is an action"
             )
-    if unused := table.unused():
-        notes.append(f"columns that are not used: {listed(unused)}")
+    if unused:
+        notes.append(f"columns that are not used: {listed(list(unused.values()))}")
     return found | {"notes": tuple(notes)}
 
 

@@ -57,8 +57,7 @@ def decode(plans: Plans | Tensor, prior: Prior | None = None) -> list[list[str]]
         assert prior is not None
         plans = Plans(as_actions(plans), prior.num_actions, action_names=prior.action_names, end=prior.end)
     names = plans.action_names or [str(action) for action in range(plans.num_actions)]
-    kept = plans.mask() if plans.end is None else plans.mask() & (plans.actions != plans.end)
-    taken = zip(plans.actions.tolist(), kept.sum(1).tolist(), strict=True)
+    taken = zip(plans.actions.tolist(), plans.mask(end=False).sum(1).tolist(), strict=True)
     return [[names[action] for action in actions[:length]] for actions, length in taken]
 
 

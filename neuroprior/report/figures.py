@@ -44,6 +44,7 @@ from neuroprior.report.drawing import (
     whole_numbers,
 )
 from neuroprior.report.page import INK, clean
+from neuroprior.report.part import action_names, group_names
 
 MOST_PLANS = 1000  # drawn as points; of more, evenly spaced ones
 MOST_GROUPS = 40  # drawn as a row each; of more, evenly spaced ones between the lowest and the highest
@@ -463,7 +464,7 @@ def ethogram_figure(plans: Plans) -> Figure:
 
     Time is the sum of the durations, in their unit, where plans have them; else a step is an action. A duration that is
     not known is left blank, as long as the median one. Of actions shorter than one of `MOST_BINS` parts of the longest
-    plan some are not seen. At most `MOST_ROWS` plans are drawn, evenly spaced; the figure says so.
+    plan some are not drawn. At most `MOST_ROWS` plans are drawn, evenly spaced; the figure says so.
 
     Args:
         plans: with names, groups, conditions and durations where there are any.
@@ -476,7 +477,7 @@ def ethogram_figure(plans: Plans) -> Figure:
     mask = plans.mask().cpu().numpy()
     if not mask.any():
         raise ValueError("plans: at least one action is expected; without any there is no figure")
-    names = list(plans.action_names or map(str, range(plans.num_actions)))
+    names = action_names(plans)
     count = plans.actions.cpu()[torch.from_numpy(mask)].long().bincount(minlength=len(names)).numpy()
     palette, keys, columns = _strip_colors(count, names)
     whole = np.flatnonzero(mask.any(1))
@@ -500,7 +501,7 @@ def ethogram_figure(plans: Plans) -> Figure:
     axes.imshow(image, aspect="auto", interpolation="none", extent=(0, longest, lines, 0))
     starts = np.flatnonzero(new_group)
     middle = (tops[starts] + tops[np.append(starts[1:], len(some)) - 1]) / 2 + 2
-    called = [plans.group_names[g] if plans.group_names else f"group {g}" for g in group[starts]]
+    called = group_names(plans, torch.from_numpy(group[starts]))
     axes.set_yticks([], []) if plans.group is None else axes.set_yticks(middle, [short(c, 18) for c in called])
     axes.tick_params(axis="y", length=0, labelsize=8)
     for row in np.flatnonzero(new_condition) if plans.condition is not None else []:

@@ -365,6 +365,11 @@ def test_starts_and_stops_that_are_not_used_are_noted(tmp_path):
     assert any("'Behavior type' holds START and STOP" in note for note in plans.notes)
 
 
+def test_unused_columns_of_one_name():
+    frame = pd.DataFrame([[1, "a", "x", "y"], [1, "b", "x", "y"]], columns=["plan", "action", "note", "note"])
+    assert Plans.from_dataframe(frame).notes == ("columns that are not used: note, note",)
+
+
 def test_decimal_commas_where_semicolons_part_columns(tmp_path):
     text = "plan;action;start;stop\n1;a;0,0;1,5\n1;b;1,5;4\n"
     assert read(tmp_path, text).durations.tolist() == [[1.5, 2.5]]

@@ -71,15 +71,15 @@ def test_the_tables_hold_what_was_found(conditions):
 
 def test_stars_and_limits_of_the_printed_tables():
     section, frames = section_of(changed(between(12)))
-    tests, features, told, carried = section.tables
+    tests, features, predicted, carried = section.tables
     assert tests.rows[0][0] == "all tests together"
     assert all(row[-1].endswith("*") == (float(row[-1].strip("*")) < 0.05) for row in tests.rows[1:])
     assert "Smallest possible p: 0.0022; corrected for 6 tests: 0.013." in tests.caption
     assert len(features.rows) == LISTED < len(frames["conditions"])
     starred = [row[0] for row in features.rows if row[-1].endswith("*")]
     assert starred == frames["conditions"]["feature"][frames["conditions"]["significant"]].tolist()[:LISTED]
-    assert [row[0] for row in told.rows] == ["drug 0", "drug 1"]
-    assert [sum(map(int, row[1:])) for row in told.rows] == [6, 6]
+    assert [row[0] for row in predicted.rows] == ["drug 0", "drug 1"]
+    assert [sum(map(int, row[1:])) for row in predicted.rows] == [6, 6]
     assert len(carried.rows) == min(LISTED, len(frames["condition_sequences"]))
 
 

@@ -290,7 +290,7 @@ class DurationModel(nn.Module):
         time = by_law("quantile", self.law[row], rest, self.values[row]).float()
         limits = torch.finfo(torch.float32)
         time = time.clamp(limits.tiny, limits.max).masked_fill(drawn < zero, 0).view(plans.actions.shape)
-        return time.masked_fill(~self._taken(plans), 0)
+        return time.masked_fill(~plans.mask(end=False), 0)  # an end symbol takes no time
 
     def _rows(self, plans: Plans) -> Tensor:
         """`[N, L]`: the row of the tables for each action, given the next one."""
@@ -306,12 +306,8 @@ class DurationModel(nn.Module):
         after = plans.actions.long().masked_fill(~plans.mask(), -1)
         return functional.pad(after[:, 1:], (0, min(plans.max_length, 1)), value=-1)
 
-    def _taken(self, plans: Plans) -> Tensor:
-        """`[N, L]` bool: the actions that take time; an end symbol takes none."""
-        return plans.mask() if plans.end is None else plans.mask() & (plans.actions != plans.end)
-
     def _known(self, plans: Plans) -> Tensor:
-        return self._taken(plans) & ~durations_of(plans).isnan()
+        return plans.mask(end=False) & ~durations_of(plans).isnan()
 
     def _check(self, plans: Plans, durations: bool = True) -> None:
         if plans.num_actions != self.num_actions:
