@@ -21,6 +21,7 @@ with ending_at_interrupts():
     )
     from neuroprior.plans import Plans, read_plans, write_plans
     from neuroprior.priors import (
+        CombinedPrior,
         ContextTreePrior,
         GRUPrior,
         MacroPrior,
@@ -40,6 +41,7 @@ with ending_at_interrupts():
     from neuroprior.worlds import TabularWorld, World, from_gymnasium, gridworld
 
 __all__ = [
+    "CombinedPrior",
     "ContextTreePrior",
     "ExhaustivePlanner",
     "FrontierPlanner",

@@ -1,7 +1,7 @@
 """Priors compared on held-out plans: bits per action with intervals, and count-based baselines."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf, log
 
 import torch
@@ -10,24 +10,14 @@ from torch import Tensor
 from neuroprior.analysis.statistics import ENOUGH_UNITS, Difference, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
-from neuroprior.priors import ContextTreePrior, MarkovPrior, Prior, UniformPrior
-from neuroprior.priors.counts import Backoff, TooLargeError
+from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
+from neuroprior.priors.counts import TooLargeError, chains
 
 ORDERS = range(7)
 """Orders of the Markov chains among the baselines."""
 
 DEPTH = 10
 """Depth of the context tree among the baselines."""
-
-BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
-    ("kneser-ney", 1),
-    ("kneser-ney", 0.5),
-    ("witten-bell", 1),
-    ("witten-bell", 4),
-    ("dirichlet", 1),
-    ("dirichlet", 8),
-]
-"""Back-offs and their smoothing; for each Markov order the best of them is chosen on validation plans."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +96,7 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
     Raises:
         ValueError: plans that the prior cannot score.
     """
-    given = plans if prior.takes_context else replace(plans, context=None, context_names=None)
+    given = plans if prior.takes_context else plans.without_context()
     with torch.no_grad():
         return -prior.action_log_probs(given).double().cpu() / log(2)
 
@@ -199,15 +189,10 @@ def baselines(
 
 
 def _chains(training: Plans, order: int, contexts: list[int | None]) -> Iterator[tuple[str, Prior]]:
-    """Markov chains of an order with every back-off; what they count is counted once."""
+    """Markov chains of an order with every back-off."""
     for num_contexts in contexts:
-        counted = None
-        for backoff, smoothing in BACKOFFS_TRIED:
-            prior = MarkovPrior(training.num_actions, order, smoothing, num_contexts=num_contexts, backoff=backoff)
-            counted = prior.count(training) if counted is None else counted
-            prior.training_plans(training)
-            prior.learn(*counted)
-            yield f"{backoff} {smoothing:g}", prior
+        for prior in chains(training, order, num_contexts):
+            yield f"{prior.backoff} {prior.smoothing:g}", prior
 
 
 def _best(model: str, made: Iterable[tuple[str, Prior]], validation: Plans) -> Baseline:

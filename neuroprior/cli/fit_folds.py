@@ -42,6 +42,7 @@ def cross_validated(
         KeyboardInterrupt: finished folds are kept.
     """
     share = data.settings.validation
+    assert isinstance(share, float)
     fit = partial(_fit_and_score, prior, dict(settings), data.plans, data.folds, data.seed, share, num_contexts)
     asked = {"plans": plans_digest(data.plans), "prior": repr(prior), "settings": dict(settings), "seed": data.seed}
     asked |= {"folds": data.folds, "validation": share, "num_contexts": num_contexts}

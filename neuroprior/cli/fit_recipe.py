@@ -12,7 +12,8 @@ import yaml
 from neuroprior.planners import Planner, collect
 from neuroprior.plans import Columns, Missing, PastDurations, Plans, read_plans
 from neuroprior.priors import Prior
-from neuroprior.priors.fitting import context_arguments, make_prior
+from neuroprior.priors.fitting import make_prior
+from neuroprior.priors.prior import context_arguments
 from neuroprior.training import PlansModule, PriorModule, Settings
 from neuroprior.worlds import World
 

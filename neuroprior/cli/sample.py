@@ -1,7 +1,6 @@
 """`neuroprior sample`: new plans from a saved prior."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -40,7 +39,7 @@ def sample(
     given = _context(prior, context, folder, num_plans)
     if isinstance(prior, SemiMarkovPrior):
         plans = prior.sample_plans(num_plans, length, given, temperature=temperature, generator=generator)
-        plans = replace(plans, context=None, context_names=None)
+        plans = plans.without_context()
     else:
         actions = prior.sample(num_plans, length, given, temperature=temperature, generator=generator)
         plans = Plans(actions, prior.num_actions, action_names=prior.action_names, end=prior.end)

@@ -267,6 +267,10 @@ class Plans:
         )
         return opened.steps(stop=int(lengths.max())) if len(self) else opened
 
+    def without_context(self) -> "Plans":
+        """The same plans without their context."""
+        return self if self.context is None else replace(self, context=None, context_names=None)
+
     def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple["Plans", "Plans"]:
         """Split at random into plans for training and plans for validation; groups stay together.
 

@@ -2,7 +2,7 @@
 
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.durations import DurationLaw, DurationModel, SemiMarkovPrior
-from neuroprior.priors.ensembles import MixturePrior, StackedPrior
+from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.fitting import fit
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
 from neuroprior.priors.matching import decode, match_plans
@@ -12,6 +12,7 @@ from neuroprior.priors.serialization import load, save
 from neuroprior.priors.uniform import UniformPrior
 
 __all__ = [
+    "CombinedPrior",
     "ContextTreePrior",
     "DurationLaw",
     "DurationModel",

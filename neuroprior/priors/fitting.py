@@ -9,9 +9,9 @@ from torch import Tensor
 from neuroprior.plans import Plans
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
 from neuroprior.priors.durations import SemiMarkovPrior
-from neuroprior.priors.ensembles import MixturePrior, StackedPrior
+from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
-from neuroprior.priors.prior import Prior, as_actions, construct
+from neuroprior.priors.prior import Prior, as_actions, construct, context_arguments
 from neuroprior.priors.uniform import UniformPrior
 
 MakePrior = Callable[..., Prior]
@@ -20,7 +20,7 @@ MakePrior = Callable[..., Prior]
 
 def fit(
     plans: Plans | Tensor,
-    prior: MakePrior | str = GRUPrior,
+    prior: MakePrior | str = CombinedPrior,
     *,
     generator: torch.Generator | None = None,
     **settings: Any,
@@ -29,9 +29,10 @@ def fit(
 
     Args:
         plans: `Plans`, or integers `[N, L]` for plans without context, of as many actions as occur.
-        prior: its class, such as `GRUPrior`; a function that makes it, such as `partial(GRUPrior, hidden_size=128)`,
-            called with the number of actions and, where it takes it, `num_contexts` or `context_size`; or one of the
-            names in `NAMES`. A prior that cannot take the context of the plans ignores it.
+        prior: its class, such as `GRUPrior`; by default `CombinedPrior`, which combines priors of every kind. Or a
+            function that makes it, such as `partial(GRUPrior, hidden_size=128)`, called with the number of actions and,
+            where it takes it, `num_contexts` or `context_size`; or one of the names in `NAMES`. A prior that cannot
+            take the context of the plans ignores it.
         generator: source of randomness; see `Prior.fit`.
         settings: of the prior's `fit`, such as `max_steps=500`; see `neuroprior.training.Settings`.
 
@@ -67,20 +68,6 @@ def make_prior(plans: Plans, prior: MakePrior, use_context: bool = True) -> Prio
     return construct(prior, plans.num_actions, context_arguments(plans) if use_context else {})
 
 
-def context_arguments(plans: Plans) -> dict[str, int]:
-    """The constructor's arguments of a prior that takes the context of `plans`: `num_contexts`, `context_size` or none.
-
-    The number of contexts is that of their names, if these are more than occur.
-    """
-    context = plans.context
-    if context is None:
-        return {}
-    if context.is_floating_point():
-        return {"context_size": context.shape[-1]}
-    most = int(context.max()) + 1 if context.numel() else 1
-    return {"num_contexts": max(most, len(plans.context_names or ()))}
-
-
 def _mixture(num_actions: int, num_contexts: int | None = None) -> MixturePrior:
     """Chains, a context tree and a network."""
     kinds = (MarkovPrior, ContextTreePrior, GRUPrior)
@@ -88,6 +75,7 @@ def _mixture(num_actions: int, num_contexts: int | None = None) -> MixturePrior:
 
 
 NAMES: dict[str, MakePrior] = {
+    "combined": CombinedPrior,
     "uniform": UniformPrior,
     "markov": MarkovPrior,
     "context-tree": ContextTreePrior,

@@ -32,7 +32,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
         raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")
     plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
     if not prior.takes_context:
-        plans = replace(plans, context=None, context_names=None)
+        plans = plans.without_context()
     plans = plans if prior.end is None else plans.with_end()
     return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
 

@@ -3,7 +3,7 @@
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -175,6 +175,16 @@ class Prior(nn.Module, ABC):
             ValueError: plans that this prior cannot learn from, or a setting that it does not have.
         """
 
+    def recount(self, plans: Plans) -> Self:
+        """Count anew in `plans` what this prior counts, and keep what it was trained to; returns self.
+
+        A prior that learned from some plans can so take others into account that were held out in the meantime.
+
+        Raises:
+            ValueError: plans that this prior cannot learn from.
+        """
+        return self if self.fit_settings else self.fit(plans)
+
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         """The logits of each action given those before it.
 
@@ -326,7 +336,7 @@ class Prior(nn.Module, ABC):
         self.action_names = None if plans.action_names is None else tuple(plans.action_names)
         self.context_names = None
         if not self.takes_context:
-            return replace(plans, context=None, context_names=None)
+            return plans.without_context()
         self.check_context_of(plans)
         self.context_per = "step" if is_per_step(plans.context) else "plan"
         if plans.context_names is not None and len(plans.context_names) <= (self.num_contexts or 0):
@@ -354,6 +364,20 @@ def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[st
     parameters = inspect.signature(make).parameters
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     return make(num_actions, **{name: c for name, c in contexts.items() if takes_any or name in parameters})
+
+
+def context_arguments(*some: Plans) -> dict[str, int]:
+    """The constructor's arguments of a prior that takes the context of plans: `num_contexts`, `context_size` or none.
+
+    The number of contexts is that of their names, if these are more than occur.
+    """
+    contexts = [plans.context for plans in some if plans.context is not None]
+    if not contexts:
+        return {}
+    if contexts[0].is_floating_point():
+        return {"context_size": contexts[0].shape[-1]}
+    most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
+    return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
 
 
 def as_actions(plans: Any) -> Tensor:

@@ -17,6 +17,7 @@ from neuroprior.plans import PastDurations, Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
 from neuroprior.priors import GRUPrior, MarkovPrior, MixturePrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.counts import TooLargeError
+from neuroprior.priors.prior import context_arguments
 from neuroprior.sampling.ancestral import sample, sample_in_world
 from neuroprior.worlds import TabularWorld
 
@@ -128,7 +129,7 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     mask = counted(whole, design.skip, design.cut)
     unit, scored = units(whole, mask)[index], whole[index]
     if job.inputs != CONTEXT:
-        learned, scored = (replace(some, context=None, context_names=None) for some in (learned, scored))
+        learned, scored = (some.without_context() for some in (learned, scored))
     if job.inputs == DURATIONS:
         past = PastDurations.of(learned)
         learned, scored = past.added_to(learned), past.added_to(scored)
@@ -136,7 +137,7 @@ def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) ->
     if job.kind in LAGS:
         return _by_lag(job.kind, learned, scored, design, seed)
     found: Arrays = {}
-    world = None if job.fold else _world(learned, _sizes(learned, scored).get("num_contexts", 0))
+    world = None if job.fold else _world(learned, context_arguments(learned, scored).get("num_contexts", 0))
     for name, how, prior in _fitted(job.kind, learned, scored, design, seed):
         arrays = {"how": np.array(how)} | score_arrays(prior, scored, mask[index], unit)
         if job.fold == 0:
@@ -166,7 +167,7 @@ def score_arrays(prior: Prior, scored: Plans, mask: Tensor, unit: Tensor) -> Arr
 
 def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Iterator[tuple[str, str, Prior]]:
     """The name, the settings and the prior of each model of a kind."""
-    sizes = _sizes(learned, scored)
+    sizes = context_arguments(learned, scored)
     learned = divisible(learned)
     if "context_size" in sizes and kind in ("counts", "stacked", "mixture"):
         return  # features cannot be counted
@@ -192,17 +193,6 @@ def _made(kind: str, num_actions: int, **how: Any) -> Any:
     return NEURAL[kind][0](num_actions, **how)
 
 
-def _sizes(*some: Plans) -> dict[str, int]:
-    """The arguments by which a prior takes the context of these plans."""
-    contexts = [plans.context for plans in some if plans.context is not None]
-    if not contexts:
-        return {}
-    if contexts[0].is_floating_point():
-        return {"context_size": contexts[0].shape[-1]}
-    most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
-    return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
-
-
 def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
     """The bits of the last actions of short pieces, with 0, 1, 2 and more of the actions before them known."""
     # At most half of what the median plan has, so that pieces stand anywhere in plans.
@@ -210,7 +200,7 @@ def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
     reach = min(design.reach, *halves)
     if reach < 1:
         return {}
-    sizes = _sizes(learned, scored)
+    sizes = context_arguments(learned, scored)
     generator = torch.Generator().manual_seed(seed)
     late = scored.steps(0 if design.cut else max(design.skip - reach, 0))
     if int(late.mask().sum(1).max()) <= reach:

@@ -50,7 +50,10 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
         ValueError: too few plans or groups, or the training diverged.
     """
     device = next(prior.parameters()).device
-    training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
+    if isinstance(settings.validation, Plans):
+        training, validation = plans, settings.validation
+    else:
+        training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
     window = settings.window if hasattr(prior, "forward_from") else plans.max_length
     data = PlansModule(training, validation, replace(settings, window=window), seed)
     cuda = device.type == "cuda"

@@ -12,7 +12,6 @@ from scipy import stats
 
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, UniformPrior
 from neuroprior.analysis.comparison import (
-    BACKOFFS_TRIED,
     DEPTH,
     ORDERS,
     action_bits,
@@ -24,7 +23,7 @@ from neuroprior.analysis.comparison import (
 )
 from neuroprior.analysis.statistics import mean_interval, paired_difference, ratio_difference
 from neuroprior.plans.folds import BLOCKS
-from neuroprior.priors.counts import HistoryPrior
+from neuroprior.priors.counts import BACKOFFS_TRIED, HistoryPrior
 from tests.support.sources import FALSE_ALARM, refuses, seeded
 
 

@@ -14,8 +14,8 @@ import torch
 
 from eval.__main__ import main
 from neuroprior import MarkovPrior, Plans
-from neuroprior.analysis.comparison import BACKOFFS_TRIED
 from neuroprior.plans import write_plans
+from neuroprior.priors.counts import BACKOFFS_TRIED
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICKLY, bits, fails, report
 from tests.support.sessions import interrupted

@@ -1,6 +1,6 @@
 """What holds for every prior: settings of `fit`, `repr`, plans or actions alone, and fitting in one call."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 
 import pytest
@@ -9,6 +9,7 @@ import torch
 from neuroprior import priors
 from neuroprior.plans import Plans
 from neuroprior.priors import (
+    CombinedPrior,
     ContextTreePrior,
     GRUPrior,
     MacroPrior,
@@ -21,6 +22,7 @@ from neuroprior.priors import (
     UniformPrior,
     fit,
 )
+from neuroprior.priors.fitting import NAMES
 from neuroprior.training import Settings
 from tests.support.sources import refuses, seeded
 
@@ -45,6 +47,7 @@ NETWORKS = {
     "nested mixture": lambda: MixturePrior(A, [MixturePrior(A, [StackedPrior(A, 8, depth=2)]), UniformPrior(A)]),
     "semi-markov gru": lambda: SemiMarkovPrior(A, GRUPrior(A, 8, context_size=2)),
     "macro": lambda: MacroPrior(A, GRUPrior(A + 2, 8)),
+    "combined": lambda: CombinedPrior(A, [MarkovPrior(A, 1), GRUPrior(A, 8), MacroPrior(A, GRUPrior(A + 1, 8))]),
 }
 ALL = COUNTS | NETWORKS
 
@@ -138,10 +141,14 @@ def test_actions_alone_are_plans_without_context(name):
         MarkovPrior(A, 1, num_contexts=C).log_prob(plans.actions)
 
 
-@pytest.mark.parametrize("name", ["uniform", "markov", "context-tree", "gru", "transformer", "stacked", "mixture"])
+@pytest.mark.parametrize(
+    "name", ["uniform", "markov", "context-tree", "gru", "transformer", "stacked", "mixture", "combined"]
+)
 def test_fit_by_name(name):
     plans = plans_for(COUNTS["markov context"]())
-    quick = QUICK if name in ("gru", "transformer", "stacked", "mixture") else {}
+    quick = QUICK if name in ("gru", "transformer", "stacked", "mixture", "combined") else {}
+    if name == "semi-markov":
+        plans = replace(plans, durations=torch.rand(plans.actions.shape, generator=seeded(1)))
     prior = fit(plans, name, generator=seeded(0), **quick)
     assert prior.num_actions == A
     assert prior.num_contexts == (None if name == "uniform" else C)
@@ -159,7 +166,7 @@ def test_fit_makes_a_prior_for_the_plans():
     )
     assert fit(named, MarkovPrior).num_contexts == 2
     assert fit([[0, 1, 4]], MarkovPrior).num_actions == 5
-    assert isinstance(fit(features.actions, generator=seeded(0), **QUICK), GRUPrior)
+    assert isinstance(fit(features.actions, generator=seeded(0), **QUICK), CombinedPrior)
     with refuses("markof", "context-tree"):
         fit(features, "markof")
     with refuses("max_steps", "MarkovPrior"):

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuroprior.analysis.comparison import BACKOFFS_TRIED, DEPTH, score_bits, units
+from neuroprior.analysis.comparison import DEPTH, score_bits, units
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds, in_parts
 from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior
+from neuroprior.priors.counts import BACKOFFS_TRIED
 from neuroprior.report import fits
 from neuroprior.report.fits import ACTIONS, CONTEXT, KINDS, Design, Job, counted, split
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, jobs

@@ -3,6 +3,16 @@
 from neuroprior.priors.counts.context_tree import ContextTreePrior, Leaf
 from neuroprior.priors.counts.histories import TooLargeError
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.counts.markov import BACKOFFS, Backoff, MarkovPrior
+from neuroprior.priors.counts.markov import BACKOFFS, BACKOFFS_TRIED, Backoff, MarkovPrior, chains
 
-__all__ = ["BACKOFFS", "Backoff", "ContextTreePrior", "HistoryPrior", "Leaf", "MarkovPrior", "TooLargeError"]
+__all__ = [
+    "BACKOFFS",
+    "BACKOFFS_TRIED",
+    "Backoff",
+    "ContextTreePrior",
+    "HistoryPrior",
+    "Leaf",
+    "MarkovPrior",
+    "TooLargeError",
+    "chains",
+]

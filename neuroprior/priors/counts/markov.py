@@ -1,10 +1,12 @@
 """Markov priors of any order: counts of what followed the last k actions, with back-off to shorter histories."""
 
+from collections.abc import Iterator
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
 
@@ -14,6 +16,16 @@ BACKOFFS: tuple[Backoff, ...] = get_args(Backoff)
 
 FALLBACK_DISCOUNTS = (0.5, 1.0, 1.5)
 """Discounts of Kneser-Ney where the counts give none: those of KenLM's option `--discount_fallback`."""
+
+BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
+    ("kneser-ney", 1),
+    ("kneser-ney", 0.5),
+    ("witten-bell", 1),
+    ("witten-bell", 4),
+    ("dirichlet", 1),
+    ("dirichlet", 8),
+]
+"""Back-offs and their smoothing; for each order the best of them is chosen on validation plans."""
 
 
 class MarkovPrior(HistoryPrior):
@@ -162,6 +174,21 @@ def kneser_ney_discounts(counts: Tensor) -> Tensor:
     if not all(0 < d <= k for k, d in enumerate(found, 1)):
         found = list(FALLBACK_DISCOUNTS)
     return torch.tensor(found, dtype=torch.double, device=counts.device)
+
+
+def chains(plans: Plans, order: int, num_contexts: int | None = None) -> Iterator[MarkovPrior]:
+    """Markov chains of an order, one for each of `BACKOFFS_TRIED`; what they count is counted once.
+
+    Raises:
+        TooLargeError: their tables would be too large.
+    """
+    counted = None
+    for backoff, smoothing in BACKOFFS_TRIED:
+        prior = MarkovPrior(plans.num_actions, order, smoothing, num_contexts=num_contexts, backoff=backoff)
+        counted = prior.count(plans) if counted is None else counted
+        prior.training_plans(plans)
+        prior.learn(*counted)
+        yield prior
 
 
 def _pooled(counts: Counts, contexts: int, lower: Tensor, rule: Backoff, smoothing: float) -> Tensor:

@@ -109,6 +109,11 @@ class SemiMarkovPrior(Prior):
         self.actions.fit(plans, generator=generator, **settings)
         return self
 
+    def recount(self, plans: Plans) -> Self:
+        self.durations.fit(plans)
+        self.actions.recount(plans)
+        return self
+
     def duration_log_prob(self, plans: Plans) -> Tensor:
         """The log-density of the known durations of plans, given their actions; see `DurationModel.log_prob`.
 

@@ -1,6 +1,7 @@
 """The mixture of priors: experts weighted by how well they have predicted the plan so far."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -8,7 +9,6 @@ from torch import Tensor, nn
 
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import divisible
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.prior import Prior
@@ -16,8 +16,8 @@ from neuroprior.priors.prior import Prior
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates for the share; `fit` takes the best."""
 
-VALIDATION = 0.1
-"""Share of the plans on which the weights are learned, where the settings have none."""
+MOST, LARGEST, LEAST = 0.1, 5000, 0.02
+"""The share of plans that is held out to learn the weights: `LARGEST` actions, but from `LEAST` to `MOST` of them."""
 
 STEPS = 50
 """Steps of expectation maximisation, which learns the weights."""
@@ -38,6 +38,7 @@ class MixturePrior(Prior):
         num_actions: A.
         experts: E priors; or, as in a saved `config`, objects with `prior`, the name of a class, and its `config`.
         share: s, between 0 and 1; set by `fit`.
+        num_contexts, context_size: see `Prior`; None: as the experts with a context take it.
 
     Raises:
         ValueError: no experts, or experts that differ in their actions or contexts.
@@ -46,7 +47,14 @@ class MixturePrior(Prior):
     first: Tensor
     """`[E]`: the logarithms of the initial weights."""
 
-    def __init__(self, num_actions: int, experts: Sequence[Prior | Mapping[str, Any]], share: float = 0.0) -> None:
+    def __init__(
+        self,
+        num_actions: int,
+        experts: Sequence[Prior | Mapping[str, Any]],
+        share: float = 0.0,
+        num_contexts: int | None = None,
+        context_size: int | None = None,
+    ) -> None:
         if not experts:
             raise ValueError("experts: at least one is expected")
         if not 0 <= share <= 1:
@@ -55,7 +63,8 @@ class MixturePrior(Prior):
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")
-        contexts = {(e.num_contexts, e.context_size) for e in made if e.takes_context} or {(None, None)}
+        given = {(num_contexts, context_size)} - {(None, None)}
+        contexts = given | {(e.num_contexts, e.context_size) for e in made if e.takes_context} or {(None, None)}
         if len(contexts) > 1:
             raise ValueError(f"experts: those with a context must have the same, not {sorted(map(str, contexts))}")
         super().__init__(num_actions, *contexts.pop())
@@ -66,7 +75,7 @@ class MixturePrior(Prior):
     @property
     def config(self) -> dict[str, Any]:
         experts = [{"prior": type(e).__name__, "config": e.config} for e in self._experts()]
-        return {"num_actions": self.num_actions, "experts": experts}
+        return super().config | {"experts": experts}
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -89,15 +98,14 @@ class MixturePrior(Prior):
         if len(state) == 0:
             return torch.zeros(0, self.num_actions, device=self.device), state
         weights, forecasts, *states = unpack(state, 2 + len(self.experts))
-        taken = forecasts.gather(2, action.long()[:, None, None].expand(-1, forecasts.shape[1], 1))[..., 0]
         found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
-        return self._mixed(self._after(weights, taken), found)
+        return self._mixed(after(weights, taken_of(forecasts, action), self.first, self.share), found)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
         forecasts = self._forecasts(plans, context)
-        weights = self._weights(_taken(forecasts, plans))
+        weights = weights_before(taken_of(forecasts, plans), self.first, self.share)
         return (weights[..., None] + forecasts).logsumexp(2)
 
     @property
@@ -112,7 +120,7 @@ class MixturePrior(Prior):
         Args:
             plans: `Plans`, or integers `[N, L]` for plans without context.
             generator: draws the held-out plans, and is passed on to the experts.
-            settings: `validation`, the share of the plans on which the weights are learned; it and all others, see
+            settings: `validation`, the `Plans` that are held out, or their share of the plans; it and all others, see
                 `neuroprior.training.Settings`, are passed on to the experts that have them.
 
         Raises:
@@ -121,44 +129,30 @@ class MixturePrior(Prior):
         self.check_settings(settings)
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
-        plans = divisible(plans)
-        learned, held_out = plans.split(settings.get("validation", VALIDATION), generator)
-        for expert in self._experts():
-            known = {name: value for name, value in settings.items() if name in expert.fit_settings}
-            expert.fit(learned, generator=generator, **known)
+        learned, held_out = divided(plans, settings.pop("validation", None), generator)
+        self.fit_experts(learned, held_out, generator, settings)
         self.learn_weights(held_out)
-        self._count(plans)
-        return self
+        return self.recount(plans)
 
-    def _count(self, plans: Plans) -> None:
-        """Fit the experts that count anew, those of mixtures among the experts as well."""
+    def fit_experts(
+        self, learned: Plans, held_out: Plans, generator: torch.Generator, settings: Mapping[str, Any]
+    ) -> None:
+        """Fit each expert to `learned`; networks are stopped early by `held_out`."""
         for expert in self._experts():
-            if isinstance(expert, MixturePrior):
-                expert._count(plans)
-            elif not expert.fit_settings:
-                expert.fit(plans)
+            known = {"validation": held_out, **settings}
+            known = {name: value for name, value in known.items() if name in expert.fit_settings}
+            expert.fit(learned, generator=generator, **known)
+
+    def recount(self, plans: Plans) -> Self:
+        for expert in self._experts():
+            expert.recount(plans)
+        return self
 
     @torch.no_grad()
     def learn_weights(self, plans: Plans) -> None:
         """Learn the initial weights, and which of `SHARES` is best, from plans that the experts did not learn from."""
-        mask = plans.mask()
-        taken = _taken(self._forecasts(plans.actions, plans.context), plans.actions)
-        best = (float("-inf"), self.first, self.share)
-        for share in SHARES:
-            self.share, self.first = share, torch.full_like(self.first, 1 / len(self.first)).log()
-            for _ in range(STEPS):
-                joint = self._weights(taken) + taken
-                total = joint.logsumexp(-1)[mask].sum()
-                if float(total) > best[0]:
-                    best = (float(total), self.first, share)
-                # The posterior of the expert: of each action, or without a share of the whole plan.
-                after = (joint.softmax(-1) if share else self._last(taken, mask).unsqueeze(1))[mask if share else ...]
-                self.first = after.reshape(-1, len(self.first)).mean(0).clamp(min=1e-6).log().log_softmax(-1)
-        _, self.first, self.share = best
-
-    def _last(self, taken: Tensor, mask: Tensor) -> Tensor:
-        """`[N, E]`: the weights at the end of each plan, without a share."""
-        return (self.first + taken.masked_fill(~mask[..., None], 0).sum(1)).softmax(-1)
+        taken = taken_of(self._forecasts(plans.actions, plans.context), plans.actions)
+        self.first, self.share = learned_weights(taken, plans.mask())
 
     def _experts(self) -> list[Prior]:
         return [e for e in self.experts if isinstance(e, Prior)]
@@ -167,27 +161,82 @@ class MixturePrior(Prior):
         """`[N, L, E, A]`: the log-probabilities of each expert."""
         return torch.stack([e(plans, context_for(e, context)).log_softmax(-1) for e in self._experts()], 2)
 
-    def _weights(self, taken: Tensor) -> Tensor:
-        """The logarithms of the weights before each action, from those of its probabilities: both `[N, L, E]`."""
-        weights = [self.first.expand(len(taken), -1)]
-        for t in range(taken.shape[1] - 1):
-            weights.append(self._after(weights[-1], taken[:, t]))
-        return torch.stack(weights, 1)
-
-    def _after(self, weights: Tensor, taken: Tensor) -> Tensor:
-        """The weights `[N, E]` after an action whose log-probabilities were `taken [N, E]`."""
-        after = (weights + taken).log_softmax(-1)
-        if self.share == 0:
-            return after
-        return (after.exp() * (1 - self.share) + self.first.exp() * self.share).log()
-
     def _mixed(self, weights: Tensor, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
         forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in found], 1)
         logits = (weights[..., None] + forecasts).logsumexp(1)
         return logits, pack([weights, forecasts, *(state for _, state in found)])
 
 
-def _taken(forecasts: Tensor, plans: Tensor) -> Tensor:
-    """`[N, L, E]`: of log-probabilities `[N, L, E, A]`, those of the actions of `plans [N, L]`."""
-    index = plans.long()[:, :, None, None].expand(-1, -1, forecasts.shape[2], 1)
-    return forecasts.gather(3, index)[..., 0]
+def taken_of(forecasts: Tensor, actions: Tensor) -> Tensor:
+    """`[..., E]`: of log-probabilities `[..., E, A]`, those of `actions [...]`."""
+    index = actions.long()[..., None, None].expand(*forecasts.shape[:-1], 1)
+    return forecasts.gather(-1, index)[..., 0]
+
+
+def after(weights: Tensor, taken: Tensor, first: Tensor, share: float) -> Tensor:
+    """The logarithms of the weights after an action whose log-probabilities were `taken`; all `[..., E]`.
+
+    Args:
+        weights: before the action, normalised.
+        taken: of the action, by each expert.
+        first: `[E]`, the initial weights.
+        share: of all weight that is redistributed as these.
+    """
+    new = (weights + taken).log_softmax(-1)
+    return new if share == 0 else (new.exp() * (1 - share) + first.exp() * share).log()
+
+
+def weights_before(taken: Tensor, first: Tensor, share: float) -> Tensor:
+    """The logarithms of the weights before each action, from those of its probabilities: both `[N, L, E]`."""
+    if share == 0:
+        before = nn.functional.pad(taken, (0, 0, 1, 0))[:, :-1].cumsum(1)
+        return (first + before).log_softmax(-1)
+    weights = [first.expand(len(taken), -1)]
+    for t in range(taken.shape[1] - 1):
+        weights.append(after(weights[-1], taken[:, t], first, share))
+    return torch.stack(weights, 1)
+
+
+def learned_weights(taken: Tensor, mask: Tensor, steps: int = STEPS) -> tuple[Tensor, float]:
+    """The initial weights and the share, one of `SHARES`, under which plans are likeliest: by expectation maximisation.
+
+    Args:
+        taken: `[N, L, E]`, the log-probability of each action under each expert.
+        mask: `[N, L]` bool: the actions that count.
+        steps: of expectation maximisation, for each share.
+
+    Returns:
+        The logarithms of the weights `[E]`, and the share.
+    """
+    even = torch.full_like(taken[0, 0], 1 / taken.shape[-1]).log()
+    best = (float("-inf"), even, 0.0)
+    for share in SHARES:
+        first = even
+        for _ in range(steps):
+            joint = weights_before(taken, first, share) + taken
+            total = float(joint.logsumexp(-1)[mask].sum())
+            if total > best[0]:
+                best = (total, first, share)
+            # The posterior of the expert: of each action, or without a share of the whole plan.
+            whole = first + taken.masked_fill(~mask[..., None], 0).sum(1)
+            posterior = joint.softmax(-1)[mask] if share else whole.softmax(-1)
+            first = posterior.mean(0).clamp(min=1e-6).log().log_softmax(-1)
+    return best[1], best[2]
+
+
+def divided(plans: Plans, validation: Plans | float | None, generator: torch.Generator) -> tuple[Plans, Plans]:
+    """The plans that experts learn from, and those on which networks are stopped and weights are learned.
+
+    Groups stay together where there are so many that few actions are lost.
+
+    Raises:
+        ValueError: there are too few plans.
+    """
+    if isinstance(validation, Plans):
+        return plans, validation
+    plans = plans[plans.mask().any(1)]
+    if validation is None:
+        validation = min(MOST, max(LARGEST / max(int(plans.mask().sum()), 1), LEAST))
+    if plans.group is not None and 1 / len(plans.group.unique()) > 2 * validation:
+        plans = replace(plans, group=None, group_names=None)
+    return plans.split(validation, generator)

@@ -143,11 +143,23 @@ class StackedPrior(Prior):
         if len(learned) < FEWEST_UNITS:
             raise ValueError("plans: at least two plans with an action are needed to train a stacked prior")
         learned = divisible(learned)
-        context = self._each_step(learned.actions, learned.context)
-        features = self._all_features(self._forecasts(learned, generator), learned.actions, context)
-        stacked = replace(learned, context=features, context_names=None)
+        stacked = self._stacked(learned, self._forecasts(learned, generator))
+        self.recount(plans)
+        if isinstance(held_out := settings.get("validation"), Plans):
+            held_out = self.training_plans(held_out)
+            with torch.no_grad():
+                forecasts = [e(held_out.actions, context_for(e, held_out.context)) for e in self._experts()]
+            settings = settings | {"validation": self._stacked(held_out, torch.stack(forecasts, 2))}
         self.mixer.fit(stacked, generator=generator, **settings)
         self.mixer.window = None  # its hidden state is carried on without limit
+        return self
+
+    def _stacked(self, plans: Plans, forecasts: Tensor) -> Plans:
+        """The plans as the network reads them, from forecasts `[N, L, E, A]` of their actions."""
+        features = self._all_features(forecasts, plans.actions, self._each_step(plans.actions, plans.context))
+        return replace(plans, context=features, context_names=None)
+
+    def recount(self, plans: Plans) -> Self:
         for expert in self._experts():
             expert.fit(plans)
         return self

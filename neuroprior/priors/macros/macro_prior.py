@@ -10,7 +10,7 @@ from neuroprior._checks import check_sizes
 from neuroprior._hashing import row_hashes
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
-from neuroprior.priors.macros.macros import CRITERIA, Criterion, Macro, learn_macros
+from neuroprior.priors.macros.macros import CRITERIA, Criterion, Macro, macros_of
 from neuroprior.priors.prior import Prior
 
 
@@ -107,9 +107,11 @@ class MacroPrior(Prior):
         """
         self.check_settings(settings)
         given = plans if isinstance(plans, Plans) else Plans(torch.as_tensor(plans), self.num_actions)
-        macros, recoded = learn_macros(given, self.num_macros, self.by)  # raises before anything is changed
+        held_out = [some for some in (settings.get("validation"),) if isinstance(some, Plans)]
+        macros, recoded = macros_of(given, self.num_macros, self.by, *held_out)  # raises before anything is changed
         self.training_plans(given)
-        self._inner().fit(recoded, generator=generator, **settings)
+        settings |= {"validation": recoded[1]} if held_out else {}
+        self._inner().fit(recoded[0], generator=generator, **settings)
         self._set_macros(macros)
         return self
 

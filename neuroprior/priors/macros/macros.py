@@ -56,34 +56,43 @@ def learn_macros(plans: Plans, num_macros: int, by: Criterion = "count") -> tupl
     Raises:
         ValueError: an argument is out of range, or the plans have an end symbol.
     """
+    macros, (recoded,) = macros_of(plans, num_macros, by)
+    return macros, recoded
+
+
+def macros_of(plans: Plans, num_macros: int, by: Criterion, *others: Plans) -> tuple[list[Macro], list[Plans]]:
+    """As `learn_macros`; other plans, from which no macros are learned, are recoded as well."""
     check_sizes(num_macros=num_macros)
     if by not in CRITERIA:
         raise ValueError(f"by: one of {', '.join(map(repr, CRITERIA))} is expected, not {by!r}")
-    if plans.end is not None:
+    if any(some.end is not None for some in (plans, *others)):
         raise ValueError("plans: an end symbol cannot be part of a macro; learn from plans without one")
-    symbols = plans.actions.long().masked_fill(~plans.mask(), -1)
+    symbols = [some.actions.long().masked_fill(~some.mask(), -1) for some in (plans, *others)]
     meaning: list[tuple[int, ...]] = [(action,) for action in range(plans.num_actions)]
     macros: list[Macro] = []
-    while len(macros) < num_macros and (best := _best_pair(symbols, len(meaning), by)) is not None:
+    while len(macros) < num_macros and (best := _best_pair(symbols[0], len(meaning), by)) is not None:
         first, second, gain = best
-        starts = _occurrences(symbols)
-        starts &= (symbols[:, :-1] == first) & (symbols[:, 1:] == second)
-        symbols = _replaced(symbols, starts, len(meaning))
+        starts = [_occurrences(some, first, second) for some in symbols]
+        symbols = [_replaced(some, begin, len(meaning)) for some, begin in zip(symbols, starts, strict=True)]
         meaning.append(meaning[first] + meaning[second])
-        macros.append(Macro(meaning[-1], int(starts.sum()), gain))
-    lengths = (symbols >= 0).sum(1)
-    longest = int(lengths.max()) if len(lengths) else 0
-    actions = symbols[:, :longest].clamp(min=0)
-    return macros, Plans(actions, plans.num_actions + num_macros, lengths, group=plans.group)
+        macros.append(Macro(meaning[-1], int(starts[0].sum()), gain))
+    recoded = []
+    for some, found in zip((plans, *others), symbols, strict=True):
+        lengths = (found >= 0).sum(1)
+        longest = int(lengths.max()) if len(lengths) else 0
+        actions = found[:, :longest].clamp(min=0)
+        recoded.append(Plans(actions, plans.num_actions + num_macros, lengths, group=some.group))
+    return macros, recoded
 
 
-def _occurrences(symbols: Tensor) -> Tensor:
-    """Where pairs begin, `[N, L - 1]`; of overlapping pairs of equal symbols, every other one."""
+def _occurrences(symbols: Tensor, one: int | None = None, two: int | None = None) -> Tensor:
+    """Where pairs, or the pair (one, two), begin: `[N, L - 1]`; of overlapping pairs of equals, every other one."""
     first, second = symbols[:, :-1], symbols[:, 1:]
     same = first == second
     place = torch.arange(first.shape[1], device=symbols.device).expand_as(first)
     run = torch.where(same, -1, place).cummax(1).values if first.shape[1] else place
-    return (second >= 0) & (~same | ((place - run) % 2 == 1))
+    begins: Tensor = (second >= 0) & (~same | ((place - run) % 2 == 1))
+    return begins if one is None else begins & (first == one) & (second == two)
 
 
 def _best_pair(symbols: Tensor, kinds: int, by: Criterion) -> tuple[int, int, float] | None:

@@ -1,7 +1,7 @@
 """The base of the neural priors: inputs, the window beyond the training length, and fitting."""
 
 from abc import abstractmethod
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Self
 
 import torch
@@ -215,6 +215,8 @@ class NeuralPrior(Prior):
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
         how = Settings(**settings)
+        if isinstance(how.validation, Plans):
+            how = replace(how, validation=self.training_plans(how.validation))
         plans = self.prepare(plans, how.window)
         train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
         return self

@@ -1,0 +1,103 @@
+"""The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
+
+from collections.abc import Iterator, Mapping
+from math import inf
+from typing import Any, Literal
+
+import torch
+
+from neuroprior._random import draw_seed
+from neuroprior.plans import Plans
+from neuroprior.priors.counts import ContextTreePrior, MarkovPrior, TooLargeError, chains
+from neuroprior.priors.ensembles.stacked import StackedPrior
+from neuroprior.priors.neural import GRUPrior, TransformerPrior
+from neuroprior.priors.prior import Prior, construct
+from neuroprior.priors.uniform import UniformPrior
+
+Effort = Literal["fast", "standard", "full"]
+"""What is spent: "fast" trains a GRU beside what counts, "standard" a stacked prior as well, "full" two GRUs and a
+transformer as well."""
+
+NETWORKS: dict[Effort, tuple[type[Prior], ...]] = {
+    "fast": (GRUPrior,),
+    "standard": (GRUPrior, StackedPrior),
+    "full": (GRUPrior, StackedPrior, TransformerPrior, GRUPrior),
+}
+"""The experts that are trained, in this order."""
+
+ORDERS = range(7)
+"""Orders of the Markov chains that are tried; the best is an expert."""
+
+DEPTH = 10
+"""Depth of context trees."""
+
+
+def fitted_experts(
+    learned: Plans,
+    held_out: Plans,
+    contexts: dict[str, int],
+    effort: Effort,
+    generator: torch.Generator,
+    settings: Mapping[str, Any],
+) -> Iterator[Prior]:
+    """Experts of every kind, fitted one after the other.
+
+    Args:
+        learned: plans to learn from.
+        held_out: plans on which orders of chains are chosen, and networks are stopped.
+        contexts: `num_contexts` or `context_size`, as experts take it that can, or none.
+        effort: which networks are trained.
+        generator: draws their initial weights and the order of training.
+        settings: of their training.
+    """
+    yield from counted(learned, held_out, contexts)
+    for prior in networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31):
+        yield prior.fit(learned, generator=generator, **{"validation": held_out, **settings})
+
+
+def networks(num_actions: int, contexts: dict[str, int], effort: Effort, seed: int) -> list[Prior]:
+    """The experts of `NETWORKS`, not trained yet, with the context where they can take it."""
+    kinds = enumerate(NETWORKS[effort])
+    return [construct(kind, num_actions, contexts | {"seed": seed + number}) for number, kind in kinds]
+
+
+def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterator[Prior]:
+    """The experts that count, fitted to `learned`: a uniform prior, and a chain and a context tree of each context.
+
+    Args:
+        learned: plans to count in.
+        held_out: plans on which the orders and back-offs of chains are chosen.
+        contexts: `num_contexts`, for priors that take an index and as many that do not; features cannot be counted.
+    """
+    num_contexts = contexts.get("num_contexts")
+    yield UniformPrior(learned.num_actions).fit(learned)
+    for number in [None] if num_contexts is None else [None, num_contexts]:
+        found = best_chain(learned, held_out, number)
+        if found is not None:
+            yield found
+        try:
+            yield ContextTreePrior(learned.num_actions, DEPTH, num_contexts=number).fit(learned)
+        except TooLargeError:
+            continue
+
+
+@torch.no_grad()
+def best_chain(learned: Plans, held_out: Plans, num_contexts: int | None) -> MarkovPrior | None:
+    """The Markov chain, of `ORDERS` and all back-offs, under which held-out plans are likeliest; None: all too large.
+
+    Args:
+        learned: plans to count in.
+        held_out: plans to choose on.
+        num_contexts: of the chain's context, or None.
+    """
+    best: tuple[float, MarkovPrior | None] = (inf, None)
+    plain = held_out.without_context()
+    try:
+        for order in ORDERS:
+            for prior in chains(learned, order, num_contexts):
+                loss = -float(prior.log_prob(held_out if prior.takes_context else plain).sum())
+                if loss < best[0]:
+                    best = (loss, prior)
+    except TooLargeError:
+        pass  # those of higher order are larger still
+    return best[1]

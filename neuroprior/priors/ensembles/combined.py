@@ -1,0 +1,310 @@
+"""The combined prior: experts of every kind, weighted so that it is hardly ever behind the best of them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neuroprior._random import generator_on
+from neuroprior.plans import Plans
+from neuroprior.priors.ensembles.candidates import NETWORKS, Effort, fitted_experts, networks
+from neuroprior.priors.ensembles.mixture import MixturePrior, after, divided, learned_weights, taken_of, weights_before
+from neuroprior.priors.ensembles.packing import pack, unpack
+from neuroprior.priors.ensembles.stacked import context_for
+from neuroprior.priors.prior import Prior
+from neuroprior.priors.uniform import UniformPrior
+
+LEAST = -30.0
+"""Log-probabilities of experts are at least this in the pool."""
+
+TOLERANCE = 5e-4
+"""An expert is left out where the held-out loss rises by less than so many nats per action."""
+
+NUMBERS = 2**22
+"""At most so many forecasts are looked at to learn the powers of the pool."""
+
+RIDGE = 1.0
+"""Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean."""
+
+STEPS, TRACKING_STEPS = 100, 5
+"""Steps of expectation maximisation, which learns the initial weights; of the fixed share for each share tried."""
+
+MOST_STEPS = 500
+"""Actions of each plan from which the fixed share is learned."""
+
+
+class CombinedPrior(MixturePrior):
+    """Experts of every kind as one prior, which is hardly ever behind the best of them.
+
+    The experts are priors that count (uniform, Markov chains and context trees, with and without the context) and
+    networks. Of their forecasts p_e, three kinds of forecast are mixed:
+
+    - each expert's own;
+    - the pool, proportional to the product of all p_e ** power_e (the logarithmic opinion pool: Genest and Zidek 1986;
+      products of experts: Hinton 2002), whose powers are learned on held-out plans;
+    - where it predicts held-out plans better, a mixture of these with fixed share (Herbster and Warmuth 1998), in
+      which another expert may be best later on.
+
+    Their weights follow Bayes' rule, from initial weights that are learned on held-out plans. None of these is below
+    1 / K, where K forecasts were tried: on every sequence whatever, the negative log-likelihood is at most log K above
+    that of the best of those that are kept (Cesa-Bianchi and Lugosi 2006, section 9.2). An expert is left out where
+    held-out plans are predicted as well without it.
+
+    Args:
+        num_actions: A.
+        experts: priors that `fit` then fits and combines; None: those that suit the plans.
+        share: of the fixed share; set by `fit`.
+        num_contexts, context_size: see `Prior`.
+
+    Raises:
+        ValueError: an argument is out of range, or experts that differ in their actions or contexts.
+    """
+
+    powers: Tensor
+    """`[E]`: those of the experts in the pool."""
+
+    tracking: Tensor
+    """`[E + 1]`: the logarithms of the initial weights of experts and pool in the fixed share; empty without it."""
+
+    actions_at_once = 2**16
+
+    def __init__(
+        self,
+        num_actions: int,
+        experts: Sequence[Prior | Mapping[str, Any]] | None = None,
+        share: float = 0.0,
+        num_contexts: int | None = None,
+        context_size: int | None = None,
+    ) -> None:
+        made = [UniformPrior(num_actions)] if experts is None else experts
+        super().__init__(num_actions, made, share, num_contexts, context_size)
+        self.given = experts is not None
+        self.tried = 0
+        self._allocate()
+
+    def _allocate(self) -> None:
+        """Even weights, for as many forecasts as there are to mix."""
+        size, anchor = len(self.experts), self._anchor
+        assert isinstance(anchor, Tensor)
+        self.register_buffer("powers", anchor.new_full((size,), 1 / size))
+        self.register_buffer("tracking", anchor.new_zeros(size + 1 if self.share else 0).log_softmax(-1))
+        self.register_buffer("first", anchor.new_zeros(size + 1 + (self.share > 0)).log_softmax(-1))
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return super().learned | {"tried": self.tried}
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
+        if not isinstance(learned["tried"], int) or learned["tried"] < 0:
+            raise ValueError(f"tried: an integer of at least 0 is expected, not {learned['tried']!r}")
+        self.tried = learned["tried"]
+        self._allocate()
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        found = [e.start(batch_size, context_for(e, context)) for e in self._experts()]
+        return self._mixed_now(self.first.expand(batch_size, -1), self.tracking.expand(batch_size, -1), found)
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        if len(state) == 0:
+            return torch.zeros(0, self.num_actions, device=self.device), state
+        weights, tracking, forecasts, *states = unpack(state, 3 + len(self.experts))
+        found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
+        taken = taken_of(forecasts, action)
+        weights = after(weights, taken, self.first, 0)
+        if self.share:
+            tracking = after(tracking, taken[:, :-1], self.tracking, self.share)
+        return self._mixed_now(weights, tracking, found)
+
+    def _mixed_now(
+        self, weights: Tensor, tracking: Tensor, found: list[tuple[Tensor, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
+        """The logits `[N, A]` and the state, from all weights and from what the experts returned."""
+        forecasts = with_pool(torch.stack([logits.log_softmax(-1) for logits, _ in found], 1), self.powers)
+        if self.share:
+            forecasts = torch.cat([forecasts, mixed(tracking, forecasts)[:, None]], 1)
+        return mixed(weights, forecasts), pack([weights, tracking, forecasts, *(state for _, state in found)])
+
+    def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
+        if plans.shape[1] == 0:
+            return torch.zeros(*plans.shape, self.num_actions, device=self.device)
+        forecasts = with_pool(self._forecasts(plans, context), self.powers)
+        if self.share:
+            tracking = weights_before(taken_of(forecasts, plans), self.tracking, self.share)
+            forecasts = torch.cat([forecasts, mixed(tracking, forecasts)[:, :, None]], 2)
+        return mixed(weights_before(taken_of(forecasts, plans), self.first, 0), forecasts)
+
+    @property
+    def fit_settings(self) -> tuple[str, ...]:
+        trained = self._experts() if self.given else networks(self.num_actions, {}, "full", 0)
+        own = ["validation"] if self.given else ["effort", "validation"]
+        return tuple(dict.fromkeys([*own, *(name for e in trained for name in e.fit_settings)]))
+
+    def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+        """Fit the experts; learn on plans held out from them which are kept, and how they are combined; returns self.
+
+        What counts learns from all plans in the end.
+
+        Args:
+            plans: `Plans`, or integers `[N, L]` for plans without context.
+            generator: draws the held-out plans and the seeds of networks, and is passed on to the experts.
+            settings: `effort`, "fast", "standard" (default) or "full": which networks are trained, see
+                `neuroprior.priors.ensembles.candidates`; `validation`: `Plans` that are held out, or their share. It
+                and all others, see `neuroprior.training.Settings`, are passed on to the experts that have them.
+
+        Raises:
+            ValueError: plans that the experts cannot learn from, too few of them, or an unknown setting.
+        """
+        self.check_settings(settings)
+        effort: Effort = settings.pop("effort", "standard")
+        if effort not in NETWORKS:
+            raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
+        plans = self.training_plans(plans)
+        generator = generator_on(generator, "cpu")
+        learned, held_out = divided(plans, settings.pop("validation", None), generator)
+        if self.given:
+            self.fit_experts(learned, held_out, generator, settings)
+        else:
+            sizes = {"num_contexts": self.num_contexts, "context_size": self.context_size}
+            contexts = {name: size for name, size in sizes.items() if size is not None}
+            made = fitted_experts(learned, held_out, contexts, effort, generator, settings)
+            self.experts = nn.ModuleList(made).to(self.device)
+        self.learn_weights(held_out)
+        return self.recount(plans)
+
+    @torch.no_grad()
+    def learn_weights(self, plans: Plans) -> None:
+        """Learn from plans that the experts did not learn from which of them are kept, and how they are combined."""
+        actions, mask, plain = plans.actions, plans.mask(), plans.without_context()
+        forecasts = [
+            torch.cat([log_probs for _, log_probs in e.forecasts(plans if e.takes_context else plain)])
+            for e in self._experts()
+        ]
+        held_out = HeldOut(torch.stack(forecasts, 2), actions, mask)
+        kept, powers = held_out.choose([sum(weight.numel() for weight in e.parameters()) for e in self._experts()])
+        members = with_pool(held_out.forecasts[:, :, kept], powers)
+        taken = taken_of(members, actions).masked_fill(~mask[..., None], 0)
+        early = slice(0, MOST_STEPS)
+        tracking, share = learned_weights(taken[:, early], mask[:, early], TRACKING_STEPS)
+        if share:
+            tracked = taken_of(mixed(weights_before(taken, tracking, share), members)[:, :, None], actions)
+            tracked = torch.cat([taken, tracked.masked_fill(~mask[..., None], 0)], 2)
+            if held_out.loss(tracked) > held_out.loss(taken) - held_out.tolerance:
+                share = 0.0
+        self.experts = nn.ModuleList([self._experts()[number] for number in kept])
+        self.share, self.tried = share, held_out.tried
+        self._allocate()
+        self.powers = powers.float()
+        if share:
+            self.tracking, taken = tracking, tracked
+        self.first = held_out.initial_weights(taken.sum(1)).float()
+
+    @property
+    def bound(self) -> float:
+        """Nats by which the negative log-likelihood of any sequence is at most above that of the best expert here."""
+        return -float(self.first.min())
+
+
+class HeldOut:
+    """What experts forecast for held-out plans, and how they are best combined there.
+
+    Args:
+        forecasts: `[N, L, E, A]`, log-probabilities.
+        actions: `[N, L]`.
+        mask: `[N, L]` bool: the actions that count.
+    """
+
+    def __init__(self, forecasts: Tensor, actions: Tensor, mask: Tensor) -> None:
+        self.forecasts, self.actions, self.mask = forecasts, actions, mask
+        self.taken = taken_of(forecasts, actions).masked_fill(~mask[..., None], 0)
+        self.count = max(int(mask.sum()), 1)
+        self.tried = forecasts.shape[2] + 2
+        self.tolerance = max(TOLERANCE, 1 / self.count)
+        # Some actions, evenly spread, are enough for a few powers.
+        every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
+        self.some = forecasts[mask][::every].double().clamp(min=LEAST)
+        self.seen = actions[mask][::every].long()
+
+    def choose(self, costs: Sequence[int]) -> tuple[list[int], Tensor]:
+        """The experts that are kept, and their powers `[K]`, float64, in the pool.
+
+        One expert after the other is left out: the dearest of those without which no more than the tolerance is lost.
+
+        Args:
+            costs: of each expert, such as its number of weights. (Seconds differ from run to run, and so would what is
+                chosen.)
+        """
+        kept = list(range(len(costs)))
+        powers, best = self.combined(kept)
+        while len(kept) > 1:
+            found = []
+            for out in kept:
+                rest = [number for number in kept if number != out]
+                rest_powers, loss = self.combined(rest)
+                best = min(best, loss)
+                found.append((costs[out], loss, rest, rest_powers))
+            spared = [entry for entry in found if entry[1] <= best + self.tolerance]
+            if not spared:
+                break
+            # The dearest; among those that count, which cost the same, the one that is missed least.
+            _, _, kept, powers = max(spared, key=lambda entry: (entry[0], -entry[1]))
+        return kept, powers
+
+    def combined(self, kept: list[int]) -> tuple[Tensor, float]:
+        """The powers of some experts in their pool, and the loss of the mixture of these and the pool."""
+        powers = self.powers(self.some[:, kept])
+        pooled = with_pool(self.forecasts[:, :, kept], powers)[:, :, -1:]
+        taken = taken_of(pooled, self.actions).masked_fill(~self.mask[..., None], 0)
+        return powers, self.loss(torch.cat([self.taken[:, :, kept], taken], 2))
+
+    def powers(self, forecasts: Tensor) -> Tensor:
+        """The powers `[K]` of the pool under which some actions are likeliest, of `forecasts [M, K, A]`."""
+        from scipy.optimize import minimize  # takes a second to import: only where it is needed
+
+        size = forecasts.shape[1]
+
+        def loss(values: np.ndarray[Any, Any]) -> tuple[float, np.ndarray[Any, Any]]:
+            now = torch.tensor(values, device=forecasts.device)
+            log_probs = torch.einsum("mka,k->ma", forecasts, now).log_softmax(-1)
+            taken = log_probs.gather(1, self.seen[:, None]).sum()
+            # The gradient: what was forecast of the action taken, less what the pool expects.
+            chosen = forecasts.gather(2, self.seen[:, None, None].expand(-1, size, 1))[..., 0].sum(0)
+            slope = torch.einsum("mka,ma->k", forecasts, log_probs.exp()) - chosen
+            away = now - 1 / size
+            return float(RIDGE * (away**2).sum() - taken), (slope + 2 * RIDGE * away).cpu().numpy()
+
+        found = minimize(loss, np.full(size, 1 / size), jac=True, method="L-BFGS-B", bounds=[(0, None)] * size)
+        return torch.tensor(found.x, device=forecasts.device)
+
+    def loss(self, taken: Tensor) -> float:
+        """Nats per action of the Bayesian mixture of forecasts, from those of the actions taken, `[N, L, K]`."""
+        totals = taken.sum(1)
+        return -float((self.initial_weights(totals) + totals.double()).logsumexp(-1).sum()) / self.count
+
+    def initial_weights(self, totals: Tensor) -> Tensor:
+        """The logarithms `[K]` of the weights, of 1 / `tried` at least, under which plans are likeliest.
+
+        Args:
+            totals: `[N, K]`, the log-probability of each plan under each forecast.
+        """
+        totals, size = totals.double(), totals.shape[1]
+        least, free = 1 / self.tried, 1 - size / self.tried
+        share = totals.new_full((size,), 1 / size)
+        for _ in range(STEPS):
+            weights = least + free * share
+            earned = (weights.log() + totals).softmax(-1) * (free * share / weights)
+            share = earned.sum(0) / earned.sum().clamp(min=1e-300)
+        return (least + free * share).log().log_softmax(-1)
+
+
+def with_pool(forecasts: Tensor, powers: Tensor) -> Tensor:
+    """Log-probabilities `[..., E, A]`, and behind them their pool's, `[..., E + 1, A]`."""
+    pooled = torch.einsum("...ea,e->...a", forecasts.clamp(min=LEAST), powers.to(forecasts)).log_softmax(-1)
+    return torch.cat([forecasts, pooled[..., None, :]], -2)
+
+
+def mixed(weights: Tensor, forecasts: Tensor) -> Tensor:
+    """The log-probabilities `[..., A]` of a mixture of `forecasts [..., K, A]` with the weights' logarithms."""
+    return (weights[..., None] + forecasts).logsumexp(-2)

@@ -1,0 +1,255 @@
+"""The combined prior: its bound, the pool's powers, initial weights against a search, which experts are kept."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+import neuroprior
+from neuroprior import (
+    CombinedPrior,
+    ContextTreePrior,
+    GRUPrior,
+    MarkovPrior,
+    Plans,
+    Prior,
+    StackedPrior,
+    TransformerPrior,
+    UniformPrior,
+    load,
+    save,
+)
+from neuroprior.testing import check_prior
+from tests.support.sources import every_plan, seeded
+
+A, C = 3, 4
+QUICK = {"max_steps": 3, "progress": False}
+
+
+def some_plans(num: int = 60, length: int = 8, contexts: bool = False, seed: int = 0) -> Plans:
+    """Plans of a chain of order 1 that mostly goes on to the next action."""
+    steps = torch.multinomial(torch.tensor([0.1, 0.7, 0.2]), num * length, True, generator=seeded(seed))
+    context = torch.randint(C, (num, length), generator=seeded(seed + 1)) if contexts else None
+    return Plans(steps.view(num, length).cumsum(1) % A, A, context=context)
+
+
+def independent(probs: list[float]) -> MarkovPrior:
+    """A prior whose actions are independent, with these probabilities."""
+    prior = MarkovPrior(len(probs), 0, 1e-9)
+    prior.fit(torch.arange(len(probs)).repeat_interleave((torch.tensor(probs) * 10_000).round().long())[:, None])
+    return prior
+
+
+def drawn(probs: list[float], num: int = 400, length: int = 50, seed: int = 0) -> Plans:
+    actions = torch.multinomial(torch.tensor(probs), num * length, True, generator=seeded(seed))
+    return Plans(actions.view(num, length), len(probs))
+
+
+@cache
+def fitted() -> CombinedPrior:
+    experts = [UniformPrior(A), MarkovPrior(A, 1), ContextTreePrior(A, 3), GRUPrior(A, 8)]
+    prior = CombinedPrior(A, experts).fit(some_plans(200), generator=seeded(0), **QUICK)
+    assert isinstance(prior, CombinedPrior)
+    return prior
+
+
+def switching(num: int = 10) -> tuple[list[Prior], Plans]:
+    """Two experts, each sure of its own action, and plans in which now the one is right and now the other."""
+    experts: list[Prior] = [independent([0.9, 0.05, 0.05]), independent([0.05, 0.9, 0.05])]
+    turn = (torch.arange(40 * num).view(num, 40) // 10) % 2
+    noise = torch.multinomial(torch.tensor([0.9, 0.05, 0.05]), 40 * num, True, generator=seeded(2)).view(num, 40)
+    return experts, Plans(torch.where(noise > 0, noise + turn, turn) % A, A)
+
+
+@pytest.mark.parametrize("kind", ["plain", "contexts", "features", "tracking", "untrained"])
+def test_it_is_a_prior(kind):
+    if kind == "plain":
+        prior = fitted()
+    elif kind == "contexts":
+        experts = [MarkovPrior(A, 1, num_contexts=C), ContextTreePrior(A, 2), GRUPrior(A, 8, num_contexts=C)]
+        prior = CombinedPrior(A, experts).fit(some_plans(contexts=True), generator=seeded(0), **QUICK)
+    elif kind == "features":
+        plans = Plans(some_plans().actions, A, context=torch.randn(60, 8, 2, generator=seeded(1)))
+        prior = CombinedPrior(A, context_size=2).fit(plans, generator=seeded(0), effort="fast", **QUICK)
+    elif kind == "tracking":
+        experts, plans = switching()
+        prior = CombinedPrior(A, experts)
+        prior.learn_weights(plans)
+        assert prior.share > 0
+    else:
+        prior = CombinedPrior(A, num_contexts=C)
+    check_prior(prior, 3, 2000)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.lists(st.integers(0, A - 1), min_size=1, max_size=60), st.booleans())
+@torch.no_grad()
+def test_no_sequence_is_predicted_worse_than_by_the_best_expert_and_the_bound(sequence, tracks):
+    prior = fitted()
+    if tracks:
+        experts, plans = switching()
+        prior = CombinedPrior(A, experts)
+        prior.learn_weights(plans)
+    plan = torch.tensor([sequence])
+    best = max(float(expert.log_prob(plan)) for expert in prior.experts)
+    assert prior.bound <= math.log(prior.tried) + 1e-5
+    assert float(prior.log_prob(plan)) >= best - prior.bound - 1e-3
+
+
+@torch.no_grad()
+def test_a_plan_has_its_probability_in_the_mixture_of_experts_and_pool():
+    prior, plans = fitted(), every_plan(A, 4)
+    experts = torch.stack([e(plans).log_softmax(-1) for e in prior.experts])
+    pool = (prior.powers[:, None, None, None] * experts).sum(0).log_softmax(-1)
+    taken = torch.cat([experts, pool[None]]).gather(-1, plans.expand(len(prior.experts) + 1, -1, -1)[..., None])
+    by_hand = (prior.first.exp()[:, None] * taken[..., 0].sum(-1).exp()).sum(0)
+    assert prior.share == 0
+    assert prior.log_prob(plans).exp().allclose(by_hand, atol=1e-6)
+    assert float(by_hand.sum()) == pytest.approx(1, abs=1e-5)
+
+
+def test_powers_are_found_where_the_source_is_a_pool():
+    """Of 20,000 actions; the standard error of a power is below .02, and .1 a false alarm of 1e-6."""
+    one, two = [0.6, 0.3, 0.1], [0.1, 0.3, 0.6]
+    product = torch.tensor(one) * torch.tensor(two)
+    for probs, experts, expected in (
+        (product / product.sum(), [one, two], [1.0, 1.0]),
+        (torch.tensor(one).sqrt() / torch.tensor(one).sqrt().sum(), [one], [0.5]),
+    ):
+        prior = CombinedPrior(A, [independent(p) for p in experts])
+        prior.learn_weights(drawn(probs.tolist()))
+        assert prior.powers.tolist() == pytest.approx(expected, abs=0.1)
+
+
+def test_initial_weights_are_the_likeliest_that_are_at_least_even_over_what_was_tried():
+    """Against a search over weights, for plans of which most are of one expert."""
+    experts: list[Prior] = [independent([0.8, 0.1, 0.1]), independent([0.1, 0.8, 0.1])]
+    plans = Plans(torch.cat([drawn([0.8, 0.1, 0.1], 300, 6).actions, drawn([0.1, 0.8, 0.1], 60, 6, 1).actions]), A)
+    prior = CombinedPrior(A, experts)
+    prior.learn_weights(plans)
+    assert len(prior.experts) == 2
+    pool = torch.stack([e(plans.actions).log_softmax(-1) for e in prior.experts])
+    pool = torch.cat([pool, (prior.powers[:, None, None, None] * pool).sum(0, keepdim=True).log_softmax(-1)])
+    totals = pool.gather(-1, plans.actions.expand(3, -1, -1)[..., None].long())[..., 0].sum(-1).T.double().numpy()
+
+    def loss(weights: np.ndarray) -> float:
+        return -float(np.log(np.exp(totals) @ weights).sum())
+
+    least = 1 / prior.tried
+    total = {"type": "eq", "fun": lambda weights: weights.sum() - 1}
+    found = minimize(loss, np.full(3, 1 / 3), bounds=[(least, 1)] * 3, constraints=total)
+    assert prior.first.exp().tolist() == pytest.approx(found.x.tolist(), abs=5e-3)
+
+
+def test_experts_that_add_nothing_are_left_out():
+    class Dear(MarkovPrior):
+        def __init__(self, *args):
+            super().__init__(*args)
+            self.spare = torch.nn.Parameter(torch.zeros(1000))
+
+    plans = some_plans(400)
+    quick, dear = MarkovPrior(A, 1).fit(plans), Dear(A, 1).fit(plans)
+    prior = CombinedPrior(A, [UniformPrior(A), dear, quick, MarkovPrior(A, 0).fit(plans)])
+    prior.learn_weights(some_plans(400, seed=5))
+    assert list(prior.experts) == [quick]
+    assert prior.tried == 6
+
+
+def test_experts_of_different_plans_are_both_kept():
+    """The pool of two experts, of which each is right in half of the plans, is right in none."""
+    one, two = independent([0.8, 0.1, 0.1]), independent([0.1, 0.8, 0.1])
+    plans = Plans(torch.cat([drawn([0.8, 0.1, 0.1], 200, 20).actions, drawn([0.1, 0.8, 0.1], 200, 20, 1).actions]), A)
+    prior = CombinedPrior(A, [one, two, UniformPrior(A)])
+    prior.learn_weights(plans)
+    assert {id(one), id(two)} <= set(map(id, prior.experts))
+    with torch.no_grad():
+        assert float(prior.log_prob(plans).mean()) > max(float(e.log_prob(plans).mean()) for e in (one, two)) + 1
+
+
+@torch.no_grad()
+def test_where_the_best_expert_changes_it_follows():
+    experts, plans = switching()
+    prior = CombinedPrior(A, experts)
+    prior.learn_weights(plans)
+    _, new = switching(20)
+    assert 0 < prior.share < 1
+    assert float(prior.log_prob(new).mean()) > max(float(e.log_prob(new).mean()) for e in prior.experts) + 5
+
+
+def test_weights_are_learned_on_held_out_plans_and_counts_from_all():
+    """A chain of order 5 knows each training plan by heart; in the end it counts the held-out plans, too."""
+    plans = Plans(torch.randint(A, (60, 8), generator=seeded(0)), A)
+    training, held_out = plans[:45], plans[45:]
+    prior = CombinedPrior(A, [MarkovPrior(A, 5, backoff="dirichlet", smoothing=0.01), MarkovPrior(A, 0)])
+    prior.fit(training, validation=held_out)
+    assert [e.order for e in prior.experts if isinstance(e, MarkovPrior)] == [0]
+    again = CombinedPrior(A, [MarkovPrior(A, 0)]).fit(plans, generator=seeded(0))
+    assert again.experts[0].log_prob(plans).equal(MarkovPrior(A, 0).fit(plans).log_prob(plans))
+
+
+@pytest.mark.parametrize(
+    ("effort", "kinds"),
+    [
+        ("fast", {GRUPrior}),
+        ("standard", {GRUPrior, StackedPrior}),
+        ("full", {GRUPrior, StackedPrior, TransformerPrior}),
+    ],
+)
+def test_effort_says_which_networks_are_trained(effort, kinds, monkeypatch):
+    trained = []
+
+    def record(kind: type[Prior]) -> None:
+        fit = kind.fit
+
+        def recorded(self, plans, **how):
+            trained.append(kind)
+            return fit(self, plans, **how)
+
+        monkeypatch.setattr(kind, "fit", recorded)
+
+    for kind in (GRUPrior, StackedPrior, TransformerPrior):
+        record(kind)
+    prior = neuroprior.fit(some_plans(contexts=True), effort=effort, generator=seeded(0), **QUICK)
+    assert isinstance(prior, CombinedPrior)
+    assert prior.num_contexts == C
+    assert set(trained) == kinds
+
+
+def test_the_same_seed_gives_the_same_prior(tmp_path):
+    plans, found = some_plans(contexts=True), []
+    for seed in (3, 3, 4):
+        prior = neuroprior.fit(plans, generator=seeded(seed), effort="fast", **QUICK)
+        found.append(prior.log_prob(plans))
+    assert found[0].equal(found[1])
+    assert not found[0].equal(found[2])
+    assert load(save(prior, tmp_path / "combined")).log_prob(plans).equal(found[2])
+
+
+def test_a_share_is_saved_too(tmp_path):
+    experts, plans = switching()
+    prior = CombinedPrior(A, experts)
+    prior.learn_weights(plans)
+    again = load(save(prior, tmp_path / "combined"))
+    assert isinstance(again, CombinedPrior)
+    assert (again.share, again.tried) == (prior.share, prior.tried)
+    assert again.log_prob(plans).equal(prior.log_prob(plans))
+
+
+@pytest.mark.parametrize(
+    ("plans", "how", "word"),
+    [
+        (some_plans(), {"effort": "most"}, "effort: one of fast, standard, full is expected, not 'most'"),
+        (some_plans(), {"efort": "fast"}, "efort: not a setting"),
+        (some_plans(1, 1), {}, "cannot be split"),
+        (some_plans(), {"validation": 1.5}, "validation"),
+        (some_plans(), {"validation": Plans(torch.zeros(3, 3, dtype=torch.long), 7)}, "7 actions"),
+    ],
+)
+def test_what_cannot_be_fitted(plans, how, word):
+    with pytest.raises(ValueError, match=word):
+        neuroprior.fit(plans, **how)
