@@ -141,9 +141,7 @@ def test_actions_alone_are_plans_without_context(name):
         MarkovPrior(A, 1, num_contexts=C).log_prob(plans.actions)
 
 
-@pytest.mark.parametrize(
-    "name", ["uniform", "markov", "context-tree", "gru", "transformer", "stacked", "mixture", "combined"]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_fit_by_name(name):
     plans = plans_for(COUNTS["markov context"]())
     quick = QUICK if name in ("gru", "transformer", "stacked", "mixture", "combined") else {}
