@@ -32,6 +32,9 @@ LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 """What a checkpoint must hold for a training to go on from it."""
 
+DEFAULT = "combined"
+"""The recipe where plans are given and no other."""
+
 OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
 """Options of `--data` that other commands have, too."""
 
@@ -122,14 +125,20 @@ class FitCLI(LightningCLI):
     def instantiate_trainer(self, **more: Any) -> Trainer:
         """The trainer; its progress bar is for terminals."""
         bar = self.config.fit.trainer.enable_progress_bar and sys.stdout.isatty()
-        return super().instantiate_trainer(enable_progress_bar=bar, **more)
+        chosen = self.datamodule.settings
+        given = self.config.fit.trainer.patience
+        patience = chosen.patience if given is None else given
+        return super().instantiate_trainer(
+            enable_progress_bar=bar, max_steps=chosen.max_steps, patience=patience, **more
+        )
 
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
         neural, many = isinstance(model.prior, NeuralPrior), datamodule.folds > 1
         settings = {} if neural and not many else self._settings(model, datamodule)
         fresh = deepcopy(model.prior) if many else None
-        if neural:
+        if isinstance(model.prior, NeuralPrior):
+            model.prior.prepare(datamodule.learned_from, datamodule.settings.window)
             self._check_checkpoints(model, datamodule)
         if self.trainer.is_global_zero:
             self._keep(datamodule)
@@ -155,7 +164,7 @@ class FitCLI(LightningCLI):
                 hint = " in cross-validation; --data.folds 1 holds out a share of the plans instead" if neural else ""
                 raise ValueError(f"trainer.{name}: a {type(prior).__name__} is trained with {default} alone{hint}")
         prior.to(self.trainer.strategy.root_device)
-        settings = asdict(data.settings) | {
+        settings = asdict(data.given) | {
             "learning_rate": model.learning_rate,
             "weight_decay": model.weight_decay,
             "gradient_clip": trainer.gradient_clip_val,
@@ -173,7 +182,7 @@ class FitCLI(LightningCLI):
         if epoch >= data.epochs:
             raise ValueError(
                 f"trainer.max_steps: the run in {self.folder} has made more steps than"
-                f" {self.config.fit.trainer.max_steps} already"
+                f" {data.settings.max_steps} already"
             )
 
     def _keep(self, data: PlansData) -> None:
@@ -187,8 +196,6 @@ class FitCLI(LightningCLI):
         write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
 
     def _train(self, model: PriorModel, data: PlansData) -> None:
-        assert isinstance(model.prior, NeuralPrior)
-        model.prior.prepare(data.learned_from, data.settings.window)
         last = self.folder / LAST
         with self._saying_how_to_go_on(lambda: f"saved up to step {model.curve[-1]['step']}" if model.curve else ""):
             run_training(self.trainer, model, data, last if last.exists() else None)
@@ -223,7 +230,16 @@ def _check(checkpoint: Path, model: PriorModel) -> dict[str, Any]:
 
 
 def _in_full(arguments: list[str]) -> list[str]:
-    """The arguments, with the paths of recipes that are given by name, and the sections of short options."""
+    """The arguments, with the paths of recipes that are given by name, and the sections of short options.
+
+    The first argument may be the file of plans. With plans and no recipe, the recipe is that of the combined prior.
+    """
+    if arguments[:1] == ["fit"]:
+        if len(arguments) > 1 and not arguments[1].startswith("-"):
+            arguments = ["fit", "--data.file", *arguments[1:]]
+        known = ("--config", "-c", "--model", "--resume", "--help", "-h", "--print_config")
+        if any(a.startswith("--data.file") for a in arguments) and not any(a.startswith(known) for a in arguments):
+            arguments = ["fit", "--config", DEFAULT, *arguments[1:]]
     out: list[str] = []
     for argument in arguments:
         if out and out[-1] in ("--config", "-c"):
@@ -243,8 +259,8 @@ def _with_saved_config(arguments: list[str], program: str) -> list[str]:
         sources = ("--config", "-c", "--model", "--help", "-h", "--print_config")
         if arguments[:1] == ["fit"] and not any(argument.startswith(sources) for argument in arguments):
             raise ValueError(
-                f"{program} fit: give --config and a recipe ({', '.join(recipes())}, or a file), or --resume and the"
-                " folder of a run"
+                f"{program} fit: give a file of plans, --config and a recipe ({', '.join(recipes())}, or a file), or"
+                " --resume and the folder of a run"
             )
         return arguments
     place = Path(folder)

@@ -41,7 +41,7 @@ def cross_validated(
         ValueError: plans of a fold that cannot be learned from.
         KeyboardInterrupt: finished folds are kept.
     """
-    share = data.settings.validation
+    share = data.given.validation
     assert isinstance(share, float)
     fit = partial(_fit_and_score, prior, dict(settings), data.plans, data.folds, data.seed, share, num_contexts)
     asked = {"plans": plans_digest(data.plans), "prior": repr(prior), "settings": dict(settings), "seed": data.seed}

@@ -78,11 +78,12 @@ class PlansData(PlansModule):
         folds: of a cross-validation over groups (over plans without groups), in place of a held-out share: the prior
             and the baselines are fitted once more for each fold, for the table alone, and the prior that is saved
             learns from all plans. null: 5 with fewer than 15 groups, else 1, which holds out a share.
-        batch_size: plans a step (pieces of plans, where they are longer than a window).
+        batch_size: plans a step (pieces of plans, where they are longer than a window); null for as many as have about
+            2,048 actions.
         window: actions that a step reads of a plan; longer plans are read in windows, the hidden state carried over.
         check_every: steps between two validations; null for two passes through the plans, but at least 10 and at most
             100.
-        max_steps: steps of training.
+        max_steps: steps of training; null for 50 passes through the plans, but 1,000 to 4,000 steps.
         seed: draws the collected plans, the split and the order of training.
     """
 
@@ -104,10 +105,10 @@ class PlansData(PlansModule):
         validation: float = 0.1,
         held_out: float = 0.1,
         folds: int | None = None,
-        batch_size: int = 64,
+        batch_size: int | None = None,
         window: int = 128,
         check_every: int | None = None,
-        max_steps: int = 1000,
+        max_steps: int | None = None,
         seed: int = 0,
     ) -> None:
         for name, share in (("validation", validation), ("held_out", held_out)):
@@ -158,7 +159,7 @@ class PlansData(PlansModule):
             self.learned_from, self.chosen_on = past.added_to(self.learned_from), past.added_to(self.chosen_on)
             self.num_contexts = None
         super().__init__(self.learned_from, self.chosen_on, settings, seed)
-        self.settings = replace(settings, validation=validation)
+        self.given = replace(settings, validation=validation)
 
 
 class PriorModel(PriorModule):

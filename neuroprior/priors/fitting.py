@@ -1,6 +1,7 @@
 """Fitting in one call: a prior is made for the plans, and learns from them."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from neuroprior.plans import Plans
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
 from neuroprior.priors.durations import SemiMarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
+from neuroprior.priors.ensembles.candidates import Effort
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior, as_actions, construct, context_arguments
 from neuroprior.priors.uniform import UniformPrior
@@ -22,6 +24,7 @@ def fit(
     plans: Plans | Tensor,
     prior: MakePrior | str = CombinedPrior,
     *,
+    effort: Effort | None = None,
     generator: torch.Generator | None = None,
     **settings: Any,
 ) -> Prior:
@@ -33,6 +36,8 @@ def fit(
             function that makes it, such as `partial(GRUPrior, hidden_size=128)`, called with the number of actions and,
             where it takes it, `num_contexts` or `context_size`; or one of the names in `NAMES`. A prior that cannot
             take the context of the plans ignores it.
+        effort: how much the combined prior spends on networks: "fast", "standard" (default) or "full"; see
+            `CombinedPrior`.
         generator: source of randomness; see `Prior.fit`.
         settings: of the prior's `fit`, such as `max_steps=500`; see `neuroprior.training.Settings`.
 
@@ -54,6 +59,10 @@ def fit(
         if prior not in NAMES:
             raise ValueError(f"prior: one of {', '.join(NAMES)} is expected, not {prior!r}")
         prior = NAMES[prior]
+    if effort is not None:
+        if prior is not CombinedPrior:
+            raise ValueError("effort: for the combined prior alone; leave it out, or leave prior out")
+        prior = partial(CombinedPrior, effort=effort)
     return make_prior(plans, prior).fit(plans, generator=generator, **settings)
 
 

@@ -16,11 +16,10 @@ def plans(
     priors: list[str] | None = None,
     test: str | None = None,
     folds: int | None = None,
-    models: list[ModelName] = list(MODELS[:4]),  # noqa: B006
+    models: list[ModelName] = list(MODELS),  # noqa: B006
     inputs: list[InputName] = list(INPUTS[:2]),  # noqa: B006
     skip: int = 0,
-    max_steps: int = 1000,
-    patience: float = 0.25,
+    max_steps: int | None = None,
     num_actions: int | None = None,
     action_names: list[str] | None = None,
     columns: Columns | None = None,

@@ -27,20 +27,19 @@ WIDTH = 7.5
 """Width of a figure, inches: that of a column of text."""
 
 KINDS = {
-    "stacked": "#d64550",
-    "mixture": "#d64550",
-    "ensemble": "#d64550",
+    "stacked": "#a0703c",
+    "combined": "#d64550",
     "uniform": "#7d838c",
     "tree": "#2e9e5b",
     "gru": "#d9731a",
     "transformer": "#9a5fd0",
 }
-"""The colour of each kind of model, by what its name holds. A mixture, named after what it mixes, goes first."""
+"""The colour of each kind of model, by what its name holds."""
 
 MARKOV = ["#1f9db3", "#2a94cf", "#2f89d6", "#3079d8", "#3a69d6", "#4360d4", "#4659cf"]
 """The colours of Markov chains of order 0, 1, 2 and so on; the last for all higher ones."""
 
-SPARE = ["#1f9797", "#c8579a", "#a0703c", "#7f8f2a", "#5f7fa8", "#3079d8"]
+SPARE = ["#1f9797", "#c8579a", "#7f8f2a", "#5f7fa8", "#3079d8"]
 """Colours of what is no kind of model, in turn."""
 
 PLAIN = MARKOV[3]

@@ -1,9 +1,9 @@
 """One job of a cross-validation: models are fitted without a fold and scored on it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from math import ceil, log
+from math import log
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,11 @@ from neuroprior.analysis import Reliability, pieces, reliability
 from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits, units
 from neuroprior.plans import PastDurations, Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
-from neuroprior.priors import GRUPrior, MarkovPrior, MixturePrior, Prior, StackedPrior, TransformerPrior
+from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.counts import TooLargeError
-from neuroprior.priors.prior import context_arguments
+from neuroprior.priors.ensembles.candidates import fitted_experts
+from neuroprior.priors.ensembles.mixture import divided
+from neuroprior.priors.prior import construct, context_arguments
 from neuroprior.sampling.ancestral import sample, sample_in_world
 from neuroprior.worlds import TabularWorld
 
@@ -29,30 +31,23 @@ ACTIONS, CONTEXT, DURATIONS = "actions", "actions and context", "actions and dur
 WITH = {ACTIONS: "", CONTEXT: ", with context", DURATIONS: ", with durations"}
 """The inputs in the order of tables, and what names of models say of them."""
 
-OF_FEATURES = ("transformer", "gru", "gru-large")
+NETWORKS: dict[str, type[Prior]] = {"gru": GRUPrior, "transformer": TransformerPrior, "stacked": StackedPrior}
+"""Models that are trained."""
+
+COMBINED = "combined"
+"""The combined prior."""
+
+EXPERTS = {"gru", "stacked"}
+"""The networks among its experts, which its job scores as well."""
+
+OF_FEATURES = (COMBINED, "transformer", "gru")
 """Jobs whose models can take features, such as past durations."""
 
-KINDS = ("mixture", "gru-large", "stacked", "transformer", "gru", "gru-lags", "lags", "counts")
+KINDS = (COMBINED, "stacked", "transformer", "gru", "gru-lags", "lags", "counts")
 """What one job fits; the slowest first."""
 
 LAGS = ("lags", "gru-lags")
 """Jobs of the information by lag, by counts and by a GRU; of one fold only."""
-
-NEURAL: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
-    "gru": (GRUPrior, {}),
-    "transformer": (TransformerPrior, {}),
-    # It hardly overfits: few plans will do to find when to stop.
-    "stacked": (StackedPrior, {"learning_rate": 4e-3, "validation": 0.02}),
-    # For long sequences of few subjects: without lags, with which it overfits such plans.
-    "gru-large": (
-        partial(GRUPrior, hidden_size=256, lags=1, dropout=0.5),
-        {"learning_rate": 4e-3, "validation": 0.02},
-    ),
-}
-"""How neural priors are made and trained; the first two by default recipes."""
-
-MIXED = ("stacked", "gru-large")
-"""The experts of the mixture, each by its own recipe but for the training, which is that of the first."""
 
 COUNTED = "markov"
 """The count-based model of the information by lag; the other is the GRU."""
@@ -72,8 +67,7 @@ class Design:
     folds: int  # how many; 1: learn from some plans and score on others
     seed: int = 0  # draws the folds, and everything in training
     skip: int = 0  # actions at the beginning of each plan that are left out of the score
-    max_steps: int = 1000  # gradient steps of neural priors
-    patience: float = 0.25  # share of them without improvement after which training stops
+    max_steps: int | None = None  # gradient steps of neural priors; None: by the plans
     reach: int = 16  # the most past actions whose information is measured
     cut: bool = False  # whether the plans are consecutive parts of a single one
     version: str = __version__  # of the library
@@ -81,8 +75,7 @@ class Design:
     @property
     def training(self) -> dict[str, Any]:
         """How neural priors are trained."""
-        patience = max(ceil(self.patience * self.max_steps), 1)
-        return {"max_steps": self.max_steps, "patience": patience, "progress": False}
+        return {"max_steps": self.max_steps, "progress": False}
 
 
 @dataclass(frozen=True)
@@ -169,7 +162,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
     """The name, the settings and the prior of each model of a kind."""
     sizes = context_arguments(learned, scored)
     learned = divisible(learned)
-    if "context_size" in sizes and kind in ("counts", "stacked", "mixture"):
+    if "context_size" in sizes and kind in ("counts", "stacked"):
         return  # features cannot be counted
     generator = torch.Generator().manual_seed(seed)
     if kind == "counts":
@@ -180,17 +173,21 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
             if baseline.prior is not None:
                 # Chosen on the validation plans; then these are learned from as well.
                 yield baseline.model, baseline.how, baseline.prior.fit(learned)
-        return
-    how = design.training | NEURAL[MIXED[0] if kind == "mixture" else kind][1]
-    prior = _made(kind, learned.num_actions, seed=seed, **sizes)
-    yield kind, "", prior.fit(learned, generator=generator, **how)
-
-
-def _made(kind: str, num_actions: int, **how: Any) -> Any:
-    """A neural prior, or a mixture of them, before training."""
-    if kind == "mixture":
-        return MixturePrior(num_actions, [_made(expert, num_actions, **how) for expert in MIXED])
-    return NEURAL[kind][0](num_actions, **how)
+    elif kind == COMBINED:
+        training, validation = divided(learned, None, generator)
+        experts = list(fitted_experts(training, validation, sizes, "standard", generator, design.training))
+        combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
+        assert isinstance(combined, CombinedPrior)
+        combined.learn_weights(validation)
+        names = {type_: name for name, type_ in NETWORKS.items()}
+        for expert in [expert.recount(learned) for expert in experts]:
+            if type(expert) in names:
+                yield names[type(expert)], "", expert
+        combined.training_plans(learned)
+        yield kind, combined.summary(), combined
+    else:
+        prior: Any = construct(NETWORKS[kind], learned.num_actions, sizes | {"seed": seed})
+        yield kind, "", prior.fit(learned, generator=generator, **design.training)
 
 
 def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:

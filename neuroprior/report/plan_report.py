@@ -20,10 +20,10 @@ from neuroprior.report.fits import ACTIONS, CONTEXT, DURATIONS, LAGS, OF_FEATURE
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.report.sections import SECTIONS, describe
 
-ModelName = Literal["counts", "gru", "transformer", "stacked", "gru-large", "mixture"]
+ModelName = Literal["counts", "gru", "transformer", "stacked", "combined"]
 InputName = Literal["actions", "context", "durations"]
 
-MODELS: tuple[ModelName, ...] = ("counts", "gru", "transformer", "stacked", "gru-large", "mixture")
+MODELS: tuple[ModelName, ...] = ("counts", "gru", "transformer", "stacked", "combined")
 INPUTS: tuple[InputName, ...] = ("actions", "context", "durations")
 
 MOST_ACTIONS = 10_000
@@ -43,11 +43,10 @@ def report(
     priors: Mapping[str, Prior] | Sequence[str] | None = None,
     test: Plans | str | Path | None = None,
     folds: int | None = None,
-    models: Sequence[ModelName] = MODELS[:4],
+    models: Sequence[ModelName] = MODELS,
     inputs: Sequence[InputName] = INPUTS[:2],
     skip: int = 0,
-    max_steps: int = 1000,
-    patience: float = 0.25,
+    max_steps: int | None = None,
     num_actions: int | None = None,
     action_names: Sequence[str] | None = None,
     columns: Columns | Mapping[str, Any] | None = None,
@@ -70,14 +69,12 @@ def report(
         test: learn from the plans and score on these, or on those of this file, in place of cross-validation.
         folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
         models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
-            weighs the forecasts of counts), gru-large (256 wide, with dropout), mixture (of stacked and gru-large);
-            the last two are slow, and left out by default.
-        inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, gru-large and
-            transformer, durations: how long the last action took, beside the actions. Each in turn; durations, with
+            weighs the forecasts of counts), combined (of the others but the transformer, which are fitted for it).
+        inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, transformer
+            and combined, durations: how long the last action took, beside the actions. Each in turn; durations, with
             which these take as long again, are left out by default.
         skip: actions at the beginning of each plan that do not count in scores.
-        max_steps: gradient steps of a neural prior.
-        patience: share of these steps without improvement after which training stops; 1 trains to the end.
+        max_steps: gradient steps of a neural prior; None: by the plans, see `neuroprior.training.Settings`.
         num_actions: number of actions, where a file does not say.
         action_names: names of the actions in the order of their numbers, where a file does not say.
         columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration,
@@ -108,7 +105,7 @@ def report(
             raise ValueError(f"{name}: a list is expected, such as [{given!r}], not a text")
         if not given or set(given) - set(known):
             raise ValueError(f"{name}: some of {', '.join(known)} are expected, not {', '.join(given) or 'none'}")
-    _check(skip, max_steps, patience, seed, processes)
+    _check(skip, max_steps, seed, processes)
     file = "" if isinstance(plans, Plans) else str(plans)
     reading: dict[str, Any] = {"num_actions": num_actions, "action_names": action_names, "columns": columns}
     reading |= {"missing": missing, "merge_repeats": merge_repeats, "max_gap": max_gap}
@@ -140,7 +137,7 @@ def report(
         if other is not None:
             other, cut = _in_parts(other)
         number = 1 if other is not None else _folds(file or "plans", learned, folds)
-        design = Design(number, seed, skip, max_steps, patience, cut=cut)
+        design = Design(number, seed, skip, max_steps, cut=cut)
         kinds: list[str] = [*models]
         if "lags" in sections:
             kinds += LAGS if set(models) != {"counts"} else LAGS[:1]
@@ -207,12 +204,11 @@ def _lead(found: Evaluation) -> str:
     return f"{found.best.label} takes {fewest}{bits:.3f} {interval}; {found.too_few}."
 
 
-def _check(skip: int, max_steps: int, patience: float, seed: int, processes: int | None) -> None:
+def _check(skip: int, max_steps: int | None, seed: int, processes: int | None) -> None:
     """Raise ValueError, naming the argument, unless these can be."""
     for name, value, right, expected in (
         ("skip", skip, skip >= 0, "at least 0 is"),
-        ("max_steps", max_steps, max_steps >= 1, "at least 1 is"),
-        ("patience", patience, 0 < patience <= 1, "a share of the steps, above 0 and at most 1, is"),
+        ("max_steps", max_steps, max_steps is None or max_steps >= 1, "at least 1 is"),
         ("seed", seed, 0 <= seed < 2**50, "an integer from 0 to 2**50 - 1 is"),
         ("processes", processes, processes is None or processes >= 1, "at least 1 is"),
     ):

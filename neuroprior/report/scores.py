@@ -24,9 +24,11 @@ from neuroprior.priors.matching import match_plans
 from neuroprior.report import fits
 from neuroprior.report.fits import (
     ACTIONS,
+    COMBINED,
     CONTEXT,
     COUNTED,
     DURATIONS,
+    EXPERTS,
     KINDS,
     LAGS,
     OF_FEATURES,
@@ -39,7 +41,7 @@ from neuroprior.report.fits import (
 )
 
 ORDERED = ["uniform", *(f"markov-{order}" for order in ORDERS)]
-ORDERED += ["context tree", "gru", "transformer", "gru-large", "stacked", "mixture"]
+ORDERED += ["context tree", "gru", "transformer", "stacked", COMBINED]
 """The models of a cross-validation in the order of the main table."""
 
 
@@ -129,6 +131,7 @@ def cross_validation(folder: Path, plans: Plans, test: Plans | None, design: Des
 def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Job]:
     """What there is to do: the slowest first, so that no process is left alone with one at the end."""
     kinds, inputs = set(kinds), list(inputs)
+    kinds -= EXPERTS if COMBINED in kinds else set()
     return [
         Job(fold, kind, each)
         for kind in KINDS

@@ -72,6 +72,7 @@ class PlansModule(lightning.LightningDataModule):
         seed: draws the order.
 
     Attributes:
+        settings: with what was not given chosen for these plans.
         epochs: how many there are at most.
         steps: steps in each.
 
@@ -81,9 +82,11 @@ class PlansModule(lightning.LightningDataModule):
 
     def __init__(self, training: Plans, validation: Plans, settings: Settings, seed: int) -> None:
         super().__init__()
-        self.training = Windows(training, settings.window, settings.batch_size, LEAST_WINDOWS)
+        batch_size = settings.batches_of(training.max_length)
+        self.training = Windows(training, settings.window, batch_size, LEAST_WINDOWS)
         self.validation = Windows(_some(validation, seed), settings.window, 1024, 2 * LEAST_WINDOWS)
-        self.epochs, self.steps = settings.epochs(self.training.steps)
+        self.settings = settings.for_passes(self.training.steps)
+        self.epochs, self.steps = self.settings.epochs(self.training.steps)
         self.seed = seed
 
     def train_dataloader(self) -> DataLoader[Batch]:

@@ -1,6 +1,6 @@
-"""The settings of a training, with defaults that suit small priors on a CPU."""
+"""The settings of a training; what is not given follows from the plans."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 from neuroprior.plans import Plans
@@ -8,14 +8,26 @@ from neuroprior.plans import Plans
 FEWEST_STEPS, MOST_STEPS = 10, 100
 """The least and the most steps between two validations, where these are not given."""
 
+FEWEST, MOST, PASSES = 1000, 4000, 50
+"""Steps of a training, where these are not given: so many passes through the plans, within these bounds."""
+
+PATIENCE = 0.4
+"""Share of the steps without improvement after which training stops."""
+
+ACTIONS_A_STEP, LEAST_BATCH, MOST_BATCH = 2048, 16, 64
+"""Actions that a step learns from, about, where the size of batches is not given, and the bounds of that size."""
+
 
 @dataclass(frozen=True)
 class Settings:
     """How a prior is trained.
 
     Attributes:
-        max_steps: gradient steps; the learning rate falls to 0 over them.
-        batch_size: plans (pieces of plans, where they are longer than a window) a step.
+        max_steps: gradient steps; the learning rate falls to 0 over them. None: `PASSES` passes through the plans, but
+            at least `FEWEST` and at most `MOST` steps.
+        batch_size: plans (pieces of plans, where they are longer than a window) a step. None: as many as have about
+            `ACTIONS_A_STEP` actions, from `LEAST_BATCH` to `MOST_BATCH`: smaller batches learn long sequences in less
+            time.
         window: actions that one step reads of a plan. Longer plans are read window by window, in order, with the hidden
             state carried over (truncated backpropagation through time).
         learning_rate: of AdamW, after the first tenth of the steps.
@@ -25,27 +37,28 @@ class Settings:
             it, and all plans are learned from.
         check_every: steps between two validations (on the held-out plans); None: two passes through the plans, but at
             least `FEWEST_STEPS` and at most `MOST_STEPS`, so that small data sets are not overfitted before the first.
-        patience: steps without a lower validation loss after which training stops.
+        patience: steps without a lower validation loss after which training stops. None: `PATIENCE` of all steps.
         progress: show a progress bar.
 
     Raises:
         ValueError: a value out of range.
     """
 
-    max_steps: int = 1000
-    batch_size: int = 64
+    max_steps: int | None = None
+    batch_size: int | None = None
     window: int = 128
     learning_rate: float = 5e-3
     weight_decay: float = 0.01
     gradient_clip: float = 1.0
     validation: float | Plans = 0.1
     check_every: int | None = None
-    patience: int = 400
+    patience: int | None = None
     progress: bool = True
 
     def __post_init__(self) -> None:
-        names = ["max_steps", "batch_size", "window", "learning_rate", "gradient_clip", "patience"]
-        for name in names + ["check_every"] * (self.check_every is not None):
+        names = ("max_steps", "batch_size", "window", "learning_rate", "gradient_clip", "check_every", "patience")
+        optional = ("max_steps", "batch_size", "check_every", "patience")
+        for name in (name for name in names if name not in optional or getattr(self, name) is not None):
             kind = float if name in ("learning_rate", "gradient_clip") else int
             value = getattr(self, name)
             if not isinstance(value, int | kind) or isinstance(value, bool) or not 0 < value < float("inf"):
@@ -55,6 +68,16 @@ class Settings:
         if self.weight_decay < 0:
             raise ValueError(f"weight_decay: must not be negative, not {self.weight_decay}")
 
+    def batches_of(self, longest: int) -> int:
+        """The size of batches of plans of which the longest has so many actions."""
+        fits = ACTIONS_A_STEP // max(min(longest, self.window), 1)
+        return self.batch_size or min(max(fits, LEAST_BATCH), MOST_BATCH)
+
+    def for_passes(self, steps_a_pass: int) -> "Settings":
+        """The settings with their number of steps and patience, where one pass takes so many steps."""
+        steps = self.max_steps or min(max(PASSES * steps_a_pass, FEWEST), MOST)
+        return replace(self, max_steps=steps, patience=self.patience or ceil(PATIENCE * steps))
+
     def epochs(self, steps_a_pass: int) -> tuple[int, int]:
         """The number of validations, if training is not stopped early, and the steps before each.
 
@@ -62,5 +85,7 @@ class Settings:
             steps_a_pass: steps that take all plans once.
         """
         wanted = self.check_every or min(max(2 * steps_a_pass, FEWEST_STEPS), MOST_STEPS)
-        validations = ceil(self.max_steps / wanted)
-        return validations, ceil(self.max_steps / validations)
+        steps = self.for_passes(steps_a_pass).max_steps
+        assert steps is not None
+        validations = ceil(steps / wanted)
+        return validations, ceil(steps / validations)

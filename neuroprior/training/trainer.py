@@ -23,7 +23,7 @@ from neuroprior._threads import one_thread
 from neuroprior.plans import Plans
 from neuroprior.training.batches import PlansModule
 from neuroprior.training.module import PriorModule
-from neuroprior.training.settings import Settings
+from neuroprior.training.settings import FEWEST, PATIENCE, Settings
 
 SMALL_STEP = 1e9
 """Operations in a training step below which it runs on one thread."""
@@ -61,8 +61,8 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
         torch.manual_seed(seed)
         trainer = make_trainer(
             folder,
-            settings.max_steps,
-            settings.patience,
+            data.settings.max_steps,
+            data.settings.patience,
             data.steps,
             accelerator="gpu" if cuda else device.type,
             devices=[device.index or 0] if cuda else 1,
@@ -78,8 +78,8 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
 
 def make_trainer(
     folder: str = "",
-    max_steps: int = 1000,
-    patience: int = 400,
+    max_steps: int | None = None,
+    patience: int | None = None,
     validate_every: int = 100,
     accelerator: str = "auto",
     devices: int | str | list[int] = 1,
@@ -99,8 +99,10 @@ def make_trainer(
 
     Args:
         folder: of checkpoints and logs.
-        max_steps: gradient steps at most (rounded up to whole epochs); the learning rate falls to 0 over them.
-        patience: steps without lower validation bits after which training stops (rounded up to whole epochs).
+        max_steps: gradient steps at most (rounded up to whole epochs); the learning rate falls to 0 over them. None:
+            on the command line by the number of plans, see `Settings`; else 1,000.
+        patience: steps without lower validation bits after which training stops (rounded up to whole epochs). None: 0.4
+            of all steps.
         validate_every: steps between two validations, as in `PlansModule.steps`.
         accelerator: "cpu", "gpu", or "auto".
         devices: number of devices, or their numbers.
@@ -117,6 +119,8 @@ def make_trainer(
     Raises:
         ValueError: a number of steps or batches below 1.
     """
+    max_steps = FEWEST if max_steps is None else max_steps
+    patience = ceil(PATIENCE * max_steps) if patience is None else patience
     steps = {"max_steps": max_steps, "patience": patience, "accumulate_grad_batches": accumulate_grad_batches}
     for name, number in steps.items():
         if number < 1:

@@ -77,15 +77,14 @@ def test_the_entropy_rate_is_reached(second_order):
     }
 
 
-@pytest.mark.slow
-def test_a_mixture_is_as_good_as_its_experts(second_order, tmp_path):
-    """Its stacked expert knows the chain by counts, the large GRU has hardly learned in 20 steps."""
+def test_the_combined_prior_is_as_good_as_its_experts(second_order, tmp_path):
+    """It knows the chain by counts; its networks, which are scored as well, have hardly learned in 20 steps."""
     plans = markov_plans(second_order[1], 400, 30, 1)
-    options = {"skip": 2, "folds": 2, "models": ["mixture"], "max_steps": 20, "sections": ["scores"]}
+    options = {"skip": 2, "folds": 2, "models": ["combined", "gru"], "max_steps": 20, "sections": ["scores"]}
     own = bits(report(plans, tmp_path, **options))
     known = bits(second_order[0])
-    assert list(own) == ["mixture"]
-    assert own["mixture"] < known["markov-2"] + 0.01
+    assert set(own) == {"gru", "stacked", "combined"}
+    assert own["combined"] < min(known["markov-2"], own["gru"], own["stacked"]) + 0.01
 
 
 def test_two_actions_back_and_no_further(second_order):

@@ -202,7 +202,7 @@ def test_without_durations_there_is_no_section():
 def test_networks_with_durations():
     """They know more than those without, and the table says so."""
     plans = timed(True, 64, 12)
-    quick = QUICK | {"models": ["gru"], "inputs": ["actions", "durations"], "max_steps": 60, "patience": 1.0}
+    quick = QUICK | {"models": ["gru"], "inputs": ["actions", "durations"], "max_steps": 60}
     made = report(plans, folds=2, **quick, sections=["scores", "durations"])
     bits = made.tables["plans"].set_index("context")["bits_per_action"]
     assert bits["actions and durations"] < bits["actions"] - 0.1
@@ -210,7 +210,7 @@ def test_networks_with_durations():
     assert row["gain"] == pytest.approx(bits["actions"] - bits["actions and durations"])
     with refuses("no durations"):
         report(replace(plans, durations=None), inputs=["durations"], **ONLY)
-    with refuses("durations are an input of transformer, gru"):
+    with refuses("durations are an input of combined, transformer, gru"):
         report(plans, inputs=["durations"], **ONLY)
 
 

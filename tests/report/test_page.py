@@ -42,7 +42,7 @@ from tests.support.sources import refuses
 
 HOSTILE = ["<b>\"&'", "</svg><script>alert(1)</script>", "$x$ $\\frac{$", "\x00\x1b\ud800", "http://evil.org", "_x"]
 MANY = [f"groom left forepaw while rearing {n}" for n in range(57)]
-MODELS = ["uniform", "markov-0", "markov-3", "context tree", "gru", "gru, context", "mixture of all"]
+MODELS = ["uniform", "markov-0", "markov-3", "context tree", "gru", "gru, context", "combined"]
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -162,7 +162,7 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
 
 
 CASES = {
-    "few": (["in", "left", "right", "out"], ["gru", "mixture"], ["a", "b"], True),
+    "few": (["in", "left", "right", "out"], ["gru", "combined"], ["a", "b"], True),
     "one": (["L", "R"], ["markov-1"], ["only"], False),
     "many": (MANY, MODELS, [f"session of animal {n}" for n in range(30)], False),
     "hostile": (HOSTILE, HOSTILE[:3], HOSTILE[:3], True),
@@ -309,10 +309,10 @@ def test_colors_are_those_of_the_kind_of_model():
         "Context tree",
         "GRU",
         "transformer",
-        "mixture: gru",
+        "combined",
     ]
     expected = [KINDS["uniform"], MARKOV[0], MARKOV[2], MARKOV[-1]]
-    assert list(colors(names)) == expected + [KINDS[kind] for kind in ("tree", "gru", "transformer", "mixture")]
+    assert list(colors(names)) == expected + [KINDS[kind] for kind in ("tree", "gru", "transformer", "combined")]
     assert list(colors(["this", "gru", "that"])) == [SPARE[0], KINDS["gru"], SPARE[1]]
     assert list(lines(["gru", "gru, context"])) == [(KINDS["gru"], "-"), (KINDS["gru"], "--")]
 

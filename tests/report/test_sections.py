@@ -126,7 +126,7 @@ def test_actions_whose_share_changes_most_come_first():
         assert row.change == pytest.approx(own[1] - own[0])
 
 
-ASKED: dict[str, Any] = {"folds": 2, "skip": 1, "patience": 0.125, "seed": 5} | QUICK
+ASKED: dict[str, Any] = {"folds": 2, "skip": 1, "seed": 5} | QUICK
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +209,6 @@ def test_priors_by_name_are_scored(skip):
         ({"inputs": ["nodes"]}, ("inputs", "nodes")),
         ({"inputs": ["context"]}, ("inputs", "no context")),
         ({"sections": ["weather"]}, ("sections", "weather")),
-        ({"patience": 0.0}, ("patience",)),
         ({"num_actions": 3}, ("num_actions", "files")),
         ({"priors": {}}, ("priors", "at least one")),
         ({"priors": {"a": UniformPrior(3)}, "folds": 2}, ("priors", "folds")),

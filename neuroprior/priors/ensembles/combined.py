@@ -19,8 +19,8 @@ from neuroprior.priors.uniform import UniformPrior
 LEAST = -30.0
 """Log-probabilities of experts are at least this in the pool."""
 
-TOLERANCE = 5e-4
-"""An expert is left out where the held-out loss rises by less than so many nats per action."""
+TOLERANCE, IN_ALL = 5e-4, 0.1
+"""An expert is left out where the held-out loss rises by less than so many nats per action, or so many in all."""
 
 NUMBERS = 2**22
 """At most so many forecasts are looked at to learn the powers of the pool."""
@@ -56,6 +56,8 @@ class CombinedPrior(MixturePrior):
         num_actions: A.
         experts: priors that `fit` then fits and combines; None: those that suit the plans.
         share: of the fixed share; set by `fit`.
+        effort: which networks are trained where no experts are given: "fast", a GRU alone; "standard", a stacked prior
+            as well; "full", a second GRU and a transformer as well.
         num_contexts, context_size: see `Prior`.
 
     Raises:
@@ -75,11 +77,15 @@ class CombinedPrior(MixturePrior):
         num_actions: int,
         experts: Sequence[Prior | Mapping[str, Any]] | None = None,
         share: float = 0.0,
+        effort: Effort = "standard",
         num_contexts: int | None = None,
         context_size: int | None = None,
     ) -> None:
+        if effort not in NETWORKS:
+            raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
+        self.effort: Effort = effort
         self.given = experts is not None
         self.tried = 0
         self._allocate()
@@ -138,9 +144,8 @@ class CombinedPrior(MixturePrior):
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
-        trained = self._experts() if self.given else networks(self.num_actions, {}, "full", 0)
-        own = ["validation"] if self.given else ["effort", "validation"]
-        return tuple(dict.fromkeys([*own, *(name for e in trained for name in e.fit_settings)]))
+        trained = self._experts() if self.given else networks(self.num_actions, {}, self.effort, 0)
+        return tuple(dict.fromkeys(["validation", *(name for e in trained for name in e.fit_settings)]))
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Fit the experts; learn on plans held out from them which are kept, and how they are combined; returns self.
@@ -150,17 +155,13 @@ class CombinedPrior(MixturePrior):
         Args:
             plans: `Plans`, or integers `[N, L]` for plans without context.
             generator: draws the held-out plans and the seeds of networks, and is passed on to the experts.
-            settings: `effort`, "fast", "standard" (default) or "full": which networks are trained, see
-                `neuroprior.priors.ensembles.candidates`; `validation`: `Plans` that are held out, or their share. It
-                and all others, see `neuroprior.training.Settings`, are passed on to the experts that have them.
+            settings: `validation`: `Plans` that are held out, or their share. It and all others, see
+                `neuroprior.training.Settings`, are passed on to the experts that have them.
 
         Raises:
             ValueError: plans that the experts cannot learn from, too few of them, or an unknown setting.
         """
         self.check_settings(settings)
-        effort: Effort = settings.pop("effort", "standard")
-        if effort not in NETWORKS:
-            raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
         learned, held_out = divided(plans, settings.pop("validation", None), generator)
@@ -169,7 +170,7 @@ class CombinedPrior(MixturePrior):
         else:
             sizes = {"num_contexts": self.num_contexts, "context_size": self.context_size}
             contexts = {name: size for name, size in sizes.items() if size is not None}
-            made = fitted_experts(learned, held_out, contexts, effort, generator, settings)
+            made = fitted_experts(learned, held_out, contexts, self.effort, generator, settings)
             self.experts = nn.ModuleList(made).to(self.device)
         self.learn_weights(held_out)
         return self.recount(plans)
@@ -201,6 +202,11 @@ class CombinedPrior(MixturePrior):
             self.tracking, taken = tracking, tracked
         self.first = held_out.initial_weights(taken.sum(1)).float()
 
+    def summary(self) -> str:
+        """What is combined, such as "0.3 markov + 0.8 gru": the powers of the experts in the pool."""
+        terms = zip(self.powers.tolist(), self._experts(), strict=True)
+        return " + ".join(f"{power:.2f} {type(e).__name__.removesuffix('Prior').lower()}" for power, e in terms)
+
     @property
     def bound(self) -> float:
         """Nats by which the negative log-likelihood of any sequence is at most above that of the best expert here."""
@@ -221,7 +227,7 @@ class HeldOut:
         self.taken = taken_of(forecasts, actions).masked_fill(~mask[..., None], 0)
         self.count = max(int(mask.sum()), 1)
         self.tried = forecasts.shape[2] + 2
-        self.tolerance = max(TOLERANCE, 1 / self.count)
+        self.tolerance = max(TOLERANCE, IN_ALL / self.count)
         # Some actions, evenly spread, are enough for a few powers.
         every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
         self.some = forecasts[mask][::every].double().clamp(min=LEAST)

@@ -25,6 +25,9 @@ LONG_AGO = 500.0
 MOST_NUMBERS = 2**24
 """Largest size of the table of when each action was last taken in each context."""
 
+TRAINING = {"batch_size": 64, "learning_rate": 4e-3}
+"""Settings of the network's training where none are given; it gains nothing from the smaller batches of others."""
+
 PARTS = 8
 """Parts of the plans: experts forecast each part after learning from the others."""
 
@@ -128,7 +131,7 @@ class StackedPrior(Prior):
             plans: at least two (two groups, where there are any), or one long one; integers `[N, L]` for plans without
                 context.
             generator: draws the parts, the held-out plans and the order of training.
-            settings: fields of `neuroprior.training.Settings`, for the network.
+            settings: fields of `neuroprior.training.Settings`, for the network; by default `TRAINING`.
 
         Raises:
             ValueError: plans that this prior cannot learn from, too few of them, a setting that is unknown or out of
@@ -150,7 +153,7 @@ class StackedPrior(Prior):
             with torch.no_grad():
                 forecasts = [e(held_out.actions, context_for(e, held_out.context)) for e in self._experts()]
             settings = settings | {"validation": self._stacked(held_out, torch.stack(forecasts, 2))}
-        self.mixer.fit(stacked, generator=generator, **settings)
+        self.mixer.fit(stacked, generator=generator, **TRAINING | settings)
         self.mixer.window = None  # its hidden state is carried on without limit
         return self
 
@@ -251,17 +254,17 @@ class Mixer(NeuralPrior):
         seed: int,
     ) -> None:
         check_sizes(hidden_size=hidden_size, num_experts=num_experts)
-        self.num_experts, self.hidden_size, self.contexts = num_experts, hidden_size, contexts
+        self.num_experts, self.contexts = num_experts, contexts
         size = num_experts * num_actions + (0 if contexts is None else 1 + num_actions)
-        super().__init__(num_actions, None, 1, dropout, None, size, seed)
+        super().__init__(num_actions, hidden_size, None, 1, dropout, None, size, seed)
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"num_experts": self.num_experts, "hidden_size": self.hidden_size, "contexts": self.contexts}
+        own = {"num_experts": self.num_experts, "hidden_size": self.width, "contexts": self.contexts}
         return own | {"num_actions": self.num_actions, "dropout": self.dropout, "seed": 0}
 
     def build(self) -> None:
-        width, forecasts = self.hidden_size, self.num_experts * self.num_actions
+        width, forecasts = self.width, self.num_experts * self.num_actions
         self.action = nn.Embedding(self.num_actions + 1, width)
         self.index = None if self.contexts is None else context_embedding(self.contexts, width)
         self.features = nn.Linear(forecasts + (0 if self.contexts is None else self.num_actions), width)
@@ -287,7 +290,7 @@ class Mixer(NeuralPrior):
         return self.head(out) + mixed, last[0]
 
     def hidden_size_of(self, state_size: int) -> int:
-        return self.hidden_size
+        return self.width
 
 
 def context_for(expert: Prior, context: Tensor | None) -> Tensor | None:

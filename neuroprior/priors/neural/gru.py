@@ -18,7 +18,8 @@ class GRUPrior(NeuralPrior):
         hidden_size: width of the hidden state and of the input vectors.
         num_layers: number of layers.
         window, lags, dropout, num_contexts, context_size, seed: see `NeuralPrior`. Dropout is applied to the input
-            vectors and to the output of each layer.
+            vectors and to the output of each layer. What is None of `hidden_size`, `lags` and `dropout` is chosen by
+            `fit` for its first plans, see `neuroprior.priors.neural.Sizes`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -27,19 +28,24 @@ class GRUPrior(NeuralPrior):
     def __init__(
         self,
         num_actions: int,
-        hidden_size: int = 64,
+        hidden_size: int | None = None,
         num_layers: int = 1,
         window: int | None = None,
-        lags: int = 16,
-        dropout: float = 0.0,
+        lags: int | None = None,
+        dropout: float | None = None,
         num_contexts: int | None = None,
         context_size: int | None = None,
         seed: int = 0,
     ) -> None:
-        check_sizes(hidden_size=hidden_size, num_layers=num_layers)
-        check_memory(24 * num_layers * hidden_size**2, num_layers=num_layers, hidden_size=hidden_size)
-        self.hidden_size, self.num_layers = hidden_size, num_layers
-        super().__init__(num_actions, window, lags, dropout, num_contexts, context_size, seed)
+        check_sizes(hidden_size=1 if hidden_size is None else hidden_size, num_layers=num_layers)
+        check_memory(24 * num_layers * (hidden_size or 1) ** 2, num_layers=num_layers, hidden_size=hidden_size)
+        self.num_layers = num_layers
+        super().__init__(num_actions, hidden_size, window, lags, dropout, num_contexts, context_size, seed)
+
+    @property
+    def hidden_size(self) -> int:
+        """The width of the hidden state."""
+        return self.width
 
     @property
     def config(self) -> dict[str, Any]:

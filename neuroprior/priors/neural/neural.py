@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from dataclasses import fields, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,45 @@ CONTEXT_SPREAD = 0.03
 
 LAG_WIDTH = 16
 """Size of the embedding of each of the last actions."""
+
+
+SHORT = 32
+"""Plans of at most so many actions are short: the last actions are shown to a network directly."""
+
+FEW = 20_000
+"""Actions up to which a network is small."""
+
+KINDS = 16
+"""Kinds of actions beyond which a large one finds more."""
+
+
+class Sizes(NamedTuple):
+    """What a network is made with, where it is not given.
+
+    Attributes:
+        width: of its hidden state and vectors.
+        lags: past actions that each input shows directly.
+        dropout: share of activations that is set to 0 in training.
+    """
+
+    width: int = 64
+    lags: int = 16
+    dropout: float = 0.0
+
+    @classmethod
+    def of(cls, plans: Plans) -> "Sizes":
+        """Those with which networks predict plans like these best; see `python -m eval quality`.
+
+        Short plans are learned exactly: a small network, without dropout unless they are few. In long sequences a wider
+        network with dropout finds more, and is overfitted less by what it has to carry itself than by the last actions
+        shown to it directly.
+        """
+        few = int(plans.mask().sum()) < FEW
+        if plans.max_length <= SHORT:
+            return cls(dropout=0.2 if few else 0.0)
+        if few or plans.num_actions <= KINDS:
+            return cls(64 if few else 128, 1, 0.3)
+        return cls(256, 1, 0.4)
 
 
 class NeuralPrior(Prior):
@@ -43,6 +82,7 @@ class NeuralPrior(Prior):
 
     Args:
         num_actions: A.
+        width: of the network's vectors, and of its hidden state.
         window: past actions that are read, at most; None: set by `fit`, and no limit before that.
         lags: past actions that each input shows to the network directly; see `Embedding`.
         dropout: share of the network's activations that is set to 0 at random in training.
@@ -58,9 +98,10 @@ class NeuralPrior(Prior):
     def __init__(
         self,
         num_actions: int,
+        width: int | None,
         window: int | None,
-        lags: int,
-        dropout: float,
+        lags: int | None,
+        dropout: float | None,
         num_contexts: int | None,
         context_size: int | None,
         seed: int,
@@ -68,17 +109,23 @@ class NeuralPrior(Prior):
         super().__init__(num_actions, num_contexts, context_size)
         if window is not None and (not isinstance(window, int) or isinstance(window, bool) or window < 0):
             raise ValueError(f"window: an integer of at least 0 is expected, not {window!r}")
-        if not 0 <= dropout < 1:
+        if dropout is not None and not 0 <= dropout < 1:
             raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
-        check_sizes(lags=lags)
         self._given_window = self.window = window
-        self.lags = lags
-        self.dropout = float(dropout)
+        check_sizes(lags=1 if lags is None else lags)
+        self._given = (width, lags, dropout)
+        self._seed, self._sized = seed, False
         self.input_size = 1 + (1 if num_contexts is not None else context_size or 0)
+        self._make(Sizes())
+
+    def _make(self, sizes: Sizes) -> None:
+        """Make the layers, with the sizes that were given and these where none were."""
+        width, lags, dropout = (own if own is not None else size for own, size in zip(self._given, sizes, strict=True))
+        self.width, self.lags, self.dropout = int(width), int(lags), float(dropout)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.manual_seed(self._seed)
             self.build()
-        self.eval()
+        self.to(self.device).eval()
 
     @property
     def config(self) -> dict[str, Any]:
@@ -224,11 +271,16 @@ class NeuralPrior(Prior):
     def prepare(self, plans: Plans | Tensor, window: int) -> Plans:
         """The plans to train on, in windows of so many actions; sets the window in which the prior will read.
 
+        What was not given of the network's sizes is chosen when it first learns; see `Sizes`.
+
         Raises:
             ValueError: plans that this prior cannot learn from, or too few of them.
         """
         plans = self.training_plans(plans)
         plans = plans[plans.mask().any(1)]
+        if None in self._given and not self._sized:
+            self._make(Sizes.of(plans))
+        self._sized = True
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
             raise ValueError("plans: at least two plans with an action are needed to train a neural prior")

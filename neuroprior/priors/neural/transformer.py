@@ -25,7 +25,8 @@ class TransformerPrior(NeuralPrior):
         num_layers: number of blocks.
         num_heads: attention heads.
         window, lags, dropout, num_contexts, context_size, seed: see `NeuralPrior`. Dropout is applied to the input
-            vectors and to what each block adds.
+            vectors and to what each block adds. What is None of `lags` and `dropout` is chosen by `fit` for its
+            first plans, see `neuroprior.priors.neural.Sizes`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -38,8 +39,8 @@ class TransformerPrior(NeuralPrior):
         num_layers: int = 2,
         num_heads: int = 4,
         window: int | None = None,
-        lags: int = 16,
-        dropout: float = 0.0,
+        lags: int | None = None,
+        dropout: float | None = None,
         num_contexts: int | None = None,
         context_size: int | None = None,
         seed: int = 0,
@@ -48,9 +49,9 @@ class TransformerPrior(NeuralPrior):
         if width % (2 * num_heads):
             raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
         check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
-        self.width, self.num_layers, self.num_heads = width, num_layers, num_heads
+        self.num_layers, self.num_heads = num_layers, num_heads
         self.span: int | None = None
-        super().__init__(num_actions, window, lags, dropout, num_contexts, context_size, seed)
+        super().__init__(num_actions, width, window, lags, dropout, num_contexts, context_size, seed)
 
     @property
     def config(self) -> dict[str, Any]:

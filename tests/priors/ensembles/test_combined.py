@@ -75,7 +75,7 @@ def test_it_is_a_prior(kind):
         prior = CombinedPrior(A, experts).fit(some_plans(contexts=True), generator=seeded(0), **QUICK)
     elif kind == "features":
         plans = Plans(some_plans().actions, A, context=torch.randn(60, 8, 2, generator=seeded(1)))
-        prior = CombinedPrior(A, context_size=2).fit(plans, generator=seeded(0), effort="fast", **QUICK)
+        prior = CombinedPrior(A, effort="fast", context_size=2).fit(plans, generator=seeded(0), **QUICK)
     elif kind == "tracking":
         experts, plans = switching()
         prior = CombinedPrior(A, experts)
@@ -245,6 +245,7 @@ def test_a_share_is_saved_too(tmp_path):
     [
         (some_plans(), {"effort": "most"}, "effort: one of fast, standard, full is expected, not 'most'"),
         (some_plans(), {"efort": "fast"}, "efort: not a setting"),
+        (some_plans(), {"effort": "fast", "prior": "gru"}, "effort: for the combined prior alone"),
         (some_plans(1, 1), {}, "cannot be split"),
         (some_plans(), {"validation": 1.5}, "validation"),
         (some_plans(), {"validation": Plans(torch.zeros(3, 3, dtype=torch.long), 7)}, "7 actions"),

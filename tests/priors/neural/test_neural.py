@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuroprior import GRUPrior, Plans, TransformerPrior
+from neuroprior import GRUPrior, Plans, TransformerPrior, load, save
 from tests.support.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
 
 BOTH = pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
@@ -82,7 +82,7 @@ def test_learns_from_each_kind_of_context(kind, what, per):
     arguments = {"num_contexts": 3}
     if what == "features":
         context, arguments = torch.nn.functional.one_hot(context, 3).float(), {"context_size": 3}
-    prior = small(kind, **arguments)
+    prior = small(kind, dropout=0.0, **arguments)
     prior.fit(Plans(actions, 3, context=context), generator=seeded(0), max_steps=60, learning_rate=0.03, progress=False)
     assert prior.context_per == per
     assert prior.log_prob(Plans(actions, 3, context=context)).exp().mean() > 0.7  # uniform: 1/81
@@ -330,3 +330,29 @@ def test_no_more_room_is_taken_than_is_used(window, span):
         _, state = prior.start(2)
         _, state = prior.advance(torch.tensor([0, 1]), state, None, 10**6)
     assert state.untyped_storage().nbytes() < 2 * 4 * 12 * (prior.cache_size + prior.lags + 1)
+
+
+@BOTH
+def test_sizes_follow_from_the_first_plans(kind, tmp_path):
+    """Short plans: small, with dropout where they are few; long sequences: no lags, the wider the more there are."""
+
+    def plans(num: int, length: int, actions: int = 3) -> Plans:
+        return Plans(torch.randint(actions, (num, length), generator=seeded(0)), actions)
+
+    quick = {"max_steps": 1, "progress": False}
+    for few, expected in (
+        (plans(100, 8), (64, 16, 0.2)),
+        (plans(3000, 8), (64, 16, 0.0)),
+        (plans(20, 100), (64, 1, 0.3)),
+        (plans(300, 100), (128, 1, 0.3)),
+        (plans(300, 100, 17), (256, 1, 0.4)),
+    ):
+        prior = kind(few.num_actions).fit(few, generator=seeded(0), **quick)
+        width = 64 if kind is TransformerPrior else expected[0]
+        assert (prior.width, prior.lags, prior.dropout) == (width, *expected[1:])
+    again = load(save(prior, tmp_path / "prior"))
+    for kept in (prior, again):  # what has learned keeps its sizes
+        kept.fit(plans(100, 8, 17), generator=seeded(0), **quick)
+        assert (kept.lags, kept.dropout) == (1, 0.4)
+    given = kind(3, 16, lags=2).fit(plans(20, 100), generator=seeded(0), **quick)
+    assert (given.width, given.lags, given.dropout) == (16, 2, 0.3)
