@@ -17,7 +17,7 @@ from neuroprior.plans import PastDurations, Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.counts import TooLargeError
-from neuroprior.priors.ensembles.candidates import fitted_experts
+from neuroprior.priors.ensembles.candidates import fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import divided
 from neuroprior.priors.prior import construct, context_arguments
 from neuroprior.sampling.ancestral import sample, sample_in_world
@@ -178,7 +178,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         experts = list(fitted_experts(training, validation, sizes, "standard", generator, design.training))
         combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
         assert isinstance(combined, CombinedPrior)
-        combined.learn_weights(validation)
+        combined.learn_weights(validation, number_tried(experts))
         names = {type_: name for name, type_ in NETWORKS.items()}
         for expert in [expert.recount(learned) for expert in experts]:
             if type(expert) in names:

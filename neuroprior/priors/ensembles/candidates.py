@@ -1,6 +1,6 @@
 """The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from math import inf
 from typing import Any, Literal
 
@@ -8,7 +8,7 @@ import torch
 
 from neuroprior._random import draw_seed
 from neuroprior.plans import Plans
-from neuroprior.priors.counts import ContextTreePrior, MarkovPrior, TooLargeError, chains
+from neuroprior.priors.counts import BACKOFFS_TRIED, ContextTreePrior, MarkovPrior, TooLargeError, chains
 from neuroprior.priors.ensembles.stacked import StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior, construct
@@ -53,6 +53,11 @@ def fitted_experts(
     yield from counted(learned, held_out, contexts)
     for prior in networks(learned.num_actions, contexts, effort, draw_seed(generator) % 2**31):
         yield prior.fit(learned, generator=generator, **{"validation": held_out, **settings})
+
+
+def number_tried(experts: Iterable[Prior]) -> int:
+    """How many experts there were to choose from: each chain is the best of many."""
+    return sum(len(ORDERS) * len(BACKOFFS_TRIED) if isinstance(e, MarkovPrior) else 1 for e in experts)
 
 
 def networks(num_actions: int, contexts: dict[str, int], effort: Effort, seed: int) -> list[Prior]:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.priors.ensembles.candidates import NETWORKS, Effort, fitted_experts, networks
+from neuroprior.priors.ensembles.candidates import NETWORKS, Effort, fitted_experts, networks, number_tried
 from neuroprior.priors.ensembles.mixture import MixturePrior, after, divided, learned_weights, taken_of, weights_before
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
@@ -172,18 +172,23 @@ class CombinedPrior(MixturePrior):
             contexts = {name: size for name, size in sizes.items() if size is not None}
             made = fitted_experts(learned, held_out, contexts, self.effort, generator, settings)
             self.experts = nn.ModuleList(made).to(self.device)
-        self.learn_weights(held_out)
+        self.learn_weights(held_out, None if self.given else number_tried(self._experts()))
         return self.recount(plans)
 
     @torch.no_grad()
-    def learn_weights(self, plans: Plans) -> None:
-        """Learn from plans that the experts did not learn from which of them are kept, and how they are combined."""
+    def learn_weights(self, plans: Plans, tried: int | None = None) -> None:
+        """Learn from plans that the experts did not learn from which of them are kept, and how they are combined.
+
+        Args:
+            plans: held-out plans.
+            tried: how many experts there were, where these are the best of more; None: these.
+        """
         actions, mask, plain = plans.actions, plans.mask(), plans.without_context()
         forecasts = [
             torch.cat([log_probs for _, log_probs in e.forecasts(plans if e.takes_context else plain)])
             for e in self._experts()
         ]
-        held_out = HeldOut(torch.stack(forecasts, 2), actions, mask)
+        held_out = HeldOut(torch.stack(forecasts, 2), actions, mask, (tried or len(forecasts)) + 2)
         kept, powers = held_out.choose([sum(weight.numel() for weight in e.parameters()) for e in self._experts()])
         members = with_pool(held_out.forecasts[:, :, kept], powers)
         taken = taken_of(members, actions).masked_fill(~mask[..., None], 0)
@@ -220,13 +225,13 @@ class HeldOut:
         forecasts: `[N, L, E, A]`, log-probabilities.
         actions: `[N, L]`.
         mask: `[N, L]` bool: the actions that count.
+        tried: how many forecasts, of experts, the pool and the fixed share, there were to choose from.
     """
 
-    def __init__(self, forecasts: Tensor, actions: Tensor, mask: Tensor) -> None:
-        self.forecasts, self.actions, self.mask = forecasts, actions, mask
+    def __init__(self, forecasts: Tensor, actions: Tensor, mask: Tensor, tried: int) -> None:
+        self.forecasts, self.actions, self.mask, self.tried = forecasts, actions, mask, tried
         self.taken = taken_of(forecasts, actions).masked_fill(~mask[..., None], 0)
         self.count = max(int(mask.sum()), 1)
-        self.tried = forecasts.shape[2] + 2
         self.tolerance = max(TOLERANCE, IN_ALL / self.count)
         # Some actions, evenly spread, are enough for a few powers.
         every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
