@@ -9,6 +9,8 @@ import pytest
 from neuroprior import load
 from neuroprior.cli.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 COLUMNS = ["--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
 COLUMNS += ["--columns.start", "t", "--columns.condition", "drug"]
 

@@ -15,6 +15,8 @@ from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import FROM_ELSEWHERE, QUICKLY, bits, fails, report
 from tests.support.sources import seeded
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def chain(num: int, length: int, actions: int = 3, **more) -> Plans:
     return markov_plans(markov_probs(actions, 1, 0, 1.5), num, length, 1, **more)

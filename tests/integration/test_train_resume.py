@@ -22,6 +22,8 @@ import neuroprior.cli.fit, neuroprior.cli.fit_report
 from neuroprior.training.trainer import WholeCheckpoints
 from train.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 
