@@ -14,6 +14,8 @@ from tests.integration.test_train import ROOT, Poison, small
 from tests.integration.test_train_faults import metrics, one_line
 from train.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 CUT = ["--data.check_every", "5"]
 
 DRIVER = """
@@ -21,8 +23,6 @@ import os, resource, signal, sys
 import neuroprior.cli.fit, neuroprior.cli.fit_report
 from neuroprior.training.trainer import WholeCheckpoints
 from train.__main__ import main
-
-pytestmark = pytest.mark.usefixtures("undrawn")
 
 def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)
