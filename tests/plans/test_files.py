@@ -106,7 +106,7 @@ def assert_same(one, other, numbering=True):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".jsonl"])
-@settings(derandomize=True, deadline=None, max_examples=150)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(plans=plans_of_all_kinds(), closed=st.booleans())
 def test_npz_and_jsonl_hold_everything(tmp_path_factory, suffix, plans, closed):
     path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
@@ -116,7 +116,7 @@ def test_npz_and_jsonl_hold_everything(tmp_path_factory, suffix, plans, closed):
 
 
 @pytest.mark.parametrize(("suffix", "layout"), [(".csv", None), (".csv", "step"), (".tsv", None)])
-@settings(derandomize=True, deadline=None, max_examples=150)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(plans=plans_of_all_kinds(shortest=1, names=NAMES.filter(in_csv)))
 def test_csv_holds_actions_contexts_and_groups(tmp_path_factory, suffix, layout, plans):
     path = tmp_path_factory.mktemp("files") / f"plans{suffix}"

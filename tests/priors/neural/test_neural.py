@@ -30,7 +30,7 @@ def torus_plans():
 @pytest.mark.parametrize("kind", [GRUPrior, pytest.param(TransformerPrior, marks=pytest.mark.slow)])
 def test_divergence_from_the_torus_source(kind, torus_plans):
     """With default settings but fewer steps, in bits per action over all 256 plans; Markov-2 is at .01387 at best."""
-    prior = kind(4).fit(torus_plans, generator=seeded(0), max_steps=300, progress=False)
+    prior = kind(4).fit(torus_plans, generator=seeded(0), max_steps=150, progress=False)
     with torch.no_grad():
         log_probs = prior.log_prob(every_plan(4, 4))
     assert float(log_probs.exp().sum()) == pytest.approx(1, abs=1e-4)
