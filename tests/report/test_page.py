@@ -471,6 +471,23 @@ def test_an_ethogram_has_the_actions_in_their_colours_by_condition_and_group():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["rest", "walk", "eat"]
 
 
+def test_parts_of_a_plan_are_in_one_row_of_an_ethogram():
+    """In their order, with a blank between them; plans of one name in two groups are two."""
+    actions, group = torch.tensor([[0, 1], [1, 0], [0, 0], [1, 1]]), torch.tensor([0, 1, 0, 0])
+    plans = Plans(actions, 2, torch.tensor([2, 2, 1, 2]), group=group, plan_names=["x", "x", "x", "y"])
+    rows, _ = strips(ethogram_figure(plans))
+    due = [[0, 1, None, 0], [1, 1, None, None], [1, 0, None, None]]
+    shown = [[to_hex(color[:3]) if color[3] else None for color in row] for row in rows]
+    assert shown == [[None if action is None else STRIPS[action] for action in row] for row in due]
+    timed = Plans(actions, 2, plans.lengths, group=group, plan_names=plans.plan_names, durations=2.0 + actions)
+    (first, *_), _ = strips(ethogram_figure(timed))  # 2, 3, a blank of 3 (the median), 2
+    at = (np.arange(MOST_BINS) + 0.5) * 10 / MOST_BINS
+    for low, high, action in ((0, 2, 0), (2, 5, 1), (5, 8, None), (8, 10, 0)):
+        here = first[(at > low) & (at < high)]
+        assert (here[:, 3] == (action is not None)).all()
+        assert action is None or {to_hex(color) for color in here} == {STRIPS[action]}
+
+
 def test_an_ethogram_of_durations_is_in_time():
     """Of durations 1, 3, unknown and 4, the third is blank for the median of the known ones, 3."""
     times = torch.tensor([[1.0, 3.0, float("nan"), 4.0]])

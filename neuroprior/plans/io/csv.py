@@ -4,7 +4,7 @@ import csv
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -60,6 +60,7 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
         return flat, sizes, features, [other.look_up([row[at[what]] for row in rows]) for what, other in others.items()]
 
     all_sizes, all_features, all_lines = [], [], []
+    plan_names: list[str] = []
     for block_lines, rows in sheet.blocks():
         flat, block_sizes, features, numbers = sheet.parse(parse, block_lines, rows)
         if block_sizes is None or table:
@@ -69,6 +70,8 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
             other.add_numbers(block)
         if features is not None:
             all_features.append(features)
+        if "plan" in at:
+            plan_names += [row[at["plan"]].strip() for row in rows]
         all_sizes.append(block_sizes)
         all_lines.append(block_lines.astype(np.uint32))
     sizes, lines = np.concatenate(all_sizes), np.concatenate(all_lines)
@@ -88,7 +91,7 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
         number, condition_names = found["condition"]
         condition = torch.from_numpy(number.astype(np.int64))
         plans = replace(plans, condition=condition, condition_names=condition_names)
-    return plans
+    return replace(plans, plan_names=plan_names) if plan_names else plans
 
 
 def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
@@ -145,6 +148,11 @@ def _read_gaps(sheet: "_Sheet", action_columns: list[int], **table: Any) -> Plan
     }
     frame = pd.DataFrame({"plan": row, "action": actions[taken]} | others)
     fields = fields_of(frame, place=lambda i: f"{sheet.path}, line {lines[row[i]]}", of=str(sheet.path), **table)
+    rows_of = fields.pop("plan_names", None)
+    if "plan" in sheet.columns:
+        called = cells[:, sheet.columns["plan"]]
+        pieces = range(len(fields["actions"])) if rows_of is None else map(int, rows_of)
+        fields["plan_names"] = tuple(str(called[i]) for i in pieces)
     if fields.get("context") is not None:
         fields["context"] = fields["context"][:, 0]  # one for each plan, repeated on its rows
     if empty := int((reach == 0).sum()):
@@ -313,7 +321,7 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
     lengths = plans.mask().sum(1)
     if not lengths.any():
         raise ValueError(f"{path}: CSV cannot hold plans of which none has an action")
-    for what in ("action", "context", "group", "condition"):
+    for what in ("action", "context", "group", "condition", "plan"):
         names = getattr(plans, f"{what}_names")
         for name in names or ():
             if not name.strip() or name != name.strip() or "\n" in name or "\r" in name:
@@ -341,9 +349,14 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
 
 
 def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
-    """The rows of a CSV file, the header first; with one step a row, plans are numbered from 0."""
+    """The rows of a CSV file, the header first; with one step a row, plans without names are numbered from 0.
+
+    Between two parts of one plan there is a row without an action, a gap.
+    """
     width, per_step = plans.max_length, is_per_step(plans.context)
+    plan_names, parted = _plan_column(plans) if by_step else (plans.plan_names, frozenset())
     header = ["plan", "action"] if by_step else [f"action_{i + 1}" for i in range(width)]
+    header = ["plan", *header] if not by_step and plan_names is not None else header
     if plans.context is not None:
         features = plans.context.shape[-1] if plans.context.is_floating_point() else 0
         header += [f"context_{i + 1}" for i in range(features)] or ["context"]
@@ -364,13 +377,40 @@ def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
         for i, (taken, length, context, group) in enumerate(
             zip(actions, lengths, contexts, groups, strict=True), start
         ):
+            called = i if plan_names is None else plan_names[i]
             if by_step:
+                if i in parted:
+                    blank = [""] * (len(_as_list(context[0] if per_step else context)))
+                    yield [called, "", *blank, *group, *([] if times is None else [""])]
                 yield from (
-                    [i, taken[t], *_as_list(context[t] if per_step else context), *group, *_time(times, i - start, t)]
+                    [
+                        called,
+                        taken[t],
+                        *_as_list(context[t] if per_step else context),
+                        *group,
+                        *_time(times, i - start, t),
+                    ]
                     for t in range(length)
                 )
             else:
-                yield [*taken[:length], *[""] * (width - length), *_as_list(context), *group]
+                name = [] if plan_names is None else [called]
+                yield [*name, *taken[:length], *[""] * (width - length), *_as_list(context), *group]
+
+
+def _plan_column(plans: Plans) -> tuple[Sequence[str] | None, frozenset[int]]:
+    """The names of plans in a file with one step a row, and which plans are further parts of the one before.
+
+    None where rows of one name would not be read as the same plans again: parts that do not follow one another, or
+    that no group holds together.
+    """
+    names = plans.plan_names
+    if names is None:
+        return None, frozenset()
+    group = [None] * len(plans) if plans.group is None else plans.group.tolist()
+    whole = list(zip(names, group, strict=True))
+    again = frozenset(i for i in range(1, len(whole)) if whole[i] == whole[i - 1])
+    apart = len(whole) - len(again) != len(set(whole))
+    return (None, frozenset()) if apart or (again and plans.group is None) else (names, again)
 
 
 def _time(times: list[list[float]] | None, plan: int, step: int) -> list[float | str]:
