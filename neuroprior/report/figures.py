@@ -33,6 +33,7 @@ from neuroprior.report.drawing import (
     colors,
     dot,
     drawn,
+    expect_columns,
     expect_some,
     floats,
     legend,
@@ -110,6 +111,7 @@ def score_figure(scores: pd.DataFrame) -> Figure:
             or "actions and durations"), `bits_per_action`, `low`, `high`; a model may have a row for each input.
     """
     expect_some("scores", scores)
+    expect_columns("scores", scores, "model context bits_per_action low high")
     best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
     models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
@@ -153,6 +155,7 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
             `low`, `high`, and `chance`, the 95 % quantile of what independent actions would give, or missing.
     """
     expect_some("lags", lags)
+    expect_columns("lags", lags, "what model context lag bits low high chance")
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     sizes = np.abs(floats(lags["bits"]))
     sizes = sizes[sizes > 0]
@@ -184,6 +187,8 @@ def order_figure(orders: pd.DataFrame, scores: pd.DataFrame, ringed: bool = True
         scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
         ringed: False where there are too few independent units for a verdict.
     """
+    expect_columns("orders", orders, "order context bic_bits aic_bits")
+    expect_columns("scores", scores, "model context bits_per_action low high")
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     styles = iter(("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1))))
     for inputs, own in orders.groupby("context", sort=False):
@@ -229,6 +234,7 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
             unit of the natural logarithm.
     """
     expect_some("dwell", dwell)
+    expect_columns("dwell", dwell, "action number zero law low high density fitted")
     actions = list(dict(iter(dwell.groupby("action", sort=False))).items())
     shown = sorted(actions, key=lambda item: -int(item[1]["number"].iloc[0]))[:MOST_PANELS]
     across = min(len(shown), 3)
@@ -271,6 +277,7 @@ def calibration_figure(calibration: pd.DataFrame) -> Figure:
             `low`, `high`, and `number` of forecasts; larger points hold more.
     """
     expect_some("calibration", calibration)
+    expect_columns("calibration", calibration, "model context forecast taken low high number")
     curves = dict(iter(calibration.groupby(model_names(calibration), sort=False)))
     across = min(len(curves), 3)
     down = -(-len(curves) // across)
@@ -371,6 +378,8 @@ def condition_figure(means: pd.DataFrame, values: pd.DataFrame, paired: bool = F
         paired: each unit is under every condition: lines join its dots.
     """
     expect_some("means", means)
+    expect_columns("means", means, "feature condition mean low high")
+    expect_columns("values", values, "feature unit condition value")
     conditions = list(means["condition"].unique())
     features = list(means["feature"].unique())
     height = 0.62 + (0.36 if paired else 0.26) * len(conditions)
@@ -404,6 +413,7 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
             `count`; drawn from the top down.
     """
     expect_some("motifs", motifs)
+    expect_columns("motifs", motifs, "sequence ratio low high count")
     names = ["\n".join(wrap(clean(name), 36, max_lines=4, placeholder=" …")) for name in motifs["sequence"]][::-1]
     heights = np.array([0.5 + 0.5 * (1 + name.count("\n")) for name in names])
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.3 * max(heights.sum(), 2)))
@@ -614,6 +624,8 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
             drawn, the one that takes the most bits at the top.
         plans: `index` of a plan in its group, `bits` per action; at most `MOST_PLANS` are drawn.
     """
+    expect_columns("drift", drift, "what name bits low high")
+    expect_columns("plans", plans, "index bits")
     parts, groups = (drift[drift["what"] == what] for what in ("place", "group"))
     ranked = groups[groups["bits"].notna()].sort_values("bits", kind="stable")
     ranked = ranked.iloc[_evenly(len(ranked), MOST_GROUPS)]

@@ -52,6 +52,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "Held-out scores" not in said
     assert "(training data)" in said
+    assert f"These are training data: prior has learned from {plans['training_data'].sum()} of the 32 plans." in said
 
 
 @pytest.mark.parametrize(

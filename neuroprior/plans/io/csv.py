@@ -6,7 +6,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,6 +32,9 @@ ROWS_AT_ONCE = 2**10
 """Rows that are parsed together; a few times faster than blocks that exceed the processor's cache."""
 
 DELIMITERS = (",", ";", "\t")
+SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*\s*', re.IGNORECASE)
+"""A first line by which spreadsheets are told what parts the columns."""
+
 OUR_WORDS = re.compile(r"plan|action(_1)?|context_1")
 OUR_COLUMNS = re.compile(r"plan|group|condition|start|stop|duration|(action|context)(_\d+)?")
 OTHER_WORDS = re.compile(r"session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code")
@@ -42,15 +45,22 @@ T = TypeVar("T")
 def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
     """Plans of a CSV file: see `read_plans`."""
     sheet = _Sheet(path, "columns" in table)
+    plans = _read(sheet, num_actions, action_names, **table)
+    note = f"line 1 says that {sheet.delimiter!r} parts the columns, and is no plan"
+    return replace(plans, notes=(*plans.notes, note)) if sheet.top > 1 else plans
+
+
+def _read(sheet: "_Sheet", num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
+    path = sheet.path
     action_columns = sheet.numbered("action") if sheet.has_header else list(range(sheet.width))
     if "columns" in table or not action_columns:
         return _read_events(sheet, num_actions=num_actions, action_names=action_names, **table)
     at = sheet.columns
     if "action" in at:
-        raise ValueError(f"{path}, line 1: 'action' and 'action_1'; one of them is expected")
+        raise ValueError(f"{path}, line {sheet.top}: 'action' and 'action_1'; one of them is expected")
     feature_columns = sheet.numbered("context")
     if "context" in at and feature_columns:
-        raise ValueError(f"{path}, line 1: 'context' and 'context_1'; one of them is expected")
+        raise ValueError(f"{path}, line {sheet.top}: 'context' and 'context_1'; one of them is expected")
     actions = Column("action", action_names, num_actions, untyped=True, blank=True)
     others = {what: Column(what, untyped=True) for what in ("context", "group", "condition") if what in at}
 
@@ -98,15 +108,15 @@ def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
     """Plans of a file with one action a row; see `Plans.from_dataframe`."""
     pd = _pandas(sheet.path)
     if not sheet.columns:
-        raise ValueError(f"{sheet.path}, line 1: a header is expected, and this looks like data")
+        raise ValueError(f"{sheet.path}, line {sheet.top}: a header is expected, and this looks like data")
     blocks = list(sheet.blocks())
     lines = np.concatenate([lines for lines, _ in blocks])
     frame = pd.DataFrame([row for _, rows in blocks for row in rows], columns=sheet.header, dtype=object)
     usual = "action" in sheet.columns and bool({"plan", "group"} & sheet.columns.keys())
     if not table.keys() - {"num_actions", "action_names"} and not usual:
         raise ValueError(
-            f"{sheet.path}, line 1: both columns 'plan' and 'action', or 'action_1', are expected; or say which"
-            " columns they are (--columns.action, --columns.plan)"
+            f"{sheet.path}, line {sheet.top}: both columns 'plan' and 'action', or 'action_1', are expected; or"
+            " say which columns they are (--columns.action, --columns.plan)"
         )
     try:
         # Where semicolons part the columns, commas are decimal: so spreadsheets write in much of Europe.
@@ -198,6 +208,7 @@ class _Sheet:
         columns: the position of each column by its name, in lower case; empty without a header.
         header: the names of the columns as they are.
         width: the number of cells of every row.
+        top: the number of the line with which the table begins.
 
     Raises:
         ValueError: an empty file, one that is not UTF-8 or not CSV, or a header with a column twice.
@@ -206,8 +217,11 @@ class _Sheet:
     def __init__(self, path: Path, has_header: bool = False) -> None:
         self.path = path
         with open_text(path) as file:
-            sample = next((line for line in file if line.strip()), "")
-        self.delimiter = _delimiter(sample)
+            line = file.readline()
+            said = SEPARATOR.fullmatch(line)
+            sample = next((each for each in chain([line], file) if each.strip()), "")
+        self.top = 2 if said else 1
+        self.delimiter = said[1] if said else _delimiter(sample)
         first = next((row for _, rows in self._all() for row in rows), None)
         if first is None:
             raise ValueError(f"{path}: no rows; plans are expected")
@@ -219,12 +233,12 @@ class _Sheet:
             known = [name for name in names if OUR_COLUMNS.fullmatch(name)]
             twice = next((name for name in known if known.count(name) > 1), None)
             if twice is not None:
-                raise ValueError(f"{path}, line 1: the column {twice!r} is there twice")
+                raise ValueError(f"{path}, line {self.top}: the column {twice!r} is there twice")
         elif other := next((name for name in names if OTHER_WORDS.fullmatch(name)), None):
             raise ValueError(
-                f"{path}, line 1: looks like a header ({other!r}) without a column 'action' (or 'action_1', ...); say"
-                " which column holds the actions (--columns.action), and which says to which plan a row belongs"
-                " (--columns.plan)"
+                f"{path}, line {self.top}: looks like a header ({other!r}) without a column 'action' (or 'action_1',"
+                " ...); say which column holds the actions (--columns.action), and which says to which plan a row"
+                " belongs (--columns.plan)"
             )
         self.columns = {name: i for i, name in enumerate(names)} if self.has_header else {}
 
@@ -244,17 +258,18 @@ class _Sheet:
     def _all(self) -> Iterator[tuple[Integers, list[Row]]]:
         """All rows but blank ones."""
         with open_text(self.path) as file:
-            reader = csv.reader(file, delimiter=self.delimiter, strict=True)
+            before = self.top - 1
+            reader = csv.reader(islice(file, before, None), delimiter=self.delimiter, strict=True)
             while True:
-                start = reader.line_num
+                start = before + reader.line_num
                 try:
                     rows = list(islice(reader, ROWS_AT_ONCE))
                 except csv.Error as error:
-                    raise ValueError(f"{self.path}, line {reader.line_num}: not CSV ({error})") from None
+                    raise ValueError(f"{self.path}, line {before + reader.line_num}: not CSV ({error})") from None
                 if not rows:
                     return
                 lines = np.arange(start + 1, start + len(rows) + 1)
-                if reader.line_num != start + len(rows):  # a quoted cell goes over several lines
+                if before + reader.line_num != start + len(rows):  # a quoted cell goes over several lines
                     taken = [1 + sum(len(re.findall(r"\r\n|\r|\n", cell)) for cell in row) for row in rows]
                     lines = start + np.cumsum(taken)
                 if not all(rows):
@@ -282,7 +297,9 @@ class _Sheet:
                 found[int(match[1])] = i
         missing = next((number for number in range(1, len(found) + 1) if number not in found), None)
         if missing is not None:
-            raise ValueError(f"{self.path}, line 1: columns up to {name}_{max(found)}, but {name}_{missing} is missing")
+            raise ValueError(
+                f"{self.path}, line {self.top}: columns up to {name}_{max(found)}, but {name}_{missing} is missing"
+            )
         return [found[number] for number in range(1, len(found) + 1)]
 
 
