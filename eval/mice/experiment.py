@@ -234,7 +234,7 @@ def _cut(plans: Plans, length: int) -> Plans:
         return values[:, : pieces * length].reshape(-1, length)
 
     group = torch.arange(len(plans)).repeat_interleave(pieces)
-    return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group)
+    return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group, plan_names=None)
 
 
 def _count_based(sources: dict[str, Plans], generator: torch.Generator) -> tuple[dict[PriorName, Prior], pd.DataFrame]:

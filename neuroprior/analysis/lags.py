@@ -213,6 +213,7 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
         durations=None,
         condition=None,
         condition_names=None,
+        plan_names=None,
     )
 
 

@@ -81,6 +81,7 @@ class _Search:
         state: `[B, M, ...]`: of the world at each node.
         size: `[B]`: nodes so far.
         left: `[B]`: simulator steps that may still be taken.
+        over: `[B]`: whether they are too few for the plan that was to be tried next.
     """
 
     def __init__(self, planner: MCTSPlanner, world: World, state: Tensor, generator: torch.Generator) -> None:
@@ -95,12 +96,12 @@ class _Search:
         self.reward, self.state = torch.zeros(batch, 1, device=state.device), state[:, None]
         self.size = torch.ones(batch, dtype=torch.long, device=state.device)
         self.steps = planner.num_plans * planner.length
-        self.left = torch.full_like(self.size, self.steps)
+        self.left, self.over = torch.full_like(self.size, self.steps), torch.zeros_like(self.size, dtype=torch.bool)
         self.low, self.high = (self.total.new_full((batch,), sign * torch.inf) for sign in (1, -1))
 
     def unfinished(self) -> Tensor:
         """The starts whose trees may be extended."""
-        return ((self.left > 0) & ~self.closed[:, 0].all(1)).nonzero()[:, 0]
+        return ((self.left > 0) & ~self.over & ~self.closed[:, 0].all(1)).nonzero()[:, 0]
 
     def most_steps(self) -> int:
         """Simulator steps, of the start that took most."""
@@ -134,7 +135,7 @@ class _Search:
                 column.append(values)
             if t + 1 < length:
                 logits, hidden = self.stepper.step_in(self.world, action, hidden, now, length - t - 2)
-        self.left[rows[~alive]] = 0
+        self.over[rows[~alive]] = True
         plan, rewards, states = (torch.stack(column, 1) for column in columns)
         rollout = Rollout(states[:, -1], rewards, states if self.planner.any_prefix else None)
         score, ends = self.planner.score_rollout(rollout)

@@ -75,4 +75,5 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
         group_names=None,
         durations=None if plans.durations is None else plans.durations[0][place.clamp(max=length - 1)],
         condition=None if plans.condition is None else plans.condition.expand(parts),
+        plan_names=None if plans.plan_names is None else tuple(plans.plan_names) * parts,
     )

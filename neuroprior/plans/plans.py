@@ -39,6 +39,8 @@ class Plans:
         condition: integers `[N]`: what plans are compared by, such as the treatment of the subject; None for none.
         condition_names: names of the conditions, numbered from 0, or None.
         notes: what a reader of files has to say of them, a line each.
+        plan_names: N names, such as those of sessions, or None. The parts of a plan that was cut at gaps share its
+            name, and plans of different groups may have the same one.
 
     Raises:
         ValueError: a shape, dtype or value is wrong; the message says which and where.
@@ -57,6 +59,7 @@ class Plans:
     condition: Tensor | None = None
     condition_names: Sequence[str] | None = None
     notes: Sequence[str] = ()
+    plan_names: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         check_sizes(num_actions=self.num_actions)
@@ -101,7 +104,12 @@ class Plans:
             object.__setattr__(self, "context", _tensor("context", self.context))
             check_context(self.context, num, length)
         for what in ("action", "context", "group", "condition"):
-            _check_texts(f"{what}_names", getattr(self, f"{what}_names"))
+            if _check_texts(f"{what}_names", getattr(self, f"{what}_names")):
+                check_distinct(f"{what}_names", getattr(self, f"{what}_names"))
+        if _check_texts("plan_names", self.plan_names):
+            if len(self.plan_names or ()) != num:
+                raise ValueError(f"plan_names: {num} are expected, one a plan, not {len(self.plan_names or ())}")
+            object.__setattr__(self, "plan_names", tuple(self.plan_names or ()))
         _check_names("group", self.group, self.group_names)
         _check_names("condition", self.condition, self.condition_names)
         _check_names("context", self.context, self.context_names)
@@ -154,7 +162,14 @@ class Plans:
             group=pick(self.group),
             durations=pick(self.durations),
             condition=pick(self.condition),
+            plan_names=None if self.plan_names is None else self._names_at(self.plan_names, index),
         )
+
+    def _names_at(self, names: Sequence[str], index: Tensor | slice) -> tuple[str, ...]:
+        if isinstance(index, slice):
+            return tuple(names[index])
+        chosen = torch.as_tensor(index).cpu()
+        return tuple(names[i] for i in torch.arange(len(self))[chosen].tolist())
 
     @classmethod
     def from_dataframe(
@@ -397,13 +412,11 @@ def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
         raise ValueError(f"{name}: shape {list(shape)} is expected, not {list(values.shape)}")
 
 
-def _check_texts(what: str, names: Sequence[str] | None) -> None:
-    """Raise ValueError unless names are texts, each of them once."""
-    if names is None:
-        return
-    if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+def _check_texts(what: str, names: Sequence[str] | None) -> bool:
+    """Whether there are names; ValueError unless they are texts."""
+    if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
         raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
-    check_distinct(what, names)
+    return names is not None
 
 
 def _check_names(what: str, numbers: Tensor | None, names: Sequence[str] | None) -> None:

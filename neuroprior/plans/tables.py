@@ -354,6 +354,11 @@ def fields_of(
             notes += _alike(known, what)
             number, kept = _numbered(what, values, known, None, None, lambda i: place(int(row[starts[i]])))
             found |= _named(what, number, kept)
+    if "plan" in table.at:
+        codes_of, called = table.texts(table.at["plan"])
+        own_names = tuple(called[code] for code in codes_of[row[starts]].tolist())
+        if own_names != tuple(map(str, range(len(own_names)))):  # plans that are numbered from 0 have no names
+            found["plan_names"] = own_names
     if gaps and "group" not in table.at:
         # The parts of a plan are not independent of one another.
         kept_plans, group = np.unique(plan[starts], return_inverse=True)

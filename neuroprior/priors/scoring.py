@@ -29,9 +29,9 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
         by: what a row is.
 
     Returns:
-        A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, and its `group` and
-        `condition`, where there are any); `log_likelihood`, nats; `bits_per_action`. The likelihood of a plan's end,
-        where the prior predicts it, counts for the plan, not for an action.
+        A pandas frame: `by`; `plans` and `actions`, how many (of a plan `actions` alone, its name (without names its
+        number), and its `group` and `condition`, where there are any); `log_likelihood`, nats; `bits_per_action`. The
+        likelihood of a plan's end, where the prior predicts it, counts for the plan, not for an action.
 
     Raises:
         ValueError: the prior does not know the actions or contexts, or plans have no groups or conditions.
@@ -62,7 +62,9 @@ def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
         found["action"] = [names[action] for action in found["action"]]
     else:
         own = {what: _names(plans, what) for what in ("group", "condition")}
-        found = pd.DataFrame({"plan": range(len(plans))} | {what: names for what, names in own.items() if names})
+        found = pd.DataFrame(
+            {"plan": plans.plan_names or range(len(plans))} | {what: names for what, names in own.items() if names}
+        )
         found = found.assign(actions=mask.sum(1).tolist(), bits=bits.sum(1).tolist())
         if by != "plan":
             sums = found.groupby(by, sort=False, as_index=False)

@@ -115,6 +115,15 @@ def expect_some(name: str, values: Sized) -> None:
         raise ValueError(f"{name}: at least one is expected; without any there is no figure")
 
 
+def expect_columns(name: str, frame: Any, columns: str) -> None:
+    """Raise ValueError unless a table has these columns, which are given with spaces between them."""
+    missing = [column for column in columns.split() if column not in getattr(frame, "columns", ())]
+    if missing:
+        raise ValueError(
+            f"{name}: a table with the columns {', '.join(columns.split())} is expected; {', '.join(missing)} missing"
+        )
+
+
 def floats(values: Iterable[Any]) -> Array:
     """Numbers, or rows of them, as an array, float64; None becomes NaN."""
     return np.array(list(values), dtype=np.float64)

@@ -33,6 +33,7 @@ from neuroprior.report.drawing import (
     colors,
     dot,
     drawn,
+    expect_columns,
     expect_some,
     floats,
     legend,
@@ -110,6 +111,7 @@ def score_figure(scores: pd.DataFrame) -> Figure:
             or "actions and durations"), `bits_per_action`, `low`, `high`; a model may have a row for each input.
     """
     expect_some("scores", scores)
+    expect_columns("scores", scores, "model context bits_per_action low high")
     best = scores.assign(bits=floats(scores["bits_per_action"])).groupby("model", sort=False)["bits"].min()
     models = best.fillna(np.inf).sort_values(ascending=False, kind="stable").index
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.36 * max(len(models), 2)))
@@ -153,6 +155,7 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
             `low`, `high`, and `chance`, the 95 % quantile of what independent actions would give, or missing.
     """
     expect_some("lags", lags)
+    expect_columns("lags", lags, "what model context lag bits low high chance")
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     sizes = np.abs(floats(lags["bits"]))
     sizes = sizes[sizes > 0]
@@ -184,6 +187,8 @@ def order_figure(orders: pd.DataFrame, scores: pd.DataFrame, ringed: bool = True
         scores: the table `plans`, of which the rows of Markov chains are drawn: see `score_figure`.
         ringed: False where there are too few independent units for a verdict.
     """
+    expect_columns("orders", orders, "order context bic_bits aic_bits")
+    expect_columns("scores", scores, "model context bits_per_action low high")
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     styles = iter(("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1))))
     for inputs, own in orders.groupby("context", sort=False):
@@ -229,6 +234,7 @@ def dwell_figure(dwell: pd.DataFrame) -> Figure:
             unit of the natural logarithm.
     """
     expect_some("dwell", dwell)
+    expect_columns("dwell", dwell, "action number zero law low high density fitted")
     actions = list(dict(iter(dwell.groupby("action", sort=False))).items())
     shown = sorted(actions, key=lambda item: -int(item[1]["number"].iloc[0]))[:MOST_PANELS]
     across = min(len(shown), 3)
@@ -271,6 +277,7 @@ def calibration_figure(calibration: pd.DataFrame) -> Figure:
             `low`, `high`, and `number` of forecasts; larger points hold more.
     """
     expect_some("calibration", calibration)
+    expect_columns("calibration", calibration, "model context forecast taken low high number")
     curves = dict(iter(calibration.groupby(model_names(calibration), sort=False)))
     across = min(len(curves), 3)
     down = -(-len(curves) // across)
@@ -371,6 +378,8 @@ def condition_figure(means: pd.DataFrame, values: pd.DataFrame, paired: bool = F
         paired: each unit is under every condition: lines join its dots.
     """
     expect_some("means", means)
+    expect_columns("means", means, "feature condition mean low high")
+    expect_columns("values", values, "feature unit condition value")
     conditions = list(means["condition"].unique())
     features = list(means["feature"].unique())
     height = 0.62 + (0.36 if paired else 0.26) * len(conditions)
@@ -404,6 +413,7 @@ def motif_figure(motifs: pd.DataFrame) -> Figure:
             `count`; drawn from the top down.
     """
     expect_some("motifs", motifs)
+    expect_columns("motifs", motifs, "sequence ratio low high count")
     names = ["\n".join(wrap(clean(name), 36, max_lines=4, placeholder=" …")) for name in motifs["sequence"]][::-1]
     heights = np.array([0.5 + 0.5 * (1 + name.count("\n")) for name in names])
     figure, (axes,) = panels(1, 1, (WIDTH, 0.9 + 0.3 * max(heights.sum(), 2)))
@@ -464,10 +474,11 @@ def ethogram_figure(plans: Plans) -> Figure:
 
     Time is the sum of the durations, in their unit, where plans have them; else a step is an action. A duration that is
     not known is left blank, as long as the median one. Of actions shorter than one of `MOST_BINS` parts of the longest
-    plan some are not drawn. At most `MOST_ROWS` plans are drawn, evenly spaced; the figure says so.
+    plan some are not drawn. At most `MOST_ROWS` plans are drawn, evenly spaced; the figure says so. The parts of a plan
+    that was cut at gaps (plans of one name and group) are in one row, in their order, with a blank between them.
 
     Args:
-        plans: with names, groups, conditions and durations where there are any.
+        plans: with names of actions and plans, groups, conditions and durations where there are any.
 
     Raises:
         ValueError: no plan has an action.
@@ -481,7 +492,9 @@ def ethogram_figure(plans: Plans) -> Figure:
     count = plans.actions.cpu()[torch.from_numpy(mask)].long().bincount(minlength=len(names)).numpy()
     palette, keys, columns = _strip_colors(count, names)
     whole = np.flatnonzero(mask.any(1))
-    some = whole[_evenly(len(whole), MOST_ROWS)]
+    row_of = _rows_of(plans, whole)
+    starts_row = np.unique(row_of, return_index=True)[1]
+    some = whole[starts_row[_evenly(len(starts_row), MOST_ROWS)]]  # the first plan of each row
     group, condition = (
         np.zeros(len(some), int) if values is None else values.cpu().numpy()[some]
         for values in (plans.group, plans.condition)
@@ -494,7 +507,11 @@ def ethogram_figure(plans: Plans) -> Figure:
     # Strips of five lines, the last of them blank; more blank lines before a group, and still more before a condition.
     tops = 5 * np.arange(len(some)) + np.cumsum(3 * new_group + 10 * new_condition * (plans.condition is not None))
     lines = int(tops[-1]) + 5
-    shown, longest = _over_time(plans[torch.tensor(some)])
+    place = np.full(len(starts_row), -1)
+    place[row_of[np.searchsorted(whole, some)]] = np.arange(len(some))
+    parts = np.argsort(place[row_of], kind="stable")
+    parts = parts[place[row_of[parts]] >= 0]
+    shown, longest = _over_time(plans[torch.from_numpy(whole[parts])], place[row_of[parts]])
     image = np.zeros((lines, shown.shape[1], 4))
     image[np.add.outer(tops, range(4))] = palette[shown][:, None]
     figure, (axes,) = panels(1, 1, (WIDTH, 0.034 * lines + 0.7 + 0.22 * -(-len(keys) // columns)))
@@ -510,17 +527,44 @@ def ethogram_figure(plans: Plans) -> Figure:
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.xaxis.set_major_locator(MaxNLocator(integer=plans.durations is None, min_n_ticks=1))
     across = "action of the plan" if plans.durations is None else "time, in the unit of the durations"
-    axes.set_xlabel(across + (f"; {len(some)} of {len(whole)} plans" if len(some) < len(whole) else ""))
+    axes.set_xlabel(across + (f"; {len(some)} of {len(starts_row)} plans" if len(some) < len(starts_row) else ""))
     figure.legend(handles=keys, loc="outside lower left", ncols=columns, fontsize=9, handlelength=1, columnspacing=1.4)
     return figure
 
 
-def _over_time(plans: Plans) -> tuple[NDArray[np.int64], float]:
-    """The action `[N, bins]` of plans at evenly spaced times, A for none, and how long the longest plan takes."""
-    actions, taken = plans.actions.cpu().numpy().astype(np.int64), plans.mask().cpu().numpy()
+def _rows_of(plans: Plans, index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The row of an ethogram of each of some plans, numbered from 0: parts of one plan have the same."""
+    if plans.plan_names is None:
+        return np.arange(len(index))
+    names = np.unique(np.array(plans.plan_names, dtype=str)[index], return_inverse=True)[1]
+    group = np.zeros(len(index), np.int64) if plans.group is None else plans.group.cpu().numpy()[index]
+    _, first, row = np.unique(np.stack([names, group]), axis=1, return_index=True, return_inverse=True)
+    rows: NDArray[np.int64] = np.argsort(np.argsort(first))[row.reshape(-1)]  # in the order of the plans
+    return rows
+
+
+def _over_time(plans: Plans, row: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+    """The action `[R, bins]` in R rows at evenly spaced times, A for none, and how long the longest row takes.
+
+    Args:
+        plans: N of them.
+        row: `[N]`, ascending from 0: in which row each is, behind those before it in the same row.
+    """
+    mask, rows = plans.mask().cpu().numpy(), int(row[-1]) + 1
+    # A part takes its actions and, where another one comes after it, a blank whose duration is not known.
+    size = mask.sum(1) + np.append(row[1:] == row[:-1], False)
+    before = np.cumsum(size) - size
+    offset = before - before[np.searchsorted(row, row)]
+    reach = np.bincount(row, size).astype(int)
+    plan, step = mask.nonzero()
+    at_row, at = row[plan], offset[plan] + step
+    actions = np.full((rows, reach.max()), plans.num_actions)
+    actions[at_row, at] = plans.actions.cpu().numpy()[plan, step]
+    taken = np.arange(actions.shape[1]) < reach[:, None]
     times, bins = taken.astype(np.float64), min(actions.shape[1], MOST_BINS)
     if plans.durations is not None:
-        times, bins = plans.durations.cpu().double().numpy() * taken, MOST_BINS
+        times, bins = np.where(taken, np.nan, 0.0), MOST_BINS
+        times[at_row, at] = plans.durations.cpu().double().numpy()[plan, step]
     unknown = np.isnan(times)
     known = times[taken & ~unknown]
     ends = np.where(unknown, np.median(known) if known.size else 1.0, times).cumsum(1)
@@ -580,6 +624,8 @@ def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
             drawn, the one that takes the most bits at the top.
         plans: `index` of a plan in its group, `bits` per action; at most `MOST_PLANS` are drawn.
     """
+    expect_columns("drift", drift, "what name bits low high")
+    expect_columns("plans", plans, "index bits")
     parts, groups = (drift[drift["what"] == what] for what in ("place", "group"))
     ranked = groups[groups["bits"].notna()].sort_values("bits", kind="stable")
     ranked = ranked.iloc[_evenly(len(ranked), MOST_GROUPS)]

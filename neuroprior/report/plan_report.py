@@ -196,6 +196,14 @@ def _document(found: Evaluation, sections: Sequence[str], file: str, command: st
 
 def _lead(found: Evaluation) -> str:
     """The finding: the model that takes the fewest bits, which is called the best where there are enough units."""
+    learned = found.settings.get("training data", {})
+    same = "; ".join(
+        f"{name} has learned from {number:,} of the {len(found.plans):,} plans" for name, number in learned.items()
+    )
+    return f"{_finding(found)} These are training data: {same}." if learned else _finding(found)
+
+
+def _finding(found: Evaluation) -> str:
     bits, low, high, _ = found.best.score.bits_per_action()
     interval = f"(95 % interval {low:.3f} to {high:.3f} over {found.unit})"
     if not found.too_few:

@@ -137,8 +137,9 @@ def test_help_lists_commands_and_options(capsys):
     assert "In which worlds, one after another." in out
 
 
-@pytest.mark.parametrize("module", ["neuroprior.cli", "eval", "train"])
-@pytest.mark.parametrize("after", [0.15, 0.6])
+@pytest.mark.parametrize(
+    ("module", "after"), [("neuroprior.cli", 0.15), ("neuroprior.cli", 0.6), ("eval", 0.3), ("train", 0.5)]
+)
 def test_ctrl_c_while_libraries_load(module, after):
     """It takes about two seconds until a command runs: no traceback before that either."""
     arguments = {"eval": ["plans", "none.csv"]}.get(module, ["fit", "--config", "none"])

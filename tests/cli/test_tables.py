@@ -9,6 +9,8 @@ import pytest
 from neuroprior import load
 from neuroprior.cli.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 COLUMNS = ["--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
 COLUMNS += ["--columns.start", "t", "--columns.condition", "drug"]
 
@@ -42,6 +44,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     assert len(pd.read_csv("score/groups.csv")) == 8
     plans = pd.read_csv("score/plans.csv")
     assert len(plans) == 32
+    assert plans["plan"].tolist() == [1, 1, 2, 2] * 8  # the sessions as the file names them, in two parts each
     said = " ".join(capsys.readouterr().out.split())
     assert f"Training data: {plans['training_data'].sum()} of 32 plans" in said
     assert plans["training_data"].sum() >= 24  # all but the held-out ones, and those of these that are the same
@@ -49,6 +52,7 @@ def test_report_fit_and_score_read_it_alike(table, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "Held-out scores" not in said
     assert "(training data)" in said
+    assert f"These are training data: prior has learned from {plans['training_data'].sum()} of the 32 plans." in said
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,11 @@ from eval.compare.command import KINDS, compare
 from eval.compare.results import Results
 from eval.worlds.suite import TASKS
 from neuroprior import GRUPrior, MarkovPrior, Plans, save
-from neuroprior.report import page
 from neuroprior.report.document import Document
 from tests.support.made_up_runs import made_up
 from tests.support.reports import FROM_ELSEWHERE
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 BAD = [
     (["--worlds", "nowhere"], "worlds"),
@@ -62,7 +63,6 @@ def quick(monkeypatch):
     monkeypatch.setattr(command, "compare_run", made_up)
     monkeypatch.setattr(command, "document", bare)
     monkeypatch.setattr(curriculum, "curriculum_run", made_up)
-    monkeypatch.setattr(page, "svg", lambda figure: "<svg></svg>")
 
 
 def results(out: Path) -> dict:

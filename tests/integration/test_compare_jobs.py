@@ -18,10 +18,11 @@ from eval.compare.run import Settings
 from eval.worlds.runs import Run, runs_of
 from neuroprior import MarkovPrior, save
 from neuroprior._jobs import JobRun
-from neuroprior.report import page
 from tests.support.made_up_runs import broken, killed, made_up
 from tests.support.sessions import interrupted
 from tests.support.sources import refuses
+
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 SETTINGS = Settings((2, 4), ("markov",), ("none",), 1, 3, 4, 5, 0)
 RUNS = runs_of(["maze", "grid"], 3)
@@ -64,7 +65,11 @@ def test_whatever_changes_results_makes_another_folder(tmp_path):
     assert len(set(folders)) == len(folders)
 
 
-@pytest.mark.parametrize(("run", "error"), [(broken, ValueError), (killed, MemoryError)])
+# A process that is killed: in `test_jobs.py`, too.
+KILLED = pytest.param(killed, MemoryError, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("run", "error"), [(broken, ValueError), KILLED])
 def test_a_failed_run_is_named_and_finished_ones_are_kept(run, error, tmp_path):
     jobs = jobs_in(tmp_path, run)
     words = ("maze-1", "no plan scored more than 0") if run is broken else ("killed", "--processes 1")
@@ -77,7 +82,6 @@ def test_a_failed_run_is_named_and_finished_ones_are_kept(run, error, tmp_path):
 def finish(out: Path) -> int:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "compare_run", made_up)
-        patch.setattr(page, "svg", lambda figure: "<svg></svg>")
         return main([*OPTIONS, "--processes", "1", "--out", str(out)])
 
 

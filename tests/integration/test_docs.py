@@ -4,14 +4,14 @@ import csv
 import importlib
 import io
 import json
-import os
 import pkgutil
 import re
+import runpy
 import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stdout, suppress
+from contextlib import chdir, redirect_stdout, suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -35,10 +35,10 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def run(code: str, folder: Path) -> None:
+    """Run a program in a folder; in this process, as libraries load for seconds."""
     (folder / "example.py").write_text(code, encoding="utf-8")
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "example.py"], cwd=folder, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    with chdir(folder):
+        runpy.run_path("example.py", run_name="__main__")
 
 
 EXAMPLES = [(page, number) for page in PAGES if page != OWN_DATA for number in range(len(blocks(page, "python")))]

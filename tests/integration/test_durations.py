@@ -13,6 +13,8 @@ from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.priors import GRUPrior, MarkovPrior, SemiMarkovPrior, load, match_plans
 from tests.support.sources import seeded
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 QUICK = ["--trainer.max_steps", "40", "--trainer.accelerator", "cpu", "--data.check_every", "10"]
 
 

@@ -17,6 +17,8 @@ from neuroprior.report import report
 from neuroprior.report.document import records, results_of
 from tests.support.sources import seeded
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 NAMES = ("left", "on", "right")
 CONTEXTS = ("cold", "mild", "warm")
 

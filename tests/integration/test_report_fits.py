@@ -21,6 +21,8 @@ from tests.support.reports import QUICKLY, bits, fails, report
 from tests.support.sessions import interrupted
 from tests.support.sources import seeded
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def cost_after(probs: torch.Tensor, length: int, skip: int) -> float:
     """The mean entropy, bits, of actions `skip` + 1 to `length` of `markov_plans` of a chain of order 2."""

@@ -15,6 +15,8 @@ from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import FROM_ELSEWHERE, QUICKLY, bits, fails, report
 from tests.support.sources import seeded
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def chain(num: int, length: int, actions: int = 3, **more) -> Plans:
     return markov_plans(markov_probs(actions, 1, 0, 1.5), num, length, 1, **more)
@@ -66,8 +68,9 @@ def test_long_plans_of_many_actions(tmp_path):
     assert len(bits(report(chain(2, 2500, 57), tmp_path, folds=2))) == 9
 
 
-def test_names_are_text(tmp_path, capsys):
+def test_names_are_text(tmp_path, capsys, monkeypatch, undrawn):
     """With all figures, in the page, in the terminal and in the name of the folder."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", undrawn)
     names = ('<b>"x"</b>', "[bold]", "[/red]", "日本\u202eé & $x_1$")
     groups = ("</td>", "[/i]", "{{ 7 }}")
     plans = chain(12, 6, 4, action_names=names, group=torch.arange(12) % 3, group_names=groups)

@@ -21,6 +21,8 @@ from neuroprior.training import PriorModule, Settings
 from tests.support.sources import seeded
 from train.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 ROOT = Path(__file__).parents[2]
 SMALL = {
     "gru": ["--model.prior.hidden_size", "8"],

@@ -12,6 +12,8 @@ from tests.integration.test_train import QUICK, SMALL, recipe, run, small, some_
 from tests.support.sources import seeded
 from train.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def one_line(capsys, arguments: list[str], *words: str, code: int = 2) -> None:
     capsys.readouterr()

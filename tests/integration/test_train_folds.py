@@ -16,6 +16,8 @@ from tests.integration.test_train_faults import metrics, one_line
 from tests.support.sources import seeded
 from train.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 GRU = ["--model.prior.hidden_size", "4", "--trainer.max_steps", "10", "--trainer.accelerator", "cpu"]
 
 

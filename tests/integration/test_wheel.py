@@ -42,34 +42,60 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "venv" / "bin"
 
 
-def run(installed: Path, folder: Path, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+def done(program: list[str], folder: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    """What a program said, of which nothing but what is installed is known."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    program = [str(installed / "neuroprior"), *words]
-    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+    ended = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True)
+    assert ended.returncode == code, ended.stderr
+    assert "Traceback" not in ended.stderr
+    return ended
 
 
-def test_the_four_commands(installed: Path, tmp_path: Path) -> None:
+def run(installed: Path, folder: Path, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+    return done([str(installed / "neuroprior"), *words], folder, code)
+
+
+IN_ONE_PROCESS = """
+import json, sys
+import neuroprior
+from neuroprior.cli.__main__ import main
+
+assert neuroprior.__file__.startswith(sys.prefix), neuroprior.__file__
+for words in json.loads(sys.argv[1]):
+    print("$", words[0], flush=True)
+    assert main(words) == 0, words
+"""
+
+
+def test_the_five_commands(installed: Path, tmp_path: Path) -> None:
+    """The program itself makes the example; the others run in one process, as libraries load for seconds."""
     run(installed, tmp_path, "example", "study.csv")
+    events = pd.read_csv(tmp_path / "study.csv")
+    assert events["animal"].nunique() == 12
+    events[events["animal"].isin(events["animal"].unique()[:3])].to_csv(tmp_path / "study.csv", index=False)
     study = ["study.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
     quick = ["--trainer.max_steps", "20", "--trainer.accelerator", "cpu", "--data.folds", "1"]
-    fitted = run(installed, tmp_path, "fit", "--config", "gru", "--data.file", *study, "--out", "gru", *quick)
-    assert "bits per action" in fitted.stdout
-    report = ["--models", "counts", "--processes", "1", "--out", "report"]
-    assert "report: report/report.html" in run(installed, tmp_path, "report", *study, *report).stdout
+    commands = [
+        ["fit", "--config", "gru", "--data.file", *study, "--out", "gru", *quick],
+        ["report", *study, "--priors", "gru", "--out", "report"],
+        ["score", "gru", *study, "--out", "score"],
+        ["sample", "gru", "--num-plans", "7", "--length", "5"],
+        ["sample", "gru", "--num-plans", "3", "--out", "new.csv"],
+    ]
+    program = [str(installed / "python"), "-c", IN_ONE_PROCESS, json.dumps(commands)]
+    said = done(program, tmp_path).stdout.split("$ ")
+    fitted, reported, scored, sampled = said[1:5]
+    assert "bits per action" in fitted
+    assert (tmp_path / "gru" / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    assert "report: report/report.html" in reported
     assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
-    scored = run(installed, tmp_path, "score", "gru", *study, "--out", "score")
-    assert "bits per action" in scored.stdout
+    assert "bits per action" in scored
     plans = pd.read_csv(tmp_path / "score" / "plans.csv")
     groups = pd.read_csv(tmp_path / "score" / "groups.csv")
-    assert (len(plans), len(groups)) == (100, 12)
+    assert len(plans) > len(groups) == 3
     assert plans["log_likelihood"].sum() == pytest.approx(groups["log_likelihood"].sum())
-    said = run(installed, tmp_path, "sample", "gru", "--num-plans", "7", "--length", "5").stdout.splitlines()
-    actions = [json.loads(line)["actions"] for line in said if "actions" in json.loads(line)]
-    assert [len(some) for some in actions] == [5] * 7
-    run(installed, tmp_path, "sample", "gru", "--num-plans", "3", "--out", "new.csv")
+    lines = [json.loads(line) for line in sampled.splitlines()[1:]]
+    assert [len(line["actions"]) for line in lines if "actions" in line] == [5] * 7
     known = {"drink", "eat", "freeze", "groom", "rear", "rest", "sniff", "walk"}
     assert set(pd.read_csv(tmp_path / "new.csv").stack()) <= known
 

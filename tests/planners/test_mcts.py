@@ -151,7 +151,7 @@ def test_the_tree_grows_as_puct_says(scores, exploration):
         taken = by_hand(scores, probs, exploration, num_plans)
         assert [state - 1 for state in world.log if 1 <= state <= 5] == taken
         assert float(decision.score[0]) == max(scores[a] for a in taken)
-        assert len(taken) + len(set(taken)) <= decision.model_steps <= 2 * num_plans
+        assert decision.model_steps == len(world.log) == len(taken) + len(set(taken))
 
 
 def test_other_states_than_numbers_and_priors_that_see():

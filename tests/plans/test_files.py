@@ -58,6 +58,7 @@ def plans_of_all_kinds(draw, shortest=0, names=NAMES):
         size = num * longest
         some = st.floats(0, 2.0**100, width=32) | st.just(math.nan)
         durations = torch.tensor(draw(st.lists(some, min_size=size, max_size=size))).reshape(num, longest)
+    plan_names = [f"plan {n}" for n in range(1, num + 1)] if draw(st.booleans()) else None
     return Plans(
         actions,
         num_actions,
@@ -70,6 +71,7 @@ def plans_of_all_kinds(draw, shortest=0, names=NAMES):
         durations=durations,
         condition=numbers(2, num) if condition_names or draw(st.booleans()) else None,
         condition_names=condition_names,
+        plan_names=plan_names,
     )
 
 
@@ -100,13 +102,14 @@ def assert_same(one, other, numbering=True):
         else:
             assert list(map(str, called(a, getattr(one, names)))) == list(map(str, called(b, getattr(other, names))))
     assert one.action_names == other.action_names
+    assert one.plan_names == other.plan_names
     if numbering:
         for what in ("context", "group", "condition"):
             assert getattr(one, f"{what}_names") == getattr(other, f"{what}_names")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".jsonl"])
-@settings(derandomize=True, deadline=None, max_examples=150)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(plans=plans_of_all_kinds(), closed=st.booleans())
 def test_npz_and_jsonl_hold_everything(tmp_path_factory, suffix, plans, closed):
     path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
@@ -116,7 +119,7 @@ def test_npz_and_jsonl_hold_everything(tmp_path_factory, suffix, plans, closed):
 
 
 @pytest.mark.parametrize(("suffix", "layout"), [(".csv", None), (".csv", "step"), (".tsv", None)])
-@settings(derandomize=True, deadline=None, max_examples=150)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(plans=plans_of_all_kinds(shortest=1, names=NAMES.filter(in_csv)))
 def test_csv_holds_actions_contexts_and_groups(tmp_path_factory, suffix, layout, plans):
     path = tmp_path_factory.mktemp("files") / f"plans{suffix}"
@@ -321,3 +324,39 @@ def test_codes_from_1_are_noted(name, tmp_path):
     assert read_plans(path).num_actions == 4
     assert not read_plans(path, num_actions=4).notes
     assert not read_plans(path, action_names=list("abcd")).notes
+
+
+def parted() -> Plans:
+    """Three sessions of two mice; one of them in three parts."""
+    names, group = ["day 2", "day 2", "day 2", "day 1", "day 2"], torch.tensor([0, 0, 0, 0, 1])
+    own = {"group": group, "group_names": ["m1", "m2"], "condition": group, "durations": torch.ones(5, 3)}
+    return Plans(torch.arange(15).view(5, 3) % 4, 4, torch.tensor([2, 1, 3, 3, 1]), plan_names=names, **own)
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.jsonl", "a.csv"])
+def test_parts_of_a_plan_have_its_name(tmp_path, name):
+    """They are parts of one plan when they are read again, and not one plan."""
+    write_plans(parted(), tmp_path / name)
+    assert_same(read_plans(tmp_path / name, num_actions=4), parted(), numbering=False)
+
+
+def test_in_csv_parts_that_are_not_together_are_numbered(tmp_path):
+    some = parted()[torch.tensor([0, 3, 1])]
+    assert some.plan_names == ("day 2", "day 1", "day 2")
+    write_plans(some, tmp_path / "a.csv")
+    assert_same(read_plans(tmp_path / "a.csv", num_actions=4), replace(some, plan_names=None), numbering=False)
+
+
+def test_plans_are_named_as_in_the_file(tmp_path):
+    """Where a row without a label ends a plan, its parts have one name; numbers from 0 are no names."""
+    rows = ["s,b", "m1-day2,walk", "m1-day2,", "m1-day2,rest", "m1-day3,walk"]
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    plans = read_plans(tmp_path / "a.csv", columns={"action": "b", "plan": "s"})
+    assert plans.plan_names == ("m1-day2", "m1-day2", "m1-day3")
+    (tmp_path / "b.csv").write_text("plan,action_1,action_2,action_3\nx,0,?,1\ny,1,1,\n")
+    assert read_plans(tmp_path / "b.csv").plan_names == ("x", "x", "y")
+    (tmp_path / "c.csv").write_text("plan,action\n0,1\n1,0\n")
+    assert read_plans(tmp_path / "c.csv").plan_names is None
+    (tmp_path / "d.jsonl").write_text('{"actions": [0], "plan": "x"}\n{"actions": [1]}\n')
+    with pytest.raises(ValueError, match="line 2: plan: a name in every plan, or in none"):
+        read_plans(tmp_path / "d.jsonl")

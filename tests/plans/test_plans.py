@@ -227,3 +227,17 @@ def test_steps_of_plans() -> None:
         plans.steps(-1)
     with pytest.raises(ValueError, match="stop: at least 3"):
         plans.steps(3, 2)
+
+
+def test_plans_keep_their_names():
+    plans = Plans(torch.arange(6).view(3, 2), 6, plan_names=["a", "b", "a"])
+    assert plans.plan_names == ("a", "b", "a")
+    assert plans[1:].plan_names == ("b", "a")
+    assert plans[torch.tensor([2, 1])].plan_names == ("a", "b")
+    assert plans[torch.tensor([True, False, True])].plan_names == ("a", "a")
+    assert plans.with_end().plan_names == plans.steps(1).plan_names == plans.plan_names
+    for part in plans.split(0.4, torch.Generator().manual_seed(0)):
+        assert [("a", "b", "a")[int(first) // 2] for first in part.actions[:, 0]] == list(part.plan_names)
+    for wrong, words in ((["a", "b"], "3 are expected, one a plan, not 2"), ("abc", "a list of texts")):
+        with pytest.raises(ValueError, match=f"plan_names: {words}"):
+            Plans(plans.actions, 6, plan_names=wrong)

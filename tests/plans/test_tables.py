@@ -416,3 +416,16 @@ def test_frames_of_keypoint_moseq(tmp_path):
     assert plans.group is None
     assert "actions are numbers from 0 to 3, of which 2 never occurs" in plans.notes
     assert len(read(tmp_path, MOSEQ, columns=columns).actions[0]) == 3  # only on request
+
+
+@pytest.mark.parametrize("first", ["sep=;", "sep=;;", '"sep=;"', "SEP=;"])
+def test_a_line_that_names_the_separator_is_no_row(tmp_path, first):
+    """As spreadsheets write it; lines are still counted from the first one."""
+    (tmp_path / "a.csv").write_text(f"{first}\nplan;action;duration\nx;walk;0,5\nx;rest;1\n")
+    plans = read_plans(tmp_path / "a.csv")
+    assert plans.action_names == ("rest", "walk")
+    assert plans.durations.tolist() == [[0.5, 1.0]]
+    assert plans.notes[-1] == "line 1 says that ';' parts the columns, and is no plan"
+    (tmp_path / "b.csv").write_text(f"{first}\naction_1;action_2\n1;0\n0\n")
+    with pytest.raises(ValueError, match=r"b\.csv, line 4: 1 cells, where the header has 2"):
+        read_plans(tmp_path / "b.csv")

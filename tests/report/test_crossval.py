@@ -101,8 +101,6 @@ def by_hand(model: str, learned: Plans, held: Plans, seed: int, contexts: int | 
     ("kind", "grouped", "skip"),
     [
         ("nothing", False, 0),
-        ("nothing", True, 2),
-        ("index a plan", False, 2),
         ("index a plan", True, 0),
         ("index a step", False, 0),
         ("index a step", True, 2),

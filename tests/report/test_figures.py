@@ -6,7 +6,15 @@ from matplotlib.axes import Axes
 
 from neuroprior.report import condition_figure
 from neuroprior.report.drawing import lines
-from neuroprior.report.figures import calibration_figure, dwell_figure, motif_figure, order_figure
+from neuroprior.report.figures import (
+    calibration_figure,
+    drift_figure,
+    dwell_figure,
+    lag_figure,
+    motif_figure,
+    order_figure,
+    score_figure,
+)
 
 
 def title(axes: Axes) -> str:
@@ -113,3 +121,28 @@ def test_orders_that_are_left_out():
     assert not [
         line for line in order_figure(orders, scores, ringed=False).axes[0].lines if line.get_markersize() == 13
     ]
+
+
+@pytest.mark.parametrize(
+    ("make", "frames", "words"),
+    [
+        (score_figure, ["model context low high"], "scores: .*; bits_per_action missing"),
+        (lag_figure, ["model lag bits low high chance"], "lags: .*; what, context missing"),
+        (
+            order_figure,
+            ["order", "model context bits_per_action low high"],
+            "orders: .*; context, bic_bits, aic_bits m",
+        ),
+        (order_figure, ["order context bic_bits aic_bits", "model"], "scores: .*; context, bits_per_action"),
+        (dwell_figure, ["action"], "dwell: .*; number, zero"),
+        (calibration_figure, ["model context"], "calibration: .*; forecast"),
+        (condition_figure, ["feature", "feature"], "means: .*; condition"),
+        (condition_figure, ["feature condition mean low high", "feature"], "values: .*; unit, condition, value m"),
+        (motif_figure, ["sequence"], "motifs: .*; ratio, low, high, count missing"),
+        (drift_figure, ["what name", "index bits"], "drift: .*; bits, low, high missing"),
+        (drift_figure, ["what name bits low high", "index"], "plans: .*; bits missing"),
+    ],
+)
+def test_tables_without_a_column_are_refused(make, frames, words):
+    with pytest.raises(ValueError, match=words):
+        make(*(pd.DataFrame([dict.fromkeys(columns.split(), 1)]) for columns in frames))

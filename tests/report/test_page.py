@@ -162,9 +162,8 @@ def figures(names: list[str], models: list[str], groups: list[str], context: boo
 
 
 CASES = {
-    "few": (["in", "left", "right", "out"], ["gru", "combined"], ["a", "b"], True),
     "one": (["L", "R"], ["markov-1"], ["only"], False),
-    "many": (MANY, MODELS, [f"session of animal {n}" for n in range(30)], False),
+    "many": (MANY, MODELS, [f"session of animal {n}" for n in range(14)], False),
     "hostile": (HOSTILE, HOSTILE[:3], HOSTILE[:3], True),
 }
 
@@ -240,7 +239,9 @@ def test_pages_need_nothing_from_outside(boxes, page):
 
 def test_the_same_results_give_the_same_bytes(tmp_path):
     first, second = (
-        written(tmp_path, page_of("x", [FigureBox(figure, "", "") for figure in figures(*CASES["one"]).values()]))
+        written(
+            tmp_path, page_of("x", [FigureBox(figure, "", "") for figure in [*figures(*CASES["one"]).values()][::3]])
+        )
         for _ in range(2)
     )
     assert first == second
@@ -468,6 +469,23 @@ def test_an_ethogram_has_the_actions_in_their_colours_by_condition_and_group():
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["rest 0", "rest 2", "rest 1"]
     assert [text.get_text() for text in figure.axes[0].texts] == ["x", "eat"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["rest", "walk", "eat"]
+
+
+def test_parts_of_a_plan_are_in_one_row_of_an_ethogram():
+    """In their order, with a blank between them; plans of one name in two groups are two."""
+    actions, group = torch.tensor([[0, 1], [1, 0], [0, 0], [1, 1]]), torch.tensor([0, 1, 0, 0])
+    plans = Plans(actions, 2, torch.tensor([2, 2, 1, 2]), group=group, plan_names=["x", "x", "x", "y"])
+    rows, _ = strips(ethogram_figure(plans))
+    due = [[0, 1, None, 0], [1, 1, None, None], [1, 0, None, None]]
+    shown = [[to_hex(color[:3]) if color[3] else None for color in row] for row in rows]
+    assert shown == [[None if action is None else STRIPS[action] for action in row] for row in due]
+    timed = Plans(actions, 2, plans.lengths, group=group, plan_names=plans.plan_names, durations=2.0 + actions)
+    (first, *_), _ = strips(ethogram_figure(timed))  # 2, 3, a blank of 3 (the median), 2
+    at = (np.arange(MOST_BINS) + 0.5) * 10 / MOST_BINS
+    for low, high, action in ((0, 2, 0), (2, 5, 1), (5, 8, None), (8, 10, 0)):
+        here = first[(at > low) & (at < high)]
+        assert (here[:, 3] == (action is not None)).all()
+        assert action is None or {to_hex(color) for color in here} == {STRIPS[action]}
 
 
 def test_an_ethogram_of_durations_is_in_time():

@@ -50,18 +50,18 @@ def read_plans(
 
     - `.npz`: arrays named like the attributes of `Plans`; only `actions [N, L]` is required. Nothing is unpickled.
     - `.jsonl`: one plan a line, an object with `actions`, a list of integers or of names, and optionally `context`,
-      `group`, `condition` and `durations`, a list of numbers; other keys are ignored. A context is an integer or a
-      name; a list of these, one for each action; features of the plan, a list of numbers (at least one in the file with
-      a decimal point, else all are taken for integers); or features of each step, a list of lists; all plans of a file
-      have the same kind. The first line may have, in place of `actions`, any of `num_actions`, `action_names`,
-      `context_names`, `group_names`, `condition_names` and `end`.
+      `plan` (its name), `group`, `condition` and `durations`, a list of numbers; other keys are ignored. A context is
+      an integer or a name; a list of these, one for each action; features of the plan, a list of numbers (at least one
+      in the file with a decimal point, else all are taken for integers); or features of each step, a list of lists; all
+      plans of a file have the same kind. The first line may have, in place of `actions`, any of `num_actions`,
+      `action_names`, `context_names`, `group_names`, `condition_names` and `end`.
     - `.csv`, `.tsv` (commas, semicolons or tabs) with one action a row: columns `plan` and `action`, and perhaps
       `context` (or `context_1`, `context_2`, ..., features), `group`, `condition`, `start`, `stop` or `duration`; or
       other columns, which `columns` names. See `Plans.from_dataframe`. The rows of a plan stand together, in their
       order, unless there is a `start`.
     - `.csv`, `.tsv` with one plan a row: columns `action_1`, `action_2`, ..., empty after a plan's end, and perhaps a
-      context, `group` and `condition`; or no header, and all cells are actions. A label that is missing before a plan's
-      end is a gap, as with one action a row.
+      context, `plan` (its name), `group` and `condition`; or no header, and all cells are actions. A label that is
+      missing before a plan's end is a gap, as with one action a row.
 
     Whole numbers are indices; names are numbered in sorted order. In CSV, groups are names if any of them is not a
     number.
@@ -105,7 +105,8 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
 
     `.npz` and `.jsonl` keep everything. CSV keeps names where there are any, else numbers, but not how many actions are
     possible: give `num_actions` or `action_names` when reading it. Names of contexts and groups are numbered in sorted
-    order then.
+    order then. In a CSV file with one step a row, a row without an action is between two parts of one plan
+    (`Plans.plan_names`); where such parts do not follow one another, or have no group, plans are numbered, not named.
 
     Args:
         plans: at least one.

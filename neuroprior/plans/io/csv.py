@@ -4,9 +4,9 @@ import csv
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,6 +32,9 @@ ROWS_AT_ONCE = 2**10
 """Rows that are parsed together; a few times faster than blocks that exceed the processor's cache."""
 
 DELIMITERS = (",", ";", "\t")
+SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*\s*', re.IGNORECASE)
+"""A first line by which spreadsheets are told what parts the columns."""
+
 OUR_WORDS = re.compile(r"plan|action(_1)?|context_1")
 OUR_COLUMNS = re.compile(r"plan|group|condition|start|stop|duration|(action|context)(_\d+)?")
 OTHER_WORDS = re.compile(r"session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code")
@@ -42,15 +45,22 @@ T = TypeVar("T")
 def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
     """Plans of a CSV file: see `read_plans`."""
     sheet = _Sheet(path, "columns" in table)
+    plans = _read(sheet, num_actions, action_names, **table)
+    note = f"line 1 says that {sheet.delimiter!r} parts the columns, and is no plan"
+    return replace(plans, notes=(*plans.notes, note)) if sheet.top > 1 else plans
+
+
+def _read(sheet: "_Sheet", num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
+    path = sheet.path
     action_columns = sheet.numbered("action") if sheet.has_header else list(range(sheet.width))
     if "columns" in table or not action_columns:
         return _read_events(sheet, num_actions=num_actions, action_names=action_names, **table)
     at = sheet.columns
     if "action" in at:
-        raise ValueError(f"{path}, line 1: 'action' and 'action_1'; one of them is expected")
+        raise ValueError(f"{path}, line {sheet.top}: 'action' and 'action_1'; one of them is expected")
     feature_columns = sheet.numbered("context")
     if "context" in at and feature_columns:
-        raise ValueError(f"{path}, line 1: 'context' and 'context_1'; one of them is expected")
+        raise ValueError(f"{path}, line {sheet.top}: 'context' and 'context_1'; one of them is expected")
     actions = Column("action", action_names, num_actions, untyped=True, blank=True)
     others = {what: Column(what, untyped=True) for what in ("context", "group", "condition") if what in at}
 
@@ -60,6 +70,7 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
         return flat, sizes, features, [other.look_up([row[at[what]] for row in rows]) for what, other in others.items()]
 
     all_sizes, all_features, all_lines = [], [], []
+    plan_names: list[str] = []
     for block_lines, rows in sheet.blocks():
         flat, block_sizes, features, numbers = sheet.parse(parse, block_lines, rows)
         if block_sizes is None or table:
@@ -69,6 +80,8 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
             other.add_numbers(block)
         if features is not None:
             all_features.append(features)
+        if "plan" in at:
+            plan_names += [row[at["plan"]].strip() for row in rows]
         all_sizes.append(block_sizes)
         all_lines.append(block_lines.astype(np.uint32))
     sizes, lines = np.concatenate(all_sizes), np.concatenate(all_lines)
@@ -88,22 +101,22 @@ def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **
         number, condition_names = found["condition"]
         condition = torch.from_numpy(number.astype(np.int64))
         plans = replace(plans, condition=condition, condition_names=condition_names)
-    return plans
+    return replace(plans, plan_names=plan_names) if plan_names else plans
 
 
 def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
     """Plans of a file with one action a row; see `Plans.from_dataframe`."""
     pd = _pandas(sheet.path)
     if not sheet.columns:
-        raise ValueError(f"{sheet.path}, line 1: a header is expected, and this looks like data")
+        raise ValueError(f"{sheet.path}, line {sheet.top}: a header is expected, and this looks like data")
     blocks = list(sheet.blocks())
     lines = np.concatenate([lines for lines, _ in blocks])
     frame = pd.DataFrame([row for _, rows in blocks for row in rows], columns=sheet.header, dtype=object)
     usual = "action" in sheet.columns and bool({"plan", "group"} & sheet.columns.keys())
     if not table.keys() - {"num_actions", "action_names"} and not usual:
         raise ValueError(
-            f"{sheet.path}, line 1: both columns 'plan' and 'action', or 'action_1', are expected; or say which"
-            " columns they are (--columns.action, --columns.plan)"
+            f"{sheet.path}, line {sheet.top}: both columns 'plan' and 'action', or 'action_1', are expected; or"
+            " say which columns they are (--columns.action, --columns.plan)"
         )
     try:
         # Where semicolons part the columns, commas are decimal: so spreadsheets write in much of Europe.
@@ -145,6 +158,11 @@ def _read_gaps(sheet: "_Sheet", action_columns: list[int], **table: Any) -> Plan
     }
     frame = pd.DataFrame({"plan": row, "action": actions[taken]} | others)
     fields = fields_of(frame, place=lambda i: f"{sheet.path}, line {lines[row[i]]}", of=str(sheet.path), **table)
+    rows_of = fields.pop("plan_names", None)
+    if "plan" in sheet.columns:
+        called = cells[:, sheet.columns["plan"]]
+        pieces = range(len(fields["actions"])) if rows_of is None else map(int, rows_of)
+        fields["plan_names"] = tuple(str(called[i]) for i in pieces)
     if fields.get("context") is not None:
         fields["context"] = fields["context"][:, 0]  # one for each plan, repeated on its rows
     if empty := int((reach == 0).sum()):
@@ -190,6 +208,7 @@ class _Sheet:
         columns: the position of each column by its name, in lower case; empty without a header.
         header: the names of the columns as they are.
         width: the number of cells of every row.
+        top: the number of the line with which the table begins.
 
     Raises:
         ValueError: an empty file, one that is not UTF-8 or not CSV, or a header with a column twice.
@@ -198,8 +217,11 @@ class _Sheet:
     def __init__(self, path: Path, has_header: bool = False) -> None:
         self.path = path
         with open_text(path) as file:
-            sample = next((line for line in file if line.strip()), "")
-        self.delimiter = _delimiter(sample)
+            line = file.readline()
+            said = SEPARATOR.fullmatch(line)
+            sample = next((each for each in chain([line], file) if each.strip()), "")
+        self.top = 2 if said else 1
+        self.delimiter = said[1] if said else _delimiter(sample)
         first = next((row for _, rows in self._all() for row in rows), None)
         if first is None:
             raise ValueError(f"{path}: no rows; plans are expected")
@@ -211,12 +233,12 @@ class _Sheet:
             known = [name for name in names if OUR_COLUMNS.fullmatch(name)]
             twice = next((name for name in known if known.count(name) > 1), None)
             if twice is not None:
-                raise ValueError(f"{path}, line 1: the column {twice!r} is there twice")
+                raise ValueError(f"{path}, line {self.top}: the column {twice!r} is there twice")
         elif other := next((name for name in names if OTHER_WORDS.fullmatch(name)), None):
             raise ValueError(
-                f"{path}, line 1: looks like a header ({other!r}) without a column 'action' (or 'action_1', ...); say"
-                " which column holds the actions (--columns.action), and which says to which plan a row belongs"
-                " (--columns.plan)"
+                f"{path}, line {self.top}: looks like a header ({other!r}) without a column 'action' (or 'action_1',"
+                " ...); say which column holds the actions (--columns.action), and which says to which plan a row"
+                " belongs (--columns.plan)"
             )
         self.columns = {name: i for i, name in enumerate(names)} if self.has_header else {}
 
@@ -236,17 +258,18 @@ class _Sheet:
     def _all(self) -> Iterator[tuple[Integers, list[Row]]]:
         """All rows but blank ones."""
         with open_text(self.path) as file:
-            reader = csv.reader(file, delimiter=self.delimiter, strict=True)
+            before = self.top - 1
+            reader = csv.reader(islice(file, before, None), delimiter=self.delimiter, strict=True)
             while True:
-                start = reader.line_num
+                start = before + reader.line_num
                 try:
                     rows = list(islice(reader, ROWS_AT_ONCE))
                 except csv.Error as error:
-                    raise ValueError(f"{self.path}, line {reader.line_num}: not CSV ({error})") from None
+                    raise ValueError(f"{self.path}, line {before + reader.line_num}: not CSV ({error})") from None
                 if not rows:
                     return
                 lines = np.arange(start + 1, start + len(rows) + 1)
-                if reader.line_num != start + len(rows):  # a quoted cell goes over several lines
+                if before + reader.line_num != start + len(rows):  # a quoted cell goes over several lines
                     taken = [1 + sum(len(re.findall(r"\r\n|\r|\n", cell)) for cell in row) for row in rows]
                     lines = start + np.cumsum(taken)
                 if not all(rows):
@@ -274,7 +297,9 @@ class _Sheet:
                 found[int(match[1])] = i
         missing = next((number for number in range(1, len(found) + 1) if number not in found), None)
         if missing is not None:
-            raise ValueError(f"{self.path}, line 1: columns up to {name}_{max(found)}, but {name}_{missing} is missing")
+            raise ValueError(
+                f"{self.path}, line {self.top}: columns up to {name}_{max(found)}, but {name}_{missing} is missing"
+            )
         return [found[number] for number in range(1, len(found) + 1)]
 
 
@@ -313,7 +338,7 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
     lengths = plans.mask().sum(1)
     if not lengths.any():
         raise ValueError(f"{path}: CSV cannot hold plans of which none has an action")
-    for what in ("action", "context", "group", "condition"):
+    for what in ("action", "context", "group", "condition", "plan"):
         names = getattr(plans, f"{what}_names")
         for name in names or ():
             if not name.strip() or name != name.strip() or "\n" in name or "\r" in name:
@@ -341,9 +366,14 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
 
 
 def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
-    """The rows of a CSV file, the header first; with one step a row, plans are numbered from 0."""
+    """The rows of a CSV file, the header first; with one step a row, plans without names are numbered from 0.
+
+    Between two parts of one plan there is a row without an action, a gap.
+    """
     width, per_step = plans.max_length, is_per_step(plans.context)
+    plan_names, parted = _plan_column(plans) if by_step else (plans.plan_names, frozenset())
     header = ["plan", "action"] if by_step else [f"action_{i + 1}" for i in range(width)]
+    header = ["plan", *header] if not by_step and plan_names is not None else header
     if plans.context is not None:
         features = plans.context.shape[-1] if plans.context.is_floating_point() else 0
         header += [f"context_{i + 1}" for i in range(features)] or ["context"]
@@ -364,13 +394,40 @@ def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
         for i, (taken, length, context, group) in enumerate(
             zip(actions, lengths, contexts, groups, strict=True), start
         ):
+            called = i if plan_names is None else plan_names[i]
             if by_step:
+                if i in parted:
+                    blank = [""] * (len(_as_list(context[0] if per_step else context)))
+                    yield [called, "", *blank, *group, *([] if times is None else [""])]
                 yield from (
-                    [i, taken[t], *_as_list(context[t] if per_step else context), *group, *_time(times, i - start, t)]
+                    [
+                        called,
+                        taken[t],
+                        *_as_list(context[t] if per_step else context),
+                        *group,
+                        *_time(times, i - start, t),
+                    ]
                     for t in range(length)
                 )
             else:
-                yield [*taken[:length], *[""] * (width - length), *_as_list(context), *group]
+                name = [] if plan_names is None else [called]
+                yield [*name, *taken[:length], *[""] * (width - length), *_as_list(context), *group]
+
+
+def _plan_column(plans: Plans) -> tuple[Sequence[str] | None, frozenset[int]]:
+    """The names of plans in a file with one step a row, and which plans are further parts of the one before.
+
+    None where rows of one name would not be read as the same plans again: parts that do not follow one another, or
+    that no group holds together.
+    """
+    names = plans.plan_names
+    if names is None:
+        return None, frozenset()
+    group = [None] * len(plans) if plans.group is None else plans.group.tolist()
+    whole = list(zip(names, group, strict=True))
+    again = frozenset(i for i in range(1, len(whole)) if whole[i] == whole[i - 1])
+    apart = len(whole) - len(again) != len(set(whole))
+    return (None, frozenset()) if apart or (again and plans.group is None) else (names, again)
 
 
 def _time(times: list[list[float]] | None, plan: int, step: int) -> list[float | str]:

@@ -83,6 +83,8 @@ def write_jsonl(plans: Plans, path: Path) -> None:
                 values = getattr(some, what)
                 if values is not None:
                     columns[what] = named(values.tolist(), getattr(plans, f"{what}_names"))
+            if some.plan_names is not None:
+                columns["plan"] = list(some.plan_names)
             if some.durations is not None:
                 known = some.durations.tolist()
                 columns["durations"] = [[None if time != time else time for time in times] for times in known]
@@ -141,6 +143,7 @@ class _Rows:
         self.kind_of: dict[str, type] = {}
         self.durations: array[float] | None = None
         self.lengths, self.lines = array("q"), array("q")
+        self.plan_names: list[str] = []
 
     def add(self, line: int, row: dict[str, Any]) -> None:
         """Append one plan; ValueError says what is wrong with it."""
@@ -162,6 +165,10 @@ class _Rows:
         for what in OF_PLANS:
             self._check_entry(what, row.get(what))
         durations = self._durations(row.get("durations"), len(actions))
+        if (plan_name := row.get("plan")) is not None and type(plan_name) not in (int, str):
+            raise ValueError(f"plan: {_short(plan_name)}; a name or a number is expected")
+        if (plan_name is not None) != (len(self.plan_names) == len(self.lines)) and self.lines:
+            raise ValueError("plan: a name in every plan, or in none, is expected")
         self.contexts.add(row.get("context"))
         self.actions.add(actions)
         for what, column in self.of_plans.items():
@@ -169,6 +176,8 @@ class _Rows:
                 column.add((row[what],))
         if self.durations is not None:
             self.durations.extend(durations)
+        if plan_name is not None:
+            self.plan_names.append(str(plan_name))
         self.lengths.append(len(actions))
         self.lines.append(line)
 
@@ -230,6 +239,8 @@ class _Rows:
         if len(condition):
             numbers = torch.from_numpy(condition.astype(np.int64))
             plans = replace(plans, condition=numbers, condition_names=condition_names)
+        if self.plan_names:
+            plans = replace(plans, plan_names=self.plan_names)
         return renamed(plans, self.given_names, str(self.path))
 
 

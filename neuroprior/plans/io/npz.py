@@ -15,7 +15,7 @@ from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
 
 NUMBERS = ("actions", "lengths", "context", "group", "durations", "condition")
-NAMES = ("action_names", "context_names", "group_names", "condition_names")
+NAMES = ("action_names", "context_names", "group_names", "condition_names", "plan_names")
 
 
 def read_npz(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:

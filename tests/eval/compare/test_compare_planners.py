@@ -13,6 +13,8 @@ from eval.compare.planners import planner_document
 from neuroprior.analysis.statistics import interquartile_mean, paired_difference
 from tests.support.reports import FROM_ELSEWHERE
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SMALL = ["compare", "--planners", *planners.PLANNERS, "--kinds", "markov", "--rounds", "1", "--processes", "1"]
 SMALL += ["--worlds", "grid", "slippery", "--seeds", "2", "--starts", "4", "--training-starts", "60"]
 SMALL += ["--num-plans", "4", "16"]

@@ -16,6 +16,8 @@ from neuroprior.analysis.statistics import paired_difference
 from neuroprior.planners import Execution, SamplingPlanner
 from tests.support.reports import FROM_ELSEWHERE
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SMALL = ["live", "--worlds", "forage_grid", "--kinds", "markov", "--seeds", "2", "--seasons", "2", "--period", "64"]
 SMALL += ["--agents", "3", "--items", "2", "--num-plans", "4", "--length", "8", "--processes", "1"]
 

@@ -13,6 +13,8 @@ from neuroprior import MarkovPrior, Plans, UniformPrior, save
 from neuroprior.plans import write_plans
 from tests.support.sources import FALSE_ALARM, p_value, seeded
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 SOURCES = sources(seeded(0))
 
 

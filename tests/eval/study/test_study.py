@@ -8,6 +8,8 @@ import pytest
 from eval.__main__ import main
 from eval.study import command
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 def test_studies_with_and_without_an_effect(tmp_path, capsys):
     out = tmp_path / "study"

@@ -107,7 +107,7 @@ def test_it_learns_what_counts_cannot_hold():
     """One bit is what an action holds, two choices; a chain of any order knows little of it."""
     training, held_out = memories(200, 0), memories(100, 1)
     stacked = StackedPrior(A, 32, 0.1, (1, 2), 3, num_contexts=C)
-    stacked.fit(training, generator=seeded(0), max_steps=250, progress=False)
+    stacked.fit(training, generator=seeded(0), max_steps=100, learning_rate=0.02, progress=False)
     mine = score("stacked", stacked, held_out).bits_per_action().mean
     chains = [MarkovPrior(A, order, num_contexts=C).fit(training) for order in range(4)]
     best = min(score("chain", chain, held_out).bits_per_action().mean for chain in chains)
