@@ -7,7 +7,7 @@ import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt, restricted_number_type
 
 from eval.compare.planners import PlannerName, PlannerSettings, check_planners, planner_document, planner_run
-from eval.compare.priors import NEURAL, load_for
+from eval.compare.priors import COMBINED, NEURAL, load_for
 from eval.compare.report import document
 from eval.compare.results import Results
 from eval.compare.run import Settings, compare_run
@@ -15,7 +15,7 @@ from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, run_experiment
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
 from neuroprior.report.document import Document
 
-KINDS = ("markov", "macro", *NEURAL)
+KINDS = ("markov", "macro", *NEURAL, COMBINED)
 """Kinds of priors that can be fitted."""
 
 Kind = Literal[KINDS]  # type: ignore[valid-type]
@@ -52,7 +52,8 @@ def compare(
         num_plans: numbers of candidate plans, powers of two.
         priors: model folders to compare, such as `neuroprior fit` writes.
         kinds: kinds of priors that are fitted: markov, macro (a chain of order 2 over actions and 16 macro-actions,
-            without context), gru, transformer; all by default, but none if there are saved ones.
+            without context), gru, transformer, combined (of the chains and a GRU); all by default, but none if there
+            are saved ones.
         planners: some of sampling, distinct, frontier, mcts, cross-entropy, halving and replanning (these two in
             stochastic worlds): they are compared, not priors, at as many model steps, with uniform plans, a chain of
             order 3 and the networks of --kinds, after the horizon curriculum.

@@ -9,13 +9,27 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from neuroprior import GRUPrior, MacroPrior, MarkovPrior, Plans, Prior, TabularWorld, TransformerPrior, World, load
+from neuroprior import (
+    CombinedPrior,
+    GRUPrior,
+    MacroPrior,
+    MarkovPrior,
+    Plans,
+    Prior,
+    TabularWorld,
+    TransformerPrior,
+    World,
+    load,
+)
 from neuroprior.analysis.comparison import score
 from neuroprior.plans import is_per_step
 from neuroprior.priors.matching import numbers
 
 ORDERS = range(5)
 """Orders of the Markov chains."""
+
+COMBINED = "combined"
+"""The label of the combined prior."""
 
 MACROS, MACRO_ORDER = 16, 2
 """Number of macro-actions, and the order of the chain over actions and macro-actions."""
@@ -72,6 +86,14 @@ def network(kind: str, world: World, plans: Plans, seed: int) -> Prior:
     sizes = context_sizes(world, plans)
     wide = WIDE[kind] if sizes.get("context_size", 0) >= MANY else {}
     return NEURAL[kind](plans.num_actions, seed=seed, **sizes, **RECIPE[kind], **wide)
+
+
+def combined(world: World, plans: Plans, feature_sets: Sequence[tuple[int, ...]], seed: int) -> CombinedPrior:
+    """The combined prior of what it is compared with: chains of all orders, with the context and without, and a GRU."""
+    sizes = context_sizes(world, plans)
+    chains = [chain(order, world, plans, feature_sets) for order in ORDERS]
+    chains += [MarkovPrior(plans.num_actions, order) for order in ORDERS if sizes]
+    return CombinedPrior(plans.num_actions, [*chains, network("gru", world, plans, seed)], **sizes)
 
 
 def context_sizes(world: World, plans: Plans) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from eval.compare import figures
 from eval.compare.figures import POINTS, Style
-from eval.compare.results import BEST, Results, grouped, kind_of
+from eval.compare.results import AGAINST, BEST, Results, grouped, kind_of
 from eval.worlds.runs import FORMER_NAMES, across_table, plus_minus, table_by
 from neuroprior.report.document import Column, Document, table
 from neuroprior.report.figures import transition_figure
@@ -142,6 +142,13 @@ def headlines(results: Results) -> Section:
         caption = f"Best neural minus best Markov prior, percentage points, by candidate plans. {HALF} {HOLM}"
         labels = plain["world"].map(breakable)
         tables.append(table_by(plain.assign(world=labels), {"world": "world"}, "num_plans", _gaps(plain), caption))
+    for what in AGAINST:
+        if len(own := results.paired[results.paired["what"] == what]):
+            caption = f"{what[0].upper() + what[1:]} prior, percentage points, by candidate plans. {HALF} {HOLM}"
+            labels = own["world"].map(breakable)
+            of = own.assign(world=labels, rounds=np.where(own["rounds"] == "0", "before", "after"))
+            names = {"world": "world", "context": "context", "curriculum": "rounds"}
+            tables.append(table_by(of, names, "num_plans", _gaps(own), caption))
     for (context, after), rows in grouped(words[best].assign(after=words["rounds"] > 0), ["context", "after"]):
         how = f"{context.replace('none', 'no')} context, {'after' if after else 'before'} the horizon curriculum"
         caption = f"Best neural minus best Markov prior with {results.shown:,} plans, {how}. Hollow: not significant."
@@ -331,7 +338,11 @@ def _context(row: Any) -> str:
 
 def _pair(row: Any) -> str:
     # Which priors are the best may differ with the number of plans.
-    pair = "best neural - best Markov" if row["what"] == BEST else f"{row['first']} - {row['second']}"
+    pair = (
+        str(row["what"]).replace("minus", "-")
+        if row["what"] in (BEST, *AGAINST)
+        else f"{row['first']} - {row['second']}"
+    )
     pair = str(row["first"]) if row["first"] == row["second"] else pair
     context = "" if row["context"] == "none" else f", context {row['context']}"
     after = f", rounds {row['rounds']}" if "-" in row["rounds"] else ", after curriculum"

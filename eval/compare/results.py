@@ -14,13 +14,16 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from eval.compare.priors import NEURAL
+from eval.compare.priors import COMBINED, NEURAL
 from eval.worlds.runs import across_worlds, frame_of, seed_means
 from neuroprior.analysis.statistics import Difference, holm
 
 Array = NDArray[np.float64]
 
 BEST = "best neural minus best Markov"
+AGAINST = ("combined minus best single", "combined minus best Markov", "combined minus best neural")
+"""What the combined prior is compared with."""
+
 LEARNED = ("neural", "markov", "other")
 """Kinds of priors that have learned something."""
 
@@ -299,6 +302,10 @@ def _pairs(tables: Mapping[Key, pd.DataFrame]) -> Iterator[Pair]:
         if neural and markov:
             yield BEST, neural, markov
         yield from (("neural minus Markov", [one], [other]) for one in neural for other in markov)
+        own = [k for k in keys if k.prior == COMBINED and k[1:] == like]
+        for what, others in zip(AGAINST, ([*neural, *markov], markov, neural), strict=True):
+            if own and others:
+                yield what, own, others
     for place, key in enumerate(keys):
         for later, other in enumerate(keys):
             alike = other != key and other[1:] == key[1:]

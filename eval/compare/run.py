@@ -17,7 +17,7 @@ from eval.compare.curves import (
     seconds_per_decision,
     starts_of,
 )
-from eval.compare.priors import NEURAL, ORDERS, TRAINING, chain, digests, load_for, macro, network
+from eval.compare.priors import COMBINED, NEURAL, ORDERS, TRAINING, chain, combined, digests, load_for, macro, network
 from eval.worlds.runs import Run
 from eval.worlds.suite import TASKS, Context, Task
 from neuroprior import ExhaustivePlanner, Plans, Prior, UniformPrior, World, collect
@@ -194,10 +194,13 @@ class Contest:
             for order in self.orders:
                 prior = chain(order, world, first, self.task.feature_sets)
                 yield from self._curriculum(f"markov-{order}", context, prior, first)
+        training = TRAINING | {"max_steps": self.settings.steps}
         for kind in (kind for kind in NEURAL if kind in kinds):
             prior = network(kind, world, first, draw_seed(self.generator))
-            training = TRAINING | {"max_steps": self.settings.steps}
             yield from self._curriculum(kind, context, prior, first, **training)
+        if COMBINED in kinds:
+            prior = combined(world, first, self.task.feature_sets, draw_seed(self.generator))
+            yield from self._curriculum(COMBINED, context, prior, first, **training)
         if "macro" in kinds and context == "none":
             yield from self._curriculum("macro", context, macro(first), first)
 

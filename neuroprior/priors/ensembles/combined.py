@@ -86,7 +86,8 @@ class CombinedPrior(MixturePrior):
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
         self.effort: Effort = effort
-        self.given = experts is not None
+        # What `fit` begins with, each time anew; in a list, as those that are left out are no part of the module.
+        self.given = None if experts is None else [self._experts()]
         self.tried = 0
         self._allocate()
 
@@ -144,7 +145,7 @@ class CombinedPrior(MixturePrior):
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
-        trained = self._experts() if self.given else networks(self.num_actions, {}, self.effort, 0)
+        trained = self.given[0] if self.given else networks(self.num_actions, {}, self.effort, 0)
         return tuple(dict.fromkeys(["validation", *(name for e in trained for name in e.fit_settings)]))
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
@@ -166,6 +167,7 @@ class CombinedPrior(MixturePrior):
         generator = generator_on(generator, "cpu")
         learned, held_out = divided(plans, settings.pop("validation", None), generator)
         if self.given:
+            self.experts = nn.ModuleList(*self.given).to(self.device)
             self.fit_experts(learned, held_out, generator, settings)
         else:
             sizes = {"num_contexts": self.num_contexts, "context_size": self.context_size}
