@@ -85,7 +85,7 @@ class PlansModule(lightning.LightningDataModule):
         batch_size = settings.batches_of(training.max_length)
         self.training = Windows(training, settings.window, batch_size, LEAST_WINDOWS)
         self.validation = Windows(_some(validation, seed), settings.window, 1024, 2 * LEAST_WINDOWS)
-        self.settings = settings.for_passes(self.training.steps)
+        self.settings = settings.for_passes(self.training.steps, training.max_length)
         self.epochs, self.steps = self.settings.epochs(self.training.steps)
         self.seed = seed
 

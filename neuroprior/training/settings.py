@@ -8,8 +8,9 @@ from neuroprior.plans import Plans
 FEWEST_STEPS, MOST_STEPS = 10, 100
 """The least and the most steps between two validations, where these are not given."""
 
-FEWEST, MOST, PASSES = 1000, 4000, 50
-"""Steps of a training, where these are not given: so many passes through the plans, within these bounds."""
+FEWEST, MOST, PASSES, SHORT = 1000, 4000, 50, 32
+"""Steps of a training, where these are not given: so many passes through the plans, within these bounds; the fewest for
+plans of at most so many actions, of which more steps teach hardly more."""
 
 PATIENCE = 0.4
 """Share of the steps without improvement after which training stops."""
@@ -23,8 +24,8 @@ class Settings:
     """How a prior is trained.
 
     Attributes:
-        max_steps: gradient steps; the learning rate falls to 0 over them. None: `PASSES` passes through the plans, but
-            at least `FEWEST` and at most `MOST` steps.
+        max_steps: gradient steps; the learning rate falls to 0 over them. None: `FEWEST` for short plans; else `PASSES`
+            passes through the plans, but at least `FEWEST` and at most `MOST` steps.
         batch_size: plans (pieces of plans, where they are longer than a window) a step. None: as many as have about
             `ACTIONS_A_STEP` actions, from `LEAST_BATCH` to `MOST_BATCH`: smaller batches learn long sequences in less
             time.
@@ -73,9 +74,15 @@ class Settings:
         fits = ACTIONS_A_STEP // max(min(longest, self.window), 1)
         return self.batch_size or min(max(fits, LEAST_BATCH), MOST_BATCH)
 
-    def for_passes(self, steps_a_pass: int) -> "Settings":
-        """The settings with their number of steps and patience, where one pass takes so many steps."""
-        steps = self.max_steps or min(max(PASSES * steps_a_pass, FEWEST), MOST)
+    def for_passes(self, steps_a_pass: int, longest: int) -> "Settings":
+        """The settings with their number of steps and patience.
+
+        Args:
+            steps_a_pass: steps that take all plans once.
+            longest: actions of the longest plan.
+        """
+        passes = PASSES if longest > SHORT else 0
+        steps = self.max_steps or min(max(passes * steps_a_pass, FEWEST), MOST)
         return replace(self, max_steps=steps, patience=self.patience or ceil(PATIENCE * steps))
 
     def epochs(self, steps_a_pass: int) -> tuple[int, int]:
@@ -85,7 +92,5 @@ class Settings:
             steps_a_pass: steps that take all plans once.
         """
         wanted = self.check_every or min(max(2 * steps_a_pass, FEWEST_STEPS), MOST_STEPS)
-        steps = self.for_passes(steps_a_pass).max_steps
-        assert steps is not None
-        validations = ceil(steps / wanted)
-        return validations, ceil(steps / validations)
+        validations = ceil((self.max_steps or FEWEST) / wanted)
+        return validations, ceil((self.max_steps or FEWEST) / validations)
