@@ -20,7 +20,7 @@ from torch import nn
 
 from neuroprior._files import write_whole
 from neuroprior._threads import one_thread
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, is_per_step
 from neuroprior.training.batches import PlansModule
 from neuroprior.training.module import PriorModule
 from neuroprior.training.settings import FEWEST, PATIENCE, Settings
@@ -47,11 +47,12 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
         Bits per action on the held-out plans.
 
     Raises:
-        ValueError: too few plans or groups, or the training diverged.
+        ValueError: too few plans or groups, validation plans with other actions or contexts, or the training diverged.
     """
     device = next(prior.parameters()).device
     if isinstance(settings.validation, Plans):
         training, validation = plans, settings.validation
+        _check_alike(training, validation)
     else:
         training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
     window = settings.window if hasattr(prior, "forward_from") else plans.max_length
@@ -74,6 +75,18 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
         best = run_training(trainer, module, data)
         module.to(device)
     return best
+
+
+def _check_alike(training: Plans, validation: Plans) -> None:
+    """Raise ValueError unless the actions and contexts of both are the same ones."""
+    if validation.num_actions != training.num_actions:
+        raise ValueError(f"validation: {training.num_actions} actions are expected, not {validation.num_actions}")
+    for what in ("action_names", "context_names"):
+        expected, given = getattr(training, what), getattr(validation, what)
+        if expected is not None and given is not None and list(expected) != list(given):
+            raise ValueError(f"validation: its {what} are not those of the plans that are learned from, in their order")
+    if is_per_step(training.context) != is_per_step(validation.context):
+        raise ValueError("validation: a context per step, or one a plan, is expected, as in the plans learned from")
 
 
 def make_trainer(

@@ -138,6 +138,8 @@ class StackedPrior(Prior):
                 range, or a training that diverged.
         """
         self.check_settings(settings)
+        held_out = settings.get("validation")
+        held_out = self.training_plans(held_out) if isinstance(held_out, Plans) else None
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
         learned = plans[plans.mask().any(1)]
@@ -148,8 +150,7 @@ class StackedPrior(Prior):
         learned = divisible(learned)
         stacked = self._stacked(learned, self._forecasts(learned, generator))
         self.recount(plans)
-        if isinstance(held_out := settings.get("validation"), Plans):
-            held_out = self.training_plans(held_out)
+        if held_out is not None:
             with torch.no_grad():
                 forecasts = [e(held_out.actions, context_for(e, held_out.context)) for e in self._experts()]
             settings = settings | {"validation": self._stacked(held_out, torch.stack(forecasts, 2))}

@@ -1,5 +1,6 @@
 """`python -m eval quality` and `python -m eval plans`: sources of known entropy, and saved priors on a file."""
 
+import itertools
 import json
 import math
 
@@ -9,9 +10,10 @@ from scipy import stats
 
 from eval.__main__ import main
 from eval.quality.command import LAG, LENGTH, REPEAT, _fit, sources
+from eval.quality.sequences import CHARACTERS, KINDS, SWITCH, draw, sequences, switching_chain, text
 from neuroprior import MarkovPrior, Plans, UniformPrior, save
 from neuroprior.plans import write_plans
-from tests.support.sources import FALSE_ALARM, p_value, seeded
+from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
@@ -82,6 +84,66 @@ def test_excess_is_of_actions_that_depend_on_the_past(number):
     free = {1: 64 * 3, 4: 8 * 4 * 3}.get(number)
     cost = free and 100 * free / (2 * math.log(2) * 500 * (LENGTH - first)) / rate
     assert row["expected_percent"] == (cost and pytest.approx(cost))
+
+
+def test_hidden_conditions_are_weighed_by_all_ways_to_draw_them():
+    """The log-probability of four actions is that of a sum over all sequences of conditions."""
+    table = switching_chain(seeded(0))[:2, :3, :3]
+    table = table / table.sum(-1, keepdim=True)
+    plans, log_probs = draw(table, 20, seeded(1))
+    same = 1 - SWITCH / 2
+    for actions, found in zip(plans.actions[:, :4].tolist(), log_probs[:, :4].sum(1).tolist(), strict=True):
+        total = 0.0
+        for hidden in itertools.product(range(2), repeat=4):
+            p = 1 / 2 / 3
+            for t in range(1, 4):
+                p *= same if hidden[t] == hidden[t - 1] else 1 - same
+                p *= float(table[hidden[t], actions[t - 1], actions[t]])
+            total += p
+        assert found == pytest.approx(math.log(total))
+
+
+def test_sequences_are_drawn_from_their_source():
+    """If they are, the surprisal of an action less its expectation has mean 0; and in one condition a chain is left."""
+    table = switching_chain(seeded(0))
+    assert torch.allclose(table.sum(-1), torch.ones(6, KINDS, dtype=torch.double))
+    plans, log_probs = draw(table[:1], 20, seeded(2))
+    actions = plans.actions.long()
+    probs = table[0, actions[:, :-1]]
+    assert torch.allclose(log_probs[:, 1:], probs.gather(2, actions[:, 1:, None])[..., 0].log())
+    mean = (probs * probs.log()).sum(-1)
+    spread = ((probs * probs.log() ** 2).sum(-1) - mean**2).sum().sqrt()
+    assert abs(float((log_probs[:, 1:] - mean).sum() / spread)) < 4.9  # false alarm 1e-6
+
+
+def test_text_is_cut_into_parts_that_are_divided():
+    parts = text(seeded(0))
+    line = "".join(CHARACTERS[number] for number in parts.actions[0].tolist())
+    assert sum(line.count(word) for word in (" the ", " of ", " is ")) > 10  # among 1,000 characters of English
+    learned, other = sequences(20, seeded(0))[1].training, sequences(20, seeded(0))[1].test
+    assert (len(learned), len(other)) == (20, 10)
+    assert len(torch.cat([learned.actions, other.actions]).unique(dim=0)) == 30
+    assert sequences(0, seeded(0)) == []
+    with refuses("num_sequences", "not 100000"):
+        sequences(100_000, seeded(0))
+
+
+def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("eval.quality.command.OF_SEQUENCES", ("markov", "context-tree"))
+    monkeypatch.setattr("eval.quality.command.sources", lambda generator: SOURCES[:1])
+    monkeypatch.setattr("eval.quality.command.GRUPrior.fit", lambda prior, *_, **__: prior)
+    monkeypatch.setattr("eval.quality.command.TransformerPrior.fit", lambda prior, *_, **__: prior)
+    assert (
+        main(["quality", "--num-plans", "100", "--held-out", "100", "--num-sequences", "4", "--out", str(tmp_path)])
+        == 0
+    )
+    rows = json.loads((tmp_path / "results.json").read_text())["sequences"]
+    assert [row["model"] for row in rows] == ["markov", "context-tree"] * 2
+    for row in rows:
+        assert row["seconds"] > 0
+        kinds = KINDS if row["entropy"] else len(CHARACTERS)
+        assert (row["entropy"] or 1) < row["bits_per_action"] < math.log2(kinds)
+    assert f"{rows[0]['bits_per_action']:.4f}" in capsys.readouterr().out
 
 
 def context_at(source, plans: Plans, t: int) -> torch.Tensor | int:
