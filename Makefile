@@ -9,7 +9,7 @@ paper: .venv/cli
 	$(BIN)/python -m eval paper
 
 mice: .venv/cli
-	$(BIN)/python -m eval plans eval/data/labyrinth/plans.jsonl --skip 1 --max-steps 400 --out runs/mice
+	$(BIN)/python -m eval plans eval/data/labyrinth/plans.jsonl --skip 1 --models counts combined --out runs/mice
 
 mice-planner: .venv/cli
 	$(BIN)/python -m eval mice --out runs/mice-planner

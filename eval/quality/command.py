@@ -104,7 +104,7 @@ def sources(generator: torch.Generator) -> list[Source]:
 def quality(
     num_plans: PositiveInt = 100_000,
     held_out: PositiveInt = 5_000,
-    num_sequences: NonNegativeInt = 100,
+    num_sequences: NonNegativeInt = 40,
     seed: NonNegativeInt = 0,
     out: str = "runs/quality",
 ) -> None:
