@@ -13,6 +13,7 @@ from eval.compare.priors import (
     Renumbered,
     UnlimitedGRU,
     chain,
+    combined,
     context_sizes,
     digests,
     load_for,
@@ -99,6 +100,22 @@ def stepped(prior: Prior, plans: Plans) -> torch.Tensor:
         if t + 1 < plans.max_length:
             logits, state = prior.step(action, state, plans.context[:, t + 1])
     return log_prob
+
+
+def test_the_combined_prior_is_made_of_what_it_is_compared_with():
+    """With a context that is new in each world: chains with it and without, and the network of the comparison."""
+    world = small(0)
+    plans = collect(ExhaustivePlanner(3), world, 60, context="step", generator=seeded(0))
+    prior = combined(world, plans, (), 5)
+    names = [type(expert).__name__ for expert in prior.experts]
+    assert names == ["ContextMarkov"] * 5 + ["MarkovPrior"] * 5 + ["UnlimitedGRU"]
+    for _ in range(2):  # experts that were left out are fitted again
+        prior.fit(plans, generator=seeded(0), max_steps=3, progress=False)
+        assert prior.tried == len(names) + 2
+    sampled, _ = sample_in_world(prior, world, world.reset(4, seeded(1)), 8, 3, generator=seeded(2))
+    assert sampled.shape == (4, 8, 3)
+    alone = combined(world, plans.without_context(), (), 5)
+    assert [type(expert).__name__ for expert in alone.experts] == ["MarkovPrior"] * 5 + ["UnlimitedGRU"]
 
 
 def test_chains_choose_among_sets_of_features():

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from eval.compare.results import BEST, Results, best_difference, chosen, needed
+from eval.compare.results import AGAINST, BEST, Results, best_difference, chosen, needed
 from neuroprior.analysis.statistics import (
     holm,
     interquartile_mean,
@@ -84,6 +84,22 @@ def test_what_a_curve_needs():
     assert needed(np.array([0.5, 0.6]), [1, 2], 0.7) == np.inf
     # A random peak is no crossing: made to climb, the curve is 0, 0.3, 0.3, 0.6.
     assert needed(np.array([0.0, 0.5, 0.1, 0.6]), [1, 2, 4, 8], 0.45) == pytest.approx(2**2.5)
+
+
+def test_the_combined_prior_against_the_best_of_its_parts():
+    times = {"uniform": 1.0, "markov-1": 2.0, "markov-2": 3.0, "gru": 2.5, "combined": 3.5}
+    made = Results(worlds(["maze"], 6, times), [256])
+    shares = {
+        name: np.array([one["share"][8] for r in made.runs for one in r["entries"] if one["prior"] == name])
+        for name in times
+    }
+    against = (("gru", "markov-1", "markov-2"), ("markov-1", "markov-2"), ("gru",))
+    for what, others in zip(AGAINST, against, strict=True):
+        (row,) = found(made.paired, what=what, rounds="0", context="none")
+        expected = best_difference(shares["combined"][None], np.stack([shares[name] for name in others]))
+        assert row["first"] == "combined"
+        assert (row["difference"], row["low"], row["high"], row["p_value"]) == pytest.approx(tuple(expected))
+    assert not found(Results(worlds(["maze"], 6), [256]).paired, what=AGAINST[0])
 
 
 def test_efficiency_is_how_many_random_plans_one_is_worth():
