@@ -35,6 +35,9 @@ STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops",
 DEFAULT = "combined"
 """The recipe where plans are given and no other."""
 
+OTHERWISE = {"--config", "-c", "--model", "--model.prior", "--model.prior.class_path", "--resume", "--help", "-h"}
+"""Options with which it is not needed."""
+
 OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
 """Options of `--data` that other commands have, too."""
 
@@ -237,8 +240,8 @@ def _in_full(arguments: list[str]) -> list[str]:
     if arguments[:1] == ["fit"]:
         if len(arguments) > 1 and not arguments[1].startswith("-"):
             arguments = ["fit", "--data.file", *arguments[1:]]
-        known = ("--config", "-c", "--model", "--resume", "--help", "-h", "--print_config")
-        if any(a.startswith("--data.file") for a in arguments) and not any(a.startswith(known) for a in arguments):
+        given = {argument.partition("=")[0] for argument in arguments}
+        if "--data.file" in given and not given & OTHERWISE:
             arguments = ["fit", "--config", DEFAULT, *arguments[1:]]
     out: list[str] = []
     for argument in arguments:

@@ -13,7 +13,8 @@ from neuroprior._files import versions, write_json
 from neuroprior.analysis.comparison import Score, baselines, score, too_few, unit_name
 from neuroprior.cli.fit_folds import TRAINED, cross_validated
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
-from neuroprior.priors import Prior, save
+from neuroprior.priors import CombinedPrior, Prior, save
+from neuroprior.priors.fitting import name_of
 from neuroprior.priors.scoring import keep_learned
 from neuroprior.report.document import printed, records, table, write_figures, write_frames
 
@@ -33,7 +34,7 @@ def report(
         settings: of its `fit` there.
     """
     console = Console()
-    prior, name = model.prior.cpu().eval(), type(model.prior).__name__
+    prior, name = model.prior.cpu().eval(), name_of(model.prior)
     save(prior, folder)
     keep_learned(folder, data.learned_from, data.chosen_on)
     contexts = data.num_contexts if prior.takes_context else None
@@ -56,7 +57,8 @@ def report(
             one = scores.get(baseline.model)
             row = _row(one, trained) if one else {"model": baseline.model}
             rows.append(row | {"how": baseline.how, "validation_bits": baseline.validation_bits})
-    last = _row(trained, trained) | {"how": "", "validation_bits": None}
+    how = prior.summary() if isinstance(prior, CombinedPrior) else ""
+    last = _row(trained, trained) | {"how": how, "validation_bits": None}
     frame = pd.DataFrame([*rows, last], columns=list(last))
     best = frame.iloc[int(frame.validation_bits.astype(float).argmin())]
     console.print(_table(frame, best.model, data))

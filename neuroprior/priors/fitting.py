@@ -95,3 +95,8 @@ NAMES: dict[str, MakePrior] = {
     "semi-markov": SemiMarkovPrior,
 }
 """Priors that `fit` knows by name."""
+
+
+def name_of(prior: Prior) -> str:
+    """The name of a prior in tables: that in `NAMES`, or of its class."""
+    return next((name for name, kind in NAMES.items() if kind is type(prior)), type(prior).__name__)

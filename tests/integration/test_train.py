@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, load
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, load
 from neuroprior.analysis import Baseline
 from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors.scoring import learned_from
@@ -28,6 +28,7 @@ SMALL = {
     "gru": ["--model.prior.hidden_size", "8"],
     "transformer": ["--model.prior.width", "16"],
     "markov": [],
+    "combined": ["--model.prior.effort", "fast"],
 }
 QUICK = [
     "--data.num_plans",
@@ -66,16 +67,19 @@ def run(arguments: list[str], **more) -> subprocess.CompletedProcess:
     )
 
 
+KINDS = {"gru": GRUPrior, "transformer": TransformerPrior, "markov": MarkovPrior, "combined": CombinedPrior}
+
+
 @pytest.mark.parametrize("name", SMALL)
 def test_each_recipe(name, tmp_path, capsys):
     assert main(small(name, tmp_path / "run")) == 0
     printed = capsys.readouterr().out
     prior = load(tmp_path / "run")
-    assert isinstance(prior, {"gru": GRUPrior, "transformer": TransformerPrior, "markov": MarkovPrior}[name])
+    assert isinstance(prior, KINDS[name])
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
     models = [row["model"] for row in rows]
     assert models[0] == "uniform"
-    assert models[-1] == type(prior).__name__
+    assert models[-1] == name
     assert [model for model in models if model.startswith("markov-")] == [f"markov-{k}" for k in range(7)]
     assert "context tree" in models
     for row in rows:
@@ -83,7 +87,7 @@ def test_each_recipe(name, tmp_path, capsys):
         assert f"{row['bits_per_action']:.4f}" in printed
     assert rows[0]["bits_per_action"] == pytest.approx(2)
     assert rows[-1]["bits_per_action"] < 1.99
-    assert (tmp_path / "run" / "learning_curve.png").exists() == (name != "markov")
+    assert (tmp_path / "run" / "learning_curve.png").exists() == (name in ("gru", "transformer"))
 
 
 def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch):
@@ -211,6 +215,17 @@ def test_the_settings_of_a_recipe_reach_the_networks_inside_other_priors(name, p
         first, second = (replace(how, validation=0.2) for how in (first, second))
     assert first == second == due
     assert seed != other
+
+
+def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
+    quick = ["--trainer.max_steps", "3", "--model.prior.effort", "fast", "--out", str(tmp_path / "run")]
+    assert main(["fit", plans_file, *quick]) == 0
+    prior = load(tmp_path / "run")
+    assert isinstance(prior, CombinedPrior)
+    row = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"][-1]
+    assert (row["model"], row["how"]) == ("combined", prior.summary())
+    assert main(["fit", "--resume", str(tmp_path / "run")]) == 0
+    assert load(tmp_path / "run").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
 
 
 def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans_file, tmp_path, capsys):

@@ -46,10 +46,10 @@ def test_each_group_is_held_out_once(tmp_path, capsys):
     found = metrics(tmp_path / "run")
     assert (found["folds"], found["unit"]) == (5, "groups")
     assert found["plans"] == {"training": 50, "validation": 10, "held_out": 60}
-    total = {"MarkovPrior": 0.0, "uniform": 0.0}
+    total = {"markov": 0.0, "uniform": 0.0}
     for training, held_out in folds(plans, 5, 0):
         prior = MarkovPrior(3, 3).fit(plans[training])
-        total["MarkovPrior"] += float(score("", prior, plans[held_out]).bits.sum())
+        total["markov"] += float(score("", prior, plans[held_out]).bits.sum())
     total["uniform"] = float(plans.mask().sum()) * torch.tensor(3.0).log2().item()
     rows = {row["model"]: row for row in found["rows"]}
     for name, bits in total.items():
