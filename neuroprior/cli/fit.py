@@ -23,7 +23,7 @@ from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import one_line
 from neuroprior.plans import write_plans
 from neuroprior.priors.neural import NeuralPrior
-from neuroprior.training import make_trainer, quiet, run_training
+from neuroprior.training import Settings, make_trainer, quiet, run_training
 
 USAGE = """{0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        {0} fit --resume FOLDER"""
@@ -34,6 +34,9 @@ STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops",
 
 DEFAULT = "combined"
 """The recipe where plans are given and no other."""
+
+PRIOR_GIVEN = ("--model", "--model.prior", "--model.prior.class_path")
+"""Options that say which prior is trained."""
 
 OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
 """Options of `--data` that other commands have, too."""
@@ -171,7 +174,9 @@ class FitCLI(LightningCLI):
             "patience": trainer.patience,
             "progress": trainer.enable_progress_bar and sys.stdout.isatty(),
         }
-        return {name: settings[name] for name in prior.fit_settings}
+        # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
+        default = vars(Settings()) | {"progress": None}
+        return {name: settings[name] for name in prior.fit_settings if settings[name] != default[name]}
 
     def _check_checkpoints(self, model: PriorModel, data: PlansData) -> None:
         last = self.folder / LAST
@@ -237,8 +242,10 @@ def _in_full(arguments: list[str]) -> list[str]:
     if arguments[:1] == ["fit"]:
         if len(arguments) > 1 and not arguments[1].startswith("-"):
             arguments = ["fit", "--data.file", *arguments[1:]]
-        known = ("--config", "-c", "--model", "--resume", "--help", "-h", "--print_config")
-        if any(a.startswith("--data.file") for a in arguments) and not any(a.startswith(known) for a in arguments):
+        known = ("--config", "-c", "--resume", "--help", "-h", "--print_config")
+        # An option of the prior, such as `--model.prior.effort`, is one of the default recipe's; a prior is another.
+        others = {a for a in arguments if a.startswith(known) or a.partition("=")[0] in PRIOR_GIVEN}
+        if any(a.startswith("--data.file") for a in arguments) and not others:
             arguments = ["fit", "--config", DEFAULT, *arguments[1:]]
     out: list[str] = []
     for argument in arguments:

@@ -83,8 +83,8 @@ class PlansData(PlansModule):
         window: actions that a step reads of a plan; longer plans are read in windows, the hidden state carried over.
         check_every: steps between two validations; null for two passes through the plans, but at least 10 and at most
             100.
-        max_steps: steps of training; null for 1,000 with plans of up to 32 actions, else for 50 passes through the plans,
-            but 1,000 to 4,000 steps.
+        max_steps: steps of training; null for 1,000 with plans of up to 32 actions, else for 50 passes through the
+            plans, but 1,000 to 4,000 steps.
         seed: draws the collected plans, the split and the order of training.
     """
 

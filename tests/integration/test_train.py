@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, load
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, StackedPrior, TransformerPrior, load
 from neuroprior.analysis import Baseline
 from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors.scoring import learned_from
@@ -211,6 +211,23 @@ def test_the_settings_of_a_recipe_reach_the_networks_inside_other_priors(name, p
         first, second = (replace(how, validation=0.2) for how in (first, second))
     assert first == second == due
     assert seed != other
+
+
+def test_what_a_recipe_does_not_set_is_left_to_the_prior(plans_file, tmp_path, monkeypatch):
+    trained = []
+    monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append(how))
+    arguments = ["--model.prior", "StackedPrior", *MADE_OF_PRIORS["StackedPrior"], "--data.file", plans_file]
+    assert main(["fit", *arguments, "--out", str(tmp_path / "run")]) == 0
+    StackedPrior(3, 8, depth=2).fit(some_plans(60), progress=False)
+    assert trained[0] == trained[1]
+
+
+def test_plans_without_a_recipe_are_learned_by_the_combined_prior_with_the_options_given(plans_file, tmp_path):
+    options = ["--model.prior.effort", "fast", "--trainer.max_steps", "2", "--out", str(tmp_path / "run")]
+    assert main(["fit", plans_file, *options]) == 0
+    prior = load(tmp_path / "run")
+    assert isinstance(prior, CombinedPrior)
+    assert prior.effort == "fast"
 
 
 def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans_file, tmp_path, capsys):
