@@ -180,7 +180,7 @@ def test_few_plans_are_validated_often():
 
 
 def test_training_is_as_long_as_the_plans_are_many():
-    """Fifty passes, but 1,000 to 4,000 steps, 1,000 where plans are short; patience is a share of them; what is given stays."""
+    """Fifty passes, but 1,000 to 4,000 steps, 1,000 where plans are short; patience is a share; what is given stays."""
     chosen = [Settings().for_passes(steps, 33) for steps in (2, 20, 40, 200)]
     assert [how.max_steps for how in chosen] == [1000, 1000, 2000, 4000]
     assert [how.patience for how in chosen] == [400, 400, 800, 1600]
