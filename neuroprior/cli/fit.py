@@ -23,7 +23,7 @@ from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import one_line
 from neuroprior.plans import write_plans
 from neuroprior.priors.neural import NeuralPrior
-from neuroprior.training import make_trainer, quiet, run_training
+from neuroprior.training import Settings, make_trainer, quiet, run_training
 
 USAGE = """{0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        {0} fit --resume FOLDER"""
@@ -36,6 +36,7 @@ DEFAULT = "combined"
 """The recipe where plans are given and no other."""
 
 OTHERWISE = {"--config", "-c", "--model", "--model.prior", "--model.prior.class_path", "--resume", "--help", "-h"}
+OTHERWISE |= {"--print_config"}
 """Options with which it is not needed."""
 
 OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
@@ -174,7 +175,9 @@ class FitCLI(LightningCLI):
             "patience": trainer.patience,
             "progress": trainer.enable_progress_bar and sys.stdout.isatty(),
         }
-        return {name: settings[name] for name in prior.fit_settings}
+        # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
+        default = vars(Settings()) | {"progress": None}
+        return {name: settings[name] for name in prior.fit_settings if settings[name] != default[name]}
 
     def _check_checkpoints(self, model: PriorModel, data: PlansData) -> None:
         last = self.folder / LAST

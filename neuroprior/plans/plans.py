@@ -300,8 +300,9 @@ class Plans:
             ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups, and not a
                 single plan of at least two actions.
         """
-        if not 0 < validation < 1:
-            raise ValueError(f"validation: a share between 0 and 1 is expected, not {validation}")
+        if not isinstance(validation, int | float) or not 0 < validation < 1:
+            given = validation if isinstance(validation, int | float | str | None) else type(validation).__name__
+            raise ValueError(f"validation: a share between 0 and 1 is expected, not {given}")
         length = int(self.mask().sum()) if len(self) == 1 else 0
         if length > 1:
             cut = length - min(max(round(length * validation), 1), length - 1)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, TransformerPrior, load
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, StackedPrior, TransformerPrior, load
 from neuroprior.analysis import Baseline
 from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors.scoring import learned_from
@@ -226,6 +226,15 @@ def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
     assert (row["model"], row["how"]) == ("combined", prior.summary())
     assert main(["fit", "--resume", str(tmp_path / "run")]) == 0
     assert load(tmp_path / "run").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
+
+
+def test_what_a_recipe_does_not_set_is_left_to_the_prior(plans_file, tmp_path, monkeypatch):
+    trained = []
+    monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append(how))
+    arguments = ["--model.prior", "StackedPrior", *MADE_OF_PRIORS["StackedPrior"], "--data.file", plans_file]
+    assert main(["fit", *arguments, "--out", str(tmp_path / "run")]) == 0
+    StackedPrior(3, 8, depth=2).fit(some_plans(60), progress=False)
+    assert trained[0] == trained[1]
 
 
 def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans_file, tmp_path, capsys):

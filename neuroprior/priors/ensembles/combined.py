@@ -81,7 +81,7 @@ class CombinedPrior(MixturePrior):
         num_contexts: int | None = None,
         context_size: int | None = None,
     ) -> None:
-        if effort not in NETWORKS:
+        if effort not in list(NETWORKS):
             raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
@@ -100,14 +100,23 @@ class CombinedPrior(MixturePrior):
         self.register_buffer("first", anchor.new_zeros(size + 1 + (self.share > 0)).log_softmax(-1))
 
     @property
+    def config(self) -> dict[str, Any]:
+        return super().config | {"effort": self.effort}
+
+    @property
     def learned(self) -> dict[str, Any]:
-        return super().learned | {"tried": self.tried}
+        return super().learned | {"tried": self.tried, "given": self.given is not None, "kept": self.config["experts"]}
 
     def restore(self, learned: dict[str, Any]) -> None:
+        if "kept" in learned:
+            kept = [Prior.known[e["prior"]](**e["config"]) for e in learned["kept"]]
+            self.experts = nn.ModuleList(kept).to(self.device)
         super().restore(learned)
         if not isinstance(learned["tried"], int) or learned["tried"] < 0:
             raise ValueError(f"tried: an integer of at least 0 is expected, not {learned['tried']!r}")
         self.tried = learned["tried"]
+        if not learned.get("given", True):
+            self.given = None  # they were chosen by `fit`, which will choose again
         self._allocate()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -133,7 +133,8 @@ class NeuralPrior(Prior):
 
     @property
     def learned(self) -> dict[str, Any]:
-        return super().learned | {"window": self.window}
+        sizes = [self.width, self.lags, self.dropout] if self._sized else None
+        return super().learned | {"window": self.window, "sizes": sizes}
 
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
@@ -141,6 +142,11 @@ class NeuralPrior(Prior):
         if window is not None and (not isinstance(window, int) or isinstance(window, bool) or window < 0):
             raise ValueError(f"window: an integer of at least 0 is expected, not {window!r}")
         self.window = window
+        sizes = learned.get("sizes")
+        if sizes is not None:
+            self._sized = True  # to `fit` again goes on from the weights that are loaded next
+            if None in self._given:
+                self._make(Sizes(*sizes))
 
     @abstractmethod
     def build(self) -> None:

@@ -254,3 +254,29 @@ def test_a_share_is_saved_too(tmp_path):
 def test_what_cannot_be_fitted(plans, how, word):
     with pytest.raises(ValueError, match=word):
         neuroprior.fit(plans, **how)
+
+
+def test_a_prior_that_was_read_back_is_fitted_anew_as_the_one_that_was_saved(tmp_path):
+    """It tries experts of every kind again, not those alone that it kept before."""
+    plans = some_plans(30)
+    prior = neuroprior.fit(plans, generator=seeded(0), effort="fast", **QUICK)
+    again = load(save(prior, tmp_path / "combined"))
+    first, second = (p.fit(some_plans(40), generator=seeded(1), **QUICK) for p in (prior, again))
+    assert (second.config, second.learned) == (first.config, first.learned)
+    assert second.log_prob(plans).equal(first.log_prob(plans))
+
+
+@pytest.mark.parametrize("prior", ["combined", "gru", "mixture"])
+@pytest.mark.parametrize("validation", ["a tenth", torch.zeros(2, 3), [0.1]])
+def test_what_is_no_share_and_no_plans_cannot_be_held_out(prior, validation):
+    with pytest.raises(ValueError, match=r"validation: a share between 0 and 1 is expected, not [a-zA-Z ]+$"):
+        neuroprior.fit(some_plans(), prior, validation=validation)
+
+
+def test_the_experts_that_were_kept_are_restored():
+    """As where an agent is restored: into a prior that was made as the saved one was."""
+    plans = some_plans(30)
+    prior, again = CombinedPrior(A, effort="fast").fit(plans, generator=seeded(0), **QUICK), CombinedPrior(A)
+    again.restore(prior.learned)
+    again.load_state_dict(prior.state_dict())
+    assert again.log_prob(plans).equal(prior.log_prob(plans))

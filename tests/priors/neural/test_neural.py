@@ -357,3 +357,17 @@ def test_sizes_follow_from_the_first_plans(kind, tmp_path):
         assert (kept.lags, kept.dropout) == (1, 0.4)
     given = kind(3, 16, lags=2).fit(plans(20, 100), generator=seeded(0), **quick)
     assert (given.width, given.lags, given.dropout) == (16, 2, 0.3)
+
+
+def test_sizes_that_were_chosen_are_restored_and_trained_further():
+    """As where an agent is restored: into a prior that was made as the saved one was."""
+    plans = Plans(torch.randint(3, (8, 40), generator=torch.Generator().manual_seed(0)), 3)
+    how = {"max_steps": 1, "progress": False}
+    first, second = GRUPrior(3).fit(plans, generator=torch.Generator().manual_seed(0), **how), GRUPrior(3)
+    assert first.lags != second.lags
+    second.restore(first.learned)
+    second.load_state_dict(first.state_dict())
+    assert second.log_prob(plans).equal(first.log_prob(plans))
+    for prior in (first, second):
+        prior.fit(plans, generator=torch.Generator().manual_seed(1), **how)
+    assert second.log_prob(plans).equal(first.log_prob(plans))
