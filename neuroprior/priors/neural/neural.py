@@ -142,6 +142,10 @@ class NeuralPrior(Prior):
             raise ValueError(f"window: an integer of at least 0 is expected, not {window!r}")
         self.window = window
 
+    def sizes_for(self, plans: Plans) -> Sizes:
+        """What is chosen for plans to learn from, where it was not given."""
+        return Sizes.of(plans)
+
     @abstractmethod
     def build(self) -> None:
         """Make the layers."""
@@ -279,7 +283,7 @@ class NeuralPrior(Prior):
         plans = self.training_plans(plans)
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:
-            self._make(Sizes.of(plans))
+            self._make(self.sizes_for(plans))
         self._sized = True
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
