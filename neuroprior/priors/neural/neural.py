@@ -148,6 +148,10 @@ class NeuralPrior(Prior):
             if None in self._given:
                 self._make(Sizes(*sizes))
 
+    def sizes_for(self, plans: Plans) -> Sizes:
+        """What is chosen for plans to learn from, where it was not given."""
+        return Sizes.of(plans)
+
     @abstractmethod
     def build(self) -> None:
         """Make the layers."""
@@ -285,7 +289,7 @@ class NeuralPrior(Prior):
         plans = self.training_plans(plans)
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:
-            self._make(Sizes.of(plans))
+            self._make(self.sizes_for(plans))
         self._sized = True
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
