@@ -83,6 +83,7 @@ class Agent:
         self.state = world.reset(1, self.generator) if state is None else state
         world.check_state(self.state)
         self.world, self.planner, self.prior, self.replay = world, planner, prior, Replay(retention)
+        self.made = prior.config  # before it learns, which may change sizes that were not given
         self.replan_every, self.change, self.warm_start = replan_every, change, warm_start
         self.num_rollouts, self.learn_every, self.plan_length = num_rollouts, learn_every, plan_length
         self.min_score, self.training, self.time = min_score, dict(training or {}), 0

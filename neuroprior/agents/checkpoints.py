@@ -115,7 +115,7 @@ def _settings(agent: Agent) -> dict[str, Any]:
     names = ("replan_every", "warm_start", "num_rollouts", "learn_every", "plan_length", "min_score", "training")
     found = {name: getattr(agent, name) for name in names} | {"retention": agent.replay.retention}
     found |= {"agents": list(agent.state.shape), "planner": type(agent.planner).__name__}
-    found |= {"prior": type(agent.prior).__name__, "config": agent.prior.config}
+    found |= {"prior": type(agent.prior).__name__, "config": agent.made}
     settings = json.loads(json.dumps(found, default=str))
     assert isinstance(settings, dict)
     return settings
