@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import torch
@@ -300,7 +301,7 @@ class Plans:
             ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups, and not a
                 single plan of at least two actions.
         """
-        if not isinstance(validation, int | float) or not 0 < validation < 1:
+        if not isinstance(validation, Real) or not 0 < validation < 1:
             given = validation if isinstance(validation, int | float | str | None) else type(validation).__name__
             raise ValueError(f"validation: a share between 0 and 1 is expected, not {given}")
         length = int(self.mask().sum()) if len(self) == 1 else 0

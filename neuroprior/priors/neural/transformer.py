@@ -73,10 +73,7 @@ class TransformerPrior(NeuralPrior):
         self.span = window
 
     def sizes_for(self, plans: Plans) -> Sizes:
-        """As for other networks; but attention needs to be shown the last actions in long sequences, too.
-
-        With the labyrinth's moves (`eval/data/labyrinth`, no context) it takes .698 nats with 16 lags, .748 with one.
-        """
+        """As for other networks; but attention needs to be shown the last actions in long sequences, too."""
         sizes = super().sizes_for(plans)
         return sizes._replace(lags=Sizes().lags) if int(plans.mask().sum()) >= FEW else sizes
 
