@@ -301,9 +301,10 @@ class Plans:
             ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups, and not a
                 single plan of at least two actions.
         """
-        if not isinstance(validation, Real) or not 0 < validation < 1:
-            given = validation if isinstance(validation, int | float | str | None) else type(validation).__name__
-            raise ValueError(f"validation: a share between 0 and 1 is expected, not {given}")
+        given: object = validation
+        if not isinstance(given, Real) or not 0 < validation < 1:
+            said = given if isinstance(given, Real | str | None) else type(given).__name__
+            raise ValueError(f"validation: a share between 0 and 1 is expected, not {said}")
         length = int(self.mask().sum()) if len(self) == 1 else 0
         if length > 1:
             cut = length - min(max(round(length * validation), 1), length - 1)
