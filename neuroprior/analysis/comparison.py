@@ -12,12 +12,7 @@ from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
 from neuroprior.priors.counts import TooLargeError, chains
-
-ORDERS = range(7)
-"""Orders of the Markov chains among the baselines."""
-
-DEPTH = 10
-"""Depth of the context tree among the baselines."""
+from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,17 @@ STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops",
 DEFAULT = "combined"
 """The recipe where plans are given and no other."""
 
-OTHERWISE = {"--config", "-c", "--model", "--model.prior", "--model.prior.class_path", "--resume", "--help", "-h"}
-OTHERWISE |= {"--print_config"}
+OTHERWISE = {
+    "--config",
+    "-c",
+    "--model",
+    "--model.prior",
+    "--model.prior.class_path",
+    "--resume",
+    "--help",
+    "-h",
+    "--print_config",
+}
 """Options with which it is not needed."""
 
 OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")

@@ -17,9 +17,10 @@ from torch import Tensor
 from neuroprior._files import written_whole
 from neuroprior._jobs import JobRun
 from neuroprior.analysis import Reliability
-from neuroprior.analysis.comparison import ORDERS, Score, score_bits, too_few, unit_name, units
+from neuroprior.analysis.comparison import Score, score_bits, too_few, unit_name, units
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior
+from neuroprior.priors.ensembles.candidates import ORDERS
 from neuroprior.priors.matching import match_plans
 from neuroprior.report import fits
 from neuroprior.report.fits import (

@@ -26,10 +26,10 @@ NETWORKS: dict[Effort, tuple[type[Prior], ...]] = {
 """The experts that are trained, in this order."""
 
 ORDERS = range(7)
-"""Orders of the Markov chains that are tried; the best is an expert."""
+"""Orders of the Markov chains that are tried: the best is an expert, and all are baselines in comparisons."""
 
 DEPTH = 10
-"""Depth of context trees."""
+"""Depth of the context trees among experts and baselines."""
 
 
 def fitted_experts(

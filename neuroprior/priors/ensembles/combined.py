@@ -9,10 +9,19 @@ from torch import Tensor, nn
 
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.priors.ensembles.candidates import NETWORKS, Effort, fitted_experts, networks, number_tried
-from neuroprior.priors.ensembles.mixture import MixturePrior, after, divided, learned_weights, taken_of, weights_before
+from neuroprior.priors.ensembles.candidates import NETWORKS, Effort, fitted_experts, number_tried
+from neuroprior.priors.ensembles.mixture import (
+    MixturePrior,
+    after,
+    divided,
+    learned_weights,
+    mixed,
+    taken_of,
+    weights_before,
+)
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
+from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
 
@@ -154,8 +163,9 @@ class CombinedPrior(MixturePrior):
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
-        trained = self.given[0] if self.given else networks(self.num_actions, {}, self.effort, 0)
-        return tuple(dict.fromkeys(["validation", *(name for e in trained for name in e.fit_settings)]))
+        if not self.given:
+            return training_settings()
+        return tuple(dict.fromkeys(["validation", *(name for e in self.given[0] for name in e.fit_settings)]))
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Fit the experts; learn on plans held out from them which are kept, and how they are combined; returns self.
@@ -246,8 +256,8 @@ class HeldOut:
         self.tolerance = max(TOLERANCE, IN_ALL / self.count)
         # Some actions, evenly spread, are enough for a few powers.
         every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
-        self.some = forecasts[mask][::every].double().clamp(min=LEAST)
-        self.seen = actions[mask][::every].long()
+        self.sample = forecasts[mask][::every].double().clamp(min=LEAST)
+        self.sample_actions = actions[mask][::every].long()
 
     def choose(self, costs: Sequence[int]) -> tuple[list[int], Tensor]:
         """The experts that are kept, and their powers `[K]`, float64, in the pool.
@@ -276,7 +286,7 @@ class HeldOut:
 
     def combined(self, kept: list[int]) -> tuple[Tensor, float]:
         """The powers of some experts in their pool, and the loss of the mixture of these and the pool."""
-        powers = self.powers(self.some[:, kept])
+        powers = self.powers(self.sample[:, kept])
         pooled = with_pool(self.forecasts[:, :, kept], powers)[:, :, -1:]
         taken = taken_of(pooled, self.actions).masked_fill(~self.mask[..., None], 0)
         return powers, self.loss(torch.cat([self.taken[:, :, kept], taken], 2))
@@ -290,9 +300,9 @@ class HeldOut:
         def loss(values: np.ndarray[Any, Any]) -> tuple[float, np.ndarray[Any, Any]]:
             now = torch.tensor(values, device=forecasts.device)
             log_probs = torch.einsum("mka,k->ma", forecasts, now).log_softmax(-1)
-            taken = log_probs.gather(1, self.seen[:, None]).sum()
+            taken = log_probs.gather(1, self.sample_actions[:, None]).sum()
             # The gradient: what was forecast of the action taken, less what the pool expects.
-            chosen = forecasts.gather(2, self.seen[:, None, None].expand(-1, size, 1))[..., 0].sum(0)
+            chosen = forecasts.gather(2, self.sample_actions[:, None, None].expand(-1, size, 1))[..., 0].sum(0)
             slope = torch.einsum("mka,ma->k", forecasts, log_probs.exp()) - chosen
             away = now - 1 / size
             return float(RIDGE * (away**2).sum() - taken), (slope + 2 * RIDGE * away).cpu().numpy()
@@ -325,8 +335,3 @@ def with_pool(forecasts: Tensor, powers: Tensor) -> Tensor:
     """Log-probabilities `[..., E, A]`, and behind them their pool's, `[..., E + 1, A]`."""
     pooled = torch.einsum("...ea,e->...a", forecasts.clamp(min=LEAST), powers.to(forecasts)).log_softmax(-1)
     return torch.cat([forecasts, pooled[..., None, :]], -2)
-
-
-def mixed(weights: Tensor, forecasts: Tensor) -> Tensor:
-    """The log-probabilities `[..., A]` of a mixture of `forecasts [..., K, A]` with the weights' logarithms."""
-    return (weights[..., None] + forecasts).logsumexp(-2)

@@ -106,7 +106,7 @@ class MixturePrior(Prior):
             return torch.zeros(*plans.shape, self.num_actions, device=self.device)
         forecasts = self._forecasts(plans, context)
         weights = weights_before(taken_of(forecasts, plans), self.first, self.share)
-        return (weights[..., None] + forecasts).logsumexp(2)
+        return mixed(weights, forecasts)
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
@@ -163,8 +163,7 @@ class MixturePrior(Prior):
 
     def _mixed(self, weights: Tensor, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
         forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in found], 1)
-        logits = (weights[..., None] + forecasts).logsumexp(1)
-        return logits, pack([weights, forecasts, *(state for _, state in found)])
+        return mixed(weights, forecasts), pack([weights, forecasts, *(state for _, state in found)])
 
 
 def taken_of(forecasts: Tensor, actions: Tensor) -> Tensor:
@@ -240,3 +239,8 @@ def divided(plans: Plans, validation: Plans | float | None, generator: torch.Gen
     if plans.group is not None and 1 / len(plans.group.unique()) > 2 * validation:
         plans = replace(plans, group=None, group_names=None)
     return plans.split(validation, generator)
+
+
+def mixed(weights: Tensor, forecasts: Tensor) -> Tensor:
+    """The log-probabilities `[..., A]` of a mixture of `forecasts [..., K, A]` with the weights' logarithms."""
+    return (weights[..., None] + forecasts).logsumexp(-2)

@@ -252,7 +252,7 @@ class NeuralPrior(Prior):
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
-        return _training_settings()
+        return training_settings()
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Train with Lightning until the loss on held-out plans no longer falls; returns self.
@@ -334,7 +334,8 @@ class NeuralPrior(Prior):
         return self.encode(inputs[last])[0][:, -1][which]
 
 
-def _training_settings() -> tuple[str, ...]:
+def training_settings() -> tuple[str, ...]:
+    """The names of the settings that `fit` of every network takes."""
     from neuroprior.training.settings import Settings  # see `NeuralPrior.fit`
 
     return tuple(field.name for field in fields(Settings))
