@@ -7,6 +7,7 @@ from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridwo
 from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
+from neuroprior.worlds.puzzles import PuzzleWorld, SlidingTilesWorld, SokobanWorld, sliding_tiles, sokoban
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
@@ -15,7 +16,10 @@ __all__ = [
     "ForagingWorld",
     "GridWorld",
     "PocketCube",
+    "PuzzleWorld",
     "Rollout",
+    "SlidingTilesWorld",
+    "SokobanWorld",
     "SteppedWorld",
     "TabularWorld",
     "World",
@@ -29,4 +33,6 @@ __all__ = [
     "local_view",
     "maze",
     "patches",
+    "sliding_tiles",
+    "sokoban",
 ]

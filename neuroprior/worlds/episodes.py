@@ -1,6 +1,7 @@
 """Tables of episodic environments: start states, absorbing terminal states, layouts."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -83,6 +84,28 @@ class EpisodicWorld(TabularWorld):
     def observe(self, state: Tensor) -> Tensor:
         """The features `[N, C]` of each state, or its number `[N]` where there are none."""
         return super().observe(state) if self.features is None else self.features[self.cell(state)]
+
+    @property
+    def has_goal(self) -> bool:  # type: ignore[override]
+        """Whether a step into a terminal state can be rewarded."""
+        return bool(self._goals.any())
+
+    def solved(self, state: Tensor) -> Tensor:
+        """In the terminal states that can be entered with a reward above 0."""
+        return self._goals[state]
+
+    @cached_property
+    def _goals(self) -> Tensor:
+        """bool `[W * S]`: terminal states that an action leads to with a reward above 0."""
+        goals = torch.zeros(self.num_maps, self.num_states, dtype=torch.bool, device=self.device)
+        possible = torch.ones_like(self.next_state, dtype=torch.bool) if self.probability is None else self.probability > 0
+        for reward, found in zip(self.reward, goals, strict=True):
+            gained = reward[self.next_state] if reward.dim() == 1 else reward
+            if gained.dim() < self.next_state.dim():
+                gained = gained[..., None]
+            rewarded = (gained > 0).expand_as(self.next_state) & possible & ~self.ended.view(-1, *[1] * (self.next_state.dim() - 1))
+            found[self.next_state[rewarded]] = True
+        return (goals & self.ended).flatten()
 
     def start_anywhere(self) -> "EpisodicWorld":
         """Let episodes start, with equal probability, in any reachable state that is not terminal; returns self."""

@@ -33,12 +33,14 @@ class World(ABC):
         num_actions: the number of actions, A.
         all_legal: True where every action is legal in every state, so that `legal_actions` need not be called.
         stochastic: True where the outcome of an action is random, so that one rollout of a plan is not enough.
+        has_goal: True where states can be solved, see `solved`.
         action_names: names of the actions, where there are any.
     """
 
     num_actions: int
     all_legal: bool = True
     stochastic: bool = False
+    has_goal: bool = False
     action_names: tuple[str, ...] | None = None
 
     @abstractmethod
@@ -102,6 +104,10 @@ class World(ABC):
 
     def terminated(self, state: Tensor) -> Tensor:
         """Which of `state [N, ...]` are final, so that no action is executed there: `[N]` bool. Default: none."""
+        return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
+
+    def solved(self, state: Tensor) -> Tensor:
+        """In which of `state [N, ...]` the goal is reached: `[N]` bool. Default: in none."""
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def group(self, state: Tensor) -> Tensor | None:

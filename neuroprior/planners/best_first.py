@@ -1,0 +1,434 @@
+"""Best-first search for a goal, batched over problems: Levin tree search with a prior, A* and its relatives."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from math import inf
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_sizes
+from neuroprior._hashing import row_hashes
+from neuroprior._random import generator_on
+from neuroprior.planners.planner import Decision, Planner, value_of
+from neuroprior.plans import action_dtype
+from neuroprior.priors.uniform import UniformPrior
+from neuroprior.sampling.draws import check_temperature
+from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world, legal_logits
+from neuroprior.worlds.world import World
+
+Heuristic = Callable[[Tensor], Tensor]
+"""The number of steps that are left, `[N]`, from states `[N, ...]`; such as `SokobanWorld.lower_bound`."""
+
+FIRST_NODES = 256
+"""Nodes for which there is room at first; twice as many whenever they are full."""
+
+BLOCK = 256
+"""Edges in a block of the queue: the minimum of each block is kept, so that few numbers are read to find the least."""
+
+EMPTY = -(2**63)
+"""Marks a free place of a hash table."""
+
+
+class Search(NamedTuple):
+    """What a search found for B problems.
+
+    Attributes:
+        solved: bool `[B]`.
+        plan: `[B, L]` actions that lead to the goal; 0 beyond `lengths`. Of an unsolved problem: to the best node.
+        lengths: int64 `[B]`: actions of each plan.
+        score: float64 `[B]`: the sum of the plan's rewards.
+        final_state: `[B, ...]`: where the plan ends.
+        expansions: int64 `[B]`: nodes that were expanded: those whose actions the prior was asked for.
+        log_bound: float64 `[B]`: log(d / pi) of the solution, d its nodes (its actions and 1) and pi the probability of
+            its actions; inf where there is none. With one node at a time, Levin tree search expands at most d / pi.
+        model_steps: int64 `[B]`: single simulator steps.
+    """
+
+    solved: Tensor
+    plan: Tensor
+    lengths: Tensor
+    score: Tensor
+    final_state: Tensor
+    expansions: Tensor
+    log_bound: Tensor
+    model_steps: Tensor
+
+
+class BestFirstPlanner(Planner):
+    """Searches for a goal: expands the node with the lowest cost, until a goal is reached or the budget is spent.
+
+    Each state is expanded once (state cuts): a path that reaches a state again is dropped. Children are made when their
+    turn comes, so that those which never come cost nothing, unless a heuristic has to see them.
+
+    Args:
+        prior: its probabilities are those of the actions at a node; None: uniform.
+        max_nodes: nodes that are expanded for each problem, at most; bounds time and memory.
+        heuristic: the number of steps left from each state; None: none is known.
+        nodes_at_once: nodes that are expanded together for each problem. Above 1 the world and the prior are asked
+            for more at once, and up to so many times more nodes are expanded.
+        temperature: divides the prior's logits.
+
+    Raises:
+        ValueError: an argument is out of range. `plan` and `search` raise it for a stochastic world, a world without
+            goals, and a prior that cannot act in the world.
+    """
+
+    steps_at_once = 2**20
+
+    def __init__(
+        self,
+        prior: Steppable | None = None,
+        max_nodes: int = 10_000,
+        *,
+        heuristic: Heuristic | None = None,
+        nodes_at_once: int = 1,
+        temperature: float = 1.0,
+    ) -> None:
+        super().__init__("return")
+        check_sizes(max_nodes=max_nodes, nodes_at_once=nodes_at_once)
+        check_temperature(temperature)
+        if prior is not None and not isinstance(prior, Steppable):
+            raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")
+        self.prior, self.max_nodes, self.heuristic = prior, max_nodes, heuristic
+        self.nodes_at_once, self.temperature = nodes_at_once, temperature
+
+    @abstractmethod
+    def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:
+        """The cost of nodes, `[...]` float64, whose order is that of expansion.
+
+        Args:
+            depth: actions from the start, at least 1.
+            log_prob: the log-probability of these actions.
+            left: what the heuristic says is left; 0 without one.
+        """
+
+    def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
+        """Search from each of B starts; see `search`. Nothing is drawn.
+
+        The plan of a start that is not solved leads to the node with the highest sum of rewards and, among these, the
+        lowest heuristic: the first such. `model_steps` are the most of any start.
+        """
+        found = self.search(world, state)
+        steps = int(found.model_steps.max()) if len(state) else 0
+        return Decision(found.plan, found.score, found.final_state, steps, found.lengths)
+
+    @torch.no_grad()
+    def search(self, world: World, state: Tensor) -> Search:
+        """Search from each of B starts.
+
+        Args:
+            world: deterministic, with goals (`World.solved`).
+            state: `[B, ...]`.
+
+        Raises:
+            ValueError: see the class.
+        """
+        if world.stochastic:
+            raise ValueError("world: a deterministic one is expected: a search reaches each state by the same actions")
+        if not world.has_goal:
+            raise ValueError(f"world: one with goals is expected (World.solved), not {type(world).__name__}")
+        prior = UniformPrior(world.num_actions).to(state.device) if self.prior is None else self.prior
+        check_in_world(prior, world, state)
+        parts = [self._search(world, prior, some) for some in self.chunks(state, self.max_nodes)]
+        longest = max(part.plan.shape[1] for part in parts)
+        plans = [torch.nn.functional.pad(part.plan, (0, longest - part.plan.shape[1])) for part in parts]
+        joined = [torch.cat(values) for values in zip(*parts, strict=True) if values[0] is not parts[0].plan]
+        return Search(joined[0], torch.cat(plans), *joined[1:])
+
+    def _search(self, world: World, prior: Steppable, state: Tensor) -> Search:
+        trees = _Trees(self, world, Stepper(prior, in_place=False), state)
+        while trees.active:
+            trees.expand_best()
+        return trees.found()
+
+
+class LevinPlanner(BestFirstPlanner):
+    """Levin tree search: nodes in the order of d / pi, their depth over the probability of the actions that lead there.
+
+    A goal at depth d whose actions have the probability pi is found after at most d / pi expansions (Orseau, Lelis,
+    Lattimore and Weber, *Single-agent policy tree search with guarantees*, NeurIPS 2018, theorem 3); d counts
+    the start. With a heuristic h the order is that of PHS*, (d + h) / pi ** (1 + h / d) (Orseau and Lelis,
+    *Policy-guided heuristic search with guarantees*, AAAI 2021).
+
+    The prior's probabilities are not renormalised over legal actions. Arguments: see `BestFirstPlanner`.
+    """
+
+    def __init__(
+        self,
+        prior: Steppable,
+        max_nodes: int = 10_000,
+        *,
+        heuristic: Heuristic | None = None,
+        nodes_at_once: int = 1,
+        temperature: float = 1.0,
+    ) -> None:
+        super().__init__(
+            prior, max_nodes, heuristic=heuristic, nodes_at_once=nodes_at_once, temperature=temperature
+        )
+
+    def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:
+        nodes = depth.double() + 1
+        return (nodes + left).log() - (1 + left / nodes) * log_prob
+
+
+class AStarPlanner(BestFirstPlanner):
+    """A* and its relatives, which need no prior: nodes in the order of depth + weight * heuristic.
+
+    Args:
+        heuristic: the steps that are left; None: breadth-first search.
+        weight: of the heuristic: 1: A*, whose plans are shortest where the heuristic is consistent; above 1: weighted
+            A*; inf: greedy best-first search.
+        max_nodes, nodes_at_once: see `BestFirstPlanner`.
+    """
+
+    def __init__(
+        self,
+        heuristic: Heuristic | None = None,
+        weight: float = 1.0,
+        max_nodes: int = 10_000,
+        *,
+        nodes_at_once: int = 1,
+    ) -> None:
+        super().__init__(None, max_nodes, heuristic=heuristic, nodes_at_once=nodes_at_once)
+        if not weight >= 0:
+            raise ValueError(f"weight: a number of at least 0 is expected, not {weight}")
+        self.weight = weight
+
+    def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:
+        return left.double() if self.weight == inf else depth + self.weight * left.double()
+
+
+class _Trees:
+    """The search trees of B problems, grown together: R of them still, `rows` numbers them among the B.
+
+    A node is numbered in the order of expansion, and its edge by action a is node * A + a. Of each node are kept the
+    edge that led to it, its depth, the log-probability and the rewards of its path, its state, and the prior's.
+    """
+
+    def __init__(self, planner: BestFirstPlanner, world: World, stepper: Stepper, state: Tensor) -> None:
+        self.planner, self.world, self.stepper, self.actions = planner, world, stepper, world.num_actions
+        batch, device = len(state), state.device
+        self.rows = torch.arange(batch, device=device)
+        self.size = torch.zeros(batch, dtype=torch.long, device=device)
+        self.capacity = min(FIRST_NODES, planner.max_nodes)
+        self.steps = torch.zeros(batch, dtype=torch.long, device=device)
+        self.paths: list[Tensor] = [torch.empty(0, dtype=torch.long, device=device)] * batch
+        empty = torch.zeros(batch, dtype=torch.long, device=device)
+        self.result = Search(
+            world.solved(state), empty[:, None], empty, empty.double(), state.clone(), empty.clone(),
+            torch.full((batch,), inf, dtype=torch.float64, device=device), empty.clone(),
+        )  # fmt: skip
+        self.result.log_bound[self.result.solved] = 0.0
+        logits, hidden = stepper.start_in(world, state)
+        self.nodes = {
+            "edge": torch.full((batch, self.capacity), -1, device=device),
+            "depth": torch.zeros(batch, self.capacity, dtype=torch.long, device=device),
+            "log_prob": torch.zeros(batch, self.capacity, dtype=torch.float64, device=device),
+            "gain": torch.zeros(batch, self.capacity, dtype=torch.float64, device=device),
+            "left": torch.zeros(batch, self.capacity, dtype=torch.float64, device=device),
+            "state": state.new_zeros(batch, self.capacity, *state.shape[1:]),
+            "hidden": hidden.new_zeros(batch, self.capacity, *hidden.shape[1:]),
+            "action_log_prob": torch.zeros(batch, self.capacity, self.actions, dtype=torch.float64, device=device),
+        }
+        self._make_room(batch)
+        every = torch.arange(batch, device=device)
+        self._insert(every, row_hashes(state))
+        self._add(every, torch.full_like(every, -1), empty, empty.double(), empty.double(), state, logits, hidden)
+        self.size[self.result.solved] = 0
+        self._drop(self.result.solved | (self.size >= planner.max_nodes) | (self.minima.amin(1) == inf))
+
+    @property
+    def active(self) -> bool:
+        """Whether a problem is still searched for."""
+        return len(self.rows) > 0
+
+    def found(self) -> Search:
+        """The results, once no tree grows any more."""
+        plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan
+        return self.result._replace(plan=plans.to(action_dtype(self.actions)))
+
+    def expand_best(self) -> None:
+        """Expand the best nodes of each tree."""
+        tree, edge = self._popped()
+        parent, action = edge.div(self.actions, rounding_mode="floor"), edge % self.actions
+        node = self.nodes
+        state, reward = self.world.step(node["state"][tree, parent], action)
+        self.steps.index_add_(0, tree, torch.ones_like(tree))
+        depth = node["depth"][tree, parent] + 1
+        log_prob = node["log_prob"][tree, parent] + node["action_log_prob"][tree, parent, action]
+        gain = node["gain"][tree, parent] + reward.double()
+        new = self._insert(tree, row_hashes(state))
+        solved = new & self.world.solved(state)
+        over = self._finish(tree[solved], edge[solved], depth[solved], log_prob[solved], gain[solved], state[solved])
+        # Of trees that reached their goal, and beyond the budget, nothing more is expanded.
+        wanted = new & ~over[tree]
+        rank = _rank(tree, wanted)
+        wanted &= self.size[tree] + rank < self.planner.max_nodes
+        tree, edge, depth, log_prob, gain = (x[wanted] for x in (tree, edge, depth, log_prob, gain))
+        state, action, parent = state[wanted], action[wanted], parent[wanted]
+        if len(tree):
+            hidden = node["hidden"][tree, parent]
+            logits, hidden = self.stepper.step_in(self.world, action, hidden, state)
+            self._add(tree, edge, depth, log_prob, gain, state, logits, hidden)
+        self._drop(over | (self.size >= self.planner.max_nodes) | (self.minima.amin(1) == inf))
+
+    def _popped(self) -> tuple[Tensor, Tensor]:
+        """The trees `[M]` and edges `[M]` with the lowest costs, taken out of the queue, the best of each tree first."""
+        trees, edges = [], []
+        every = torch.arange(len(self.rows), device=self.rows.device)
+        blocks = self.queue.view(len(self.rows), -1, BLOCK)
+        for _ in range(self.planner.nodes_at_once):
+            block = self.minima.argmin(1)
+            within = blocks[every, block].argmin(1)
+            there = blocks[every, block, within] < inf
+            trees.append(every[there])
+            edges.append((block * BLOCK + within)[there])
+            blocks[every, block, within] = inf
+            self.minima[every, block] = blocks[every, block].amin(1)
+        return torch.cat(trees), torch.cat(edges)
+
+    def _add(
+        self, tree: Tensor, edge: Tensor, depth: Tensor, log_prob: Tensor, gain: Tensor, state: Tensor,
+        logits: Tensor, hidden: Tensor,
+    ) -> None:  # fmt: skip
+        """Expand new nodes `[M]`: enter them, and their edges into the queue."""
+        at = self.size[tree] + _rank(tree, torch.ones_like(tree, dtype=torch.bool))
+        self.size.index_add_(0, tree, torch.ones_like(tree))
+        while int(self.size.max()) > self.capacity:
+            self._grow()
+        own = torch.log_softmax(logits.double() / self.planner.temperature, -1)
+        legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
+        left, of_children = self._left(tree, state, legal)
+        named = {"edge": edge, "depth": depth, "log_prob": log_prob, "gain": gain, "left": left}
+        for name, values in (named | {"state": state, "hidden": hidden, "action_log_prob": own}).items():
+            self.nodes[name][tree, at] = values
+        cost = self.planner.cost((depth + 1)[:, None].expand_as(own), log_prob[:, None] + own, of_children)
+        edges = at[:, None] * self.actions + torch.arange(self.actions, device=at.device)
+        self.queue[tree[:, None], edges] = cost.masked_fill(~legal | cost.isnan(), inf)
+        block = edges.div(BLOCK, rounding_mode="floor")
+        shape = len(self.rows), self.minima.shape[1]
+        flat = (tree[:, None] * shape[1] + block).flatten()
+        least = self.queue[tree[:, None], edges].flatten()
+        self.minima = self.minima.flatten().scatter_reduce(0, flat, least, "amin").view(shape)
+
+    def _left(self, tree: Tensor, state: Tensor, legal: Tensor) -> tuple[Tensor, Tensor]:
+        """What the heuristic says of nodes `[M]`, and of their children `[M, A]`."""
+        heuristic = self.planner.heuristic
+        if heuristic is None:
+            return torch.zeros(len(state), dtype=torch.float64, device=state.device), torch.zeros(
+                legal.shape, dtype=torch.float64, device=state.device
+            )
+        where, action = legal.nonzero(as_tuple=True)
+        reached, _ = self.world.step(state[where], action)
+        self.steps.index_add_(0, tree[where], torch.ones_like(where))
+        children = torch.zeros(legal.shape, dtype=torch.float64, device=state.device)
+        children[where, action] = value_of(heuristic, reached).double()
+        return value_of(heuristic, state).double(), children
+
+    def _insert(self, tree: Tensor, hashes: Tensor) -> Tensor:
+        """Enter states, by their `hashes [M]`, into the hash tables: which of them are new, bool `[M]`.
+
+        Of equal ones the first is new.
+        """
+        places = self.seen.shape[1]
+        place, new = hashes & (places - 1), torch.zeros_like(hashes, dtype=torch.bool)
+        left = torch.arange(len(hashes), device=hashes.device)
+        table = self.seen.view(-1)
+        while len(left):
+            flat = tree[left] * places + place[left]
+            there = table[flat]
+            free = there == EMPTY
+            claims = left[free]
+            slots, which = flat[free].unique(return_inverse=True)
+            first = torch.full_like(slots, len(hashes)).scatter_reduce(0, which, claims, "amin")
+            table[slots] = hashes[first]
+            new[first] = True
+            place[left[~free]] += 1
+            place &= places - 1
+            left = left[~new[left] & (there != hashes[left])]
+        return new
+
+    def _make_room(self, trees: int) -> None:
+        """A queue and hash tables for `capacity` nodes a tree."""
+        device, edges = self.rows.device, self.capacity * self.actions
+        blocks = -(-edges // BLOCK)
+        self.queue = torch.full((trees, blocks * BLOCK), inf, dtype=torch.float64, device=device)
+        self.minima = torch.full((trees, blocks), inf, dtype=torch.float64, device=device)
+        places = 2 ** (4 * self.capacity + self.planner.nodes_at_once).bit_length()
+        self.seen = torch.full((trees, places), EMPTY, device=device)
+
+    def _grow(self) -> None:
+        """Twice the room for nodes."""
+        trees, old, queue, minima, seen = len(self.rows), self.capacity, self.queue, self.minima, self.seen
+        self.capacity *= 2
+        self._make_room(trees)
+        self.queue[:, : queue.shape[1]], self.minima[:, : minima.shape[1]] = queue, minima
+        tree, place = (seen != EMPTY).nonzero(as_tuple=True)
+        self._insert(tree, seen[tree, place])
+        for name, values in self.nodes.items():
+            more = values.new_zeros(trees, self.capacity - old, *values.shape[2:])
+            self.nodes[name] = torch.cat([values, more], 1)
+
+    def _finish(
+        self, tree: Tensor, edge: Tensor, depth: Tensor, log_prob: Tensor, gain: Tensor, state: Tensor
+    ) -> Tensor:
+        """Take the first solution of each tree; which trees have one, bool `[R]`."""
+        over = torch.zeros(len(self.rows), dtype=torch.bool, device=tree.device)
+        first = _rank(tree, torch.ones_like(tree, dtype=torch.bool)) == 0
+        tree, edge, depth, log_prob, gain, state = (x[first] for x in (tree, edge, depth, log_prob, gain, state))
+        over[tree] = True
+        row, found = self.rows[tree], self.result
+        found.solved[row] = True
+        found.log_bound[row] = (depth.double() + 1).log() - log_prob
+        self._take(tree, edge, depth, gain, state)
+        return over
+
+    def _take(self, tree: Tensor, edge: Tensor, depth: Tensor, gain: Tensor, state: Tensor) -> None:
+        """Write the paths `[M]` that end with `edge` to the results."""
+        row, found = self.rows[tree], self.result
+        found.lengths[row], found.score[row], found.final_state[row] = depth, gain, state
+        longest = int(depth.max()) if len(depth) else 0
+        plan, now = torch.zeros(len(tree), longest, dtype=torch.long, device=tree.device), edge
+        for back in range(1, longest + 1):
+            on_path = now >= 0
+            plan[on_path, (depth - back)[on_path]] = now[on_path] % self.actions
+            node = now.clamp(min=0).div(self.actions, rounding_mode="floor")
+            now = torch.where(on_path, self.nodes["edge"][tree, node], now)
+        for one, number, path in zip(row.tolist(), depth.tolist(), plan, strict=True):
+            self.paths[one] = path[:number]
+
+    def _drop(self, over: Tensor) -> None:
+        """Leave the trees that are `over`, bool `[R]`; those without a solution with their best node."""
+        if not bool(over.any()):
+            return
+        ended = over.nonzero()[:, 0]
+        row = self.rows[ended]
+        self.result.expansions[row], self.result.model_steps[row] = self.size[ended], self.steps[ended]
+        lost = ended[~self.result.solved[row]]
+        if len(lost):
+            beyond = torch.arange(self.capacity, device=lost.device) >= self.size[lost][:, None]
+            gain = self.nodes["gain"][lost].masked_fill(beyond, -inf)
+            left = self.nodes["left"][lost].masked_fill(gain < gain.amax(1, keepdim=True), inf)
+            best = left.argmin(1)
+            of = {name: self.nodes[name][lost, best] for name in ("edge", "depth", "gain", "state")}
+            self._take(lost, *of.values())
+        kept = (~over).nonzero()[:, 0]
+        self.rows, self.size, self.steps = self.rows[kept], self.size[kept], self.steps[kept]
+        self.queue, self.minima, self.seen = self.queue[kept], self.minima[kept], self.seen[kept]
+        self.nodes = {name: values[kept] for name, values in self.nodes.items()}
+
+
+def _rank(tree: Tensor, counted: Tensor) -> Tensor:
+    """How many earlier entries of each entry's tree are counted, `[M]`."""
+    order = tree.argsort(stable=True)
+    ones = counted[order].long()
+    before = ones.cumsum(0) - ones
+    sorted_tree = tree[order]
+    starts = torch.ones_like(sorted_tree, dtype=torch.bool)
+    starts[1:] = sorted_tree[1:] != sorted_tree[:-1]
+    base = before[starts][starts.long().cumsum(0) - 1] if len(tree) else before
+    rank = torch.empty_like(before)
+    rank[order] = before - base
+    return rank

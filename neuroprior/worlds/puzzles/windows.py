@@ -1,0 +1,85 @@
+"""Patterns: what lies in small windows around the mover of a puzzle, each pattern one number."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+Window = tuple[int, int, int, int]
+"""The row and column of its first cell, counted from the mover, its height and its width."""
+
+CODES = 2**31
+"""Patterns are numbered below this."""
+
+
+def windows_within(height: int, width: int, distance: int) -> list[Window]:
+    """All windows of a size whose cells are at most `distance` rows and columns from the mover."""
+    rows = range(-distance, distance - height + 2)
+    return [(row, column, height, width) for row in rows for column in range(-distance, distance - width + 2)]
+
+
+def windows_with_mover(height: int, width: int) -> list[Window]:
+    """All windows of a size that hold the mover's cell."""
+    return [(row, column, height, width) for row in range(1 - height, 1) for column in range(1 - width, 1)]
+
+
+class Windows:
+    """Numbers what lies in windows: a cell is of one of `base` kinds, a pattern what a window's cells are.
+
+    The code of window k is `offsets[k]` plus the kinds of its cells, row by row, as a number to the base `base`; offsets
+    keep windows apart.
+
+    Args:
+        windows: see `Window`.
+        base: number of kinds.
+        outside: the kind of what lies outside of the board.
+
+    Attributes:
+        radius: the rows or columns that windows reach away from the mover.
+        offsets: int64 `[F]`.
+
+    Raises:
+        ValueError: there are no windows, or they have 2**31 patterns or more together.
+    """
+
+    def __init__(self, windows: Sequence[Window], base: int, outside: int) -> None:
+        self.windows, self.base, self.outside = tuple(windows), base, outside
+        if not self.windows:
+            raise ValueError("windows: at least one is expected")
+        sizes = [base ** (height * width) for _, _, height, width in self.windows]
+        if sum(sizes) >= CODES:
+            raise ValueError(
+                f"windows: they have {sum(sizes):,} patterns of {base} kinds of cells; fewer than 2**31 are expected: take"
+                " smaller or fewer windows"
+            )
+        self.offsets = torch.tensor([0, *sizes]).cumsum(0)[:-1]
+        self.radius = max(
+            max(-row, -column, row + height - 1, column + width - 1) for row, column, height, width in self.windows
+        )
+
+    def codes(self, kinds: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        """The patterns around the mover.
+
+        Args:
+            kinds: integers `[N, H, W]` below `base`.
+            row, column: int64 `[N]`: where the mover is.
+
+        Returns:
+            int32 `[N, F]`.
+        """
+        reach, number = self.radius, len(kinds)
+        around = torch.arange(2 * reach + 1, device=kinds.device)
+        padded = torch.nn.functional.pad(kinds.long(), (reach,) * 4, value=self.outside)
+        rows, columns = row[:, None] + around, column[:, None] + around
+        square = padded[torch.arange(number, device=kinds.device)[:, None, None], rows[:, :, None], columns[:, None, :]]
+        out = torch.empty(number, len(self.windows), dtype=torch.int32, device=kinds.device)
+        strips: dict[int, Tensor] = {1: square}
+        for wide in range(2, max(window[3] for window in self.windows) + 1):
+            shorter = strips[wide - 1]
+            strips[wide] = shorter[..., :-1] * self.base + square[..., wide - 1 :]
+        for k, (y, x, height, width) in enumerate(self.windows):
+            code = torch.zeros(number, dtype=torch.long, device=kinds.device)
+            for i in range(height):
+                code = code * self.base**width + strips[width][:, y + reach + i, x + reach]
+            out[:, k] = self.offsets[k] + code
+        return out
