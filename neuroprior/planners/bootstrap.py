@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,10 +11,12 @@ from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior._files import read_json, write_json, written_whole
-from neuroprior._random import draw_seed
 from neuroprior.planners.best_first import BestFirstPlanner, LevinPlanner, Search
-from neuroprior.plans import Plans
-from neuroprior.priors import Prior, load, save
+from neuroprior.plans import Plans, action_dtype
+from neuroprior.priors import PatternPrior, Prior, load, save
+from neuroprior.priors.patterns import Steps
+from neuroprior.worlds.puzzles import PuzzleWorld
+from neuroprior.worlds.world import World
 
 ENOUGH = 0.8
 """Where this share of the problems tried is solved, more are tried in the next sweep."""
@@ -36,7 +39,7 @@ class Sweep(NamedTuple):
         solutions: problems with a solution so far.
         mean_expansions: over the problems tried; an unsolved one counts with what was spent on it.
         actions: of the solutions that the prior then learned from, with their reflections and rotations.
-        seconds: of this sweep: for solving, and for learning.
+        search_seconds, fit_seconds: of this sweep.
     """
 
     number: int
@@ -46,87 +49,203 @@ class Sweep(NamedTuple):
     solutions: int
     mean_expansions: float
     actions: int
-    seconds: tuple[float, float]
+    search_seconds: float
+    fit_seconds: float
 
 
 def bootstrap(
-    world: Any,
+    world: World,
     prior: Prior,
     problems: Tensor,
     *,
     max_nodes: int = 2000,
     sweeps: int = 10,
     first: int = 1000,
-    symmetries: int | None = None,
     max_actions: int = 2_000_000,
     teacher: BestFirstPlanner | None = None,
     guided: bool = False,
-    folder: str | Path | None = None,
+    folder: str | PathLike[str] | None = None,
     generator: torch.Generator | None = None,
     **settings: Any,
 ) -> Iterator[Sweep]:
-    """Solve problems with a prior, fit it to the solutions, and again (Arfaee, Zilles and Holte 2011, *Learning
-    heuristic functions for large state spaces*; with a prior Orseau and Lelis, AAAI 2021).
+    """Solve problems with a prior, fit it to the solutions, and again (Arfaee, Zilles and Holte, *Learning heuristic
+    functions for large state spaces*, 2011; with a prior Orseau and Lelis, AAAI 2021).
 
     The first `first` problems are tried first. When four fifths of them are solved, four times as many are tried; when
-    all are tried and few more get solved, the budget doubles. A problem's latest solution counts. The prior learns from
-    reflections and rotations of the solutions too, where the world has any.
+    there are no more, or few more get solved, the budget doubles. Each problem's latest solution counts. In puzzles the
+    prior learns from reflections and rotations of the solutions, too.
 
     Args:
         world: with goals; see `LevinPlanner`.
         prior: fitted in place; count-based priors anew, others from their present weights.
         problems: `[N, ...]` starts.
         max_nodes: expansions for each problem in the first sweep.
-        sweeps: at most so many; it ends before that when a sweep solves all problems.
+        sweeps: number of sweeps.
         first: problems in the first sweep.
-        symmetries: reflections and rotations of each solution to learn from, itself among them; None: as many as the
-            world has and `max_actions` allows.
-        max_actions: of all solutions with their symmetries together, about; bounds memory and time.
-        teacher: solves the first sweep in the prior's place, such as an `AStarPlanner`; None: the prior as it is.
-        guided: search with the world's heuristic (PHS*), not with the prior alone.
+        max_actions: reflections and rotations are added up to about so many actions of all solutions together; bounds
+            memory and time.
+        teacher: searches in the first sweep, such as an `AStarPlanner`; None: the prior as it is.
+        guided: search with the world's `lower_bound` as heuristic (PHS*).
         folder: the prior, the solutions and the sweeps are kept there after each sweep, and an interrupted call goes on
             from them; None: nothing is kept.
         generator: draws symmetries, and what the prior's `fit` draws.
-        **settings: passed on to the prior's `fit`.
+        **settings: of the prior's `fit`.
 
     Yields:
-        Each sweep, when the prior has learned from it; finished ones at once.
+        Each sweep, when the prior has learned from it; finished ones of `folder` at once.
 
     Raises:
-        ValueError: an argument is out of range; nothing is solved in the first sweep; or the folder is of another call.
+        ValueError: an argument is out of range, nothing is solved at first, or the folder is of another call.
     """
     check_sizes(max_nodes=max_nodes, sweeps=sweeps, first=first, max_actions=max_actions)
+    world.check_state(problems)
     if len(problems) == 0:
         raise ValueError("problems: at least one is expected")
-    solutions = Solutions(problems)
-    done: list[Sweep] = []
-    kept = None if folder is None else Path(folder)
+    if guided and not hasattr(world, "lower_bound"):
+        raise ValueError(f"guided: a world with a lower_bound is expected, not {type(world).__name__}")
+    generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
     asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided}
-    if kept is not None and (kept / "sweeps.json").exists():
-        done = _restore(kept, prior, solutions, asked)
-    yield from done
-    tried, budget = (min(first, len(problems)), max_nodes) if not done else _next(done[-1], done, len(problems))
-    for number in range(len(done) + 1, sweeps + 1):
+    run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator)
+    yield from run.done[:sweeps]
+    while len(run.done) < sweeps:
+        tried, budget = run.next()
+        with_teacher = teacher is not None and not run.done
+        heuristic = world.lower_bound if guided else None  # type: ignore[attr-defined]
+        planner = teacher if with_teacher else LevinPlanner(prior, budget, heuristic=heuristic)
+        assert planner is not None
         begin = time.perf_counter()
-        how = {"max_nodes": budget, "heuristic": world.lower_bound if guided else None}
-        planner = teacher if teacher is not None and number == 1 else LevinPlanner(prior, **how)
         found = planner.search(world, problems[:tried])
-        before = solutions.known
-        solutions.take(found)
-        if solutions.known == 0:
-            raise ValueError(
-                f"problems: none of {tried} was solved within {budget} expansions; give a larger budget, a teacher or"
-                " easier problems"
-            )
-        middle = time.perf_counter()
-        actions = solutions.teach(prior, world, symmetries, max_actions, generator, settings)
-        seconds = middle - begin, time.perf_counter() - middle
+        run.take(found)
+        searched = time.perf_counter()
+        actions = run.learn(max_actions, settings)
+        seconds = searched - begin, time.perf_counter() - searched
         share, mean = float(found.solved.double().mean()), float(found.expansions.double().mean())
-        done.append(Sweep(number, tried, budget, share, solutions.known, mean, actions, seconds))
-        if kept is not None:
-            _keep(kept, prior, solutions, done, asked)
-        yield done[-1]
-        if tried == len(problems) and share == 1:
+        run.end(Sweep(len(run.done) + 1, tried, planner.max_nodes, share, len(run.plans), mean, actions, *seconds))
+        yield run.done[-1]
+
+
+class _Bootstrap:
+    """The solutions and sweeps of a call of `bootstrap`, and the folder where they are kept."""
+
+    def __init__(
+        self,
+        world: World,
+        prior: Prior,
+        problems: Tensor,
+        asked: dict[str, Any],
+        folder: Path | None,
+        generator: torch.Generator,
+    ) -> None:
+        self.world, self.prior, self.problems, self.asked, self.folder = world, prior, problems, asked, folder
+        self.generator, self.plans, self.done = generator, dict[int, Tensor](), list[Sweep]()
+        if folder is not None and (folder / "sweeps.json").exists():
+            self._restore(folder)
+
+    def next(self) -> tuple[int, int]:
+        """How many problems the next sweep tries, and its budget."""
+        tried, budget = min(self.asked["first"], len(self.problems)), self.asked["max_nodes"]
+        known = 0
+        for sweep in self.done:
+            gained, known = sweep.solutions - known, sweep.solutions
+            more = sweep.solved >= ENOUGH and tried < len(self.problems)
+            if more:
+                tried = min(MORE * tried, len(self.problems))
+            elif gained < NEW * sweep.solutions:
+                budget *= 2
+        return tried, budget
+
+    def take(self, found: Search) -> None:
+        """Keep the solutions of a search."""
+        for number in found.solved.nonzero()[:, 0].tolist():
+            self.plans[number] = found.plan[number, : int(found.lengths[number])].cpu()
+        if not self.plans:
+            raise ValueError(
+                f"problems: none of {len(found.solved)} was solved; give a larger max_nodes, a teacher or easier problems"
+            )
+
+    def learn(self, max_actions: int, settings: dict[str, Any]) -> int:
+        """Fit the prior to the solutions; returns the number of their actions."""
+        numbers = sorted(number for number, plan in self.plans.items() if len(plan))
+        plans = [self.plans[number] for number in numbers]
+        state = self.problems[torch.tensor(numbers, dtype=torch.long)]
+        own = sum(map(len, plans))
+        if isinstance(self.world, PuzzleWorld):
+            state, plans = self._with_symmetries(self.world, state, plans, max_actions // max(own, 1))
+        order = torch.randperm(len(plans), generator=self.generator).tolist()
+        state, plans = state[torch.tensor(order, dtype=torch.long)], [plans[k] for k in order]
+        if isinstance(self.prior, PatternPrior):
+            self.prior.fit_steps(solution_steps(self.world, state, plans), generator=self.generator, **settings)
+        else:
+            self.prior.fit(solution_plans(self.world, state, plans, self.prior.context_per), generator=self.generator, **settings)
+        return sum(map(len, plans))
+
+    def _with_symmetries(
+        self, world: PuzzleWorld, state: Tensor, plans: list[Tensor], times: int
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Each solution under so many symmetries, itself among them; the others drawn for each."""
+        number = world.symmetries()
+        times = min(max(times, 1), number)
+        drawn = torch.rand(len(plans), number, generator=self.generator)
+        drawn[:, 0] = -1  # itself
+        chosen = drawn.argsort(1)[:, :times]
+        states, more = [], []
+        for symmetry in range(number):
+            rows = (chosen == symmetry).any(1).nonzero()[:, 0]
+            states.append(world.transformed(state[rows], symmetry))
+            renamed = world.transformed_actions(symmetry).to(torch.uint8)
+            more += [renamed[plans[row].long()] for row in rows.tolist()]
+        return torch.cat(states), more
+
+    def end(self, sweep: Sweep) -> None:
+        """Keep a finished sweep."""
+        self.done.append(sweep)
+        if self.folder is None:
             return
-        gained = solutions.known - before
-        tried, budget = _next_sweep(done[-1], gained, len(problems))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        save(self.prior, self.folder / f"prior-{sweep.number}")
+        plans = {str(number): plan for number, plan in self.plans.items()}
+        with written_whole(self.folder / f"solutions-{sweep.number}.safetensors") as path:
+            save_file(plans, path)
+        rows = [one._asdict() for one in self.done]
+        kept = {"asked": self.asked, "sweeps": rows, "generator": self.generator.get_state().tolist()}
+        write_json(self.folder / "sweeps.json", kept)
+
+    def _restore(self, folder: Path) -> None:
+        kept = read_json(folder / "sweeps.json")
+        if kept["asked"] != self.asked:
+            raise ValueError(f"{folder}: holds sweeps of another call, with {kept['asked']}; give another folder")
+        self.done = [Sweep(**row) for row in kept["sweeps"]]
+        last = self.done[-1].number
+        saved = load(folder / f"prior-{last}")
+        if type(saved) is not type(self.prior) or saved.config != self.prior.config:
+            raise ValueError(f"{folder}: its prior is {saved}, not {self.prior}; give another folder")
+        self.prior.load_state_dict(saved.state_dict())
+        self.prior.restore(saved.learned)
+        self.plans = {int(name): plan for name, plan in load_file(folder / f"solutions-{last}.safetensors").items()}
+        self.generator.set_state(torch.tensor(kept["generator"], dtype=torch.uint8))
+
+
+def solution_steps(world: World, state: Tensor, plans: Sequence[Tensor]) -> Steps:
+    """The steps of plans from `state [N, ...]`, in a world whose observations are patterns, plan after plan."""
+    if isinstance(world, PuzzleWorld) and world.device.type == "cpu":
+        patterns = compiled("patterns_along")(world, state, plans)
+    else:
+        one = [solution_plans(world, state[k : k + 1], [plan], "step").context for k, plan in enumerate(plans)]
+        patterns = torch.cat([context[0] for context in one if context is not None])
+    action = torch.cat(list(plans)).long()
+    begin = torch.tensor([0, *map(len, plans)]).cumsum(0)[:-1]
+    last = torch.nn.functional.pad(action, (1, -1))
+    last[begin] = world.num_actions
+    return Steps(patterns, last, action)
+
+
+def solution_plans(world: World, state: Tensor, plans: Sequence[Tensor], context: str | None) -> Plans:
+    """Plans from `state [N, ...]` as `Plans`, with what the world observes on the way, as a prior takes it."""
+    lengths = torch.tensor([len(plan) for plan in plans])
+    actions = torch.nn.utils.rnn.pad_sequence(list(plans), batch_first=True).to(action_dtype(world.num_actions))
+    seen, now = [], state
+    for t in range(actions.shape[1]):
+        seen.append(world.observe(now))
+        now, _ = world.step(now, actions[:, t].long())
+    observed = None if context is None else torch.stack(seen, 1) if context == "step" else seen[0]
+    return Plans(actions, world.num_actions, lengths, world.action_names, observed, world.group(state))

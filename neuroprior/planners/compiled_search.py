@@ -3,17 +3,28 @@
 A position is held as cells and the place of the mover: in Sokoban the player, in a sliding puzzle the blank.
 """
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numba import njit
+from torch import Tensor
 
+from neuroprior.priors.patterns import LogLinearPrior, PatternCounts, PatternNetwork
 from neuroprior.priors.patterns.compiled_fit import MIXER, hash_table, place
+from neuroprior.priors.uniform import UniformPrior
+from neuroprior.worlds.puzzles import PuzzleWorld, SlidingTilesWorld
+from neuroprior.worlds.world import World
 
 Array = np.ndarray[Any, Any]
 
 SOKOBAN, TILES = 0, 1
-WALL, BOX, BOX_ON_GOAL = 1, 3, 4
+WALL, GOAL, BOX, BOX_ON_GOAL = 1, 2, 3, 4
+
+LONGEST = 4096
+"""Actions of a solution for which there is room at first."""
 
 LEVIN, ADDITIVE = 0, 1
 """Orders of expansion: d / pi (with a heuristic that of PHS*), and depth + weight * heuristic."""
@@ -381,3 +392,129 @@ def search(
             _push(costs, edges, queued, cost, node * actions + action)
             queued += 1
 
+
+KNOWN = (LogLinearPrior, PatternCounts, PatternNetwork)
+"""Priors of patterns whose tables the loop reads; the uniform prior has none."""
+
+
+def can_search(world: World, prior: Any) -> bool:
+    """Whether the compiled loop knows the world and the prior, on the CPU."""
+    if not isinstance(world, PuzzleWorld) or world.device.type != "cpu":
+        return False
+    if isinstance(prior, UniformPrior):
+        return True
+    patterned = world.observation == "patterns" and getattr(prior, "num_patterns", None) == len(world.windows.windows)
+    return patterned and type(prior) in KNOWN and getattr(prior, "combine", "product") == "product"
+
+
+def compiled_board(world: PuzzleWorld) -> Board:
+    """What all positions of a puzzle share."""
+    high, wide = world.boards.shape[1:]
+    windows, cells = world.windows, high * wide
+    if isinstance(world, SlidingTilesWorld):
+        puzzle, kinds = TILES, world.tile_kinds().numpy()
+    else:
+        puzzle, kinds = SOKOBAN, np.repeat(np.arange(windows.base)[:, None], cells, 1)
+    random = np.random.default_rng(0).integers(2**63, size=(len(kinds) + 1, cells), dtype=np.uint64)
+    reach = windows.radius
+    shifted = [(row + reach, column + reach, height, width) for row, column, height, width in windows.windows]
+    offsets = windows.offsets.numpy().astype(np.int64)
+    return Board(
+        puzzle, wide, random, kinds.astype(np.int64), windows.base, windows.outside, np.array(shifted, np.int32), offsets, reach
+    )
+
+
+def compiled_tables(prior: Any) -> Tables:
+    """The tables of a prior of patterns, or of the uniform prior."""
+    actions = prior.num_actions
+    if isinstance(prior, UniformPrior):
+        codes, weights, after = np.zeros(0, np.int64), np.zeros((0, actions), np.float32), np.zeros((actions + 1, actions))
+    else:
+        codes, weights, after = prior.patterns.numpy(), prior.weights[:-1].numpy(), prior.after.numpy()
+    layers, biases, out = np.zeros((0, 0, 0)), np.zeros((0, 0)), np.zeros((actions, 0))
+    if isinstance(prior, PatternNetwork):
+        weights = np.concatenate([weights, prior.embeddings[:-1].numpy()], 1)
+        layers, biases, out = (table.numpy() for table in (prior.layers, prior.biases, prior.out))
+    network = (np.ascontiguousarray(table, np.float32) for table in (layers, biases, out))
+    placed = hash_table(codes.astype(np.int64), np.ascontiguousarray(weights, np.float32))
+    return Tables(*placed, np.ascontiguousarray(after, np.float32), *network)
+
+
+class Found(NamedTuple):
+    """What a compiled search found for B problems: as `neuroprior.planners.best_first.Search`, in numpy's arrays."""
+
+    solved: Array
+    plans: list[Array]
+    log_bound: Array
+    expansions: Array
+    model_steps: Array
+
+
+def search_all(
+    world: PuzzleWorld, prior: Any, state: Tensor, order: int, weight: float, informed: bool, max_nodes: int
+) -> Found:
+    """Search from each of `state [B, H, W]`; the cores share the problems."""
+    board, tables = compiled_board(world), compiled_tables(prior)
+    movers, batch = world.mover(state).numpy(), len(state)
+    if isinstance(world, SlidingTilesWorld):
+        cells, goal = state.flatten(1).numpy(), world.goal.flatten().numpy()
+        distances: Any = world.distances().numpy().astype(np.float64)
+    else:
+        cells, goal = world.kinds(state).to(torch.uint8).flatten(1).numpy(), np.zeros(0, np.uint8)
+        distances = None
+    uninformed = np.zeros((0, cells.shape[1]))
+    solved, log_bound = np.zeros(batch, bool), np.full(batch, np.inf)
+    expansions, steps = np.zeros(batch, np.int64), np.zeros(batch, np.int64)
+    plans: list[Array] = [np.zeros(0, np.uint8)] * batch
+
+    def one(number: int) -> None:
+        path, far = np.zeros(LONGEST, np.uint8), uninformed
+        if informed:
+            far = goal_distances(cells[number], board.width) if distances is None else distances
+        start = np.ascontiguousarray(cells[number]), int(movers[number])
+        while True:
+            nodes, length, bound, taken = search(board, tables, *start, goal, far, order, weight, max_nodes, path)
+            if length <= len(path):
+                break
+            path = np.zeros(length, np.uint8)
+        solved[number], log_bound[number], expansions[number], steps[number] = np.isfinite(bound), bound, nodes, taken
+        plans[number] = path[:length].copy()
+
+    with ThreadPoolExecutor(max(torch.get_num_threads(), 1)) as pool:  # the loop releases Python's lock
+        list(pool.map(one, range(batch)))
+    return Found(solved, plans, log_bound, expansions, steps)
+
+
+def goal_distances(cells: Array, width: int) -> Array:
+    """The rows and columns between each goal of a Sokoban level and each cell, float64 `[G, cells]`."""
+    goals, every = np.flatnonzero((cells == GOAL) | (cells == BOX_ON_GOAL)), np.arange(len(cells))
+    rows = np.abs(goals[:, None] // width - every // width)
+    return (rows + np.abs(goals[:, None] % width - every % width)).astype(np.float64)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _replay(board: Board, start: Array, mover: int, path: Array, codes: Array) -> None:
+    """Write the patterns before each action of `path [L]` to `codes` int32 `[L, F]`."""
+    cells, high, width = start.copy(), len(start) // board.width, board.width
+    square = 2 * board.radius + 1
+    padded = np.full((high + 2 * board.radius) * (width + 2 * board.radius), board.outside, dtype=np.int64)
+    rows = np.zeros((board.windows[:, 3].max(), square, square), dtype=np.int64)
+    out = np.empty(len(board.windows), dtype=np.int64)
+    for t in range(len(path)):
+        _patterns(board, cells, mover, padded, rows, out)
+        codes[t] = out
+        if _can(board.puzzle, cells, width, mover, path[t]):
+            mover, _ = _move(board, cells, mover, path[t], np.uint64(0))
+
+
+def patterns_along(world: PuzzleWorld, state: Tensor, plans: Sequence[Tensor]) -> Tensor:
+    """The patterns before each action of plans from `state [B, H, W]`, one plan after the other: int32 `[M, F]`."""
+    board, movers = compiled_board(world), world.mover(state).numpy()
+    cells = state if isinstance(world, SlidingTilesWorld) else world.kinds(state).to(torch.uint8)
+    flat, out = cells.flatten(1).numpy(), np.empty((sum(map(len, plans)), len(board.windows)), np.int32)
+    at = 0
+    for number, plan in enumerate(plans):
+        path = plan.to(torch.uint8).numpy()
+        _replay(board, np.ascontiguousarray(flat[number]), int(movers[number]), path, out[at : at + len(path)])
+        at += len(path)
+    return torch.from_numpy(out)

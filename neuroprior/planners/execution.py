@@ -121,8 +121,10 @@ def collect(
             raise ValueError(f"min_score: none of {len(state)} plans scored more than {min_score}{best}")
         plan, state, before = plan[kept], state[kept], before[kept]
         lengths = None if lengths is None else lengths[kept]
-    if context is not None and is_per_step(world.observe(state[:1])):
-        raise ValueError("observe: indices [N] or floating point features [N, C] are expected of a world")
+    if context is not None and world.observe(state[:1]).dim() > 2:
+        raise ValueError("observe: indices [N], patterns [N, F] or floating point features [N, C] are expected of a world")
+    if context == "plan" and is_per_step(world.observe(state[:1])):
+        raise ValueError('context: patterns are observed before each action; "step" is expected in this world')
     observed = observations(world, before, context)
     return Plans(plan, world.num_actions, lengths, world.action_names, observed, world.group(state))
 

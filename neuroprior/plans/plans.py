@@ -29,7 +29,8 @@ class Plans:
         lengths: integers `[N]`, the number of actions of each plan; None where all have L.
         action_names: A names, or None.
         context: what is known when actions are chosen, such as the agent's observations: indices (integers), one per
-            plan `[N]` or per step `[N, L]`, or features (floating point) `[N, C]` or `[N, L, C]`; None for no context.
+            plan `[N]` or per step `[N, L]`; patterns (integers `[N, L, F]`): F indices at once per step, each below
+            2**31; or features (floating point) `[N, C]` or `[N, L, C]`; None for no context.
         group: integers `[N]` (subject, session, world): the plans of a group are not independent, and never split
             between training and validation; None if each plan is independent.
         context_names: names of the context indices, numbered from 0, or None.
@@ -366,8 +367,13 @@ def action_dtype(num_actions: int) -> torch.dtype:
 
 
 def check_context(context: Tensor, num_plans: int, length: int) -> None:
-    """Raise ValueError unless `context` is `[N]`, `[N, L]` integers or `[N, C]`, `[N, L, C]` finite floating point."""
+    """Raise ValueError unless `context` is integers `[N]`, `[N, L]`, `[N, L, F]` or finite features, see `Plans`."""
     shape = tuple(context.shape)
+    if is_integer(context) and len(shape) == 3:
+        if shape[:2] != (num_plans, length):
+            raise ValueError(f"context: patterns of shape [{num_plans}, {length}, F] are expected, not {list(shape)}")
+        check_patterns(context)
+        return
     if is_integer(context):
         if shape not in ((num_plans,), (num_plans, length)):
             raise ValueError(
@@ -385,6 +391,11 @@ def check_context(context: Tensor, num_plans: int, length: int) -> None:
         raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
 
 
+def check_patterns(patterns: Tensor) -> None:
+    """Raise ValueError unless all `patterns` are integers from 0 to 2**31 - 1."""
+    check_range("context", patterns, MOST_ACTIONS, "patterns")
+
+
 def durations_of(plans: Plans) -> Tensor:
     """The durations `[N, L]` of plans; ValueError where they have none."""
     if plans.durations is None:
@@ -395,8 +406,8 @@ def durations_of(plans: Plans) -> Tensor:
 
 
 def is_per_step(context: Tensor | None) -> bool:
-    """True for a context per step (`[N, L]`, `[N, L, C]`), False for none or one per plan (`[N]`, `[N, C]`)."""
-    return context is not None and context.dim() == (2 if is_integer(context) else 3)
+    """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan."""
+    return context is not None and (context.dim() == 3 or (context.dim() == 2 and is_integer(context)))
 
 
 def _tensor(name: str, values: Any) -> Tensor:

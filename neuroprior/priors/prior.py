@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroprior._checks import check_memory, check_range, check_sizes, is_integer
-from neuroprior.plans import PastDurations, Plans, check_context, is_per_step
+from neuroprior.plans import PastDurations, Plans, check_context, check_patterns, is_per_step
 from neuroprior.sampling import ancestral as sampling
 from neuroprior.sampling.draws import after_end
 
@@ -22,14 +22,15 @@ class Prior(nn.Module, ABC):
     `state` is ONE tensor whose first dimension is the batch, so reordering or branching is `state[index]`; its other
     dimensions are up to the prior. The rows of one state have the same number of actions behind them.
 
-    `context` is the observation that actions depend on: indices below `num_contexts` or features of size
-    `context_size`, never both. It is given once per plan (`[N]`, `[N, C]`: that of the start) or before each action
-    (`[N, L]`, `[N, L, C]`).
+    `context` is the observation that actions depend on: indices below `num_contexts`, features of size `context_size`,
+    or `num_patterns` indices at once, only one of these. It is given once per plan (`[N]`, `[N, C]`: that of the start)
+    or before each action (`[N, L]`, `[N, L, C]`); patterns always before each action (`[N, L, F]`).
 
     Args:
         num_actions: A.
         num_contexts: number of context indices, for a prior that takes an index.
         context_size: C, for a prior that takes features.
+        num_patterns: F, for a prior that takes so many indices at once, each from 0 to 2**31 - 1.
 
     Attributes:
         context_per: "plan" or "step", as it was in the plans that the prior learned from ("step" before that); None
@@ -54,15 +55,23 @@ class Prior(nn.Module, ABC):
         super().__init_subclass__(**kwargs)
         Prior.known[cls.__name__] = cls
 
-    def __init__(self, num_actions: int, num_contexts: int | None = None, context_size: int | None = None) -> None:
+    def __init__(
+        self,
+        num_actions: int,
+        num_contexts: int | None = None,
+        context_size: int | None = None,
+        num_patterns: int | None = None,
+    ) -> None:
         super().__init__()
-        sizes = {"num_actions": num_actions, "num_contexts": num_contexts, "context_size": context_size}
+        contexts = {"num_contexts": num_contexts, "context_size": context_size, "num_patterns": num_patterns}
+        sizes = {"num_actions": num_actions} | contexts
         required = {name: size for name, size in sizes.items() if size is not None or name == "num_actions"}
         check_sizes(**required)
         check_memory(4 * num_actions, num_actions=num_actions)  # one row of logits
-        if num_contexts is not None and context_size is not None:
-            raise ValueError("num_contexts and context_size: a prior takes an index or features, not both")
+        if sum(size is not None for size in contexts.values()) > 1:
+            raise ValueError("num_contexts, context_size, num_patterns: a prior takes an index, features or patterns")
         self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size
+        self.num_patterns = num_patterns
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
         self.end: int | None = None
         self.action_names: tuple[str, ...] | None = None
@@ -73,7 +82,7 @@ class Prior(nn.Module, ABC):
     @property
     def takes_context(self) -> bool:
         """True for a prior whose predictions depend on a context."""
-        return self.num_contexts is not None or self.context_size is not None
+        return any(size is not None for size in (self.num_contexts, self.context_size, self.num_patterns))
 
     def __repr__(self) -> str:
         """The class with its constructor's arguments; priors made of priors show these in the same way."""
@@ -89,7 +98,11 @@ class Prior(nn.Module, ABC):
     @property
     def config(self) -> dict[str, Any]:
         """The constructor's arguments that make a prior like this one (JSON values); subclasses add their own."""
-        contexts = {"num_contexts": self.num_contexts, "context_size": self.context_size}
+        contexts = {
+            "num_contexts": self.num_contexts,
+            "context_size": self.context_size,
+            "num_patterns": self.num_patterns,
+        }
         return {"num_actions": self.num_actions} | {name: size for name, size in contexts.items() if size is not None}
 
     @property
@@ -308,6 +321,18 @@ class Prior(nn.Module, ABC):
             return
         if not self.takes_context:
             raise ValueError("context: this prior takes none (make it with num_contexts= or context_size=)")
+        if self.num_patterns is not None:
+            shape = (*context.shape[:-1], self.num_patterns)
+            if not is_integer(context) or context.dim() not in (2, 3) or tuple(context.shape) != shape:
+                raise ValueError(
+                    f"context: integers [..., {self.num_patterns}], the active patterns, are expected,"
+                    f" not {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
+                )
+            if not isinstance(plans, Plans):
+                check_patterns(context)
+            return
+        if is_integer(context) and context.dim() == 3:
+            raise ValueError("context: these plans have patterns, several indices a step, which this prior does not take")
         if not isinstance(plans, Plans):
             steps = context.shape[1] if is_per_step(context) else length
             check_context(context, num_plans, steps)
@@ -359,7 +384,7 @@ def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[st
     Args:
         make: called with the number of actions, and those of `contexts` that it takes.
         num_actions: A.
-        contexts: `num_contexts` or `context_size`, or none.
+        contexts: `num_contexts`, `context_size` or `num_patterns`, or none.
     """
     parameters = inspect.signature(make).parameters
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
@@ -376,6 +401,8 @@ def context_arguments(*some: Plans) -> dict[str, int]:
         return {}
     if contexts[0].is_floating_point():
         return {"context_size": contexts[0].shape[-1]}
+    if contexts[0].dim() == 3:
+        return {"num_patterns": contexts[0].shape[-1]}
     most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
     return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
 

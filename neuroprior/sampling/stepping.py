@@ -103,7 +103,8 @@ class Stepper:
         """
         check_in_world(self._prior, world, state)
         context = None if self.context_per is None else world.observe(state)
-        if context is not None and is_per_step(context):
+        patterns = getattr(self._prior, "num_patterns", None) is not None
+        if context is not None and is_per_step(context) and not patterns:
             raise ValueError(
                 f"observe: indices [N] or features [N, C] are expected, not {context.dtype} {list(context.shape)}"
             )

@@ -36,7 +36,8 @@ def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000
         length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)
     generator = torch.Generator().manual_seed(seed)
     window = getattr(prior, "window", None) or 0
-    for kind in ("plan", "step") if prior.takes_context else (None,):
+    kinds = ("step",) if prior.num_patterns is not None else ("plan", "step") if prior.takes_context else (None,)
+    for kind in kinds:
         for steps in (1, length, window + 3):
             plans = torch.randint(actions, (7, steps), generator=generator).to(prior.device)
             context = _random_context(prior, kind, 7, steps, generator)
@@ -57,6 +58,8 @@ def _random_context(prior: Prior, kind: str | None, num: int, length: int, gener
         return None
     if prior.num_contexts is not None:
         return torch.randint(prior.num_contexts, shape, generator=generator).to(prior.device)
+    if prior.num_patterns is not None:
+        return torch.randint(9, (*shape, prior.num_patterns), generator=generator, dtype=torch.int32).to(prior.device)
     return torch.randn(*shape, prior.context_size or 0, generator=generator).to(prior.device)
 
 

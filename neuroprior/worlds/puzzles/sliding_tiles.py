@@ -80,10 +80,9 @@ class SlidingTilesWorld(PuzzleWorld):
 
     def kinds(self, state: Tensor) -> Tensor:
         """1 for the tile that must go furthest up and left, and so on, row by row; 0 lies outside of the board."""
-        return self._kinds[state.flatten(1).long(), torch.arange(state[0].numel(), device=state.device)].view_as(state)
+        return self.tile_kinds()[state.flatten(1).long(), torch.arange(state[0].numel(), device=state.device)].view_as(state)
 
-    @property
-    def _kinds(self) -> Tensor:
+    def tile_kinds(self) -> Tensor:
         """The kind of each tile in each cell, int64 `[tiles, cells]`."""
         height, width = self.goal.shape
         cell, place = torch.arange(height * width, device=self.device), self._place[:, None]
