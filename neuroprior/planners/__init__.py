@@ -1,5 +1,7 @@
 """Planners: they choose, for each start, a plan with a high score; executing, collecting and scoring plans."""
 
+from neuroprior.planners.best_first import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
+from neuroprior.planners.bootstrap import Sweep, bootstrap
 from neuroprior.planners.cross_entropy import CrossEntropyPlanner
 from neuroprior.planners.distinct import DistinctPlanner
 from neuroprior.planners.exact import expected_score, oracle
@@ -15,6 +17,8 @@ from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
 
 __all__ = [
+    "AStarPlanner",
+    "BestFirstPlanner",
     "CrossEntropyPlanner",
     "Decision",
     "DistinctPlanner",
@@ -24,10 +28,14 @@ __all__ = [
     "FrontierPlanner",
     "HorizonPlanner",
     "HorizonRound",
+    "LevinPlanner",
     "MCTSPlanner",
     "Planner",
     "PriorPlanner",
     "SamplingPlanner",
+    "Search",
+    "Sweep",
+    "bootstrap",
     "collect",
     "execute",
     "expected_score",

@@ -1,12 +1,14 @@
 """Solve and learn: a prior learns from the problems that were solved with it, and solves the next ones faster."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from safetensors.torch import load as read_tensors
+from safetensors.torch import save as write_tensors
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
@@ -18,13 +20,13 @@ from neuroprior.priors.patterns import Steps
 from neuroprior.worlds.puzzles import PuzzleWorld
 from neuroprior.worlds.world import World
 
-ENOUGH = 0.8
+ENOUGH = 0.75
 """Where this share of the problems tried is solved, more are tried in the next sweep."""
 
 MORE = 4
 """So many times as many problems, then."""
 
-NEW = 0.1
+NEW = 0.25
 """Where a sweep adds less than this share to the solved problems, and no further problems are left, the budget doubles."""
 
 
@@ -71,8 +73,8 @@ def bootstrap(
     """Solve problems with a prior, fit it to the solutions, and again (Arfaee, Zilles and Holte, *Learning heuristic
     functions for large state spaces*, 2011; with a prior Orseau and Lelis, AAAI 2021).
 
-    The first `first` problems are tried first. When four fifths of them are solved, four times as many are tried; when
-    there are no more, or few more get solved, the budget doubles. Each problem's latest solution counts. In puzzles the
+    The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried; when
+    there are no more, or fewer than a quarter of the solutions are new, the budget doubles. Each problem's latest solution counts. In puzzles the
     prior learns from reflections and rotations of the solutions, too.
 
     Args:
@@ -165,36 +167,10 @@ class _Bootstrap:
 
     def learn(self, max_actions: int, settings: dict[str, Any]) -> int:
         """Fit the prior to the solutions; returns the number of their actions."""
-        numbers = sorted(number for number, plan in self.plans.items() if len(plan))
-        plans = [self.plans[number] for number in numbers]
-        state = self.problems[torch.tensor(numbers, dtype=torch.long)]
-        own = sum(map(len, plans))
-        if isinstance(self.world, PuzzleWorld):
-            state, plans = self._with_symmetries(self.world, state, plans, max_actions // max(own, 1))
-        order = torch.randperm(len(plans), generator=self.generator).tolist()
-        state, plans = state[torch.tensor(order, dtype=torch.long)], [plans[k] for k in order]
-        if isinstance(self.prior, PatternPrior):
-            self.prior.fit_steps(solution_steps(self.world, state, plans), generator=self.generator, **settings)
-        else:
-            self.prior.fit(solution_plans(self.world, state, plans, self.prior.context_per), generator=self.generator, **settings)
-        return sum(map(len, plans))
-
-    def _with_symmetries(
-        self, world: PuzzleWorld, state: Tensor, plans: list[Tensor], times: int
-    ) -> tuple[Tensor, list[Tensor]]:
-        """Each solution under so many symmetries, itself among them; the others drawn for each."""
-        number = world.symmetries()
-        times = min(max(times, 1), number)
-        drawn = torch.rand(len(plans), number, generator=self.generator)
-        drawn[:, 0] = -1  # itself
-        chosen = drawn.argsort(1)[:, :times]
-        states, more = [], []
-        for symmetry in range(number):
-            rows = (chosen == symmetry).any(1).nonzero()[:, 0]
-            states.append(world.transformed(state[rows], symmetry))
-            renamed = world.transformed_actions(symmetry).to(torch.uint8)
-            more += [renamed[plans[row].long()] for row in rows.tolist()]
-        return torch.cat(states), more
+        numbers = sorted(self.plans)
+        state, plans = self.problems[torch.tensor(numbers)], [self.plans[number] for number in numbers]
+        how = {"max_actions": max_actions, "generator": self.generator}
+        return fit_solutions(self.prior, self.world, state, plans, **how, **settings)
 
     def end(self, sweep: Sweep) -> None:
         """Keep a finished sweep."""
@@ -204,8 +180,8 @@ class _Bootstrap:
         self.folder.mkdir(parents=True, exist_ok=True)
         save(self.prior, self.folder / f"prior-{sweep.number}")
         plans = {str(number): plan for number, plan in self.plans.items()}
-        with written_whole(self.folder / f"solutions-{sweep.number}.safetensors") as path:
-            save_file(plans, path)
+        with written_whole(self.folder / f"solutions-{sweep.number}.safetensors", "wb") as file:
+            file.write(write_tensors(plans))
         rows = [one._asdict() for one in self.done]
         kept = {"asked": self.asked, "sweeps": rows, "generator": self.generator.get_state().tolist()}
         write_json(self.folder / "sweeps.json", kept)
@@ -221,14 +197,80 @@ class _Bootstrap:
             raise ValueError(f"{folder}: its prior is {saved}, not {self.prior}; give another folder")
         self.prior.load_state_dict(saved.state_dict())
         self.prior.restore(saved.learned)
-        self.plans = {int(name): plan for name, plan in load_file(folder / f"solutions-{last}.safetensors").items()}
+        self.plans = read_solutions(folder)
         self.generator.set_state(torch.tensor(kept["generator"], dtype=torch.uint8))
+
+
+def read_solutions(folder: str | PathLike[str]) -> dict[int, Tensor]:
+    """The actions of each problem that was solved so far, by its number, from the folder of a call of `bootstrap`.
+
+    Raises:
+        OSError, KeyError: there is none.
+    """
+    last = read_json(Path(folder) / "sweeps.json")["sweeps"][-1]["number"]
+    tensors = read_tensors((Path(folder) / f"solutions-{last}.safetensors").read_bytes())
+    return {int(name): plan for name, plan in sorted(tensors.items())}
+
+
+def fit_solutions(
+    prior: Prior,
+    world: World,
+    state: Tensor,
+    plans: Sequence[Tensor],
+    *,
+    max_actions: int = 2_000_000,
+    generator: torch.Generator,
+    **settings: Any,
+) -> int:
+    """Fit a prior to solutions and, in puzzles, to their reflections and rotations; see `bootstrap`.
+
+    Args:
+        prior: fitted in place.
+        world: where the problems are.
+        state: `[N, ...]`: the problems.
+        plans: the N solutions, actions `[l]` each; empty ones are left out.
+        max_actions, generator, settings: see `bootstrap`.
+
+    Returns:
+        The number of actions that it learned from.
+    """
+    some = [k for k, plan in enumerate(plans) if len(plan)]
+    state, plans = state[torch.tensor(some, dtype=torch.long)], [plans[k] for k in some]
+    own = sum(map(len, plans))
+    if isinstance(world, PuzzleWorld):
+        state, plans = with_symmetries(world, state, plans, max_actions // max(own, 1), generator)
+    order = torch.randperm(len(plans), generator=generator)
+    state, plans = state[order], [plans[k] for k in order.tolist()]
+    if isinstance(prior, PatternPrior):
+        prior.fit_steps(solution_steps(world, state, plans), generator=generator, **settings)
+    else:
+        prior.fit(solution_plans(world, state, plans, prior.context_per), generator=generator, **settings)
+    return sum(map(len, plans))
+
+
+def with_symmetries(
+    world: PuzzleWorld, state: Tensor, plans: Sequence[Tensor], times: int, generator: torch.Generator
+) -> tuple[Tensor, list[Tensor]]:
+    """Each solution under `times` symmetries, or as many as there are: itself, and others that are drawn for each."""
+    number = world.symmetries()
+    drawn = torch.rand(len(plans), number, generator=generator)
+    drawn[:, 0] = -1  # itself
+    chosen = drawn.argsort(1)[:, : min(max(times, 1), number)]
+    states, more = [], list[Tensor]()
+    for symmetry in range(number):
+        rows = (chosen == symmetry).any(1).nonzero()[:, 0]
+        states.append(world.transformed(state[rows], symmetry))
+        renamed = world.transformed_actions(symmetry).to(torch.uint8)
+        more += [renamed[plans[row].long()] for row in rows.tolist()]
+    return torch.cat(states), more
 
 
 def solution_steps(world: World, state: Tensor, plans: Sequence[Tensor]) -> Steps:
     """The steps of plans from `state [N, ...]`, in a world whose observations are patterns, plan after plan."""
     if isinstance(world, PuzzleWorld) and world.device.type == "cpu":
-        patterns = compiled("patterns_along")(world, state, plans)
+        from neuroprior.planners.compiled_search import patterns_along  # priors of patterns learn with numba alone
+
+        patterns = patterns_along(world, state, plans)
     else:
         one = [solution_plans(world, state[k : k + 1], [plan], "step").context for k, plan in enumerate(plans)]
         patterns = torch.cat([context[0] for context in one if context is not None])

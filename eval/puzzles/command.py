@@ -1,0 +1,243 @@
+"""`python -m eval puzzles`: Sokoban and sliding tiles by policy-guided search."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from jsonargparse.typing import NonNegativeInt, PositiveInt
+
+from eval.puzzles.animation import animation
+from eval.puzzles.contest import (
+    BOOTSTRAP,
+    LEARNED,
+    SEARCHES,
+    Job,
+    Settings,
+    WorldName,
+    bootstrapped,
+    contest,
+    problems_of,
+)
+from eval.worlds.runs import check_distinct
+from neuroprior._files import write_whole
+from neuroprior._jobs import JobRun
+from neuroprior.analysis.statistics import paired_difference
+from neuroprior.report.document import Document, publish, table
+from neuroprior.report.page import Section, Table
+
+DATA = Path(__file__).parents[1] / "data"
+
+FILES = {
+    "sokoban": (DATA / "boxoban" / "train.txt.xz", DATA / "boxoban" / "test.txt.xz"),
+    "tiles": (DATA / "sliding_tiles" / "train.txt.xz", DATA / "sliding_tiles" / "test.txt.xz"),
+}
+"""Training and test problems by world."""
+
+PriorName = Literal[BOOTSTRAP, *LEARNED, *SEARCHES]  # type: ignore[valid-type]
+
+
+def puzzles(
+    world: WorldName = "sokoban",
+    train: str | None = None,
+    num_train: PositiveInt = 1000,
+    test: str | None = None,
+    num_test: PositiveInt | None = None,
+    budget: PositiveInt = 100_000,
+    priors: Sequence[PriorName] = (BOOTSTRAP, "log-linear", "network", "product", "uniform", "greedy"),
+    guided: bool | None = None,
+    sweeps: PositiveInt = 8,
+    seeds: PositiveInt = 1,
+    seed: NonNegativeInt = 0,
+    processes: PositiveInt | None = None,
+    out: str = "runs/puzzles",
+) -> None:
+    """Puzzles solved by policy-guided search: which prior needs how many expansions, and how long does it take?
+
+    A log-linear prior of patterns solves training problems and learns from its solutions, in several sweeps. Other
+    priors learn from the same solutions, and Levin tree search solves the test problems with each. Interrupted, the
+    same command goes on. Needs numba: pip install 'neuroprior[fast]'.
+
+    Args:
+        world: sokoban or tiles.
+        train: file of training problems (see docs/puzzles.md), plain or .xz; by default those of eval/data.
+        num_train: so many of them, the first.
+        test: file of test problems; by default those of eval/data.
+        num_test: so many of them, the first; all by default.
+        budget: expansions for each test problem.
+        priors: bootstrap (the log-linear prior after all sweeps); log-linear, network, product, backoff, markov (fitted
+            to its solutions; the last two to 50 problems and 2,000 expansions at most, for they are slow); uniform,
+            a-star, weighted-a-star (weight 5), greedy, breadth-first (nothing is learned).
+        guided: search with the heuristic, too (PHS*); by default in tiles alone.
+        sweeps: of solving and learning.
+        seeds: repeats; each takes the training problems in another order.
+        seed: of everything random.
+        processes: how many seeds or priors at a time; all cores by default. With 1 the seconds are the most exact.
+        out: folder for tables (CSV), `results.json`, `solutions.jsonl`, `report.html` and finished jobs.
+    """
+    check_distinct(priors=priors)
+    files = [str(given or default) for given, default in zip((train, test), FILES[world], strict=True)]
+    guided = world == "tiles" if guided is None else guided
+    settings = Settings(
+        world, files[0], int(num_train), files[1], None if num_test is None else int(num_test), int(budget), int(sweeps),
+        guided, int(seed),
+    )  # fmt: skip
+    both = problems_of(settings)
+    asked = asdict(settings) | {"digests": [sha256(Path(file).read_bytes()).hexdigest() for file in files]}
+    first = JobRun(partial(bootstrapped, settings), Path(out) / "bootstrap", asked, name="seed-{}".format)
+    first.run = partial(bootstrapped, settings, first.folder)
+    needed = any(prior not in SEARCHES for prior in priors)
+    sweeps_of = first.do(list(range(seeds if needed else 0)), processes=processes, title="solve and learn")
+    second = JobRun(partial(contest, settings, first.folder), Path(out) / "search", asked, name=lambda job: job.name)
+    jobs = [Job(k, prior) for prior in priors for k in range(seeds if prior not in SEARCHES else 1)]
+    found = second.do(jobs, processes=processes, title="search")
+    document = report(found, [row for rows in sweeps_of for row in rows], both, settings)
+    publish(document, Path(out))
+    _write_solutions(found, both[1], Path(out))
+
+
+def report(
+    found: Sequence[dict[str, Any]], sweeps: Sequence[dict[str, Any]], both: Sequence[Any], settings: Settings
+) -> Document:
+    """The tables: of all priors, of problems with walls of their own, of pairs of priors, and of the sweeps."""
+    each = pd.concat([_per_problem(one) for one in found], ignore_index=True)
+    seconds = pd.DataFrame([{key: one[key] for key in ("prior", "seed", "seconds", "fit_seconds")} for one in found])
+    rows = _rows(each, seconds)
+    frames = {"puzzles": rows, "pairs": _pairs(each), "sweeps": pd.DataFrame(sweeps)}
+    tables = [_table(rows, "Test problems", settings)]
+    if settings.world == "sokoban":
+        known = set(both[0].group(both[0].boards).tolist())
+        own = [number for number, walls in enumerate(both[1].group(both[1].boards).tolist()) if walls not in known]
+        apart = _rows(each[each["problem"].isin(own)], seconds).drop(columns=["seconds_per_problem", "fit_seconds"])
+        if len(own) < len(both[1].boards):
+            frames["own_walls"] = apart
+            tables.append(_table(apart, "Test problems whose walls are those of no training problem", settings))
+    if len(frames["pairs"]):
+        tables.append(_pair_table(frames["pairs"]))
+    if sweeps:
+        tables.append(_sweep_table(frames["sweeps"]))
+    best = rows.sort_values(["solved", "mean_expansions"], ascending=[False, True], kind="stable").iloc[0]
+    lead = (
+        f"{best['prior']} solves {100 * best['solved']:.1f} % of {best['problems']} problems within"
+        f" {best['budget']:,} expansions, with {best['mean_expansions']:,.0f} on average."
+    )
+    sections = [Section("Puzzles", tables=tables)]
+    return Document("Puzzles", lead, sections, frames, asdict(settings), "", keys={"puzzles": "rows"})
+
+
+def _per_problem(one: dict[str, Any]) -> pd.DataFrame:
+    """A row a problem: of one prior and seed."""
+    frame = pd.DataFrame({"expansions": one["expansions"], "moves": one["moves"]})
+    frame["solved"], frame["length"] = frame["moves"].notna(), frame["moves"].str.len()
+    frame["problem"] = range(len(frame))
+    return frame.assign(prior=one["prior"], seed=one["seed"], budget=one["budget"])
+
+
+def _rows(each: pd.DataFrame, seconds: pd.DataFrame) -> pd.DataFrame:
+    """A row a prior: means over problems and seeds; expansions of unsolved problems count as far as they went."""
+    grouped = each.groupby("prior", sort=False)
+    rows = pd.DataFrame(
+        {
+            "problems": grouped["problem"].nunique(),
+            "seeds": grouped["seed"].nunique(),
+            "budget": grouped["budget"].first(),
+            "solved": grouped["solved"].mean(),
+            "mean_expansions": grouped["expansions"].mean(),
+            "median_expansions": grouped["expansions"].median(),
+            "mean_expansions_solved": each[each["solved"]].groupby("prior", sort=False)["expansions"].mean(),
+            "mean_length": grouped["length"].mean(),
+        }
+    ).reindex(each["prior"].unique())
+    times = seconds.groupby("prior")[["seconds", "fit_seconds"]].mean()
+    rows["seconds_per_problem"] = times["seconds"] / rows["problems"]
+    rows["fit_seconds"] = times["fit_seconds"]
+    return rows.rename_axis("prior").reset_index()
+
+
+def _pairs(each: pd.DataFrame) -> pd.DataFrame:
+    """Each learned prior against the log-linear one: how many times as many expansions, over problems.
+
+    The geometric mean of the ratio; of a problem the mean over seeds; the interval is Student's over problems.
+    """
+    logs = each.assign(log=np.log(each["expansions"].clip(lower=1)))
+    wide = logs.pivot_table(index="problem", columns="prior", values="log", sort=False)
+    if "log-linear" not in wide:
+        return pd.DataFrame()
+    rows = []
+    for prior in wide.columns:
+        both = wide[["log-linear", prior]].dropna()
+        comparable = each.loc[each["prior"] == prior, "budget"].iloc[0] == each["budget"].max()
+        if prior != "log-linear" and comparable and len(both) > 1:
+            difference = paired_difference(both[prior], both["log-linear"])
+            ratio, low, high = (float(np.exp(x)) for x in (difference.mean, difference.low, difference.high))
+            rows.append({"prior": prior, "against": "log-linear", "problems": len(both), "ratio": ratio, "low": low, "high": high})
+    return pd.DataFrame(rows)
+
+
+def _table(rows: pd.DataFrame, title: str, settings: Settings) -> Table:
+    columns: dict[str, Any] = {
+        "prior": "prior",
+        "problems": "problems:,",
+        "solved, %": lambda row: f"{100 * row.solved:.1f}",
+        "mean expansions": "mean_expansions:,.0f",
+        "median": "median_expansions:,.0f",
+        "of solved": "mean_expansions_solved:,.0f",
+        "moves": "mean_length:.1f",
+    }
+    if "seconds_per_problem" in rows:
+        columns["ms a problem"] = lambda row: f"{1000 * row.seconds_per_problem:.1f}"
+    searched = "Levin tree search with a heuristic (PHS*)" if settings.guided else "Levin tree search"
+    caption = (
+        f"{searched}, at most {settings.budget:,} expansions a problem. Mean and median expansions: of all problems, those"
+        " that are not solved with what was spent. Means over seeds; one core."
+    )
+    return table(rows, columns, caption, title)
+
+
+def _pair_table(pairs: pd.DataFrame) -> Table:
+    columns: dict[str, Any] = {
+        "prior": "prior",
+        "problems": "problems:,",
+        "times as many expansions": lambda row: f"{row.ratio:.2f} ({row.low:.2f} to {row.high:.2f})",
+    }
+    caption = (
+        "Expansions in the ratio to those of the log-linear prior that learned from the same solutions: geometric mean and"
+        " 95 % interval (Student's) over problems, of each the mean over seeds."
+    )
+    return table(pairs, columns, caption, "The same solutions, the same patterns, the same search")
+
+
+def _sweep_table(sweeps: pd.DataFrame) -> Table:
+    columns: dict[str, Any] = {
+        "seed": "seed",
+        "sweep": "number",
+        "problems": "problems:,",
+        "budget": "max_nodes:,",
+        "solved, %": lambda row: f"{100 * row.solved:.1f}",
+        "mean expansions": "mean_expansions:,.0f",
+        "solutions": "solutions:,",
+        "learned from, actions": "actions:,",
+        "search, s": "search_seconds:.1f",
+        "fit, s": "fit_seconds:.1f",
+    }
+    return table(sweeps, columns, "Actions with those of reflected and rotated solutions.", "Solve and learn")
+
+
+def _write_solutions(found: Sequence[dict[str, Any]], test: Any, out: Path) -> None:
+    """`solutions.jsonl`, a line a problem, prior and seed; and an animated solution of the first prior."""
+    lines = [
+        json.dumps({"prior": one["prior"], "seed": one["seed"], "problem": k, "solved": moves is not None,
+                    "expansions": expansions, "moves": moves})
+        for one in found
+        for k, (moves, expansions) in enumerate(zip(one["moves"], one["expansions"], strict=True))
+    ]  # fmt: skip
+    write_whole(out / "solutions.jsonl", "\n".join(lines) + "\n")
+    solved = [(len(moves), k) for k, moves in enumerate(found[0]["moves"]) if moves]
+    if solved:
+        number = sorted(solved)[len(solved) // 2][1]
+        write_whole(out / "solution.svg", animation(test, test.boards[number], found[0]["moves"][number]))

@@ -1,0 +1,173 @@
+"""What is compared: a prior bootstrapped on training problems, others fitted to its solutions, searches without any."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from math import inf
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, bootstrap
+from neuroprior.planners.bootstrap import fit_solutions, read_solutions
+from neuroprior.priors import LogLinearPrior, MarkovPrior, PatternCounts, PatternNetwork, Prior, UniformPrior, load
+from neuroprior.worlds import PuzzleWorld, sliding_tiles, sokoban
+
+BOOTSTRAP = "bootstrap"
+"""The log-linear prior that found the solutions, from which all others learn."""
+
+LEARNED: dict[str, Callable[[int, int], Prior]] = {
+    "log-linear": LogLinearPrior,
+    "network": PatternNetwork,
+    "product": PatternCounts,
+    "backoff": partial(PatternCounts, combine="backoff"),
+    "markov": lambda actions, patterns: MarkovPrior(actions, 2),
+}
+"""Priors that learn from the solutions; all but the last from the same patterns."""
+
+SEARCHES: dict[str, Callable[[PuzzleWorld, int], BestFirstPlanner]] = {
+    "uniform": lambda world, budget: LevinPlanner(UniformPrior(4), budget),
+    "a-star": lambda world, budget: AStarPlanner(world.lower_bound, 1, budget),
+    "weighted-a-star": lambda world, budget: AStarPlanner(world.lower_bound, 5, budget),
+    "greedy": lambda world, budget: AStarPlanner(world.lower_bound, inf, budget),
+    "breadth-first": lambda world, budget: AStarPlanner(None, 1, budget),
+}
+"""Searches that learn nothing."""
+
+SLOW, SLOW_BUDGET = ("markov", "backoff"), (50, 2000)
+"""Priors that the compiled search does not know, and problems and expansions at most for these."""
+
+EPOCHS = 12
+"""Passes over the solutions of priors that are trained on them at once; the bootstrapped one had some in each sweep."""
+
+TEACHER = 100_000, 5.0
+"""Budget and weight of the weighted A* that solves the first sliding tiles."""
+
+FIRST_NODES = {"sokoban": 2_000, "tiles": 10_000}
+"""Expansions for each problem in the first sweep."""
+
+LETTERS = "udlr"
+"""Moves in files."""
+
+WorldName = Literal["sokoban", "tiles"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that decides the results of a seed; see `eval.puzzles.command.puzzles`."""
+
+    world: str
+    train: str
+    num_train: int
+    test: str
+    num_test: int | None
+    budget: int
+    sweeps: int
+    guided: bool
+    seed: int
+
+
+class Job(NamedTuple):
+    """A prior, by its name, of a seed."""
+
+    seed: int
+    prior: str
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and files."""
+        return f"{self.prior}-{self.seed}"
+
+
+def problems_of(settings: Settings) -> tuple[PuzzleWorld, PuzzleWorld]:
+    """The training and the test problems.
+
+    Raises:
+        ValueError: a file holds none, or boards of another size; the message names it.
+        OSError: a file cannot be read.
+    """
+    make: Callable[[str], PuzzleWorld] = sokoban if settings.world == "sokoban" else sliding_tiles
+    train, test = make(settings.train), make(settings.test)
+    expected, found = list(train.boards.shape[1:]), list(test.boards.shape[1:])
+    if expected != found:
+        raise ValueError(f"{settings.test}: boards of {expected} are expected, as in {settings.train}, not {found}")
+    train.boards, test.boards = train.boards[: settings.num_train], test.boards[: settings.num_test]
+    return train, test
+
+
+def bootstrapped(settings: Settings, folder: Path, seed: int) -> list[dict[str, Any]]:
+    """Bootstrap a prior on the training problems; its sweeps, also those before an interruption."""
+    train, _ = problems_of(settings)
+    how: dict[str, Any] = {"max_nodes": FIRST_NODES[settings.world], "guided": settings.guided}
+    if settings.world == "tiles":
+        nodes, weight = TEACHER
+        how["teacher"] = AStarPlanner(train.lower_bound, weight, nodes)
+    prior = LogLinearPrior(4, len(train.windows.windows))
+    sweeps = bootstrap(
+        train, prior, _shuffled(train, settings, seed), sweeps=settings.sweeps, folder=folder / f"seed-{seed}",
+        generator=torch.Generator().manual_seed(seed), **how,
+    )  # fmt: skip
+    return [{"seed": seed} | sweep._asdict() for sweep in sweeps]
+
+
+def _shuffled(train: PuzzleWorld, settings: Settings, seed: int) -> torch.Tensor:
+    """The training problems in the order of a seed."""
+    generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
+    return train.boards[torch.randperm(len(train.boards), generator=generator)]
+
+
+def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
+    """Fit a prior to the solutions of its seed, search each test problem with it, and replay what was found.
+
+    Raises:
+        RuntimeError: a solution does not solve its problem, or took more expansions than the bound allows.
+    """
+    train, test = problems_of(settings)
+    fit_seconds = 0.0
+    problems, budget = test.boards, settings.budget
+    if job.prior in SEARCHES:
+        planner = SEARCHES[job.prior](test, budget)
+    else:
+        begin = time.perf_counter()
+        prior = _prior(settings, folder / f"seed-{job.seed}", job, train)
+        fit_seconds = time.perf_counter() - begin
+        if job.prior in SLOW:
+            problems, budget = problems[: SLOW_BUDGET[0]], min(budget, SLOW_BUDGET[1])
+        planner = LevinPlanner(prior, budget, heuristic=test.lower_bound if settings.guided else None)
+    planner.search(test, problems[:1])  # compiled loops are loaded
+    begin = time.perf_counter()
+    found = planner.search(test, problems)
+    seconds = time.perf_counter() - begin
+    if not bool((test.solved(found.final_state) == found.solved).all()):
+        raise RuntimeError(f"{job.name}: a plan does not do what the search says")
+    bounded = isinstance(planner, LevinPlanner) and planner.heuristic is None
+    if bounded and bool((found.expansions.double().log() > found.log_bound + 1e-9).any()):
+        raise RuntimeError(f"{job.name}: more expansions than d / pi")
+    moves = [
+        "".join(LETTERS[action] for action in plan[:length]) if solved else None
+        for plan, length, solved in zip(found.plan.tolist(), found.lengths.tolist(), found.solved.tolist(), strict=True)
+    ]
+    return job._asdict() | {
+        "budget": budget,
+        "seconds": seconds,
+        "fit_seconds": fit_seconds,
+        "expansions": found.expansions.tolist(),
+        "log_bound": [bound if np.isfinite(bound) else None for bound in found.log_bound.tolist()],
+        "moves": moves,
+    }
+
+
+def _prior(settings: Settings, folder: Path, job: Job, train: PuzzleWorld) -> Prior:
+    """The bootstrapped prior, or another that learns from its solutions."""
+    solutions = read_solutions(folder)
+    if job.prior == BOOTSTRAP:
+        return load(folder / f"prior-{settings.sweeps}")
+    prior = LEARNED[job.prior](4, len(train.windows.windows))
+    state = _shuffled(train, settings, job.seed)[torch.tensor(list(solutions))]
+    training = {"epochs": EPOCHS} if "epochs" in prior.fit_settings else {}
+    generator = torch.Generator().manual_seed(job.seed)
+    fit_solutions(prior, train, state, list(solutions.values()), generator=generator, **training)
+    return prior
