@@ -7,6 +7,17 @@ from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridwo
 from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
+from neuroprior.worlds.puzzles import (
+    SOKOBAN_WINDOWS,
+    SlidingTilesWorld,
+    SokobanWorld,
+    format_sokoban,
+    read_sokoban,
+    read_tiles,
+    sliding_tiles,
+    sokoban,
+    windows_within,
+)
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
@@ -16,11 +27,15 @@ __all__ = [
     "GridWorld",
     "PocketCube",
     "Rollout",
+    "SOKOBAN_WINDOWS",
+    "SlidingTilesWorld",
+    "SokobanWorld",
     "SteppedWorld",
     "TabularWorld",
     "World",
     "cube",
     "egocentric",
+    "format_sokoban",
     "four_rooms",
     "from_gymnasium",
     "goal_direction",
@@ -29,4 +44,9 @@ __all__ = [
     "local_view",
     "maze",
     "patches",
+    "read_sokoban",
+    "read_tiles",
+    "sliding_tiles",
+    "sokoban",
+    "windows_within",
 ]

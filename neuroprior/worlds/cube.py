@@ -35,6 +35,8 @@ class PocketCube(World):
         action_names: such as ("U", "U2", "U'", ...).
     """
 
+    has_goal = True
+
     def __init__(
         self,
         turns: Literal["half", "quarter"],
@@ -137,6 +139,10 @@ class PocketCube(World):
         permutation = state.div(_ORIENTATIONS, rounding_mode="floor")
         orientation = state - permutation * _ORIENTATIONS
         return torch.cat([self._permutation_features[permutation], self._orientation_features[orientation]], -1)
+
+    def solved(self, state: Tensor) -> Tensor:
+        """Where the cube is solved."""
+        return state == 0
 
     def terminated(self, state: Tensor) -> Tensor:
         """Where the cube is solved, if `absorbing`."""

@@ -23,6 +23,7 @@ class EpisodicWorld(TabularWorld):
     Attributes:
         starts, ended, features: as given.
         num_layouts: number of layouts.
+        has_goal: whether a terminal state can be entered with a positive reward.
 
     Raises:
         ValueError: a shape or value is wrong, see `TabularWorld`, or an action leaves a terminal state.
@@ -54,10 +55,14 @@ class EpisodicWorld(TabularWorld):
         self.starts, self.ended, self.features = starts, ended, features
         self._layouts = torch.zeros_like(ended, dtype=torch.long) if layouts is None else layouts.long()
         self.num_layouts = int(self._layouts.max()) + 1
+        self._goals = self._entered_with_reward()
+        self.has_goal = bool(self._goals.any())
 
     def to(self, device: torch.device | str) -> "EpisodicWorld":
         super().to(device)
-        self.starts, self.ended, self._layouts = (t.to(device) for t in (self.starts, self.ended, self._layouts))
+        self.starts, self.ended, self._layouts, self._goals = (
+            t.to(device) for t in (self.starts, self.ended, self._layouts, self._goals)
+        )
         self.features = None if self.features is None else self.features.to(device)
         return self
 
@@ -83,6 +88,23 @@ class EpisodicWorld(TabularWorld):
     def observe(self, state: Tensor) -> Tensor:
         """The features `[N, C]` of each state, or its number `[N]` where there are none."""
         return super().observe(state) if self.features is None else self.features[self.cell(state)]
+
+    def solved(self, state: Tensor) -> Tensor:
+        """Where an episode has ended in a state that can be entered with a positive reward."""
+        return self._goals[self.reward_map(state), self.cell(state)]
+
+    def _entered_with_reward(self) -> Tensor:
+        """`[W, S]` bool: terminal states that some possible transition enters with a positive reward."""
+        if self.reward.dim() == 2:
+            return (self.reward > 0) & self.ended
+        gains = self.reward.view(*self.reward.shape[:3], -1) > 0
+        if self.probability is not None:
+            gains = gains & (self.probability > 0)
+        elif self.next_state.dim() == 2:
+            gains = gains.view(self.num_maps, *self.next_state.shape)
+        entered = torch.zeros(self.num_maps, self.num_states, device=self.device)
+        into = self.next_state.expand_as(gains).flatten(1)
+        return (entered.scatter_add_(1, into, gains.flatten(1).float()) > 0) & self.ended
 
     def start_anywhere(self) -> "EpisodicWorld":
         """Let episodes start, with equal probability, in any reachable state that is not terminal; returns self."""
