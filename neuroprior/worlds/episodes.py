@@ -100,7 +100,7 @@ class EpisodicWorld(TabularWorld):
         gains = self.reward.view(*self.reward.shape[:3], -1) > 0
         if self.probability is not None:
             gains = gains & (self.probability > 0)
-        elif self.next_state.dim() == 2:
+        else:
             gains = gains.view(self.num_maps, *self.next_state.shape)
         entered = torch.zeros(self.num_maps, self.num_states, device=self.device)
         into = self.next_state.expand_as(gains).flatten(1)

@@ -93,6 +93,15 @@ def test_solving_rewards_once_and_absorbs() -> None:
     assert world.has_goal
 
 
+def test_a_player_who_cannot_move_has_all_actions_to_no_effect() -> None:
+    world = sokoban(["#####\n#@$##\n##. #\n#####"])
+    state = world.reset(4)
+    assert world.legal_actions(state).all()
+    after, reward = world.step(state, torch.arange(4))
+    assert after.equal(state)
+    assert not reward.any()
+
+
 def test_patterns_are_those_of_plain_python(world: SokobanWorld) -> None:
     for some in (world, sokoban(OPEN)):
         state = scattered(some, 20)
