@@ -18,6 +18,7 @@ from eval.puzzles.contest import (
     LEARNED,
     SEARCHES,
     Job,
+    Problems,
     Settings,
     WorldName,
     bootstrapped,
@@ -83,10 +84,9 @@ def puzzles(
     check_distinct(priors=priors)
     files = [str(given or default) for given, default in zip((train, test), FILES[world], strict=True)]
     guided = world == "tiles" if guided is None else guided
-    settings = Settings(
-        world, files[0], int(num_train), files[1], None if num_test is None else int(num_test), int(budget), int(sweeps),
-        guided, int(seed),
-    )  # fmt: skip
+    numbers = {"num_train": int(num_train), "budget": int(budget), "sweeps": int(sweeps), "seed": int(seed)}
+    of_test = None if num_test is None else int(num_test)
+    settings = Settings(world=world, train=files[0], test=files[1], num_test=of_test, guided=guided, **numbers)
     both = problems_of(settings)
     asked = asdict(settings) | {"digests": [sha256(Path(file).read_bytes()).hexdigest() for file in files]}
     first = JobRun(partial(bootstrapped, settings), Path(out) / "bootstrap", asked, name="seed-{}".format)
@@ -102,7 +102,7 @@ def puzzles(
 
 
 def report(
-    found: Sequence[dict[str, Any]], sweeps: Sequence[dict[str, Any]], both: Sequence[Any], settings: Settings
+    found: Sequence[dict[str, Any]], sweeps: Sequence[dict[str, Any]], both: Sequence[Problems], settings: Settings
 ) -> Document:
     """The tables: of all priors, of problems with walls of their own, of pairs of priors, and of the sweeps."""
     each = pd.concat([_per_problem(one) for one in found], ignore_index=True)
@@ -111,8 +111,8 @@ def report(
     frames = {"puzzles": rows, "pairs": _pairs(each), "sweeps": pd.DataFrame(sweeps)}
     tables = [_table(rows, "Test problems", settings)]
     if settings.world == "sokoban":
-        known = set(both[0].group(both[0].boards).tolist())
-        own = [number for number, walls in enumerate(both[1].group(both[1].boards).tolist()) if walls not in known]
+        known, walls = (problems.world.group(problems.boards).tolist() for problems in both)
+        own = [number for number, layout in enumerate(walls) if layout not in set(known)]
         apart = _rows(each[each["problem"].isin(own)], seconds).drop(columns=["seconds_per_problem", "fit_seconds"])
         if len(own) < len(both[1].boards):
             frames["own_walls"] = apart
@@ -175,7 +175,16 @@ def _pairs(each: pd.DataFrame) -> pd.DataFrame:
         if prior != "log-linear" and comparable and len(both) > 1:
             difference = paired_difference(both[prior], both["log-linear"])
             ratio, low, high = (float(np.exp(x)) for x in (difference.mean, difference.low, difference.high))
-            rows.append({"prior": prior, "against": "log-linear", "problems": len(both), "ratio": ratio, "low": low, "high": high})
+            rows.append(
+                {
+                    "prior": prior,
+                    "against": "log-linear",
+                    "problems": len(both),
+                    "ratio": ratio,
+                    "low": low,
+                    "high": high,
+                }
+            )
     return pd.DataFrame(rows)
 
 
@@ -193,8 +202,8 @@ def _table(rows: pd.DataFrame, title: str, settings: Settings) -> Table:
         columns["ms a problem"] = lambda row: f"{1000 * row.seconds_per_problem:.1f}"
     searched = "Levin tree search with a heuristic (PHS*)" if settings.guided else "Levin tree search"
     caption = (
-        f"{searched}, at most {settings.budget:,} expansions a problem. Mean and median expansions: of all problems, those"
-        " that are not solved with what was spent. Means over seeds; one core."
+        f"{searched}, at most {settings.budget:,} expansions a problem. Mean and median expansions: of all problems,"
+        " those that are not solved with what was spent. Means over seeds; one core."
     )
     return table(rows, columns, caption, title)
 
@@ -206,8 +215,8 @@ def _pair_table(pairs: pd.DataFrame) -> Table:
         "times as many expansions": lambda row: f"{row.ratio:.2f} ({row.low:.2f} to {row.high:.2f})",
     }
     caption = (
-        "Expansions in the ratio to those of the log-linear prior that learned from the same solutions: geometric mean and"
-        " 95 % interval (Student's) over problems, of each the mean over seeds."
+        "Expansions in the ratio to those of the log-linear prior that learned from the same solutions: geometric mean"
+        " and 95 % interval (Student's) over problems, of each the mean over seeds."
     )
     return table(pairs, columns, caption, "The same solutions, the same patterns, the same search")
 
@@ -228,7 +237,7 @@ def _sweep_table(sweeps: pd.DataFrame) -> Table:
     return table(sweeps, columns, "Actions with those of reflected and rotated solutions.", "Solve and learn")
 
 
-def _write_solutions(found: Sequence[dict[str, Any]], test: Any, out: Path) -> None:
+def _write_solutions(found: Sequence[dict[str, Any]], test: Problems, out: Path) -> None:
     """`solutions.jsonl`, a line a problem, prior and seed; and an animated solution of the first prior."""
     lines = [
         json.dumps({"prior": one["prior"], "seed": one["seed"], "problem": k, "solved": moves is not None,
@@ -236,8 +245,10 @@ def _write_solutions(found: Sequence[dict[str, Any]], test: Any, out: Path) -> N
         for one in found
         for k, (moves, expansions) in enumerate(zip(one["moves"], one["expansions"], strict=True))
     ]  # fmt: skip
-    write_whole(out / "solutions.jsonl", "\n".join(lines) + "\n")
+    write_whole(out / "solutions.jsonl", ("\n".join(lines) + "\n").encode())
     solved = [(len(moves), k) for k, moves in enumerate(found[0]["moves"]) if moves]
     if solved:
         number = sorted(solved)[len(solved) // 2][1]
-        write_whole(out / "solution.svg", animation(test, test.boards[number], found[0]["moves"][number]))
+        write_whole(
+            out / "solution.svg", animation(test.world, test.boards[number], found[0]["moves"][number]).encode()
+        )

@@ -82,7 +82,14 @@ class Job(NamedTuple):
         return f"{self.prior}-{self.seed}"
 
 
-def problems_of(settings: Settings) -> tuple[PuzzleWorld, PuzzleWorld]:
+class Problems(NamedTuple):
+    """A puzzle and uint8 boards `[n, H, W]`."""
+
+    world: PuzzleWorld
+    boards: torch.Tensor
+
+
+def problems_of(settings: Settings) -> tuple[Problems, Problems]:
     """The training and the test problems.
 
     Raises:
@@ -90,11 +97,16 @@ def problems_of(settings: Settings) -> tuple[PuzzleWorld, PuzzleWorld]:
         OSError: a file cannot be read.
     """
     make: Callable[[str], PuzzleWorld] = sokoban if settings.world == "sokoban" else sliding_tiles
-    train, test = make(settings.train), make(settings.test)
-    expected, found = list(train.boards.shape[1:]), list(test.boards.shape[1:])
+    worlds = make(settings.train), make(settings.test)
+    expected, found = (list(world.shape) for world in worlds)
     if expected != found:
         raise ValueError(f"{settings.test}: boards of {expected} are expected, as in {settings.train}, not {found}")
-    train.boards, test.boards = train.boards[: settings.num_train], test.boards[: settings.num_test]
+    numbers = settings.num_train, settings.num_test
+    train, test = (
+        Problems(world, world.boards[:number])
+        for world, number in zip(worlds, numbers, strict=True)
+        if world.boards is not None
+    )
     return train, test
 
 
@@ -104,19 +116,19 @@ def bootstrapped(settings: Settings, folder: Path, seed: int) -> list[dict[str, 
     how: dict[str, Any] = {"max_nodes": FIRST_NODES[settings.world], "guided": settings.guided}
     if settings.world == "tiles":
         nodes, weight = TEACHER
-        how["teacher"] = AStarPlanner(train.lower_bound, weight, nodes)
-    prior = LogLinearPrior(4, len(train.windows.windows))
+        how["teacher"] = AStarPlanner(train.world.lower_bound, weight, nodes)
+    prior = LogLinearPrior(4, len(train.world.windows.windows))
     sweeps = bootstrap(
-        train, prior, _shuffled(train, settings, seed), sweeps=settings.sweeps, folder=folder / f"seed-{seed}",
+        train.world, prior, _shuffled(train.boards, settings, seed), sweeps=settings.sweeps, folder=folder / f"seed-{seed}",
         generator=torch.Generator().manual_seed(seed), **how,
     )  # fmt: skip
     return [{"seed": seed} | sweep._asdict() for sweep in sweeps]
 
 
-def _shuffled(train: PuzzleWorld, settings: Settings, seed: int) -> torch.Tensor:
+def _shuffled(boards: torch.Tensor, settings: Settings, seed: int) -> torch.Tensor:
     """The training problems in the order of a seed."""
     generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + seed)
-    return train.boards[torch.randperm(len(train.boards), generator=generator)]
+    return boards[torch.randperm(len(boards), generator=generator)]
 
 
 def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
@@ -125,9 +137,8 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
     Raises:
         RuntimeError: a solution does not solve its problem, or took more expansions than the bound allows.
     """
-    train, test = problems_of(settings)
-    fit_seconds = 0.0
-    problems, budget = test.boards, settings.budget
+    train, (test, problems) = problems_of(settings)
+    fit_seconds, budget = 0.0, settings.budget
     if job.prior in SEARCHES:
         planner = SEARCHES[job.prior](test, budget)
     else:
@@ -160,14 +171,14 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
     }
 
 
-def _prior(settings: Settings, folder: Path, job: Job, train: PuzzleWorld) -> Prior:
+def _prior(settings: Settings, folder: Path, job: Job, train: Problems) -> Prior:
     """The bootstrapped prior, or another that learns from its solutions."""
     solutions = read_solutions(folder)
     if job.prior == BOOTSTRAP:
         return load(folder / f"prior-{settings.sweeps}")
-    prior = LEARNED[job.prior](4, len(train.windows.windows))
-    state = _shuffled(train, settings, job.seed)[torch.tensor(list(solutions))]
+    prior = LEARNED[job.prior](4, len(train.world.windows.windows))
+    state = _shuffled(train.boards, settings, job.seed)[torch.tensor(list(solutions))]
     training = {"epochs": EPOCHS} if "epochs" in prior.fit_settings else {}
     generator = torch.Generator().manual_seed(job.seed)
-    fit_solutions(prior, train, state, list(solutions.values()), generator=generator, **training)
+    fit_solutions(prior, train.world, state, list(solutions.values()), generator=generator, **training)
     return prior

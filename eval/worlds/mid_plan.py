@@ -22,7 +22,7 @@ class MidPlanWorld(World):
     def __init__(self, world: TabularWorld, planner: Planner, taken: int) -> None:
         self.world, self.planner, self.taken = world, planner, taken
         self.num_actions, self.all_legal, self.stochastic = world.num_actions, world.all_legal, world.stochastic
-        self.action_names = world.action_names
+        self.action_names, self.has_goal = world.action_names, world.has_goal
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size, 1 + R]`, int64: the inner world's after `taken` actions, and the R actions left."""
@@ -42,6 +42,9 @@ class MidPlanWorld(World):
 
     def legal_actions(self, state: Tensor) -> Tensor:
         return self.world.legal_actions(state[:, 0])
+
+    def solved(self, state: Tensor) -> Tensor:
+        return self.world.solved(state[:, 0])
 
     def group(self, state: Tensor) -> Tensor | None:
         return self.world.group(state[:, 0])

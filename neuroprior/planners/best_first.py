@@ -16,7 +16,7 @@ from neuroprior.planners.planner import Decision, Planner, value_of
 from neuroprior.plans import action_dtype
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.draws import check_temperature
-from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world, legal_logits
+from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
 from neuroprior.worlds.puzzles import PuzzleWorld
 from neuroprior.worlds.world import World
 
@@ -72,8 +72,8 @@ class BestFirstPlanner(Planner):
             for more at once, and up to so many times more nodes are expanded.
         temperature: divides the prior's logits.
         compile: search by a compiled loop where numba is installed and it knows the world, the prior and the heuristic
-            (puzzles on the CPU, uniform priors and those of patterns, `lower_bound`): it finds the same, a hundred times
-            as fast, and uses all cores.
+            (puzzles on the CPU, uniform priors and those of patterns, `lower_bound`): it finds the same, and is some
+            hundred times as fast.
 
     Raises:
         ValueError: an argument is out of range. `plan` and `search` raise it for a stochastic world, a world without
@@ -254,6 +254,8 @@ class _Trees:
         )  # fmt: skip
         self.result.log_bound[self.result.solved] = 0.0
         logits, hidden = stepper.start_in(world, state)
+        self.queue = self.minima = torch.zeros(0, 0, dtype=torch.float64)
+        self.seen = torch.zeros(0, 0, dtype=torch.long)
         self.nodes = {
             "edge": torch.full((batch, self.capacity), -1, device=device),
             "depth": torch.zeros(batch, self.capacity, dtype=torch.long, device=device),
@@ -307,7 +309,7 @@ class _Trees:
         self._drop(over | (self.size >= self.planner.max_nodes) | (self.minima.amin(1) == inf))
 
     def _popped(self) -> tuple[Tensor, Tensor]:
-        """The trees `[M]` and edges `[M]` with the lowest costs, taken out of the queue, the best of each tree first."""
+        """The trees `[M]` and edges `[M]` of the lowest costs, taken out of the queue, the best of each tree first."""
         trees, edges = [], []
         every = torch.arange(len(self.rows), device=self.rows.device)
         blocks = self.queue.view(len(self.rows), -1, BLOCK)

@@ -27,7 +27,7 @@ MORE = 4
 """So many times as many problems, then."""
 
 NEW = 0.25
-"""Where a sweep adds less than this share to the solved problems, and no further problems are left, the budget doubles."""
+"""Where less than this share of the solutions is new, and no further problems are tried, the budget doubles."""
 
 
 class Sweep(NamedTuple):
@@ -73,9 +73,9 @@ def bootstrap(
     """Solve problems with a prior, fit it to the solutions, and again (Arfaee, Zilles and Holte, *Learning heuristic
     functions for large state spaces*, 2011; with a prior Orseau and Lelis, AAAI 2021).
 
-    The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried; when
-    there are no more, or fewer than a quarter of the solutions are new, the budget doubles. Each problem's latest solution counts. In puzzles the
-    prior learns from reflections and rotations of the solutions, too.
+    The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried;
+    else, or when there are no more, the budget doubles if fewer than a quarter of the solutions are new. Each problem's
+    latest solution counts. In puzzles the prior learns from reflections and rotations of them, too.
 
     Args:
         world: with goals; see `LevinPlanner`.
@@ -162,15 +162,15 @@ class _Bootstrap:
             self.plans[number] = found.plan[number, : int(found.lengths[number])].cpu()
         if not self.plans:
             raise ValueError(
-                f"problems: none of {len(found.solved)} was solved; give a larger max_nodes, a teacher or easier problems"
+                f"problems: none of {len(found.solved)} was solved; give a larger max_nodes, a teacher or easier ones"
             )
 
     def learn(self, max_actions: int, settings: dict[str, Any]) -> int:
         """Fit the prior to the solutions; returns the number of their actions."""
         numbers = sorted(self.plans)
         state, plans = self.problems[torch.tensor(numbers)], [self.plans[number] for number in numbers]
-        how = {"max_actions": max_actions, "generator": self.generator}
-        return fit_solutions(self.prior, self.world, state, plans, **how, **settings)
+        how: dict[str, Any] = {"max_actions": max_actions, "generator": self.generator} | settings
+        return fit_solutions(self.prior, self.world, state, plans, **how)
 
     def end(self, sweep: Sweep) -> None:
         """Keep a finished sweep."""

@@ -16,6 +16,7 @@ from neuroprior.priors.patterns import LogLinearPrior, PatternCounts, PatternNet
 from neuroprior.priors.patterns.compiled_fit import MIXER, hash_table, place
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.worlds.puzzles import PuzzleWorld, SlidingTilesWorld
+from neuroprior.worlds.puzzles.sokoban import MATCHED
 from neuroprior.worlds.world import World
 
 Array = np.ndarray[Any, Any]
@@ -75,7 +76,7 @@ class Tables(NamedTuple):
     out: Array
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _patterns(board: Board, cells: Array, mover: int, padded: Array, rows: Array, out: Array) -> None:
     """Write the codes of the windows around the mover to `out [F]`.
 
@@ -104,7 +105,7 @@ def _patterns(board: Board, cells: Array, mover: int, padded: Array, rows: Array
         out[k] = board.offsets[k] + code
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _log_probs(tables: Tables, codes: Array, last: int, hidden: Array, more: Array, out: Array) -> None:
     """Write the log-probabilities of the actions at a position with these patterns to `out [A]` (float64)."""
     actions = len(out)
@@ -136,7 +137,7 @@ def _log_probs(tables: Tables, codes: Array, last: int, hidden: Array, more: Arr
     out -= top + np.log(total)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _can(puzzle: int, cells: Array, width: int, mover: int, action: int) -> bool:
     """Whether the mover can go there: 0 up, 1 down, 2 left, 3 right."""
     y, x = mover // width, mover % width
@@ -159,7 +160,7 @@ def _can(puzzle: int, cells: Array, width: int, mover: int, action: int) -> bool
     return bool(behind != WALL and behind < BOX)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _move(board: Board, cells: Array, mover: int, action: int, code: Any) -> tuple[int, Any]:
     """Make a move that can be made, in place: where the mover is then, and the hash of the position."""
     step = board.width if action < 2 else 1
@@ -180,7 +181,7 @@ def _move(board: Board, cells: Array, mover: int, action: int, code: Any) -> tup
     return to, code
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _left(board: Board, cells: Array, distances: Array, best: Array) -> float:
     """The heuristic: in a sliding puzzle the sum over tiles, in Sokoban the cheapest matching of boxes and goals.
 
@@ -212,10 +213,10 @@ def _left(board: Board, cells: Array, distances: Array, best: Array) -> float:
                     if (chosen >> goal) & 1:
                         least = min(least, best[chosen ^ (1 << goal)] + distances[goal, cell])
                 best[chosen] = least
-    return best[-1]
+    return float(best[-1])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _push(costs: Array, edges: Array, size: int, cost: float, edge: int) -> None:
     """Enter an edge into a binary heap of `size`; of equal costs the lower edge comes first."""
     at = size
@@ -228,7 +229,7 @@ def _push(costs: Array, edges: Array, size: int, cost: float, edge: int) -> None
     costs[at], edges[at] = cost, edge
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _pop(costs: Array, edges: Array, size: int) -> None:
     """Take the first edge out of a heap that has `size` edges afterwards."""
     cost, edge, at = costs[size], edges[size], 0
@@ -247,7 +248,7 @@ def _pop(costs: Array, edges: Array, size: int) -> None:
     costs[at], edges[at] = cost, edge
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _path(came: Array, edge: int, length: int, path: Array) -> int:
     """Write the actions that end with `edge` to `path`, as many as it holds; returns how many there are."""
     at = length
@@ -259,7 +260,7 @@ def _path(came: Array, edge: int, length: int, path: Array) -> int:
     return length
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def search(
     board: Board,
     tables: Tables,
@@ -291,7 +292,7 @@ def search(
     """
     num, high, actions = len(start), len(start) // board.width, 4
     informed = len(distances) > 0
-    best = np.zeros(2 ** len(distances) if board.puzzle == SOKOBAN and len(distances) <= 10 else 1)
+    best = np.zeros(2 ** len(distances) if board.puzzle == SOKOBAN and len(distances) <= MATCHED else 1)
     patterned = order == LEVIN
     across = board.width + 2 * board.radius
     padded = np.full((high + 2 * board.radius) * across, board.outside, dtype=np.int64)
@@ -300,7 +301,11 @@ def search(
     codes, hidden = np.zeros(len(board.windows), dtype=np.int64), np.zeros(tables.biases.shape[1], dtype=np.float32)
     more = np.zeros(tables.biases.shape[1], dtype=np.float32)
     room = max_nodes + 1
-    boards, movers, hashes = np.empty((room, num), dtype=np.uint8), np.empty(room, dtype=np.int32), np.empty(room, np.uint64)
+    boards, movers, hashes = (
+        np.empty((room, num), dtype=np.uint8),
+        np.empty(room, dtype=np.int32),
+        np.empty(room, np.uint64),
+    )
     came, depths = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int32)
     log_probs, own = np.empty(room, dtype=np.float64), np.empty((room, actions), dtype=np.float64)
     places = 1
@@ -331,7 +336,7 @@ def search(
             parent, action = edge // actions, edge % actions
             cells[:] = boards[parent]
             before = np.int64(movers[parent])
-            mover, code = _move(board, cells, before, action, hashes[parent])
+            mover, code = _move(board, cells, int(before), action, hashes[parent])
             steps += 1
             wrong = wrongs[parent]
             if board.puzzle == SOKOBAN:
@@ -409,7 +414,7 @@ def can_search(world: World, prior: Any) -> bool:
 
 def compiled_board(world: PuzzleWorld) -> Board:
     """What all positions of a puzzle share."""
-    high, wide = world.boards.shape[1:]
+    high, wide = world.shape
     windows, cells = world.windows, high * wide
     if isinstance(world, SlidingTilesWorld):
         puzzle, kinds = TILES, world.tile_kinds().numpy()
@@ -420,7 +425,15 @@ def compiled_board(world: PuzzleWorld) -> Board:
     shifted = [(row + reach, column + reach, height, width) for row, column, height, width in windows.windows]
     offsets = windows.offsets.numpy().astype(np.int64)
     return Board(
-        puzzle, wide, random, kinds.astype(np.int64), windows.base, windows.outside, np.array(shifted, np.int32), offsets, reach
+        puzzle,
+        wide,
+        random,
+        kinds.astype(np.int64),
+        windows.base,
+        windows.outside,
+        np.array(shifted, np.int32),
+        offsets,
+        reach,
     )
 
 
@@ -428,7 +441,11 @@ def compiled_tables(prior: Any) -> Tables:
     """The tables of a prior of patterns, or of the uniform prior."""
     actions = prior.num_actions
     if isinstance(prior, UniformPrior):
-        codes, weights, after = np.zeros(0, np.int64), np.zeros((0, actions), np.float32), np.zeros((actions + 1, actions))
+        codes, weights, after = (
+            np.zeros(0, np.int64),
+            np.zeros((0, actions), np.float32),
+            np.zeros((actions + 1, actions)),
+        )
     else:
         codes, weights, after = prior.patterns.numpy(), prior.weights[:-1].numpy(), prior.after.numpy()
     layers, biases, out = np.zeros((0, 0, 0)), np.zeros((0, 0)), np.zeros((actions, 0))
@@ -489,10 +506,11 @@ def goal_distances(cells: Array, width: int) -> Array:
     """The rows and columns between each goal of a Sokoban level and each cell, float64 `[G, cells]`."""
     goals, every = np.flatnonzero((cells == GOAL) | (cells == BOX_ON_GOAL)), np.arange(len(cells))
     rows = np.abs(goals[:, None] // width - every // width)
-    return (rows + np.abs(goals[:, None] % width - every % width)).astype(np.float64)
+    distances: Array = (rows + np.abs(goals[:, None] % width - every % width)).astype(np.float64)
+    return distances
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _replay(board: Board, start: Array, mover: int, path: Array, codes: Array) -> None:
     """Write the patterns before each action of `path [L]` to `codes` int32 `[L, F]`."""
     cells, high, width = start.copy(), len(start) // board.width, board.width

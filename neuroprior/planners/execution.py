@@ -122,7 +122,9 @@ def collect(
         plan, state, before = plan[kept], state[kept], before[kept]
         lengths = None if lengths is None else lengths[kept]
     if context is not None and world.observe(state[:1]).dim() > 2:
-        raise ValueError("observe: indices [N], patterns [N, F] or floating point features [N, C] are expected of a world")
+        raise ValueError(
+            "observe: indices [N], patterns [N, F] or floating point features [N, C] are expected of a world"
+        )
     if context == "plan" and is_per_step(world.observe(state[:1])):
         raise ValueError('context: patterns are observed before each action; "step" is expected in this world')
     observed = observations(world, before, context)

@@ -332,7 +332,7 @@ class Prior(nn.Module, ABC):
                 check_patterns(context)
             return
         if is_integer(context) and context.dim() == 3:
-            raise ValueError("context: these plans have patterns, several indices a step, which this prior does not take")
+            raise ValueError("context: these plans have patterns, several indices a step, which this prior cannot take")
         if not isinstance(plans, Plans):
             steps = context.shape[1] if is_per_step(context) else length
             check_context(context, num_plans, steps)

@@ -14,11 +14,11 @@ from neuroprior.worlds import TabularWorld, World
 def check_world(world: World, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `world` does what a world must.
 
-    `reset`, `step`, `observe`, `legal_actions` and `terminated` return what the interface says; `step` does not change
-    its arguments and treats each state of a batch independently; the same seed gives the same trajectory; `rollout`
-    equals stepping and raises ValueError for plans of a wrong shape, dtype or range. A stochastic world says so, and
-    its rollouts have the distribution of its steps (chi-square tests, with a false-alarm probability of 1e-6 together);
-    those of a table use common random numbers for all plans of a start.
+    `reset`, `step`, `observe`, `legal_actions`, `terminated` and `solved` return what the interface says; `step` does
+    not change its arguments and treats each state of a batch independently; the same seed gives the same trajectory;
+    `rollout` equals stepping and raises ValueError for plans of a wrong shape, dtype or range. A stochastic world
+    says so, and its rollouts have the distribution of its steps (chi-square tests, with a false-alarm probability of
+    1e-6 together); those of a table use common random numbers for all plans of a start.
 
     Args:
         world: the world to check.
@@ -80,11 +80,15 @@ def _check_step(world: World, state: Tensor, action: Tensor, seed: int) -> None:
 def _check_queries(world: World, state: Tensor) -> None:
     """`observe`, `terminated` and `legal_actions`."""
     observed = world.observe(state)
-    fits = (is_integer(observed) and observed.dim() == 1) or (observed.is_floating_point() and observed.dim() == 2)
+    fits = (is_integer(observed) and observed.dim() in (1, 2)) or (observed.is_floating_point() and observed.dim() == 2)
     require(
         len(observed) == len(state) and fits,
-        f"observe must give indices [N] or floating point features [N, C], not {observed.dtype} {list(observed.shape)}",
+        "observe must give indices [N] or [N, F] or floating point features [N, C],"
+        f" not {observed.dtype} {list(observed.shape)}",
     )
+    solved = world.solved(state)
+    require(solved.dtype == torch.bool and solved.shape == state.shape[:1], f"solved must be bool [{len(state)}]")
+    require(world.has_goal or not solved.any(), "solved: a goal is reached, but has_goal is False")
     ended = world.terminated(state)
     require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
     legal = world.legal_actions(state)

@@ -7,7 +7,18 @@ from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridwo
 from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
 from neuroprior.worlds.mazes import four_rooms, maze
-from neuroprior.worlds.puzzles import PuzzleWorld, SlidingTilesWorld, SokobanWorld, sliding_tiles, sokoban
+from neuroprior.worlds.puzzles import (
+    SOKOBAN_WINDOWS,
+    PuzzleWorld,
+    SlidingTilesWorld,
+    SokobanWorld,
+    format_sokoban,
+    read_sokoban,
+    read_tiles,
+    sliding_tiles,
+    sokoban,
+    windows_within,
+)
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
@@ -18,6 +29,7 @@ __all__ = [
     "PocketCube",
     "PuzzleWorld",
     "Rollout",
+    "SOKOBAN_WINDOWS",
     "SlidingTilesWorld",
     "SokobanWorld",
     "SteppedWorld",
@@ -25,6 +37,7 @@ __all__ = [
     "World",
     "cube",
     "egocentric",
+    "format_sokoban",
     "four_rooms",
     "from_gymnasium",
     "goal_direction",
@@ -33,6 +46,9 @@ __all__ = [
     "local_view",
     "maze",
     "patches",
+    "read_sokoban",
+    "read_tiles",
     "sliding_tiles",
     "sokoban",
+    "windows_within",
 ]

@@ -141,6 +141,7 @@ class PocketCube(World):
         return torch.cat([self._permutation_features[permutation], self._orientation_features[orientation]], -1)
 
     def solved(self, state: Tensor) -> Tensor:
+        """Where the cube is solved."""
         return state == 0
 
     def terminated(self, state: Tensor) -> Tensor:

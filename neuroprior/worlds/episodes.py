@@ -1,7 +1,6 @@
 """Tables of episodic environments: start states, absorbing terminal states, layouts."""
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -24,6 +23,7 @@ class EpisodicWorld(TabularWorld):
     Attributes:
         starts, ended, features: as given.
         num_layouts: number of layouts.
+        has_goal: whether a terminal state can be entered with a positive reward.
 
     Raises:
         ValueError: a shape or value is wrong, see `TabularWorld`, or an action leaves a terminal state.
@@ -55,10 +55,14 @@ class EpisodicWorld(TabularWorld):
         self.starts, self.ended, self.features = starts, ended, features
         self._layouts = torch.zeros_like(ended, dtype=torch.long) if layouts is None else layouts.long()
         self.num_layouts = int(self._layouts.max()) + 1
+        self._goals = self._entered_with_reward()
+        self.has_goal = bool(self._goals.any())
 
     def to(self, device: torch.device | str) -> "EpisodicWorld":
         super().to(device)
-        self.starts, self.ended, self._layouts = (t.to(device) for t in (self.starts, self.ended, self._layouts))
+        self.starts, self.ended, self._layouts, self._goals = (
+            t.to(device) for t in (self.starts, self.ended, self._layouts, self._goals)
+        )
         self.features = None if self.features is None else self.features.to(device)
         return self
 
@@ -85,27 +89,22 @@ class EpisodicWorld(TabularWorld):
         """The features `[N, C]` of each state, or its number `[N]` where there are none."""
         return super().observe(state) if self.features is None else self.features[self.cell(state)]
 
-    @property
-    def has_goal(self) -> bool:  # type: ignore[override]
-        """Whether a step into a terminal state can be rewarded."""
-        return bool(self._goals.any())
-
     def solved(self, state: Tensor) -> Tensor:
-        """In the terminal states that can be entered with a reward above 0."""
-        return self._goals[state]
+        """Where an episode has ended in a state that can be entered with a positive reward."""
+        return self._goals[self.reward_map(state), self.cell(state)]
 
-    @cached_property
-    def _goals(self) -> Tensor:
-        """bool `[W * S]`: terminal states that an action leads to with a reward above 0."""
-        goals = torch.zeros(self.num_maps, self.num_states, dtype=torch.bool, device=self.device)
-        possible = torch.ones_like(self.next_state, dtype=torch.bool) if self.probability is None else self.probability > 0
-        for reward, found in zip(self.reward, goals, strict=True):
-            gained = reward[self.next_state] if reward.dim() == 1 else reward
-            if gained.dim() < self.next_state.dim():
-                gained = gained[..., None]
-            rewarded = (gained > 0).expand_as(self.next_state) & possible & ~self.ended.view(-1, *[1] * (self.next_state.dim() - 1))
-            found[self.next_state[rewarded]] = True
-        return (goals & self.ended).flatten()
+    def _entered_with_reward(self) -> Tensor:
+        """`[W, S]` bool: terminal states that some possible transition enters with a positive reward."""
+        if self.reward.dim() == 2:
+            return (self.reward > 0) & self.ended
+        gains = self.reward.view(*self.reward.shape[:3], -1) > 0
+        if self.probability is not None:
+            gains = gains & (self.probability > 0)
+        else:
+            gains = gains.view(self.num_maps, *self.next_state.shape)
+        entered = torch.zeros(self.num_maps, self.num_states, device=self.device)
+        into = self.next_state.expand_as(gains).flatten(1)
+        return (entered.scatter_add_(1, into, gains.flatten(1).float()) > 0) & self.ended
 
     def start_anywhere(self) -> "EpisodicWorld":
         """Let episodes start, with equal probability, in any reachable state that is not terminal; returns self."""

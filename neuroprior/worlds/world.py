@@ -33,7 +33,7 @@ class World(ABC):
         num_actions: the number of actions, A.
         all_legal: True where every action is legal in every state, so that `legal_actions` need not be called.
         stochastic: True where the outcome of an action is random, so that one rollout of a plan is not enough.
-        has_goal: True where states can be solved, see `solved`.
+        has_goal: True where `solved` says in which states a goal is reached.
         action_names: names of the actions, where there are any.
     """
 
@@ -92,7 +92,8 @@ class World(ABC):
         return Rollout(now.view(shape), torch.cat(rewards, -1), kept)
 
     def observe(self, state: Tensor) -> Tensor:
-        """The observation in `state [N, ...]`: integers `[N]` (indices) or floating point `[N, C]` (features).
+        """The observation in `state [N, ...]`: integers `[N]` (indices), integers `[N, F]` (several indices, as of
+        patterns), or floating point `[N, C]` (features).
 
         Default: the state itself.
         """
@@ -107,7 +108,7 @@ class World(ABC):
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def solved(self, state: Tensor) -> Tensor:
-        """In which of `state [N, ...]` the goal is reached: `[N]` bool. Default: in none."""
+        """In which of `state [N, ...]` a goal is reached: `[N]` bool. Default: none."""
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def group(self, state: Tensor) -> Tensor | None:

@@ -24,8 +24,10 @@ from neuroprior import (
 from neuroprior.priors import SemiMarkovPrior
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
-from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze
+from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze, sliding_tiles, sokoban
 from tests.support.sources import stochastic_world
+
+SOKOBAN = ["#######\n#@ $ .#\n#######", "######\n#.$  #\n# +$ #\n#    #\n######"]
 
 
 def random_plans(num_actions: int, context: Tensor | None = None, length: int = 5) -> Plans:
@@ -99,6 +101,10 @@ def legal_world() -> TabularWorld:
         from_gymnasium("Taxi-v4"),
         from_gymnasium("FrozenLake-v1", starts="any"),
         from_gymnasium("CartPole-v1", seeds=range(3)),
+        sokoban(SOKOBAN),
+        sokoban(SOKOBAN, observation="board"),
+        sliding_tiles(shape=(3, 3)),
+        sliding_tiles(shape=(2, 4), observation="board", scramble=5),
     ],
     ids=[
         "walls",
@@ -114,6 +120,10 @@ def legal_world() -> TabularWorld:
         "taxi",
         "ice",
         "cart and pole",
+        "sokoban",
+        "sokoban, board",
+        "sliding tiles",
+        "sliding tiles, board",
     ],
 )
 def test_every_world_conforms(world: World) -> None:

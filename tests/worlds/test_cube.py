@@ -119,6 +119,12 @@ def test_of_an_absorbing_cube_only_arriving_is_rewarded():
         assert world.terminated(there).tolist() == ([True, True] if absorbing else [False, False])
 
 
+def test_the_cube_is_solved_in_one_state():
+    world = cube()
+    assert world.has_goal
+    assert world.solved(torch.arange(5)).tolist() == [True, False, False, False, False]
+
+
 def test_reset():
     assert cube(scramble=0).reset(5).tolist() == [0] * 5
     one = cube("quarter", scramble=1).reset(6000, seeded(2))

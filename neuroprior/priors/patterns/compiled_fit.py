@@ -14,14 +14,14 @@ ONE = 1.0
 """What the sums of squared gradients begin with."""
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def place(codes: Array, code: int) -> int:
     """Where `code` stands in a hash table of `codes` (as many as a power of 2; -1: free), or the free place for it."""
     mask = np.uint64(len(codes) - 1)
     at = ((np.uint64(code) * np.uint64(MIXER)) >> np.uint64(32)) & mask
     while codes[at] != code and codes[at] != -1:
         at = (at + np.uint64(1)) & mask
-    return np.int64(at)  # type: ignore[return-value]
+    return np.int64(at)
 
 
 def hash_table(codes: Array, values: Array) -> tuple[Array, Array]:
@@ -53,7 +53,7 @@ def numbered(vocabulary: Array, patterns: Array) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _count(codes: Array, counts: Array, part: Array) -> int:
     new = 0
     for i in range(part.shape[0]):
@@ -67,7 +67,7 @@ def _count(codes: Array, counts: Array, part: Array) -> int:
     return new
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _larger(codes: Array, counts: Array) -> tuple[Array, Array]:
     more, kept = np.full(2 * len(codes), -1, dtype=np.int64), np.zeros(2 * len(codes), dtype=np.uint8)
     for i in range(len(codes)):
@@ -77,14 +77,14 @@ def _larger(codes: Array, counts: Array) -> tuple[Array, Array]:
     return more, kept
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _enter(places: Array, placed: Array, codes: Array, values: Array) -> None:
     for i in range(len(codes)):
         at = place(places, codes[i])
         places[at], placed[at] = codes[i], values[i]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _look_up(codes: Array, rows: Array, unknown: int, patterns: Array, out: Array) -> None:
     for i in range(patterns.shape[0]):
         for j in range(patterns.shape[1]):
@@ -92,7 +92,7 @@ def _look_up(codes: Array, rows: Array, unknown: int, patterns: Array, out: Arra
             out[i, j] = rows[at] if codes[at] != -1 else unknown
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def epoch(
     order: Array,
     rows: Array,

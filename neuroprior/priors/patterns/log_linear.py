@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
-from neuroprior._random import draw_seed
+from neuroprior._random import draw_seed, generator_on
 from neuroprior.priors.patterns.pattern_prior import PatternPrior, Steps, compiled_fit
 
 ADAGRAD = 1.0
@@ -36,6 +36,7 @@ class LogLinearPrior(PatternPrior):
         epochs: int = 4,
         learning_rate: float = 0.2,
         l2: float = 1e-4,
+        **settings: Any,
     ) -> Self:
         """Learn from steps; returns self.
 
@@ -49,11 +50,12 @@ class LogLinearPrior(PatternPrior):
         Raises:
             ValueError: a setting is out of range, or numba is not installed.
         """
+        self.check_settings(settings)
         check_sizes(epochs=epochs)
         if not learning_rate > 0 or not l2 >= 0:
             raise ValueError(f"learning_rate, l2: above 0 and at least 0 are expected, not {learning_rate} and {l2}")
         loops = compiled_fit()
-        random = np.random.default_rng(draw_seed(generator))
+        random = np.random.default_rng(draw_seed(generator_on(generator, torch.device("cpu"))))
         patterns = steps.patterns.cpu().numpy()
         vocabulary = loops.frequent([patterns], self.min_count)
         tables = self._grown(torch.from_numpy(vocabulary), random)
@@ -62,9 +64,7 @@ class LogLinearPrior(PatternPrior):
         squares = tuple(np.full(t.shape[:1] if k == 2 else t.shape, ADAGRAD, np.float32) for k, t in enumerate(tables))
         action = steps.action.cpu().numpy()
         for _ in range(epochs):
-            loops.epoch(
-                random.permutation(len(action)), rows, last, action, *tables, squares, learning_rate, l2, True
-            )
+            loops.epoch(random.permutation(len(action)), rows, last, action, *tables, squares, learning_rate, l2, True)
         self._take(vocabulary, tables)
         return self
 

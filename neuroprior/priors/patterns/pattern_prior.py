@@ -104,7 +104,9 @@ class PatternPrior(Prior):
 
     def scores(self, patterns: Tensor) -> Tensor:
         """What the active `patterns [M, F]` add to the logits, `[M, A]`."""
-        return torch.cat([self._scores(self.rows(some)) for some in patterns.split(max(AT_ONCE // patterns.shape[1], 1))])
+        return torch.cat(
+            [self._scores(self.rows(some)) for some in patterns.split(max(AT_ONCE // patterns.shape[1], 1))]
+        )
 
     def _scores(self, rows: Tensor) -> Tensor:
         return self.weights[rows].sum(1)

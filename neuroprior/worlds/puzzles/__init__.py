@@ -1,7 +1,7 @@
-"""Worlds with goals: Sokoban and sliding tiles, and their files."""
+"""Worlds with goals: Sokoban and sliding tiles, their patterns and their files."""
 
-from neuroprior.worlds.puzzles.files import format_sokoban, read_sokoban, read_tiles
 from neuroprior.worlds.puzzles.puzzle import PuzzleWorld
+from neuroprior.worlds.puzzles.reading import format_sokoban, read_sokoban, read_tiles
 from neuroprior.worlds.puzzles.sliding_tiles import SlidingTilesWorld, sliding_tiles, tile_windows
 from neuroprior.worlds.puzzles.sokoban import SOKOBAN_WINDOWS, SokobanWorld, sokoban
 from neuroprior.worlds.puzzles.windows import Window, Windows, windows_with_mover, windows_within

@@ -11,9 +11,6 @@ from neuroprior._random import generator_on
 from neuroprior.worlds.puzzles.windows import Windows
 from neuroprior.worlds.world import World
 
-STEPS = ((-1, 0), (1, 0), (0, -1), (0, 1))
-"""Rows and columns of a move up, down, left and right."""
-
 Observation = Literal["patterns", "board"]
 
 
@@ -24,13 +21,14 @@ class PuzzleWorld(World):
     solved board nothing moves any more.
 
     Args:
-        boards: uint8 `[n, H, W]`: those to start from.
+        boards: uint8 `[n, H, W]`: those to start from; None: `reset` makes its own.
+        shape: H and W.
         windows: whose patterns are observed.
         observation: "patterns": int32 `[N, F]`, the active patterns of a state, see `Windows`. "board": float32
             `[N, C * H * W]`: planes of the board, one after the other.
 
     Attributes:
-        boards, windows, observation: as given.
+        boards, shape, windows, observation: as given.
         num_planes: C.
     """
 
@@ -40,20 +38,17 @@ class PuzzleWorld(World):
     action_names = ("up", "down", "left", "right")
     num_planes: int
 
-    def __init__(self, boards: Tensor, windows: Windows, observation: Observation) -> None:
+    def __init__(
+        self, boards: Tensor | None, shape: tuple[int, int], windows: Windows, observation: Observation
+    ) -> None:
         if observation not in ("patterns", "board"):
             raise ValueError(f'observation: "patterns" or "board" is expected, not {observation!r}')
-        self.boards, self.windows, self.observation = boards, windows, observation
+        self.boards, self.shape, self.windows, self.observation = boards, shape, windows, observation
 
     @property
+    @abstractmethod
     def device(self) -> torch.device:
         """Where the boards are."""
-        return self.boards.device
-
-    def to(self, device: torch.device | str) -> "PuzzleWorld":
-        """Move the boards to `device`; returns self."""
-        self.boards = self.boards.to(device)
-        return self
 
     @abstractmethod
     def mover(self, state: Tensor) -> Tensor:
@@ -85,11 +80,10 @@ class PuzzleWorld(World):
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """Boards `[batch_size, H, W]` drawn uniformly from `boards`."""
-        check_count("batch_size", batch_size)
-        drawn = torch.randint(
-            len(self.boards), (batch_size,), generator=generator_on(generator, self.device), device=self.device
-        )
-        return self.boards[drawn]
+        assert self.boards is not None
+        check_count("batch_size", batch_size, self.boards[0].numel())
+        generator = generator_on(generator, self.device)
+        return self.boards[torch.randint(len(self.boards), (batch_size,), generator=generator, device=self.device)]
 
     def terminated(self, state: Tensor) -> Tensor:
         """Where the puzzle is solved."""
@@ -104,10 +98,9 @@ class PuzzleWorld(World):
         return self.windows.codes(self.kinds(state), row, mover - row * width)
 
     def check_state(self, state: Tensor) -> None:
-        shape = list(self.boards.shape[1:])
-        if not isinstance(state, Tensor) or state.dtype != torch.uint8 or list(state.shape[1:]) != shape:
-            found = f"{state.dtype} {list(state.shape)}" if isinstance(state, Tensor) else type(state).__name__
-            raise ValueError(f"state: uint8 boards of shape [B, {shape[0]}, {shape[1]}] are expected, not {found}")
+        height, width = self.shape
+        if not isinstance(state, Tensor) or state.dtype != torch.uint8 or tuple(state.shape[1:]) != self.shape:
+            raise ValueError(f"state: uint8 of shape [B, {height}, {width}] is expected: boards")
 
 
 def _transformed_actions(number: int) -> Tensor:

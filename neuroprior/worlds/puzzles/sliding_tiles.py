@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_sizes
+from neuroprior._checks import check_count, is_integer
 from neuroprior._random import generator_on
-from neuroprior.worlds.puzzles.files import check_boards, read_tiles
-from neuroprior.worlds.puzzles.puzzle import STEPS, Observation, PuzzleWorld, reflected
+from neuroprior.worlds.puzzles.puzzle import Observation, PuzzleWorld, reflected
+from neuroprior.worlds.puzzles.reading import read_tiles
 from neuroprior.worlds.puzzles.windows import Window, Windows, windows_within
 
 
@@ -18,74 +19,101 @@ class SlidingTilesWorld(PuzzleWorld):
     moves.
 
     In patterns a tile counts as how far it is from its place in the goal, in rows and columns, so that what is learned
-    of one tile holds for others.
+    of one tile holds for others. Planes are the blank and the tiles.
 
-    Attributes:
+    Args:
+        boards: uint8 `[n, H, W]`; None: `reset` scrambles the goal.
         goal: uint8 `[H, W]`.
-        scramble: `reset` makes so many random moves from the goal; None: it draws from `boards`.
+        windows, observation: see `PuzzleWorld`.
+        scramble: number of random moves.
+
+    Raises:
+        ValueError: the goal cannot be reached from a board; the message says which.
     """
 
     def __init__(
-        self, boards: Tensor, goal: Tensor, scramble: int | None, windows: Sequence[Window], observation: Observation
+        self,
+        boards: Tensor | None,
+        goal: Tensor,
+        windows: Sequence[Window],
+        observation: Observation,
+        scramble: int,
     ) -> None:
         height, width = goal.shape
         kinds = (2 * height - 1) * (2 * width - 1) + 1
-        super().__init__(boards, Windows(windows, kinds, 0), observation)
+        super().__init__(boards, (height, width), Windows(windows, kinds, 0), observation)
         self.goal, self.scramble, self.num_planes = goal, scramble, height * width
-        self._place = goal.flatten().long().argsort()
+        if boards is not None:
+            wrong = (~_solvable(boards, goal)).nonzero()
+            if len(wrong):
+                raise ValueError(f"boards[{int(wrong[0])}]: the goal cannot be reached from this board")
+
+    @property
+    def device(self) -> torch.device:
+        return self.goal.device
 
     def to(self, device: torch.device | str) -> "SlidingTilesWorld":
-        super().to(device)
-        self.goal, self._place = self.goal.to(device), self._place.to(device)
+        """Move the boards to `device`; returns self."""
+        self.goal = self.goal.to(device)
+        self.boards = None if self.boards is None else self.boards.to(device)
         return self
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """Boards `[batch_size, H, W]`: drawn from `boards`, or scrambled."""
-        if self.scramble is None:
+        """Random boards of those given, or the goal after random legal moves: uint8 `[batch_size, H, W]`."""
+        if self.boards is not None:
             return super().reset(batch_size, generator)
-        check_count("batch_size", batch_size)
+        check_count("batch_size", batch_size, self.goal.numel())
         generator = generator_on(generator, self.device)
         state = self.goal.expand(batch_size, *self.goal.shape).contiguous()
-        for _ in range(self.scramble):
-            weights = torch.rand(batch_size, 4, generator=generator, device=self.device)
-            state = self._moved(state, weights.masked_fill(~self.legal_actions(state), -1).argmax(1))
+        for _ in range(self.scramble if batch_size else 0):
+            action = torch.multinomial(self.legal_actions(state).float(), 1, generator=generator)[:, 0]
+            state = self._after(state, action)
         return state
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        before = self.solved(state)
-        after = torch.where(before[:, None, None], state, self._moved(state, action))
-        return after, (self.solved(after) & ~before).float()
+        """The blank moves; an illegal action, and any action where the goal is reached, leaves the state as it is.
 
-    def _moved(self, state: Tensor, action: Tensor) -> Tensor:
-        row, blank = torch.arange(len(state), device=state.device), self.mover(state)
-        steps = torch.tensor([dy * state.shape[2] + dx for dy, dx in STEPS], device=state.device)
-        able = self.legal_actions(state)[row, action]
-        to = torch.where(able, blank + steps[action], blank)
-        flat = state.flatten(1).clone()
-        flat[row, blank] = flat[row, to]
-        flat[row, to] = 0
-        return flat.view_as(state)
+        The reward is 1 for the step that reaches the goal, else 0.
+        """
+        ended = self.solved(state)
+        after = torch.where(ended[:, None, None], state, self._after(state, action))
+        return after, (self.solved(after) & ~ended).float()
+
+    def _after(self, state: Tensor, action: Tensor) -> Tensor:
+        """Boards after a move of the blank, if it is legal."""
+        flat = state.flatten(1)
+        blank = _blank(flat)
+        width = state.shape[2]
+        legal = self.legal_actions(state).gather(1, action[:, None])[:, 0]
+        move = torch.tensor([-width, width, -1, 1], device=state.device)[action]
+        to = torch.where(legal, blank + move, blank)
+        tile = flat.gather(1, to[:, None])
+        return flat.scatter(1, blank[:, None], tile).scatter(1, to[:, None], 0).view_as(state)
 
     def legal_actions(self, state: Tensor) -> Tensor:
+        """Moves of the blank that stay on the board: `[N, 4]` bool."""
         height, width = state.shape[1:]
-        blank = self.mover(state)
-        y, x = blank.div(width, rounding_mode="floor"), blank % width
-        return torch.stack([y > 0, y < height - 1, x > 0, x < width - 1], 1)
+        blank = _blank(state.flatten(1))
+        row, column = blank // width, blank % width
+        return torch.stack([row > 0, row < height - 1, column > 0, column < width - 1], 1)
 
     def solved(self, state: Tensor) -> Tensor:
+        """Where the board is the goal."""
         return (state == self.goal).flatten(1).all(1)
 
     def mover(self, state: Tensor) -> Tensor:
-        return (state == 0).flatten(1).long().argmax(1)
+        return _blank(state.flatten(1))
 
     def kinds(self, state: Tensor) -> Tensor:
         """1 for the tile that must go furthest up and left, and so on, row by row; 0 lies outside of the board."""
-        return self.tile_kinds()[state.flatten(1).long(), torch.arange(state[0].numel(), device=state.device)].view_as(state)
+        return self.tile_kinds()[state.flatten(1).long(), torch.arange(state[0].numel(), device=state.device)].view_as(
+            state
+        )
 
     def tile_kinds(self) -> Tensor:
         """The kind of each tile in each cell, int64 `[tiles, cells]`."""
         height, width = self.goal.shape
-        cell, place = torch.arange(height * width, device=self.device), self._place[:, None]
+        cell, place = torch.arange(height * width, device=self.device), self._places()[:, None]
         down = place.div(width, rounding_mode="floor") - cell.div(width, rounding_mode="floor") + height - 1
         return 1 + down * (2 * width - 1) + place % width - cell % width + width - 1
 
@@ -96,16 +124,24 @@ class SlidingTilesWorld(PuzzleWorld):
     def distances(self) -> Tensor:
         """The rows and columns from each cell to each tile's place, int64 `[tiles, cells]`; 0 for the blank."""
         width = self.goal.shape[1]
-        cell, place = torch.arange(self.goal.numel(), device=self.device), self._place[:, None]
+        cell, place = torch.arange(self.goal.numel(), device=self.device), self._places()[:, None]
         rows = (place.div(width, rounding_mode="floor") - cell.div(width, rounding_mode="floor")).abs()
         far = rows + (place % width - cell % width).abs()
         far[0] = 0
         return far
 
+    def _places(self) -> Tensor:
+        """The cell of each tile in the goal, int64 `[tiles]`."""
+        return self.goal.flatten().long().argsort()
+
     def lower_bound(self, state: Tensor) -> Tensor:
-        """The Manhattan distance: the sum of each tile's rows and columns to its place, without the blank's."""
+        """The sum of the tiles' Manhattan distances from their places in the goal, int64 `[N]`: consistent."""
         tiles = state.flatten(1).long()
         return self.distances()[tiles, torch.arange(tiles.shape[1], device=state.device)].sum(1)
+
+    def check_state(self, state: Tensor) -> None:
+        super().check_state(state)
+        _check_permutations("state", state)
 
     def symmetries(self) -> int:
         """Two where transposing the board and renaming the tiles leaves the goal as it is; else one."""
@@ -135,59 +171,88 @@ def tile_windows(height: int, width: int) -> tuple[Window, ...]:
 
 
 def sliding_tiles(
-    boards: Tensor | str | Path | None = None,
+    boards: Any = None,
     *,
     shape: tuple[int, int] | None = None,
-    goal: Tensor | None = None,
-    scramble: int = 1000,
+    goal: Any = None,
     observation: Observation = "patterns",
     windows: Sequence[Window] | None = None,
+    scramble: int = 100,
 ) -> SlidingTilesWorld:
-    """Sliding tiles on a board: the blank moves up, down, left or right, and the tile that was there takes its place.
+    """Sliding tiles: the blank moves, and changes places with the tile that is there.
 
     Args:
-        boards: integers `[n, H, W]`, or `[n, H * W]` with `shape`: 0 the blank, each number below H * W once; or the
-            path of a file with a board a line; None: boards of `shape` by random moves from the goal.
-        shape: rows and columns; None: those of the boards, or of a square with as many tiles as a line of the file has.
+        boards: a file of puzzles (see `read_tiles`), or integers `[n, H, W]`, or `[n, H * W]` with `shape`: the numbers
+            of the tiles, 0 the blank; None: the goal is scrambled, and `shape` or `goal` is needed.
+        shape: height and width.
         goal: integers `[H, W]`; None: 0, 1, 2, ... row by row.
-        scramble: number of random moves, where there are no boards.
         observation: see `PuzzleWorld`.
-        windows: see `Windows`; None: `tile_windows`.
+        windows: of the patterns; None: `tile_windows`.
+        scramble: number of random moves from the goal, where there are no boards.
 
     Raises:
-        ValueError: a board is none, or cannot be solved; the message says which.
-        OSError: the file cannot be read.
+        ValueError: a board is none, or cannot be solved (the message names the first one), or an argument is out of
+            range.
     """
-    if boards is None:
-        if shape is None:
-            raise ValueError("boards: some are expected, or the shape of boards to scramble")
-        check_sizes(rows=shape[0], columns=shape[1], scramble=scramble)
-        given = torch.arange(shape[0] * shape[1]).view(1, *shape)
-    else:
-        given = boards if isinstance(boards, Tensor) else read_tiles(boards, shape)
-        if given.dim() == 2 and shape is not None and given.shape[1] == shape[0] * shape[1]:
+    check_count("scramble", scramble)
+    if shape is not None and (len(shape) != 2 or min(shape) < 1):
+        raise ValueError(f"shape: height and width, at least 1, are expected, not {shape}")
+    given = None
+    if boards is not None:
+        is_file = isinstance(boards, str | Path)
+        given = torch.as_tensor(read_tiles(boards, shape) if is_file else boards)
+        if shape is not None and given.dim() == 2 and given.shape[1] == shape[0] * shape[1]:
             given = given.view(-1, *shape)
-    given = check_boards("boards", given)
-    height, width = given.shape[1:]
-    wanted = torch.arange(height * width).view(1, height, width) if goal is None else goal[None]
-    wanted = check_boards("goal", wanted)[0]
-    if wanted.shape != given.shape[1:]:
-        raise ValueError(f"goal: shape [{height}, {width}] is expected, not {list(wanted.shape)}")
-    if boards is None:
-        given = wanted[None]
-    odd = _parity(given) != _parity(wanted[None])
-    if bool(odd.any()):
+        if given.dim() != 3 or 0 in given.shape or (shape is not None and given.shape[1:] != shape):
+            wanted = "[n, H, W], or [n, H * W] with shape=(H, W)," if shape is None else f"[n, {shape[0]}, {shape[1]}]"
+            raise ValueError(f"boards: shape {wanted} is expected, not {list(given.shape)}")
+        shape = (given.shape[1], given.shape[2])
+    if goal is None:
+        if shape is None:
+            raise ValueError("sliding_tiles: give boards, shape or goal")
+        goal = torch.arange(shape[0] * shape[1]).view(shape)
+    goal = torch.as_tensor(goal)
+    if goal.dim() != 2 or (shape is not None and goal.shape != shape):
         raise ValueError(
-            f"boards[{int(odd.nonzero()[0])}]: no moves lead from it to the goal (its parity is not that of the goal)"
+            f"goal: shape {'[H, W]' if shape is None else list(shape)} is expected, not {list(goal.shape)}"
         )
+    if not 2 <= goal.numel() <= 256:
+        raise ValueError(f"goal: a board of 2 to 256 cells is expected, not {goal.numel()}")
+    _check_permutations("goal", goal[None])
+    if given is not None:
+        _check_permutations("boards", given)
+        given, goal = given.to(torch.uint8), goal.to(given.device)
+    height, width = goal.shape
     windows = tile_windows(height, width) if windows is None else windows
-    return SlidingTilesWorld(given, wanted, None if boards is not None else scramble, windows, observation)
+    return SlidingTilesWorld(given, goal.to(torch.uint8), windows, observation, scramble)
 
 
-def _parity(board: Tensor) -> Tensor:
-    """`[N]`, 0 or 1: of the permutation and of the blank's row and column together; moves do not change it."""
-    tiles = board.flatten(1).long()
-    earlier = torch.ones(tiles.shape[1], tiles.shape[1], dtype=torch.bool).triu(1).to(tiles.device)
-    inversions = ((tiles[:, :, None] > tiles[:, None, :]) & earlier).sum((1, 2))
-    blank = (tiles == 0).long().argmax(1)
-    return (inversions + blank.div(board.shape[2], rounding_mode="floor") + blank % board.shape[2]) % 2
+def _check_permutations(name: str, boards: Tensor) -> None:
+    """Raise ValueError unless each of `boards [n, H, W]` holds each tile once."""
+    cells = boards[0].numel() if len(boards) else 0
+    if not is_integer(boards):
+        raise ValueError(f"{name}: integers are expected, not {str(boards.dtype).removeprefix('torch.')}")
+    wrong = (boards.flatten(1).long().sort(1).values != torch.arange(cells, device=boards.device)).any(1).nonzero()
+    if len(wrong):
+        which = name if name == "goal" else f"{name}[{int(wrong[0])}]"
+        raise ValueError(f"{which}: each of 0 to {cells - 1} once is expected")
+
+
+def _solvable(boards: Tensor, goal: Tensor) -> Tensor:
+    """Whether `goal [H, W]` can be reached from `boards [n, H, W]`: `[n]` bool."""
+    order = goal.flatten().long().argsort()
+    place = order[boards.flatten(1).long()]  # where the tile of each cell belongs
+    if min(goal.shape) == 1:  # tiles in one row cannot pass one another
+        tiles = place[place != order[0]].view(len(boards), -1)
+        return (tiles.diff(dim=1) > 0).all(1)
+    # A move exchanges two tiles, which changes the parity of the permutation, and that of the blank's distance.
+    inversions = sum((place[:, i, None] > place[:, i + 1 :]).sum(1) for i in range(place.shape[1]))
+    width = goal.shape[1]
+    blank = _blank(boards.flatten(1))
+    away = (blank // width - order[0] // width).abs() + (blank % width - order[0] % width).abs()
+    return (inversions + away) % 2 == 0
+
+
+def _blank(flat: Tensor) -> Tensor:
+    """int64 `[N]`: the cell of the blank in `flat [N, H * W]`."""
+    return (flat == 0).to(torch.uint8).argmax(1)

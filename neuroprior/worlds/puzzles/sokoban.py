@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_range
 from neuroprior._hashing import row_hashes
-from neuroprior.worlds.puzzles.files import read_sokoban
-from neuroprior.worlds.puzzles.puzzle import STEPS, Observation, PuzzleWorld, reflected
+from neuroprior.worlds.puzzles.puzzle import Observation, PuzzleWorld, reflected
+from neuroprior.worlds.puzzles.reading import count_problem, read_sokoban
 from neuroprior.worlds.puzzles.windows import Window, Windows, windows_with_mover, windows_within
 
 FLOOR, WALL, GOAL, BOX, BOX_ON_GOAL, PLAYER, PLAYER_ON_GOAL = range(7)
@@ -28,147 +30,175 @@ SOKOBAN_WINDOWS: tuple[Window, ...] = (
 """Windows of 3 x 3, 4 x 2, 2 x 4, 2 x 2, 1 x 2 and 2 x 1 cells around the player, 105 in all."""
 
 MATCHED = 5
-"""Up to so many boxes are matched with goals in the heuristic; with more, each goes to its nearest goal."""
+"""Up to so many boxes are matched with goals; with more, each goes to its nearest goal."""
 
 
 class SokobanWorld(PuzzleWorld):
-    """Sokoban levels of one size; see `sokoban`. A state is a board, uint8 `[B, H, W]`, its cells 0 floor, 1 wall,
-    2 goal, 3 box, 4 box on a goal, 5 player, 6 player on a goal."""
+    """Sokoban levels of one size; see `sokoban`.
+
+    A state is a board, uint8 `[B, H, W]`, of cells 0 floor, 1 wall, 2 goal, 3 box, 4 box on goal, 5 player, 6 player on
+    goal. In patterns a cell is one of the first five; the player's own counts as what is under it, and what lies beyond
+    the board as wall. Planes are walls, goals, boxes and the player.
+
+    Args:
+        boards: uint8 `[n, H, W]`.
+        windows, observation: see `PuzzleWorld`.
+
+    Raises:
+        ValueError: a board is no level; the message says which.
+    """
 
     num_planes = 4
 
+    boards: Tensor
+
+    def __init__(self, boards: Tensor, windows: Sequence[Window], observation: Observation) -> None:
+        if boards.dim() != 3 or 0 in boards.shape:
+            raise ValueError(f"levels: codes [n, H, W] are expected, not {list(boards.shape)}")
+        check_range("levels", boards, PLAYER_ON_GOAL + 1, "codes of cells")
+        boards = boards.to(torch.uint8)
+        if (wrong := count_problem(boards.cpu().numpy())) is not None:
+            raise ValueError(f"levels[{wrong[0]}]: {wrong[1]}")
+        shape = boards.shape[1], boards.shape[2]
+        super().__init__(boards, shape, Windows(windows, KINDS, WALL), observation)
+
+    @property
+    def device(self) -> torch.device:
+        return self.boards.device
+
+    def to(self, device: torch.device | str) -> "SokobanWorld":
+        """Move the boards to `device`; returns self."""
+        self.boards = self.boards.to(device)
+        return self
+
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        before = self.solved(state)
-        possible, mover, there, behind = self._moves(state)
-        row = torch.arange(len(state), device=state.device)
-        able = possible[row, action] & ~before
-        flat = state.flatten(1).clone()
-        rows, at, to, beyond = row[able], mover[able], there[row, action][able], behind[row, action][able]
-        pushed = _boxes(flat[rows, to])
-        self._place(flat, rows[pushed], beyond[pushed], BOX)
-        flat[rows[pushed], to[pushed]] -= BOX - FLOOR - (flat[rows[pushed], to[pushed]] == BOX_ON_GOAL).to(torch.uint8)
-        flat[rows, at] = torch.where(flat[rows, at] == PLAYER_ON_GOAL, GOAL, FLOOR).to(torch.uint8)
-        self._place(flat, rows, to, PLAYER)
-        after = flat.view_as(state)
-        return after, (self.solved(after) & ~before).float()
+        """One step; an illegal action, and any action where the level is solved, leaves the state as it is.
 
-    def _place(self, flat: Tensor, rows: Tensor, cells: Tensor, what: int) -> None:
-        """Put a box or the player on floor or goal."""
-        on_goal = (flat[rows, cells] == GOAL).to(torch.uint8)
-        flat[rows, cells] = what + on_goal
-
-    def _moves(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Which moves can be made, bool `[N, 4]`; the player's cell `[N]`, that it would enter and the next `[N, 4]`."""
-        height, width = state.shape[1:]
-        flat, mover = state.flatten(1), self.mover(state)
-        y, x = mover.div(width, rounding_mode="floor"), mover % width
-        cells, kinds = [], []
-        for far in (1, 2):
-            to_y = torch.stack([y + far * dy for dy, _ in STEPS], 1)
-            to_x = torch.stack([x + far * dx for _, dx in STEPS], 1)
-            inside = (to_y >= 0) & (to_y < height) & (to_x >= 0) & (to_x < width)
-            cell = (to_y * width + to_x).where(inside, 0)
-            cells.append(cell)
-            kinds.append(flat.gather(1, cell).where(inside, WALL))
-        free = (kinds[0] == FLOOR) | (kinds[0] == GOAL)
-        push = _boxes(kinds[0]) & ((kinds[1] == FLOOR) | (kinds[1] == GOAL))
-        return free | push, mover, *cells
+        The reward is 1 for the step that solves the level, else 0.
+        """
+        board, player, offsets = _padded(state)
+        first = player + offsets[action]
+        second = first + offsets[action]
+        here, beside, behind = (board.gather(1, place[:, None])[:, 0] for place in (player, first, second))
+        pushes = _is_box(beside)
+        moves = (_is_free(beside) | pushes & _is_free(behind)) & ~self.solved(state)
+        left = torch.where(here == PLAYER_ON_GOAL, GOAL, FLOOR)
+        entered = torch.where((beside == GOAL) | (beside == BOX_ON_GOAL), PLAYER_ON_GOAL, PLAYER)
+        pushed = torch.where(behind == GOAL, BOX_ON_GOAL, BOX)
+        for place, old, new, changes in (
+            (player, here, left, moves),
+            (first, beside, entered, moves),
+            (second, behind, pushed, moves & pushes),
+        ):
+            board.scatter_(1, place[:, None], torch.where(changes, new.to(torch.uint8), old)[:, None])
+        after = board.view(len(state), state.shape[1] + 4, state.shape[2] + 4)[:, 2:-2, 2:-2].contiguous()
+        return after, (moves & self.solved(after)).float()
 
     def legal_actions(self, state: Tensor) -> Tensor:
-        """Moves onto a free cell, and pushes of a box onto one; all where there are none at all, to no effect."""
-        possible = self._moves(state)[0]
-        return possible | ~possible.any(1, keepdim=True)
+        """Moves to a free cell, and pushes of a box to a free cell: `[N, 4]` bool. Where there are none: all."""
+        board, player, offsets = _padded(state)
+        beside, behind = board.gather(1, player[:, None] + offsets), board.gather(1, player[:, None] + 2 * offsets)
+        legal = _is_free(beside) | _is_box(beside) & _is_free(behind)
+        return legal | ~legal.any(1, keepdim=True)
 
     def solved(self, state: Tensor) -> Tensor:
+        """Where all boxes are on goals."""
         return ~(state == BOX).flatten(1).any(1)
 
     def mover(self, state: Tensor) -> Tensor:
-        return (state >= PLAYER).flatten(1).long().argmax(1)
+        return _player(state.flatten(1))
 
     def kinds(self, state: Tensor) -> Tensor:
-        under = torch.tensor([FLOOR, WALL, GOAL, BOX, BOX_ON_GOAL, FLOOR, GOAL], device=state.device)
-        return under[state.long()]
+        return state.masked_fill(state == PLAYER, FLOOR).masked_fill(state == PLAYER_ON_GOAL, GOAL)
 
     def planes(self, state: Tensor) -> Tensor:
-        """Walls, goals, boxes and the player."""
-        goal = (state == GOAL) | (state == BOX_ON_GOAL) | (state == PLAYER_ON_GOAL)
-        return torch.stack([state == WALL, goal, _boxes(state), state >= PLAYER], 1).float()
-
-    def lower_bound(self, state: Tensor) -> Tensor:
-        """The pushes of the cheapest matching of boxes with goals, in rows and columns; walls and other boxes ignored.
-
-        With more than 5 boxes each goes to its nearest goal.
-        """
-        number, width = len(state), state.shape[2]
-        flat = state.flatten(1)
-        boxes, goals = _boxes(flat), (flat == GOAL) | (flat == BOX_ON_GOAL) | (flat == PLAYER_ON_GOAL)
-        if number == 0:
-            return torch.zeros(0, dtype=torch.long, device=state.device)
-        most = int(boxes.sum(1).max())
-        if most == 0:
-            return torch.zeros(number, dtype=torch.long, device=state.device)
-        box, there = _places(boxes, most)
-        goal, wanted = _places(goals, int(goals.sum(1).max()))
-        dy = (box.div(width, rounding_mode="floor")[:, :, None] - goal.div(width, rounding_mode="floor")[:, None]).abs()
-        distance = dy + (box[:, :, None] % width - goal[:, None] % width).abs()
-        far = distance.shape[2] * 2 * max(state.shape[1:]) + 1
-        distance = distance.masked_fill(~wanted[:, None], far).masked_fill(~there[:, :, None], 0)
-        if most > MATCHED or goal.shape[1] > MATCHED + 1:
-            return distance.amin(2).sum(1)
-        matchings = torch.tensor(list(permutations(range(goal.shape[1]), most)), device=state.device)
-        every = distance[:, torch.arange(most, device=state.device), matchings]  # [N, matchings, boxes]
-        return every.sum(-1).amin(1)
+        goals = (state == GOAL) | (state == BOX_ON_GOAL) | (state == PLAYER_ON_GOAL)
+        return torch.stack([state == WALL, goals, _is_box(state), state >= PLAYER], 1).float()
 
     def group(self, state: Tensor) -> Tensor:
-        """The number of the level's walls: levels with the same walls have the same number."""
-        return row_hashes((state == WALL).flatten(1))
+        """A number of the walls, int64 `[N]`, at least 0: the same for the same walls, in any world of this size."""
+        return row_hashes((state == WALL).to(torch.uint8)) & (2**63 - 1)
+
+    def lower_bound(self, state: Tensor) -> Tensor:
+        """A lower bound of the number of moves to a solved state, int64 `[N]`: an admissible heuristic.
+
+        Boxes are matched with goals so that the sum of their Manhattan distances is least; with more than 5 boxes it is
+        the sum of each box's distance to the nearest goal.
+        """
+        many = _is_box(state).flatten(1).sum(1) > MATCHED
+        if bool(many.any()) and not bool(many.all()):
+            bound = torch.zeros(len(state), dtype=torch.long, device=state.device)
+            bound[many], bound[~many] = self.lower_bound(state[many]), self.lower_bound(state[~many])
+            return bound
+        flat = state.flatten(1)
+        boxes = _is_box(flat).int()
+        goals = ((flat == GOAL) | (flat == BOX_ON_GOAL) | (flat == PLAYER_ON_GOAL)).int()
+        most = int(boxes.sum(1).max()) if len(state) else 0
+        (is_box, box), (is_goal, goal) = boxes.topk(most), goals.topk(most)
+        width, far = state.shape[2], state.shape[1] + state.shape[2]
+        distance = (box[:, :, None] // width - goal[:, None] // width).abs()
+        distance = distance + (box[:, :, None] % width - goal[:, None] % width).abs()
+        # Levels with fewer boxes are filled up with boxes and goals that can only be matched with one another.
+        both, neither = is_box[:, :, None] * is_goal[:, None], (1 - is_box[:, :, None]) * (1 - is_goal[:, None])
+        distance = distance * both + far * most * (1 - both - neither)
+        if most > MATCHED:
+            return distance.amin(2).sum(1)
+        orders = torch.tensor(list(permutations(range(most))), dtype=torch.long, device=state.device)
+        return distance[:, torch.arange(most, device=state.device), orders].sum(2).amin(1)
+
+    def check_state(self, state: Tensor) -> None:
+        super().check_state(state)
+        wrong = ((state >= PLAYER).flatten(1).sum(1) != 1).nonzero()
+        if len(wrong):
+            raise ValueError(f"state[{int(wrong[0])}]: a board with one player is expected")
 
     def symmetries(self) -> int:
         """Eight for square boards, else four."""
-        return 8 if self.boards.shape[1] == self.boards.shape[2] else 4
+        return 8 if self.shape[0] == self.shape[1] else 4
 
     def transformed(self, state: Tensor, number: int) -> Tensor:
         return reflected(state, number)
 
 
 def sokoban(
-    levels: Tensor | Sequence[str] | str | Path,
-    *,
-    observation: Observation = "patterns",
-    windows: Sequence[Window] = SOKOBAN_WINDOWS,
+    levels: Any, *, observation: Observation = "patterns", windows: Sequence[Window] = SOKOBAN_WINDOWS
 ) -> SokobanWorld:
-    """Sokoban: a player pushes boxes onto goals, up, down, left or right; it never pulls.
+    """Sokoban: a player pushes boxes, one at a time, onto goals.
 
     Args:
-        levels: uint8 boards `[n, H, W]` (see `SokobanWorld`), the path of a file, or texts of levels; see `read_sokoban`.
-        observation, windows: what is observed, see `PuzzleWorld`.
+        levels: a file of levels (see `read_sokoban`), a list of level texts, or boards `[n, H, W]`, see `SokobanWorld`.
+        observation: see `PuzzleWorld`.
+        windows: of the patterns.
 
     Raises:
-        ValueError: a level is none; the message says which and why.
+        ValueError: a level is none, or an argument is out of range; the message says which.
         OSError: the file cannot be read.
     """
-    boards = levels if isinstance(levels, Tensor) else read_sokoban(levels)
-    if boards.dim() != 3 or boards.dtype != torch.uint8 or len(boards) == 0:
-        raise ValueError(f"levels: uint8 boards [n, H, W] are expected, not {boards.dtype} {list(boards.shape)}")
-    for what, wrong in (
-        ("a cell above 6", (boards > PLAYER_ON_GOAL).flatten(1).any(1)),
-        ("not exactly one player", (boards >= PLAYER).flatten(1).sum(1) != 1),
-        ("more boxes than goals", _boxes(boards).flatten(1).sum(1) > _goals(boards).flatten(1).sum(1)),
-    ):
-        if bool(wrong.any()):
-            raise ValueError(f"levels[{int(wrong.nonzero()[0])}]: {what}")
-    return SokobanWorld(boards, Windows(windows, KINDS, WALL), observation)
+    if isinstance(levels, str | Path):
+        boards = torch.from_numpy(read_sokoban(levels))
+    elif isinstance(levels, list | tuple) and all(isinstance(level, str) for level in levels):
+        boards = torch.from_numpy(read_sokoban("\n;\n".join(["", *levels])))
+    else:
+        boards = torch.as_tensor(levels)
+    return SokobanWorld(boards, windows, observation)
 
 
-def _boxes(cells: Tensor) -> Tensor:
+def _player(flat: Tensor) -> Tensor:
+    """int64 `[N]`: the player's cell in `flat [N, H * W]`."""
+    return (flat >= PLAYER).to(torch.uint8).argmax(1)
+
+
+def _padded(state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Boards `[N, (H + 4) * (W + 4)]` within two rows of wall, the player's cell `[N]`, and the four moves `[4]`."""
+    board = torch.nn.functional.pad(state, (2, 2, 2, 2), value=WALL)
+    width = board.shape[2]
+    flat = board.flatten(1)
+    return flat, _player(flat), torch.tensor([-width, width, -1, 1], device=state.device)
+
+
+def _is_box(cells: Tensor) -> Tensor:
     return (cells == BOX) | (cells == BOX_ON_GOAL)
 
 
-def _goals(cells: Tensor) -> Tensor:
-    return (cells == GOAL) | (cells == BOX_ON_GOAL) | (cells == PLAYER_ON_GOAL)
-
-
-def _places(marked: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """The numbers `[N, most]` of the marked cells of each row `[N, cells]`, and which of these numbers count."""
-    order = marked.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
-    return order, marked.gather(1, order)
+def _is_free(cells: Tensor) -> Tensor:
+    return (cells == FLOOR) | (cells == GOAL)

@@ -12,22 +12,23 @@ CODES = 2**31
 """Patterns are numbered below this."""
 
 
-def windows_within(height: int, width: int, distance: int) -> list[Window]:
+def windows_within(height: int, width: int, distance: int) -> tuple[Window, ...]:
     """All windows of a size whose cells are at most `distance` rows and columns from the mover."""
     rows = range(-distance, distance - height + 2)
-    return [(row, column, height, width) for row in rows for column in range(-distance, distance - width + 2)]
+    columns = range(-distance, distance - width + 2)
+    return tuple((row, column, height, width) for row in rows for column in columns)
 
 
-def windows_with_mover(height: int, width: int) -> list[Window]:
+def windows_with_mover(height: int, width: int) -> tuple[Window, ...]:
     """All windows of a size that hold the mover's cell."""
-    return [(row, column, height, width) for row in range(1 - height, 1) for column in range(1 - width, 1)]
+    return tuple((row, column, height, width) for row in range(1 - height, 1) for column in range(1 - width, 1))
 
 
 class Windows:
     """Numbers what lies in windows: a cell is of one of `base` kinds, a pattern what a window's cells are.
 
-    The code of window k is `offsets[k]` plus the kinds of its cells, row by row, as a number to the base `base`; offsets
-    keep windows apart.
+    The code of window k is `offsets[k]` plus the kinds of its cells, row by row, as a number to the base `base`, the
+    first cell counting most; offsets keep windows apart.
 
     Args:
         windows: see `Window`.
@@ -35,6 +36,7 @@ class Windows:
         outside: the kind of what lies outside of the board.
 
     Attributes:
+        num_codes: all codes are below it.
         radius: the rows or columns that windows reach away from the mover.
         offsets: int64 `[F]`.
 
@@ -47,10 +49,11 @@ class Windows:
         if not self.windows:
             raise ValueError("windows: at least one is expected")
         sizes = [base ** (height * width) for _, _, height, width in self.windows]
-        if sum(sizes) >= CODES:
+        self.num_codes = sum(sizes)
+        if self.num_codes >= CODES:
             raise ValueError(
-                f"windows: they have {sum(sizes):,} patterns of {base} kinds of cells; fewer than 2**31 are expected: take"
-                " smaller or fewer windows"
+                f"windows: they have {self.num_codes:,} patterns of {base} kinds of cells; fewer than 2**31 are"
+                " expected: take smaller or fewer windows"
             )
         self.offsets = torch.tensor([0, *sizes]).cumsum(0)[:-1]
         self.radius = max(

@@ -1,0 +1,154 @@
+"""Files of puzzles: Sokoban levels and sliding tiles."""
+
+import lzma
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from neuroprior._checks import check_memory
+
+SYMBOLS = " #.$*@+"
+"""The symbols of the codes 0 to 6; `-` and `_` are floor, too."""
+_ALL_SYMBOLS = SYMBOLS + "-_"
+Boards = npt.NDArray[np.uint8]
+
+
+def read_sokoban(path_or_text: str | Path) -> Boards:
+    """Sokoban levels as codes of cells.
+
+    Understood are Boxoban's files, in which lines `; number` separate levels, and the usual `.xsb` symbols: `#` wall,
+    `@` player, `+` player on goal, `$` box, `*` box on goal, `.` goal, and a blank, `-` or `_` for floor. Blank lines,
+    comments (`;`) and titles (lines that begin with another symbol) end a level. What is missing of shorter rows and
+    smaller levels is wall.
+
+    Args:
+        path_or_text: a file (UTF-8; packed where its name ends in `.xz`), or levels as text of more than one line.
+
+    Returns:
+        uint8 `[n, H, W]`, H and W of the largest level: 0 floor, 1 wall, 2 goal, 3 box, 4 box on goal, 5 player, 6
+        player on goal.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the text holds no levels, or one of them is none: an unknown symbol, not one player, no box, or not
+            as many boxes as goals. The message names file, level (from 0) and line.
+    """
+    name, text = _text_of(path_or_text)
+    levels: list[list[str]] = []
+    first_lines: list[int] = []
+    within = False
+    for number, line in enumerate(text.split("\n"), 1):
+        row = line.rstrip()
+        is_row = bool(row) and row.lstrip()[0] in _ALL_SYMBOLS
+        if is_row:
+            if not within:
+                levels.append([])
+                first_lines.append(number)
+            if unknown := row.strip(_ALL_SYMBOLS):
+                raise ValueError(
+                    f"{name}, level {len(levels) - 1}, line {number}: {unknown[0]!r} is no symbol of Sokoban (# wall,"
+                    " @ player, + player on goal, $ box, * box on goal, . goal, blank, - or _ floor)"
+                )
+            levels[-1].append(row)
+        within = is_row
+    if not levels:
+        raise ValueError(f"{name}: there is no level in it")
+    height, width = max(map(len, levels)), max(len(row) for level in levels for row in level)
+    check_memory(len(levels) * height * width, levels=name)
+    filled = "".join(
+        "".join(row.ljust(width, "#") for row in level) + "#" * ((height - len(level)) * width) for level in levels
+    )
+    code = np.zeros(128, dtype=np.uint8)
+    code[[ord(symbol) for symbol in SYMBOLS]] = range(len(SYMBOLS))
+    boards = code[np.frombuffer(filled.encode("ascii"), dtype=np.uint8)].reshape(len(levels), height, width)
+    if (wrong := count_problem(boards)) is not None:
+        raise ValueError(f"{name}, level {wrong[0]}, line {first_lines[wrong[0]]}: {wrong[1]}")
+    return boards
+
+
+def count_problem(boards: Boards) -> tuple[int, str] | None:
+    """The first of `boards [n, H, W]` that is no level by its numbers of players, boxes and goals, and why."""
+    players, boxes, goals = (
+        np.isin(boards, codes).sum((1, 2)) for codes in (np.array([5, 6]), np.array([3, 4]), np.array([2, 4, 6]))
+    )
+    wrong = np.flatnonzero((players != 1) | (boxes != goals) | (boxes == 0))
+    if not len(wrong):
+        return None
+    first = int(wrong[0])
+    if players[first] != 1:
+        return first, f"one player is expected, not {players[first]}"
+    if boxes[first] != goals[first]:
+        return first, f"as many boxes as goals are expected, not {boxes[first]} and {goals[first]}"
+    return first, "at least one box is expected"
+
+
+def format_sokoban(board: npt.ArrayLike) -> str:
+    """A board of codes `[H, W]` (an array or a tensor) as text in the usual symbols, one row a line.
+
+    Raises:
+        ValueError: it is no board.
+    """
+    codes = np.asarray(board)
+    if codes.ndim != 2 or codes.dtype.kind not in "iu" or codes.size == 0 or codes.min() < 0 or codes.max() > 6:
+        raise ValueError("board: integers [H, W] from 0 to 6 are expected")
+    return "\n".join("".join(SYMBOLS[code] for code in row) for row in codes)
+
+
+def read_tiles(path: str | Path, shape: tuple[int, int] | None = None) -> Boards:
+    """Sliding tiles: one puzzle a line, the numbers of its tiles row by row, 0 the blank.
+
+    Args:
+        path: a file (UTF-8; packed where its name ends in `.xz`), or puzzles as text of more than one line.
+        shape: height and width; None: square.
+
+    Returns:
+        uint8 `[n, H, W]`.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: the file holds no puzzle, or a line is none; the message names file and line.
+    """
+    name, text = _text_of(path)
+    lines = [(number, line.split()) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
+    if not lines:
+        raise ValueError(f"{name}: there is no puzzle in it")
+    cells = len(lines[0][1]) if shape is None else shape[0] * shape[1]
+    side = math.isqrt(cells)
+    if shape is None and side * side != cells:
+        raise ValueError(f"{name}, line {lines[0][0]}: {cells} numbers are no square board; give shape=(height, width)")
+    height, width = (side, side) if shape is None else shape
+    tiles = {str(tile): tile for tile in range(cells)}
+    boards = []
+    for number, words in lines:
+        board = [tiles.get(word, -1) for word in words]
+        if len(board) != cells or -1 in board or len(set(board)) != cells:
+            raise ValueError(f"{name}, line {number}: each of 0 to {cells - 1} once is expected, not {_short(words)}")
+        boards.append(board)
+    if cells > 256:
+        raise ValueError(f"{name}: boards of at most 256 cells are expected, not {cells}")
+    return np.array(boards, dtype=np.uint8).reshape(-1, height, width)
+
+
+def _short(words: list[str]) -> str:
+    text = " ".join(words)
+    return repr(text if len(text) <= 80 else text[:77] + "...")
+
+
+def _text_of(path_or_text: str | Path) -> tuple[str, str]:
+    """What messages call it, and the text; a string with a line break is the text itself."""
+    if isinstance(path_or_text, str) and "\n" in path_or_text:
+        return "text", path_or_text
+    path = Path(path_or_text)
+    content = path.read_bytes()
+    if path.suffix == ".xz":
+        try:
+            content = lzma.decompress(content)
+        except (lzma.LZMAError, EOFError) as error:
+            raise ValueError(f"{path}: it is no whole .xz file ({error})") from error
+    try:
+        return str(path), content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise ValueError(f"{path}, line {line}: UTF-8 is expected, not byte {content[error.start]:#04x}") from error
