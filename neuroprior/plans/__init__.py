@@ -10,7 +10,15 @@ from neuroprior.plans.io import (
     write_plans,
 )
 from neuroprior.plans.past_durations import PastDurations
-from neuroprior.plans.plans import Plans, action_dtype, all_plans, check_context, is_per_step
+from neuroprior.plans.plans import (
+    Plans,
+    action_dtype,
+    all_plans,
+    check_context,
+    check_patterns,
+    has_patterns,
+    is_per_step,
+)
 from neuroprior.plans.tables import Columns, Missing
 
 __all__ = [
@@ -23,10 +31,12 @@ __all__ = [
     "action_dtype",
     "all_plans",
     "check_context",
+    "check_patterns",
     "divisible",
     "folds",
     "from_trajectories",
     "in_parts",
+    "has_patterns",
     "is_per_step",
     "read_minari",
     "read_plans",

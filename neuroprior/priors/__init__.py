@@ -7,6 +7,7 @@ from neuroprior.priors.fitting import fit
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
 from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
+from neuroprior.priors.patterns import LogLinearPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
 from neuroprior.priors.uniform import UniformPrior
@@ -18,6 +19,7 @@ __all__ = [
     "DurationModel",
     "GRUPrior",
     "Leaf",
+    "LogLinearPrior",
     "Macro",
     "MacroPrior",
     "MarkovPrior",

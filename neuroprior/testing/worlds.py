@@ -80,10 +80,11 @@ def _check_step(world: World, state: Tensor, action: Tensor, seed: int) -> None:
 def _check_queries(world: World, state: Tensor) -> None:
     """`observe`, `terminated` and `legal_actions`."""
     observed = world.observe(state)
-    fits = (is_integer(observed) and observed.dim() == 1) or (observed.is_floating_point() and observed.dim() == 2)
+    fits = (is_integer(observed) and observed.dim() in (1, 2)) or (observed.is_floating_point() and observed.dim() == 2)
     require(
         len(observed) == len(state) and fits,
-        f"observe must give indices [N] or floating point features [N, C], not {observed.dtype} {list(observed.shape)}",
+        "observe must give indices [N], patterns [N, F] or floating point features [N, C],"
+        f" not {observed.dtype} {list(observed.shape)}",
     )
     ended = world.terminated(state)
     require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")

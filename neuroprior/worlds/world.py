@@ -90,7 +90,8 @@ class World(ABC):
         return Rollout(now.view(shape), torch.cat(rewards, -1), kept)
 
     def observe(self, state: Tensor) -> Tensor:
-        """The observation in `state [N, ...]`: integers `[N]` (indices) or floating point `[N, C]` (features).
+        """The observation in `state [N, ...]`: integers `[N]` (indices), floating point `[N, C]` (features), or
+        integers `[N, F]` (the F active patterns, each from 0 to 2**31 - 1).
 
         Default: the state itself.
         """

@@ -21,7 +21,7 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-from neuroprior.priors import SemiMarkovPrior
+from neuroprior.priors import LogLinearPrior, SemiMarkovPrior
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
 from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze
@@ -35,6 +35,10 @@ def random_plans(num_actions: int, context: Tensor | None = None, length: int = 
 
 def index_context(*shape: int) -> Tensor:
     return torch.randint(3, shape, generator=torch.Generator().manual_seed(4))
+
+
+def pattern_context(*shape: int) -> Tensor:
+    return torch.randint(6, (*shape, 2), generator=torch.Generator().manual_seed(5), dtype=torch.int32)
 
 
 PRIORS = {
@@ -60,6 +64,8 @@ PRIORS = {
     "context tree, context a step": lambda: ContextTreePrior(3, 0, num_contexts=4).fit(
         random_plans(3, index_context(60, 5))
     ),
+    "log-linear untrained": lambda: LogLinearPrior(4, 2),
+    "log-linear": lambda: LogLinearPrior(3, 2, order=2).fit(random_plans(3, pattern_context(60, 5))),
     "gru untrained": lambda: GRUPrior(4),
     "gru": lambda: GRUPrior(4).fit(random_plans(4, length=3), progress=False, max_steps=20),
     "gru, two layers, index": lambda: GRUPrior(3, 16, 2, window=2, num_contexts=3),
