@@ -126,7 +126,7 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
     if not len(plans):
         raise ValueError(f"{place}: no plans to write")
     context = plans.context
-    if suffix != ".npz" and has_patterns(context):
+    if suffix != ".npz" and context is not None and has_patterns(context):
         raise ValueError(f"{place}: patterns {list(context.shape)} are written to .npz files only")
     if suffix != ".npz" and context is not None and context.is_floating_point():
         if not context.shape[-1]:

@@ -97,7 +97,7 @@ class LogLinearPrior(PatternPrior):
         for done in range(0, epochs, ROUND):
             optimiser.param_groups[0]["max_iter"] = min(ROUND, epochs - done)
             before = flat.detach().clone()
-            optimiser.step(closure)  # type: ignore[arg-type]
+            optimiser.step(closure)
             if validation is not None:
                 now = validation(flat.detach())[0]
                 if not now < least:

@@ -179,8 +179,8 @@ class PatternPrior(Prior):
         return self.to(device)
 
     @abstractmethod
-    def learn(self, steps: Steps, held_out: Steps | None, generator: torch.Generator | None, **settings: Any) -> None:
-        """Learn from flat steps on the CPU; those held out, where there are any, decide when to stop."""
+    def learn(self, *args: Any, **settings: Any) -> None:
+        """Learn from flat steps on the CPU: `steps`, `held_out` (or None; they decide when to stop), `generator`."""
 
     def know(self, patterns: Tensor) -> None:
         """Make `patterns` (ascending) known beside those that are; new ones weigh 0."""
