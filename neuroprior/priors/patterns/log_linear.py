@@ -23,7 +23,9 @@ class LogLinearPrior(PatternPrior):
 
     The context model of Orseau, Hutter and Lelis, "Levin tree search with context models" (IJCAI 2023), section 3.
     The log-loss is convex in the weights; L-BFGS minimises it, over all steps at once, so that nothing is random but
-    which plans are held out. `fit` goes on from the present weights, and patterns that are new begin at 0.
+    which plans are held out. `fit` goes on from the present weights, and patterns that are new begin at 0. Where these
+    weights have learned some of the plans before, those held out are no fair judge: hold out none then
+    (`validation=None`), and limit `epochs`.
 
     Args:
         num_actions: A.
@@ -84,7 +86,8 @@ class LogLinearPrior(PatternPrior):
         flat = torch.cat([part.flatten() for part in parts]).requires_grad_()
         objective = _Objective(self, steps, loss)
         validation = None if held_out is None else _Objective(self, held_out, loss)
-        best, least = flat.detach().clone(), torch.inf if validation is None else validation(flat.detach())[0]
+        # Weights from an earlier fit may have learned what is held out now, so these first ones set no mark.
+        best, least = flat.detach().clone(), torch.inf
         optimiser = torch.optim.LBFGS(
             [flat], max_iter=ROUND, history_size=8, line_search_fn="strong_wolfe", tolerance_grad=1e-7
         )

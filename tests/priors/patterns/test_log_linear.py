@@ -133,3 +133,16 @@ def test_bad_input_is_refused() -> None:
             prior.fit(plans, **settings)
     with pytest.raises(ValueError, match="last"):
         prior.fit_steps(torch.zeros(2, 2, dtype=torch.int32), torch.tensor([0, 4]), torch.tensor([0, 1]))
+
+
+def test_histories_of_two_actions_are_numbered_as_documented() -> None:
+    prior, patterns = LogLinearPrior(2, 1, order=2), torch.tensor([[0]])
+    prior.action_weights[:, 0] = torch.arange(7.0)
+    logits, state = prior.start(1, patterns)
+    assert float(logits[0, 0]) == 6  # no action yet
+    plan, rows = [1, 0, 1, 1], [5, 2, 1, 3]  # after 1; 1, 0; 0, 1; 1, 1
+    for action, row in zip(plan, rows, strict=True):
+        logits, state = prior.step(torch.tensor([action]), state)
+        assert float(logits[0, 0]) == row
+    whole = prior(torch.tensor([plan]), torch.zeros(1, 4, 1, dtype=torch.int32))
+    assert whole[0, :, 0].tolist() == [6, 5, 2, 1]
