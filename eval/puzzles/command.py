@@ -111,7 +111,7 @@ def report(
     frames = {"puzzles": rows, "pairs": _pairs(each), "sweeps": pd.DataFrame(sweeps)}
     tables = [_table(rows, "Test problems", settings)]
     if settings.world == "sokoban":
-        known, walls = (problems.world.group(problems.boards).tolist() for problems in both)
+        known, walls = (_walls(problems) for problems in both)
         own = [number for number, layout in enumerate(walls) if layout not in set(known)]
         apart = _rows(each[each["problem"].isin(own)], seconds).drop(columns=["seconds_per_problem", "fit_seconds"])
         if len(own) < len(both[1].boards):
@@ -128,6 +128,12 @@ def report(
     )
     sections = [Section("Puzzles", tables=tables)]
     return Document("Puzzles", lead, sections, frames, asdict(settings), "", keys={"puzzles": "rows"})
+
+
+def _walls(problems: Problems) -> list[int]:
+    """The number of each problem's walls."""
+    groups = problems.world.group(problems.boards)
+    return [] if groups is None else groups.tolist()
 
 
 def _per_problem(one: dict[str, Any]) -> pd.DataFrame:

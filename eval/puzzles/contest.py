@@ -118,10 +118,8 @@ def bootstrapped(settings: Settings, folder: Path, seed: int) -> list[dict[str, 
         nodes, weight = TEACHER
         how["teacher"] = AStarPlanner(train.world.lower_bound, weight, nodes)
     prior = LogLinearPrior(4, len(train.world.windows.windows))
-    sweeps = bootstrap(
-        train.world, prior, _shuffled(train.boards, settings, seed), sweeps=settings.sweeps, folder=folder / f"seed-{seed}",
-        generator=torch.Generator().manual_seed(seed), **how,
-    )  # fmt: skip
+    how |= {"folder": folder / f"seed-{seed}", "generator": torch.Generator().manual_seed(seed)}
+    sweeps = bootstrap(train.world, prior, _shuffled(train.boards, settings, seed), sweeps=settings.sweeps, **how)
     return [{"seed": seed} | sweep._asdict() for sweep in sweeps]
 
 

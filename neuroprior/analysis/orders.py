@@ -94,7 +94,7 @@ def _sum_n_log_n(counts: Tensor) -> Tensor:
 
 def _context(plans: Plans, flat: FlatPlans, num_contexts: int) -> Tensor:
     """`[M]`: the context index of each action."""
-    if plans.context is None or not is_integer(plans.context):
+    if plans.context is None or not is_integer(plans.context) or plans.context.dim() > 2:
         found = "none" if plans.context is None else str(plans.context.dtype).removeprefix("torch.")
         raise ValueError(f"context: indices below {num_contexts} are expected, not {found}")
     check_range("context", plans.context, num_contexts, "contexts")

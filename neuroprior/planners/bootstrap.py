@@ -278,7 +278,8 @@ def solution_steps(world: World, state: Tensor, plans: Sequence[Tensor]) -> Step
     begin = torch.tensor([0, *map(len, plans)]).cumsum(0)[:-1]
     last = torch.nn.functional.pad(action, (1, -1))
     last[begin] = world.num_actions
-    return Steps(patterns, last, action)
+    plan = torch.arange(len(plans)).repeat_interleave(torch.tensor([len(one) for one in plans]))
+    return Steps(patterns, last, action, plan)
 
 
 def solution_plans(world: World, state: Tensor, plans: Sequence[Tensor], context: str | None) -> Plans:

@@ -121,12 +121,12 @@ def collect(
             raise ValueError(f"min_score: none of {len(state)} plans scored more than {min_score}{best}")
         plan, state, before = plan[kept], state[kept], before[kept]
         lengths = None if lengths is None else lengths[kept]
-    if context is not None and world.observe(state[:1]).dim() > 2:
+    seen = None if context is None else world.observe(state[:1])
+    if seen is not None and is_per_step(seen) and (context == "plan" or seen.dim() != 2):
         raise ValueError(
-            "observe: indices [N], patterns [N, F] or floating point features [N, C] are expected of a world"
+            "observe: indices [N] or floating point features [N, C] are expected of a world; patterns [N, F] are a"
+            ' context per step (context="step")'
         )
-    if context == "plan" and is_per_step(world.observe(state[:1])):
-        raise ValueError('context: patterns are observed before each action; "step" is expected in this world')
     observed = observations(world, before, context)
     return Plans(plan, world.num_actions, lengths, world.action_names, observed, world.group(state))
 
@@ -159,7 +159,8 @@ def join_executions(parts: Sequence[Execution]) -> Execution:
 def observations(world: World, before: Tensor, context: Literal["plan", "step"] | None) -> Tensor | None:
     """The context of executed plans: what the world observes in the states `before [N, L, ...]` the actions.
 
-    "plan": `[N]` or `[N, C]`, in the first state; "step": `[N, L]` or `[N, L, C]`, in each; None: None.
+    "plan": `[N]` or `[N, C]`, in the first state; "step": `[N, L]`, `[N, L, F]` or `[N, L, C]`, in
+    each; None: None.
     """
     if context is None:
         return None

@@ -10,7 +10,15 @@ from neuroprior.plans.io import (
     write_plans,
 )
 from neuroprior.plans.past_durations import PastDurations
-from neuroprior.plans.plans import Plans, action_dtype, all_plans, check_context, check_patterns, is_per_step
+from neuroprior.plans.plans import (
+    Plans,
+    action_dtype,
+    all_plans,
+    check_context,
+    check_patterns,
+    has_patterns,
+    is_per_step,
+)
 from neuroprior.plans.tables import Columns, Missing
 
 __all__ = [
@@ -28,6 +36,7 @@ __all__ = [
     "folds",
     "from_trajectories",
     "in_parts",
+    "has_patterns",
     "is_per_step",
     "read_minari",
     "read_plans",

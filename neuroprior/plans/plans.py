@@ -29,8 +29,8 @@ class Plans:
         lengths: integers `[N]`, the number of actions of each plan; None where all have L.
         action_names: A names, or None.
         context: what is known when actions are chosen, such as the agent's observations: indices (integers), one per
-            plan `[N]` or per step `[N, L]`; patterns (integers `[N, L, F]`): F indices at once per step, each below
-            2**31; or features (floating point) `[N, C]` or `[N, L, C]`; None for no context.
+            plan `[N]` or per step `[N, L]`; several per step, `[N, L, F]`, stored as int32: the patterns that are
+            active in each state; or features (floating point) `[N, C]` or `[N, L, C]`; None for no context.
         group: integers `[N]` (subject, session, world): the plans of a group are not independent, and never split
             between training and validation; None if each plan is independent.
         context_names: names of the context indices, numbered from 0, or None.
@@ -103,8 +103,9 @@ class Plans:
                 )
             object.__setattr__(self, "durations", durations.float().masked_fill(~self.mask(), 0))
         if self.context is not None:
-            object.__setattr__(self, "context", _tensor("context", self.context))
-            check_context(self.context, num, length)
+            context = _tensor("context", self.context)
+            check_context(context, num, length)
+            object.__setattr__(self, "context", context.to(torch.int32) if has_patterns(context) else context)
         for what in ("action", "context", "group", "condition"):
             if _check_texts(f"{what}_names", getattr(self, f"{what}_names")):
                 check_distinct(f"{what}_names", getattr(self, f"{what}_names"))
@@ -367,17 +368,18 @@ def action_dtype(num_actions: int) -> torch.dtype:
 
 
 def check_context(context: Tensor, num_plans: int, length: int) -> None:
-    """Raise ValueError unless `context` is integers `[N]`, `[N, L]`, `[N, L, F]` or finite features, see `Plans`."""
+    """Raise ValueError unless `context` is what `Plans.context` may be for `num_plans` plans of `length` actions."""
     shape = tuple(context.shape)
-    if is_integer(context) and len(shape) == 3:
+    if has_patterns(context):
         if shape[:2] != (num_plans, length):
-            raise ValueError(f"context: patterns of shape [{num_plans}, {length}, F] are expected, not {list(shape)}")
+            raise ValueError(f"context: patterns [{num_plans}, {length}, F] are expected, not {list(shape)}")
         check_patterns(context)
         return
     if is_integer(context):
         if shape not in ((num_plans,), (num_plans, length)):
             raise ValueError(
-                f"context: indices of shape [{num_plans}] or [{num_plans}, {length}] are expected, not {list(shape)}"
+                f"context: indices of shape [{num_plans}] or [{num_plans}, {length}], or patterns"
+                f" [{num_plans}, {length}, F], are expected, not {list(shape)}"
             )
         return
     if not context.is_floating_point():
@@ -391,11 +393,6 @@ def check_context(context: Tensor, num_plans: int, length: int) -> None:
         raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
 
 
-def check_patterns(patterns: Tensor) -> None:
-    """Raise ValueError unless all `patterns` are integers from 0 to 2**31 - 1."""
-    check_range("context", patterns, MOST_ACTIONS, "patterns")
-
-
 def durations_of(plans: Plans) -> Tensor:
     """The durations `[N, L]` of plans; ValueError where they have none."""
     if plans.durations is None:
@@ -406,8 +403,21 @@ def durations_of(plans: Plans) -> Tensor:
 
 
 def is_per_step(context: Tensor | None) -> bool:
-    """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan."""
-    return context is not None and (context.dim() == 3 or (context.dim() == 2 and is_integer(context)))
+    """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
+
+    The patterns `[N, F]` of one state each look like indices per step: who expects patterns asks before this.
+    """
+    return context is not None and (context.dim() == 3 or (is_integer(context) and context.dim() == 2))
+
+
+def has_patterns(context: Tensor | None) -> bool:
+    """True for the context of plans that is several indices per step, `[N, L, F]`."""
+    return context is not None and context.dim() == 3 and is_integer(context)
+
+
+def check_patterns(patterns: Tensor) -> None:
+    """Raise ValueError unless these are integers from 0 to 2**31 - 1."""
+    check_range("context", patterns, 2**31, "patterns")
 
 
 def _tensor(name: str, values: Any) -> Tensor:

@@ -7,12 +7,13 @@ from neuroprior.priors.fitting import fit
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
 from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
-from neuroprior.priors.patterns import LogLinearPrior, PatternCounts, PatternNetwork, PatternPrior
+from neuroprior.priors.patterns import BoardNetwork, LogLinearPrior, PatternCounts, PatternNetwork, PatternPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
 from neuroprior.priors.uniform import UniformPrior
 
 __all__ = [
+    "BoardNetwork",
     "CombinedPrior",
     "ContextTreePrior",
     "DurationLaw",

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from neuroprior._checks import check_memory, check_range, check_sizes, is_integer
-from neuroprior.plans import PastDurations, Plans, check_context, check_patterns, is_per_step
+from neuroprior.plans import PastDurations, Plans, check_context, check_patterns, has_patterns, is_per_step
 from neuroprior.sampling import ancestral as sampling
 from neuroprior.sampling.draws import after_end
 
@@ -23,14 +23,14 @@ class Prior(nn.Module, ABC):
     dimensions are up to the prior. The rows of one state have the same number of actions behind them.
 
     `context` is the observation that actions depend on: indices below `num_contexts`, features of size `context_size`,
-    or `num_patterns` indices at once, only one of these. It is given once per plan (`[N]`, `[N, C]`: that of the start)
-    or before each action (`[N, L]`, `[N, L, C]`); patterns always before each action (`[N, L, F]`).
+    or `num_patterns` active patterns; one of the three. It is given once per plan (`[N]`, `[N, C]`: that of the start)
+    or before each action (`[N, L]`, `[N, L, C]`); patterns always before each action, `[N, L, F]`.
 
     Args:
         num_actions: A.
         num_contexts: number of context indices, for a prior that takes an index.
         context_size: C, for a prior that takes features.
-        num_patterns: F, for a prior that takes so many indices at once, each from 0 to 2**31 - 1.
+        num_patterns: F, for a prior that takes the active patterns of each state: integers from 0 to 2**31 - 1.
 
     Attributes:
         context_per: "plan" or "step", as it was in the plans that the prior learned from ("step" before that); None
@@ -68,8 +68,10 @@ class Prior(nn.Module, ABC):
         required = {name: size for name, size in sizes.items() if size is not None or name == "num_actions"}
         check_sizes(**required)
         check_memory(4 * num_actions, num_actions=num_actions)  # one row of logits
-        if sum(size is not None for size in contexts.values()) > 1:
-            raise ValueError("num_contexts, context_size, num_patterns: a prior takes an index, features or patterns")
+        if num_contexts is not None and context_size is not None:
+            raise ValueError("num_contexts and context_size: a prior takes an index or features, not both")
+        if num_patterns is not None and (num_contexts is not None or context_size is not None):
+            raise ValueError("num_patterns: a prior takes patterns, an index or features, one of them")
         self.num_actions, self.num_contexts, self.context_size = num_actions, num_contexts, context_size
         self.num_patterns = num_patterns
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
@@ -82,7 +84,7 @@ class Prior(nn.Module, ABC):
     @property
     def takes_context(self) -> bool:
         """True for a prior whose predictions depend on a context."""
-        return any(size is not None for size in (self.num_contexts, self.context_size, self.num_patterns))
+        return not (self.num_contexts is None and self.context_size is None and self.num_patterns is None)
 
     def __repr__(self) -> str:
         """The class with its constructor's arguments; priors made of priors show these in the same way."""
@@ -142,7 +144,7 @@ class Prior(nn.Module, ABC):
 
         Args:
             batch_size: N.
-            context: `[N]` or `[N, C]`: that of the first action; None for a prior without context.
+            context: `[N]`, `[N, C]` or `[N, F]`: that of the first action; None for a prior without context.
 
         Returns:
             Logits `[N, A]` of the first action, and the state `[N, ...]`.
@@ -155,7 +157,7 @@ class Prior(nn.Module, ABC):
         Args:
             action: integers `[N]`.
             state: as `start` or `step` returned it.
-            context: `[N]` or `[N, C]`: that of the next action; None: the last one goes on.
+            context: `[N]`, `[N, C]` or `[N, F]`: that of the next action; None: the last one goes on.
 
         Returns:
             Logits `[N, A]` of the next action, and the next state.
@@ -322,17 +324,12 @@ class Prior(nn.Module, ABC):
         if not self.takes_context:
             raise ValueError("context: this prior takes none (make it with num_contexts= or context_size=)")
         if self.num_patterns is not None:
-            shape = (*context.shape[:-1], self.num_patterns)
-            if not is_integer(context) or context.dim() not in (2, 3) or tuple(context.shape) != shape:
-                raise ValueError(
-                    f"context: integers [..., {self.num_patterns}], the active patterns, are expected,"
-                    f" not {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
-                )
-            if not isinstance(plans, Plans):
-                check_patterns(context)
+            if isinstance(plans, Plans):
+                num_plans, length = plans.actions.shape
+            _check_patterns_of(context, self.num_patterns, num_plans, length, isinstance(plans, Plans) or length > 0)
             return
-        if is_integer(context) and context.dim() == 3:
-            raise ValueError("context: these plans have patterns, several indices a step, which this prior cannot take")
+        if has_patterns(context):
+            raise ValueError(f"context: patterns {list(context.shape)}, which this prior does not take")
         if not isinstance(plans, Plans):
             steps = context.shape[1] if is_per_step(context) else length
             check_context(context, num_plans, steps)
@@ -392,7 +389,7 @@ def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[st
 
 
 def context_arguments(*some: Plans) -> dict[str, int]:
-    """The constructor's arguments of a prior that takes the context of plans: `num_contexts`, `context_size` or none.
+    """The constructor's arguments for the context of plans: `num_contexts`, `context_size`, `num_patterns` or none.
 
     The number of contexts is that of their names, if these are more than occur.
     """
@@ -401,10 +398,23 @@ def context_arguments(*some: Plans) -> dict[str, int]:
         return {}
     if contexts[0].is_floating_point():
         return {"context_size": contexts[0].shape[-1]}
-    if contexts[0].dim() == 3:
+    if has_patterns(contexts[0]):
         return {"num_patterns": contexts[0].shape[-1]}
     most = max((int(context.max()) + 1 for context in contexts if context.numel()), default=1)
     return {"num_contexts": max(most, *(len(plans.context_names or ()) for plans in some))}
+
+
+def _check_patterns_of(context: Tensor, num_patterns: int, num_plans: int, length: int, plans: bool) -> None:
+    """Raise ValueError unless `context` is the patterns of plans, `[N, L, F]`, or else of one state each, `[N, F]`."""
+    shape = list(context.shape)
+    steps = max(shape[1], length) if context.dim() == 3 else length  # those of more steps may be known
+    fitting = [num_plans, steps, num_patterns] if plans or context.dim() == 3 else [num_plans, num_patterns]
+    if not is_integer(context) or shape != fitting:
+        raise ValueError(
+            f"context: {num_patterns} patterns (integers) of each state, {fitting}, are expected, not"
+            f" {str(context.dtype).removeprefix('torch.')} of shape {shape}"
+        )
+    check_patterns(context)
 
 
 def as_actions(plans: Any) -> Tensor:

@@ -21,7 +21,7 @@ from neuroprior.analysis import (
 )
 from neuroprior.analysis.comparison import too_few, unit_name
 from neuroprior.analysis.statistics import ENOUGH_UNITS
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans, has_patterns, is_per_step
 from neuroprior.priors import learn_macros
 from neuroprior.report import figures
 from neuroprior.report.conditions import condition_section
@@ -96,6 +96,7 @@ def describe(plans: Plans) -> dict[str, Any]:
     context = "none"
     if plans.context is not None:
         kind = "features" if plans.context.is_floating_point() else f"{_num_contexts(plans)} contexts"
+        kind = "patterns" if has_patterns(plans.context) else kind
         context = f"{kind}, {'at each step' if is_per_step(plans.context) else 'once a plan'}"
     return {
         "plans": len(plans),

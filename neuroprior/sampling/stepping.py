@@ -103,8 +103,7 @@ class Stepper:
         """
         check_in_world(self._prior, world, state)
         context = None if self.context_per is None else world.observe(state)
-        patterns = getattr(self._prior, "num_patterns", None) is not None
-        if context is not None and is_per_step(context) and not patterns:
+        if context is not None and is_per_step(context) and getattr(self._prior, "num_patterns", None) is None:
             raise ValueError(
                 f"observe: indices [N] or features [N, C] are expected, not {context.dtype} {list(context.shape)}"
             )

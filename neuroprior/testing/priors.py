@@ -36,8 +36,7 @@ def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000
         length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)
     generator = torch.Generator().manual_seed(seed)
     window = getattr(prior, "window", None) or 0
-    kinds = ("step",) if prior.num_patterns is not None else ("plan", "step") if prior.takes_context else (None,)
-    for kind in kinds:
+    for kind in _kinds(prior):
         for steps in (1, length, window + 3):
             plans = torch.randint(actions, (7, steps), generator=generator).to(prior.device)
             context = _random_context(prior, kind, 7, steps, generator)
@@ -51,6 +50,11 @@ def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000
     _check_copies(prior, length, generator)
 
 
+def _kinds(prior: Prior) -> tuple[str | None, ...]:
+    """What the prior may get a context for: patterns are those of a state, so there are none for a whole plan."""
+    return ("step",) if prior.num_patterns is not None else ("plan", "step") if prior.takes_context else (None,)
+
+
 def _random_context(prior: Prior, kind: str | None, num: int, length: int, generator: torch.Generator) -> Tensor | None:
     """A random context of the kind that the prior takes, one a plan or one a step."""
     shape = (num,) if kind == "plan" else (num, length)
@@ -59,7 +63,9 @@ def _random_context(prior: Prior, kind: str | None, num: int, length: int, gener
     if prior.num_contexts is not None:
         return torch.randint(prior.num_contexts, shape, generator=generator).to(prior.device)
     if prior.num_patterns is not None:
-        return torch.randint(9, (*shape, prior.num_patterns), generator=generator, dtype=torch.int32).to(prior.device)
+        # Low numbers, which a prior may have learned, and ones that it never saw.
+        codes = torch.randint(8, (*shape, prior.num_patterns), generator=generator, dtype=torch.int32)
+        return torch.where(codes == 7, 2**31 - 1, codes).to(torch.int32).to(prior.device)
     return torch.randn(*shape, prior.context_size or 0, generator=generator).to(prior.device)
 
 
@@ -161,7 +167,7 @@ def _check_seeds(prior: Prior, kind: str | None, length: int, generator: torch.G
 @torch.no_grad()
 def _check_copies(prior: Prior, length: int, generator: torch.Generator) -> None:
     """A saved and loaded copy, and one on the GPU where there is one, say the same."""
-    context = _random_context(prior, "plan" if prior.takes_context else None, 64, length, generator)
+    context = _random_context(prior, _kinds(prior)[0], 64, length, generator)
     plans = torch.randint(prior.num_actions, (64, length), generator=generator).to(prior.device)
     want = prior.log_prob(Plans(plans, prior.num_actions, context=context)).cpu()
     with tempfile.TemporaryDirectory() as folder:

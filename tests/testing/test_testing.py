@@ -21,7 +21,7 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-from neuroprior.priors import SemiMarkovPrior
+from neuroprior.priors import BoardNetwork, LogLinearPrior, PatternCounts, PatternNetwork, SemiMarkovPrior
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
 from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze, sliding_tiles, sokoban
@@ -37,6 +37,10 @@ def random_plans(num_actions: int, context: Tensor | None = None, length: int = 
 
 def index_context(*shape: int) -> Tensor:
     return torch.randint(3, shape, generator=torch.Generator().manual_seed(4))
+
+
+def pattern_context(*shape: int) -> Tensor:
+    return torch.randint(6, (*shape, 2), generator=torch.Generator().manual_seed(5), dtype=torch.int32)
 
 
 PRIORS = {
@@ -61,6 +65,16 @@ PRIORS = {
     "context tree, context a plan": lambda: ContextTreePrior(3, num_contexts=4).fit(random_plans(3, index_context(60))),
     "context tree, context a step": lambda: ContextTreePrior(3, 0, num_contexts=4).fit(
         random_plans(3, index_context(60, 5))
+    ),
+    "log-linear untrained": lambda: LogLinearPrior(4, 2),
+    "log-linear": lambda: LogLinearPrior(3, 2).fit(random_plans(3, pattern_context(60, 5))),
+    "counts of patterns, product": lambda: PatternCounts(3, 2).fit(random_plans(3, pattern_context(60, 5))),
+    "counts of patterns, back-off": lambda: PatternCounts(3, 2, combine="backoff").fit(
+        random_plans(3, pattern_context(60, 5))
+    ),
+    "network of patterns": lambda: PatternNetwork(3, 2, depth=2).fit(random_plans(3, pattern_context(60, 5))),
+    "network of a board": lambda: BoardNetwork(3, (2, 2, 3), 4, 1).fit(
+        random_plans(3, torch.rand(60, 5, 12, generator=torch.Generator().manual_seed(6))), epochs=2
     ),
     "gru untrained": lambda: GRUPrior(4),
     "gru": lambda: GRUPrior(4).fit(random_plans(4, length=3), progress=False, max_steps=20),

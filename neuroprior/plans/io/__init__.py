@@ -11,7 +11,7 @@ from neuroprior.plans.io.jsonl import read_jsonl, write_jsonl
 from neuroprior.plans.io.minari import read_minari, write_minari
 from neuroprior.plans.io.npz import read_npz, write_npz
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
-from neuroprior.plans.plans import Plans, check_are_plans
+from neuroprior.plans.plans import Plans, check_are_plans, has_patterns
 from neuroprior.plans.tables import Columns, Missing
 
 __all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
@@ -126,6 +126,8 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
     if not len(plans):
         raise ValueError(f"{place}: no plans to write")
     context = plans.context
+    if suffix != ".npz" and context is not None and has_patterns(context):
+        raise ValueError(f"{place}: patterns {list(context.shape)} are written to .npz files only")
     if suffix != ".npz" and context is not None and context.is_floating_point():
         if not context.shape[-1]:
             raise ValueError(f"{place}: a context of no features; use None")

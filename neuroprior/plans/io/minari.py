@@ -125,6 +125,8 @@ def _context_of_steps(plans: Plans) -> tuple[torch.Tensor, Any]:
     if context.is_floating_point():
         context = context.float()
         return context, spaces.Box(-np.inf, np.inf, (context.shape[-1],), np.float32)
+    if context.dim() == 3:
+        raise ValueError(f"context: patterns {list(context.shape)} are written to .npz files only")
     count = len(plans.context_names) if plans.context_names is not None else int(context.max()) + 1
     return context, spaces.Discrete(count)
 

@@ -15,7 +15,7 @@ ONE = 1.0
 
 
 @njit(cache=True, nogil=True)
-def place(codes: Array, code: int) -> int:
+def place(codes: Array, code: Any) -> Any:
     """Where `code` stands in a hash table of `codes` (as many as a power of 2; -1: free), or the free place for it."""
     mask = np.uint64(len(codes) - 1)
     at = ((np.uint64(code) * np.uint64(MIXER)) >> np.uint64(32)) & mask
@@ -98,6 +98,7 @@ def epoch(
     rows: Array,
     last: Array,
     action: Array,
+    counts: Array,
     weights: Array,
     after: Array,
     embeddings: Array,
@@ -108,7 +109,8 @@ def epoch(
     rate: float,
     l2: float,
     learn: bool,
-) -> float:
+    losses: Array,
+) -> None:
     """One pass over steps by Adagrad, one step after the other; all parameters are changed in place.
 
     Args:
@@ -116,6 +118,7 @@ def epoch(
         rows: int32 `[M, F]`: the rows of the active patterns; the last row of the tables is for unknown ones.
         last: int `[M]`: the row of `after` for the actions before.
         action: int `[M]`: the action that was chosen.
+        counts: float32 `[M]`: how much each step counts.
         weights: float32 `[V + 1, A]`: what each pattern adds to the logits; its last row stays 0.
         after: float32 `[., A]`: what the last actions add.
         embeddings: float32 `[V + 1, E]`: E = 0: no network.
@@ -123,16 +126,14 @@ def epoch(
         squares: sums of squared gradients of these six; of embeddings `[V + 1]`, one number a row.
         rate, l2: learning rate, and the penalty of weights and embeddings.
         learn: False: nothing is changed.
-
-    Returns:
-        The mean log-loss of the steps, each before it was learned from; nats.
+        losses: float64 `[M]`: gets the log-loss of each of these steps, nats, before it was learned from.
     """
     unknown, actions, size, depth = len(weights) - 1, weights.shape[1], embeddings.shape[1], len(layers)
     logits, errors = np.empty(actions), np.empty(actions, dtype=np.float32)
     hidden = np.empty((depth + 1, size), dtype=np.float32)
     back, further = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
     w2, a2, e2, l_2, b2, o2 = squares
-    loss, step, decay = 0.0, np.float32(rate), np.float32(l2)
+    step, decay = np.float32(rate), np.float32(l2)
     for i in order:
         for a in range(actions):
             logits[a] = after[last[i], a]
@@ -157,11 +158,11 @@ def epoch(
         for a in range(actions):
             total += np.exp(logits[a] - top)
         chosen = action[i]
-        loss += top + np.log(total) - logits[chosen]
+        losses[i] = top + np.log(total) - logits[chosen]
         if not learn:
             continue
         for a in range(actions):
-            errors[a] = np.exp(logits[a] - top) / total - (1.0 if a == chosen else 0.0)
+            errors[a] = counts[i] * (np.exp(logits[a] - top) / total - (1.0 if a == chosen else 0.0))
         back[:] = 0
         for a in range(actions):
             g = errors[a]
@@ -202,4 +203,3 @@ def epoch(
                     scale = step / np.sqrt(e2[row])
                     for e in range(size):
                         embeddings[row, e] -= scale * (back[e] + decay * embeddings[row, e])
-    return loss / max(len(order), 1)

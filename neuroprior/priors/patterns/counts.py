@@ -60,6 +60,7 @@ class PatternCounts(PatternPrior):
     def fit_steps(self, steps: Steps, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Count anew; returns self. Nothing is drawn, and there are no settings."""
         self.check_settings(settings)
+        steps.check(self.num_actions, self.num_patterns or 0)
         if self.combine == "backoff":
             return self._count(steps, 1.0)
         every = torch.arange(len(steps.action))

@@ -1,6 +1,6 @@
 """Log-linear weights of patterns, and a small network on the same patterns."""
 
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
@@ -26,9 +26,9 @@ class LogLinearPrior(PatternPrior):
 
     @property
     def fit_settings(self) -> tuple[str, ...]:
-        return ("epochs", "learning_rate", "l2")
+        return ("epochs", "learning_rate", "l2", "loss")
 
-    def fit_steps(
+    def fit_steps(  # type: ignore[override]
         self,
         steps: Steps,
         *,
@@ -36,7 +36,7 @@ class LogLinearPrior(PatternPrior):
         epochs: int = 4,
         learning_rate: float = 0.2,
         l2: float = 1e-4,
-        **settings: Any,
+        loss: Literal["log", "levin"] = "log",
     ) -> Self:
         """Learn from steps; returns self.
 
@@ -46,14 +46,19 @@ class LogLinearPrior(PatternPrior):
             epochs: passes over the steps.
             learning_rate: of Adagrad.
             l2: penalty of the weights, in each step of learning.
+            loss: "log": the log-loss. "levin": the logarithm of the sum of d / pi over plans, d the actions of a plan
+                and 1, pi their probability, which bounds the expansions of Levin tree search: in each pass plans count
+                in proportion to their d / pi before it. Learn by log-loss first.
 
         Raises:
             ValueError: a setting is out of range, or numba is not installed.
         """
-        self.check_settings(settings)
         check_sizes(epochs=epochs)
         if not learning_rate > 0 or not l2 >= 0:
             raise ValueError(f"learning_rate, l2: above 0 and at least 0 are expected, not {learning_rate} and {l2}")
+        if loss not in ("log", "levin"):
+            raise ValueError(f'loss: "log" or "levin" is expected, not {loss!r}')
+        steps.check(self.num_actions, self.num_patterns or 0)
         loops = compiled_fit()
         random = np.random.default_rng(draw_seed(generator_on(generator, torch.device("cpu"))))
         patterns = steps.patterns.cpu().numpy()
@@ -62,9 +67,15 @@ class LogLinearPrior(PatternPrior):
         rows = loops.numbered(vocabulary, patterns)
         last = steps.last.cpu().numpy() if self.use_last else np.full(len(patterns), self.num_actions)
         squares = tuple(np.full(t.shape[:1] if k == 2 else t.shape, ADAGRAD, np.float32) for k, t in enumerate(tables))
-        action = steps.action.cpu().numpy()
+        action, plan = steps.action.cpu().numpy(), steps.plan.cpu().numpy()
+        counts, losses = np.ones(len(action), np.float32), np.zeros(len(action))
         for _ in range(epochs):
-            loops.epoch(random.permutation(len(action)), rows, last, action, *tables, squares, learning_rate, l2, True)
+            if loss == "levin":
+                every = np.arange(len(action))
+                loops.epoch(every, rows, last, action, counts, *tables, squares, learning_rate, l2, False, losses)
+                counts = _levin_weights(losses, plan)
+            order = random.permutation(len(action))
+            loops.epoch(order, rows, last, action, counts, *tables, squares, learning_rate, l2, True, losses)
         self._take(vocabulary, tables)
         return self
 
@@ -155,6 +166,14 @@ class PatternNetwork(LogLinearPrior):
 
     def tables_fit(self) -> bool:
         return super().tables_fit() and self.embeddings.shape == (len(self.patterns) + 1, self.size)
+
+
+def _levin_weights(losses: Any, plan: Any) -> Any:
+    """How much the steps `[M]` count: d / pi of their plan, over its mean; float32."""
+    _, number, sizes = np.unique(plan, return_inverse=True, return_counts=True)
+    cost = np.log(sizes + 1.0) + np.bincount(number, losses)
+    share = np.exp(cost - cost.max())
+    return (share / share.mean())[number].astype(np.float32)
 
 
 def _array(values: Tensor) -> Any:

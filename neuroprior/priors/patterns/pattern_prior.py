@@ -6,8 +6,8 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
-from neuroprior.plans import Plans
+from neuroprior._checks import check_range, check_sizes
+from neuroprior.plans import Plans, check_patterns
 from neuroprior.priors.prior import Prior
 
 AT_ONCE = 2**22
@@ -21,19 +21,35 @@ class Steps(NamedTuple):
         patterns: int32 `[M, F]`: what was active before each action.
         last: int64 `[M]`: the action before, or A for the first of a plan.
         action: int64 `[M]`: the action that was chosen.
+        plan: int64 `[M]`: the number of each step's plan; the steps of a plan follow one another.
     """
 
     patterns: Tensor
     last: Tensor
     action: Tensor
+    plan: Tensor
 
     @classmethod
     def of(cls, plans: Plans) -> "Steps":
         """The steps of plans with a context of patterns, plan after plan."""
         assert plans.context is not None
         mask, actions = plans.mask(), plans.actions.long()
-        last = torch.nn.functional.pad(actions, (1, -1), value=plans.num_actions)
-        return cls(plans.context[mask].to(torch.int32), last[mask], actions[mask])
+        last = torch.nn.functional.pad(actions, (1, 0), value=plans.num_actions)[:, :-1]
+        plan = torch.arange(len(plans), device=mask.device)[:, None].expand_as(mask)
+        return cls(plans.context[mask].to(torch.int32), last[mask], actions[mask], plan[mask])
+
+    def check(self, num_actions: int, num_patterns: int) -> None:
+        """Raise ValueError unless these are steps of a prior with so many actions and patterns."""
+        steps = len(self.action)
+        if tuple(self.patterns.shape) != (steps, num_patterns):
+            raise ValueError(f"patterns: shape {[steps, num_patterns]} is expected, not {list(self.patterns.shape)}")
+        check_patterns(self.patterns)
+        for name, values, most in (("last", self.last, num_actions + 1), ("action", self.action, num_actions)):
+            if tuple(values.shape) != (steps,):
+                raise ValueError(f"{name}: shape [{steps}] is expected, not {list(values.shape)}")
+            check_range(name, values, most, "actions")
+        if steps == 0:
+            raise ValueError("plans: they have no actions to learn from")
 
 
 class PatternPrior(Prior):
@@ -88,11 +104,9 @@ class PatternPrior(Prior):
         Raises:
             ValueError: plans without such a context, or without any action, or an unknown setting.
         """
+        self.check_settings(settings)
         plans = self.training_plans(plans)
-        steps = Steps.of(plans)
-        if len(steps.action) == 0:
-            raise ValueError("plans: there is no action to learn from")
-        return self.fit_steps(steps, generator=generator, **settings)
+        return self.fit_steps(Steps.of(plans), generator=generator, **settings)
 
     def rows(self, patterns: Tensor) -> Tensor:
         """The row of each of `patterns [...]` in the tables, int64; V for those that are not in the vocabulary."""
@@ -127,11 +141,11 @@ class PatternPrior(Prior):
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         num, length = plans.shape
-        if context is None:
-            raise ValueError("context: this prior takes a context, and none was given")
+        if context is None or context.dim() != 3:
+            raise ValueError("context: this prior takes patterns [N, L, F]")
         scores = self.scores(context[:, :length].reshape(num * length, -1)) if num * length else self.weights[:0]
-        last = torch.nn.functional.pad(plans.long(), (1, -1), value=self.num_actions)
-        return self._logits(scores, last.flatten()).view(num, length, self.num_actions)
+        last = torch.nn.functional.pad(plans.long(), (1, 0), value=self.num_actions)[:, :length]
+        return self._logits(scores, last.reshape(-1)).view(num, length, self.num_actions)
 
     def set_tables(self, **tables: Any) -> None:
         """Take over tables, by name, numpy arrays or tensors; `weights` get a last row of zeros."""

@@ -1,0 +1,66 @@
+"""Networks on patterns and on boards."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuroprior import Plans
+from neuroprior.priors import BoardNetwork, LogLinearPrior, PatternNetwork, load, save
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def exclusive_or() -> Plans:
+    """The action is the exclusive or of two bits, which no sum of rows gives."""
+    bits = torch.randint(2, (100, 10, 2), generator=seeded(), dtype=torch.int32)
+    return Plans((bits[..., 0] ^ bits[..., 1]).long(), 2, context=bits + torch.tensor([0, 2], dtype=torch.int32))
+
+
+def test_the_network_learns_what_sums_cannot() -> None:
+    plans = exclusive_or()
+    network = PatternNetwork(2, 2).fit(plans, generator=seeded(1), epochs=30)
+    linear = LogLinearPrior(2, 2).fit(plans, generator=seeded(1))
+    assert float(linear.log_prob(plans).mean()) < -6.5  # ten bits are 6.9 nats
+    assert float(network.log_prob(plans).mean()) > -1
+    assert network.embeddings.shape == (5, 16)
+    assert not network.embeddings[-1].any()
+    assert network.layers.shape == (1, 16, 16)
+    assert network.out.shape == (2, 16)
+
+
+def test_the_same_seed_gives_the_same_network() -> None:
+    first, second = (PatternNetwork(2, 2).fit(exclusive_or(), generator=seeded(1)) for _ in range(2))
+    assert first.out.equal(second.out)
+    assert first.out.any()
+
+
+def boards() -> Plans:
+    """The action is the quarter of a 4x4 board in which the one piece stands."""
+    place = torch.randint(16, (60, 8), generator=seeded())
+    quarter = place // 8 * 2 + place % 4 // 2
+    return Plans(quarter, 4, context=torch.eye(16)[place])
+
+
+def test_a_network_learns_from_boards(tmp_path: Path) -> None:
+    plans = boards()
+    network = BoardNetwork(4, (1, 4, 4), 8, 1).fit(plans, generator=seeded(), epochs=20, batch_size=32)
+    assert float(network.log_prob(plans).detach().mean()) > -0.8  # chance: -11
+    copy = load(save(network, tmp_path))
+    assert copy.config == {"num_actions": 4, "board": [1, 4, 4], "channels": 8, "depth": 1}
+    assert copy.log_prob(plans).equal(network.log_prob(plans))
+    again = BoardNetwork(4, (1, 4, 4), 8, 1).fit(plans, generator=seeded(), epochs=20, batch_size=32)
+    assert again.out.equal(network.out)
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(ValueError, match="board"):
+        BoardNetwork(4, (4, 4))
+    with pytest.raises(ValueError, match="height"):
+        BoardNetwork(4, (1, 0, 4))
+    with pytest.raises(ValueError, match="size 12"):
+        BoardNetwork(4, (3, 2, 2)).fit(boards())
+    with pytest.raises(ValueError, match="learning_rate"):
+        PatternNetwork(2, 2).fit(exclusive_or(), learning_rate=0.0)
