@@ -88,8 +88,13 @@ def puzzles(
     of_test = None if num_test is None else int(num_test)
     settings = Settings(world=world, train=files[0], test=files[1], num_test=of_test, guided=guided, **numbers)
     both = problems_of(settings)
-    asked = asdict(settings) | {"digests": [sha256(Path(file).read_bytes()).hexdigest() for file in files]}
-    first = JobRun(partial(bootstrapped, settings), Path(out) / "bootstrap", asked, name="seed-{}".format)
+    digests = [sha256(Path(file).read_bytes()).hexdigest() for file in files]
+    asked = asdict(settings) | {"digests": digests}
+    of_training = {
+        name: value for name, value in asked.items() if name not in ("test", "num_test", "budget", "digests")
+    }
+    of_training["digest"] = digests[0]
+    first = JobRun(partial(bootstrapped, settings), Path(out) / "bootstrap", of_training, name="seed-{}".format)
     first.run = partial(bootstrapped, settings, first.folder)
     needed = any(prior not in SEARCHES for prior in priors)
     sweeps_of = first.do(list(range(seeds if needed else 0)), processes=processes, title="solve and learn")
@@ -199,16 +204,15 @@ def _table(rows: pd.DataFrame, title: str, settings: Settings) -> Table:
         "prior": "prior",
         "problems": "problems:,",
         "solved, %": lambda row: f"{100 * row.solved:.1f}",
-        "mean expansions": "mean_expansions:,.0f",
+        "expansions": "mean_expansions:,.0f",
         "median": "median_expansions:,.0f",
-        "of solved": "mean_expansions_solved:,.0f",
         "moves": "mean_length:.1f",
     }
     if "seconds_per_problem" in rows:
         columns["ms a problem"] = lambda row: f"{1000 * row.seconds_per_problem:.1f}"
     searched = "Levin tree search with a heuristic (PHS*)" if settings.guided else "Levin tree search"
     caption = (
-        f"{searched}, at most {settings.budget:,} expansions a problem. Mean and median expansions: of all problems,"
+        f"{searched}, at most {settings.budget:,} expansions a problem. Expansions (mean and median): of all problems,"
         " those that are not solved with what was spent. Means over seeds; one core."
     )
     return table(rows, columns, caption, title)
@@ -229,18 +233,18 @@ def _pair_table(pairs: pd.DataFrame) -> Table:
 
 def _sweep_table(sweeps: pd.DataFrame) -> Table:
     columns: dict[str, Any] = {
-        "seed": "seed",
-        "sweep": "number",
-        "problems": "problems:,",
-        "budget": "max_nodes:,",
+        "seed": "seed:.0f",
+        "sweep": "number:.0f",
+        "problems": "problems:,.0f",
+        "budget": "max_nodes:,.0f",
         "solved, %": lambda row: f"{100 * row.solved:.1f}",
-        "mean expansions": "mean_expansions:,.0f",
-        "solutions": "solutions:,",
-        "learned from, actions": "actions:,",
-        "search, s": "search_seconds:.1f",
-        "fit, s": "fit_seconds:.1f",
+        "expansions": "mean_expansions:,.0f",
+        "actions": "actions:,.0f",
+        "search, s": "search_seconds:.0f",
+        "fit, s": "fit_seconds:.0f",
     }
-    return table(sweeps, columns, "Actions with those of reflected and rotated solutions.", "Solve and learn")
+    caption = "Expansions: mean over the problems tried. Actions: learned from, with reflections and rotations."
+    return table(sweeps, columns, caption, "Solve and learn")
 
 
 def _write_solutions(found: Sequence[dict[str, Any]], test: Problems, out: Path) -> None:

@@ -27,7 +27,7 @@ MORE = 4
 """So many times as many problems, then."""
 
 NEW = 0.25
-"""Where less than this share of the solutions is new, and no further problems are tried, the budget doubles."""
+"""Where less than this share of the solutions is new, the budget doubles."""
 
 
 class Sweep(NamedTuple):
@@ -73,9 +73,8 @@ def bootstrap(
     """Solve problems with a prior, fit it to the solutions, and again (Arfaee, Zilles and Holte, *Learning heuristic
     functions for large state spaces*, 2011; with a prior Orseau and Lelis, AAAI 2021).
 
-    The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried;
-    else, or when there are no more, the budget doubles if fewer than a quarter of the solutions are new. Each problem's
-    latest solution counts. In puzzles the prior learns from reflections and rotations of them, too.
+    The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried. The
+    budget doubles then, and when fewer than a quarter of the solutions are new. Each problem's latest solution counts. In puzzles the prior learns from reflections and rotations of them, too.
 
     Args:
         world: with goals; see `LevinPlanner`.
@@ -152,7 +151,7 @@ class _Bootstrap:
             more = sweep.solved >= ENOUGH and tried < len(self.problems)
             if more:
                 tried = min(MORE * tried, len(self.problems))
-            elif gained < NEW * sweep.solutions:
+            if more or gained < NEW * sweep.solutions:
                 budget *= 2
         return tried, budget
 
