@@ -377,7 +377,7 @@ def search(
             _patterns(board, cells, mover, padded, rows, codes)
             _log_probs(tables, codes, edge % actions if edge >= 0 else actions, hidden, more, own[node])
         else:
-            own[node] = 0.0
+            own[node] = -np.log(float(actions))
         for action in range(actions):
             if not _can(board.puzzle, cells, board.width, mover, action):
                 continue

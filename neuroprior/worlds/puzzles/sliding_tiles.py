@@ -229,7 +229,7 @@ def sliding_tiles(
 
 def _check_permutations(name: str, boards: Tensor) -> None:
     """Raise ValueError unless each of `boards [n, H, W]` holds each tile once."""
-    cells = boards[0].numel() if len(boards) else 0
+    cells = boards.shape[1:].numel()
     if not is_integer(boards):
         raise ValueError(f"{name}: integers are expected, not {str(boards.dtype).removeprefix('torch.')}")
     wrong = (boards.flatten(1).long().sort(1).values != torch.arange(cells, device=boards.device)).any(1).nonzero()

@@ -1,0 +1,98 @@
+"""`python -m eval puzzles`, small."""
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+import torch
+
+from eval.__main__ import main
+from eval.puzzles.contest import LETTERS
+from neuroprior.worlds import sliding_tiles, sokoban
+
+pytestmark = pytest.mark.usefixtures("undrawn")
+
+EASY = ["#######\n#@ $ .#\n#######", "#######\n#.$  @#\n#######"]
+
+
+def level_file(path: Path) -> str:
+    """Corridors and rooms with one box, which 300 expansions solve."""
+    levels = [f"########\n#{' ' * k}@ $ .#\n#{' ' * (6)}#\n########" for k in range(2)] + EASY
+    path.write_text("\n\n".join(levels * 5) + "\n")
+    return str(path)
+
+
+def test_sokoban_from_files_to_solutions(tmp_path, capsys):
+    train = level_file(tmp_path / "train.txt")
+    out, test = tmp_path / "out", tmp_path / "test.txt"
+    test.write_text("########\n#@ $ . #\n########\n########\n\n########\n#.$   @#\n########\n########\n")
+    arguments = [
+        *("puzzles", "--train", train, "--num-train", "20", "--test", str(test), "--budget", "500", "--sweeps", "2"),
+        *("--priors", "bootstrap", "log-linear", "markov", "uniform", "greedy", "--processes", "1", "--out", str(out)),
+    ]
+    assert main(arguments) == 0
+    found = json.loads((out / "results.json").read_text())
+    rows = {row["prior"]: row for row in found["rows"]}
+    assert set(rows) == {"bootstrap", "log-linear", "markov", "uniform", "greedy"}
+    assert all(row["problems"] == 2 and row["solved"] == 1 for row in rows.values())
+    assert rows["bootstrap"]["mean_expansions"] < rows["uniform"]["mean_expansions"]
+    assert all(row["seconds_per_problem"] > 0 and row["median_expansions"] >= 1 for row in rows.values())
+    boards = sokoban(test).boards
+    lines = [json.loads(line) for line in (out / "solutions.jsonl").read_text().splitlines()]
+    assert len(lines) == 5 * 2
+    world = sokoban(test)
+    for line in lines:
+        state = boards[line["problem"]][None]
+        for letter in line["moves"]:
+            state, _ = world.step(state, torch.tensor([LETTERS.index(letter)]))
+        assert world.solved(state).all()
+    by_prior = [line["expansions"] for line in lines if line["prior"] == "uniform"]
+    assert sum(by_prior) / 2 == rows["uniform"]["mean_expansions"]
+    assert ElementTree.fromstring((out / "solution.svg").read_text()).tag.endswith("svg")
+    assert "Solve and learn" in capsys.readouterr().out
+    kept = {path: path.stat().st_mtime_ns for path in out.rglob("*-0.json")}
+    assert kept
+    assert main(arguments) == 0
+    assert kept == {path: path.stat().st_mtime_ns for path in out.rglob("*-0.json")}
+
+
+def test_tiles_with_two_seeds(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    boards = sliding_tiles(shape=(3, 3), scramble=30).reset(30, generator)
+    for name, some in (("train", boards[:20]), ("test", boards[20:])):
+        text = "\n".join(" ".join(map(str, board)) for board in some.flatten(1).tolist())
+        (tmp_path / name).write_text(text)
+    out = tmp_path / "out"
+    arguments = [
+        *("puzzles", "--world", "tiles", "--train", str(tmp_path / "train"), "--num-train", "20", "--sweeps", "2"),
+        *("--test", str(tmp_path / "test"), "--num-test", "8", "--budget", "1000", "--seeds", "2"),
+        *("--priors", "bootstrap", "log-linear", "a-star", "--processes", "1", "--out", str(out)),
+    ]
+    assert main(arguments) == 0
+    found = json.loads((out / "results.json").read_text())
+    rows = {row["prior"]: row for row in found["rows"]}
+    assert {prior: row["seeds"] for prior, row in rows.items()} == {"bootstrap": 2, "log-linear": 2, "a-star": 1}
+    assert rows["bootstrap"]["solved"] == 1.0
+    # A* finds the shortest solutions.
+    assert rows["bootstrap"]["mean_length"] >= rows["a-star"]["mean_length"]
+    assert {(row["seed"], row["number"]) for row in found["sweeps"]} == {(0, 1), (0, 2), (1, 1), (1, 2)}
+    assert {row["prior"] for row in found["pairs"]} == {"bootstrap", "a-star"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--train", "nowhere.txt"], "nowhere.txt"),
+        (["--world", "chess"], "world"),
+        (["--priors", "guess"], "guess"),
+        (["--priors", "uniform", "uniform"], "uniform"),
+        (["--budget", "0"], "budget"),
+        (["--world", "tiles", "--test", "eval/data/boxoban/test.txt.xz"], "test.txt.xz"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, capsys, tmp_path):
+    assert main(["puzzles", *arguments, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error

@@ -1,0 +1,227 @@
+"""Best-first search: against a plain search with a heap, in puzzles against the compiled loop, and its bound."""
+
+import heapq
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, UniformPrior
+from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
+from neuroprior.priors import LogLinearPrior, PatternCounts, PatternNetwork, Prior
+from neuroprior.worlds import World, cube, gridworld, sliding_tiles, sokoban
+from tests.worlds.test_sokoban import LEVELS
+
+
+class Goal(TabularWorld):
+    """A table whose last cell is the goal."""
+
+    has_goal = True
+
+    def solved(self, state: Tensor) -> Tensor:
+        return state == self.num_states - 1
+
+
+def random_table(seed: int, states: int = 200) -> Goal:
+    """Three actions, of which the first is always legal."""
+    generator = torch.Generator().manual_seed(seed)
+    table = torch.randint(states, (states, 3), generator=generator)
+    legal = (torch.rand(states, 3, generator=generator) < 0.7) | (torch.arange(3) == 0)
+    return Goal(table, torch.rand(states, generator=generator), legal)
+
+
+def far(state: Tensor) -> Tensor:
+    """Some heuristic of cells."""
+    return (state * 7 % 11).double()
+
+
+def levin(depth: int, log_prob: float, left: float) -> float:
+    return math.log(depth + 1 + left) - (1 + left / (depth + 1)) * log_prob
+
+
+def plain(
+    world: World, prior: Prior, start: Tensor, budget: int, cost: Callable[..., float], heuristic: Any
+) -> tuple[int, list[int] | None, float]:
+    """Expansions, the plan that reaches the goal (None: none does) and its log(d / pi)."""
+    if bool(world.solved(start[None])[0]):
+        return 0, [], 0.0
+    seen, queue, nodes = {int(start)}, list[tuple[float, int]](), list[Any]()
+
+    def expand(state: Tensor, logits: Tensor, hidden: Tensor, log_prob: float, path: list[int]) -> None:
+        own = torch.log_softmax(logits.double(), -1)[0].tolist()
+        for action in range(world.num_actions):
+            if bool(world.legal_actions(state)[0, action]):
+                reached = world.step(state, torch.tensor([action]))[0]
+                left = 0.0 if heuristic is None else float(heuristic(reached))
+                key = cost(len(path) + 1, log_prob + own[action], left)
+                heapq.heappush(queue, (key, len(nodes) * world.num_actions + action))
+        nodes.append((state, hidden, [log_prob + one for one in own], path))
+
+    expand(start[None], *prior.start(1), 0.0, [])
+    while queue and len(nodes) < budget:
+        number, action = divmod(heapq.heappop(queue)[1], world.num_actions)
+        state, hidden, log_probs, path = nodes[number]
+        reached = world.step(state, torch.tensor([action]))[0]
+        if int(reached) in seen:
+            continue
+        seen.add(int(reached))
+        path = [*path, action]
+        if bool(world.solved(reached)[0]):
+            return len(nodes), path, math.log(len(path) + 1) - log_probs[action]
+        expand(reached, *prior.step(torch.tensor([action]), hidden), log_probs[action], path)
+    return len(nodes), None, math.inf
+
+
+@pytest.mark.parametrize("heuristic", [None, far], ids=["blind", "informed"])
+@pytest.mark.parametrize("kind", ["levin", "additive"])
+def test_searches_are_those_of_a_heap(kind: str, heuristic: Any) -> None:
+    prior: Prior = MarkovPrior(3, 2).fit(torch.randint(3, (30, 5), generator=torch.Generator().manual_seed(0)))
+    if kind == "additive":
+        prior = UniformPrior(3)
+    for seed in range(3):
+        world = random_table(seed)
+        state = torch.randint(200, (12,), generator=torch.Generator().manual_seed(seed))
+        state[0] = 199  # solved already
+        for budget in (1, 30, 400):
+            if kind == "levin":
+                planner, cost = LevinPlanner(prior, budget, heuristic=heuristic), levin
+            else:
+                planner, cost = AStarPlanner(heuristic, 2.0, budget), lambda depth, _, left: depth + 2 * left
+            found = planner.search(world, state)
+            for n, start in enumerate(state):
+                expansions, plan, bound = plain(world, prior, start, budget, cost, heuristic)
+                assert int(found.expansions[n]) == expansions
+                assert bool(found.solved[n]) == (plan is not None)
+                assert float(found.log_bound[n]) == pytest.approx(bound)
+                if plan is not None:
+                    assert found.plan[n, : int(found.lengths[n])].tolist() == plan
+
+
+def check_found(world: World, state: Tensor, found: Search) -> None:
+    """Plans lead where the search says, and gain what it says."""
+    now, score = state.clone(), torch.zeros(len(state), dtype=torch.float64)
+    for t in range(found.plan.shape[1]):
+        on = found.lengths > t
+        now[on], reward = world.step(now[on], found.plan[on, t].long())
+        score[on] += reward.double()
+    assert now.equal(found.final_state)
+    assert torch.allclose(score, found.score)
+    assert world.solved(now).equal(found.solved)
+
+
+def test_no_solution_takes_more_expansions_than_its_bound() -> None:
+    generator = torch.Generator().manual_seed(1)
+    prior = MarkovPrior(3, 1).fit(torch.randint(3, (30, 5), generator=generator))
+    solved = 0
+    for seed in range(5):
+        world = random_table(seed)
+        state = torch.randint(200, (40,), generator=generator)
+        for at_once in (1, 8):
+            found = LevinPlanner(prior, 300, nodes_at_once=at_once).search(world, state)
+            check_found(world, state, found)
+            assert bool((found.expansions <= at_once * found.log_bound.exp() + 1e-6).all())
+            solved += int(found.solved.sum())
+    assert solved > 100
+
+
+def test_a_star_finds_shortest_plans() -> None:
+    world = cube()
+    state = world.reset(6, torch.Generator().manual_seed(0))
+    found = AStarPlanner(world.distance, 1.0, 2000).search(world, state)
+    assert found.solved.all()
+    assert found.lengths.equal(world.distance(state))
+    # With an exact heuristic greedy search expands the nodes on its way and no others.
+    greedy = AStarPlanner(world.distance, math.inf, 2000).search(world, state)
+    assert greedy.expansions.equal(world.distance(state))
+    breadth = AStarPlanner(None, 1.0, 2000).search(world, state)
+    assert bool((breadth.lengths[breadth.solved] == world.distance(state)[breadth.solved]).all())
+
+
+def puzzle_plans(world: Any, state: Tensor) -> Plans:
+    """Random plans with the patterns on their way."""
+    actions = torch.randint(4, (len(state), 12), generator=torch.Generator().manual_seed(2))
+    seen = []
+    for t in range(12):
+        seen.append(world.observe(state))
+        state, _ = world.step(state, actions[:, t])
+    return Plans(actions, 4, context=torch.stack(seen, 1))
+
+
+PUZZLES = {
+    "sokoban": lambda: sokoban(sokoban(LEVELS).boards[:12]),
+    "tiles": lambda: sliding_tiles(
+        sliding_tiles(shape=(3, 4), scramble=14).reset(12, torch.Generator().manual_seed(3))
+    ),
+}
+
+
+@pytest.mark.parametrize("puzzle", PUZZLES)
+def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
+    world = PUZZLES[puzzle]()
+    state, patterns = world.boards, len(world.windows.windows)
+    plans = puzzle_plans(world, state)
+    generator = torch.Generator().manual_seed(0)
+    learned = [LogLinearPrior(4, patterns), PatternCounts(4, patterns), PatternNetwork(4, patterns, size=4)]
+    planners: list[BestFirstPlanner] = [
+        LevinPlanner(prior, 200)
+        for prior in (UniformPrior(4), *(prior.fit(plans, generator=generator) for prior in learned))
+    ]
+    planners += [LevinPlanner(learned[0], 200, heuristic=world.lower_bound)]
+    planners += [AStarPlanner(world.lower_bound, weight, 200) for weight in (1.0, 3.0, math.inf)]
+    planners += [AStarPlanner(None, 1.0, 200)]
+    solved = 0
+    for planner in planners:
+        compiled = planner.search(world, state)
+        check_found(world, state, compiled)
+        planner.compile = False
+        stepped = planner.search(world, state)
+        for name in ("solved", "expansions", "lengths", "plan", "final_state", "model_steps"):
+            assert getattr(compiled, name).equal(getattr(stepped, name)), (planner, name)
+        assert torch.allclose(compiled.log_bound, stepped.log_bound)
+        solved += int(compiled.solved.sum())
+    assert solved > 5
+
+
+def test_an_unsolved_problem_gets_the_plan_to_its_best_node() -> None:
+    world = sokoban(["########\n#@ $  .#\n########"])
+    state = world.boards
+    planner = LevinPlanner(UniformPrior(4), 4, heuristic=world.lower_bound)
+    for planner.compile in (True, False):
+        found = planner.search(world, state)
+        assert not found.solved.any()
+        assert found.plan.tolist() == [[3, 3, 3]]  # the box is one step from the goal
+        assert world.lower_bound(found.final_state).tolist() == [1]
+    decision = LevinPlanner(UniformPrior(4), 100).plan(world, state)
+    assert decision.plan.tolist() == [[3] * 4]
+    assert decision.lengths is not None
+    assert (decision.lengths.tolist(), decision.score.tolist()) == ([4], [1.0])
+    assert decision.model_steps >= 4
+
+
+def test_any_prior_searches_any_world_with_goals() -> None:
+    level = ["#######\n#@ $ .#\n#######", "#######\n#.$  @#\n#######"]
+    for prior in (GRUPrior(4), MarkovPrior(4, 1)):
+        found = LevinPlanner(prior, 100).search(sokoban(level), sokoban(level).boards)
+        assert found.solved.all()
+        assert found.lengths.tolist() == [3, 3]
+    none = LevinPlanner(UniformPrior(4), 10).search(sokoban(level), sokoban(level).boards[:0])
+    assert none.plan.shape[0] == 0
+    assert LevinPlanner(UniformPrior(9), 10).plan(cube(), torch.tensor([0])).lengths.tolist() == [0]  # type: ignore[union-attr]
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(ValueError, match="with goals"):
+        LevinPlanner(UniformPrior(4)).search(gridworld(3, 3), torch.tensor([0]))
+    with pytest.raises(ValueError, match="max_nodes"):
+        LevinPlanner(UniformPrior(4), 0)
+    with pytest.raises(ValueError, match="weight"):
+        AStarPlanner(weight=-1.0)
+    with pytest.raises(ValueError, match="actions"):
+        LevinPlanner(UniformPrior(3)).search(cube(), torch.tensor([1]))
+    with pytest.raises(ValueError, match="value"):
+        LevinPlanner(UniformPrior(9), heuristic=lambda state: state.double() * math.nan).search(
+            cube(), torch.tensor([5])
+        )

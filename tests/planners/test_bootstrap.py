@@ -1,0 +1,130 @@
+"""Solve and learn: more gets solved, and an interrupted call goes on as if nothing had happened."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from neuroprior import MarkovPrior
+from neuroprior.planners import AStarPlanner, LevinPlanner, bootstrap
+from neuroprior.planners.bootstrap import read_solutions, solution_plans, solution_steps, with_symmetries
+from neuroprior.priors import LogLinearPrior
+from neuroprior.priors.patterns import Steps
+from neuroprior.worlds import SlidingTilesWorld, cube, sliding_tiles, sokoban
+from tests.worlds.test_sokoban import LEVELS
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def tiles(number: int = 60) -> SlidingTilesWorld:
+    return sliding_tiles(sliding_tiles(shape=(3, 3), scramble=40).reset(number, seeded(1)))
+
+
+def prior_for(world: Any) -> LogLinearPrior:
+    return LogLinearPrior(4, len(world.windows.windows))
+
+
+def test_what_is_learned_solves_more_with_less() -> None:
+    world, held_out = tiles(), sliding_tiles(shape=(3, 3), scramble=40).reset(60, seeded(2))
+    prior = prior_for(world)
+    before = LevinPlanner(prior, 500).search(world, held_out)
+    sweeps = list(bootstrap(world, prior, world.boards, max_nodes=500, sweeps=4, generator=seeded()))
+    after = LevinPlanner(prior, 500).search(world, held_out)
+    assert [sweep.number for sweep in sweeps] == [1, 2, 3, 4]
+    assert sweeps[-1].solved > sweeps[0].solved
+    assert float(after.solved.double().mean()) > float(before.solved.double().mean()) + 0.2
+    assert float(after.expansions.double().mean()) < 0.7 * float(before.expansions.double().mean())
+
+
+def test_an_interrupted_call_goes_on(tmp_path: Path) -> None:
+    world = tiles(40)
+    how: dict[str, Any] = {"max_nodes": 300, "epochs": 2}
+    whole, parts = prior_for(world), prior_for(world)
+    once = list(bootstrap(world, whole, world.boards, sweeps=3, generator=seeded(), **how))
+    some = bootstrap(world, parts, world.boards, sweeps=3, generator=seeded(), folder=tmp_path, **how)
+    next(some), next(some)  # and then it is killed
+    again = prior_for(world)
+    resumed = list(bootstrap(world, again, world.boards, sweeps=3, generator=seeded(9), folder=tmp_path, **how))
+    seconds = {"search_seconds": 0.0, "fit_seconds": 0.0}
+    assert [sweep._replace(**seconds) for sweep in resumed] == [sweep._replace(**seconds) for sweep in once]
+    assert again.weights.equal(whole.weights)
+    solutions = read_solutions(tmp_path)
+    assert len(solutions) == resumed[-1].solutions
+    for number, plan in solutions.items():
+        state = world.boards[number][None]
+        for action in plan.tolist():
+            state, _ = world.step(state, torch.tensor([action]))
+        assert world.solved(state).all()
+    with pytest.raises(ValueError, match="another call"):
+        list(bootstrap(world, prior_for(world), world.boards[:10], folder=tmp_path, **how))
+    with pytest.raises(ValueError, match="its prior is"):
+        list(bootstrap(world, LogLinearPrior(4, 3), world.boards, folder=tmp_path, **how))
+
+
+def test_the_budget_and_the_problems_grow() -> None:
+    world = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=8).reset(100, seeded(3)))
+    sweeps = list(
+        bootstrap(world, prior_for(world), world.boards, max_nodes=50, first=10, sweeps=5, generator=seeded())
+    )
+    assert [sweep.problems for sweep in sweeps[:2]] == [10, 40 if sweeps[0].solved >= 0.75 else 10]
+    assert sweeps[-1].problems == 100
+    for one, other in zip(sweeps[:-1], sweeps[1:], strict=True):
+        assert other.max_nodes in (one.max_nodes, 2 * one.max_nodes)
+        assert other.max_nodes == 2 * one.max_nodes or other.problems == one.problems
+    assert sweeps[-1].solutions > 90
+
+
+def test_a_teacher_and_a_heuristic_help() -> None:
+    world = tiles(30)
+    teacher = AStarPlanner(world.lower_bound, 3.0, 2000)
+    prior = prior_for(world)
+    sweeps = list(
+        bootstrap(world, prior, world.boards, max_nodes=20, sweeps=2, teacher=teacher, guided=True, generator=seeded())
+    )
+    assert sweeps[0].solved == 1.0
+    assert (sweeps[0].max_nodes, sweeps[1].max_nodes) == (2000, 20)
+
+
+def test_symmetries_of_solutions_are_solutions() -> None:
+    for world in (tiles(), sokoban(LEVELS)):
+        state = world.boards[:60]
+        found = AStarPlanner(world.lower_bound, 5.0, 3000).search(world, state)
+        assert found.solved.sum() > 10
+        kept = found.solved
+        plans = [plan[:length] for plan, length in zip(found.plan[kept], found.lengths[kept], strict=True)]
+        states, more = with_symmetries(world, state[kept], plans, 8, seeded())
+        assert len(more) == world.symmetries() * len(plans)
+        for start, plan in zip(states, more, strict=True):
+            now = start[None]
+            for action in plan.tolist():
+                now, _ = world.step(now, torch.tensor([action]))
+            assert world.solved(now).all()
+        # The compiled replay gives the steps of the world's own.
+        steps = solution_steps(world, states, more)
+        same = Steps.of(solution_plans(world, states, more, "step"))
+        assert all(one.equal(other) for one, other in zip(steps, same, strict=True))
+
+
+def test_priors_without_patterns_learn_too() -> None:
+    world = cube("quarter", scramble=4)
+    prior = MarkovPrior(6, 2)
+    state = world.reset(50, seeded(4))
+    sweeps = list(bootstrap(world, prior, state, max_nodes=400, sweeps=2, generator=seeded()))
+    assert sweeps[-1].mean_expansions < sweeps[0].mean_expansions
+
+
+def test_bad_input_is_refused() -> None:
+    world = tiles(5)
+    hard = sliding_tiles(shape=(4, 4), scramble=500)
+    for change, message in (({"sweeps": 0}, "sweeps"), ({"max_nodes": 0}, "max_nodes"), ({"epochs": 0}, "epochs")):
+        with pytest.raises(ValueError, match=message):
+            list(bootstrap(world, prior_for(world), world.boards, generator=seeded(), **change))
+    with pytest.raises(ValueError, match="none of 3 was solved"):
+        list(bootstrap(hard, prior_for(hard), hard.reset(3, seeded()), max_nodes=5, generator=seeded()))
+    with pytest.raises(ValueError, match="at least one"):
+        list(bootstrap(world, prior_for(world), world.boards[:0]))
+    with pytest.raises(ValueError, match="lower_bound"):
+        list(bootstrap(cube(), MarkovPrior(9, 1), torch.tensor([5]), guided=True))
