@@ -75,8 +75,9 @@ def bootstrap(
     The idea is that of Arfaee, Zilles and Holte (*Learning heuristic functions for large state spaces*, Artificial
     Intelligence, 2011); with a prior, that of Orseau and Lelis (AAAI 2021).
 
-    The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried. The
-    budget doubles then, and when fewer than a quarter of the solutions are new. Each problem's latest solution counts. In puzzles the prior learns from reflections and rotations of them, too.
+    The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried.
+    The budget doubles then, and when fewer than a quarter of the solutions are new. Each problem's latest solution
+    counts. In puzzles the prior learns from reflections and rotations of the solutions, too.
 
     Args:
         world: with goals; see `LevinPlanner`.

@@ -1,5 +1,6 @@
 """Solve and learn: more gets solved, and an interrupted call goes on as if nothing had happened."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def test_the_budget_and_the_problems_grow() -> None:
     )
     assert [sweep.problems for sweep in sweeps[:2]] == [10, 40 if sweeps[0].solved >= 0.75 else 10]
     assert sweeps[-1].problems == 100
-    for one, other in zip(sweeps[:-1], sweeps[1:], strict=True):
+    for one, other in pairwise(sweeps):
         assert other.max_nodes in (one.max_nodes, 2 * one.max_nodes)
         assert other.max_nodes == 2 * one.max_nodes or other.problems == one.problems
     assert sweeps[-1].solutions > 90
