@@ -233,7 +233,7 @@ def _pair_table(pairs: pd.DataFrame) -> Table:
 
 def _sweep_table(sweeps: pd.DataFrame) -> Table:
     columns: dict[str, Any] = {
-        "seed": "seed:.0f",
+        **({"seed": "seed:.0f"} if sweeps["seed"].nunique() > 1 else {}),
         "sweep": "number:.0f",
         "problems": "problems:,.0f",
         "budget": "max_nodes:,.0f",
