@@ -71,9 +71,9 @@ def puzzles(
         test: file of test problems; by default those of eval/data.
         num_test: so many of them, the first; all by default.
         budget: expansions for each test problem.
-        priors: bootstrap (the log-linear prior after all sweeps); log-linear, network, product, backoff, markov (fitted
-            to its solutions; the last two to 50 problems and 2,000 expansions at most, for they are slow); uniform,
-            a-star, weighted-a-star (weight 5), greedy, breadth-first (nothing is learned).
+        priors: bootstrap (the log-linear prior after all sweeps); fitted to its solutions: log-linear, network, product
+            and, for 50 problems and 2,000 expansions at most, as they are slow, backoff, markov, board; without any
+            learning: uniform, a-star, weighted-a-star (weight 5), greedy, breadth-first.
         guided: search with the heuristic, too (PHS*); by default in tiles alone.
         sweeps: of solving and learning.
         seeds: repeats; each takes the training problems in another order.

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,20 +12,34 @@ import torch
 
 from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, bootstrap
 from neuroprior.planners.bootstrap import fit_solutions, read_solutions
-from neuroprior.priors import LogLinearPrior, MarkovPrior, PatternCounts, PatternNetwork, Prior, UniformPrior, load
+from neuroprior.priors import (
+    BoardNetwork,
+    LogLinearPrior,
+    MarkovPrior,
+    PatternCounts,
+    PatternNetwork,
+    Prior,
+    UniformPrior,
+    load,
+)
 from neuroprior.worlds import PuzzleWorld, sliding_tiles, sokoban
+from neuroprior.worlds.puzzles.puzzle import Observation
 
 BOOTSTRAP = "bootstrap"
 """The log-linear prior that found the solutions, from which all others learn."""
 
-LEARNED: dict[str, Callable[[int, int], Prior]] = {
-    "log-linear": LogLinearPrior,
-    "network": PatternNetwork,
-    "product": PatternCounts,
-    "backoff": partial(PatternCounts, combine="backoff"),
-    "markov": lambda actions, patterns: MarkovPrior(actions, 2),
+BOARD_CHANNELS, BOARD_DEPTH = 32, 2
+"""Of the convolutional network."""
+
+LEARNED: dict[str, Callable[[PuzzleWorld], Prior]] = {
+    "log-linear": lambda world: LogLinearPrior(4, len(world.windows.windows)),
+    "network": lambda world: PatternNetwork(4, len(world.windows.windows)),
+    "product": lambda world: PatternCounts(4, len(world.windows.windows)),
+    "backoff": lambda world: PatternCounts(4, len(world.windows.windows), combine="backoff"),
+    "markov": lambda world: MarkovPrior(4, 2),
+    "board": lambda world: BoardNetwork(4, (world.num_planes, *world.shape), BOARD_CHANNELS, BOARD_DEPTH),
 }
-"""Priors that learn from the solutions; all but the last from the same patterns."""
+"""Priors that learn from the solutions: four from the same patterns, one from moves alone, one from the whole board."""
 
 SEARCHES: dict[str, Callable[[PuzzleWorld, int], BestFirstPlanner]] = {
     "uniform": lambda world, budget: LevinPlanner(UniformPrior(4), budget),
@@ -37,11 +50,14 @@ SEARCHES: dict[str, Callable[[PuzzleWorld, int], BestFirstPlanner]] = {
 }
 """Searches that learn nothing."""
 
-SLOW, SLOW_BUDGET = ("markov", "backoff"), (50, 2000)
+SLOW, SLOW_BUDGET = ("markov", "backoff", "board"), (50, 2000)
 """Priors that the compiled search does not know, and problems and expansions at most for these."""
 
-EPOCHS = 12
+EPOCHS, BOARD_EPOCHS = 12, 3
 """Passes over the solutions of priors that are trained on them at once; the bootstrapped one had some in each sweep."""
+
+BOARD_ACTIONS = 100_000
+"""Actions that the network on boards learns from, about, with those of reflected and rotated solutions."""
 
 TEACHER = 100_000, 5.0
 """Budget and weight of the weighted A* that solves the first sliding tiles."""
@@ -89,15 +105,15 @@ class Problems(NamedTuple):
     boards: torch.Tensor
 
 
-def problems_of(settings: Settings) -> tuple[Problems, Problems]:
+def problems_of(settings: Settings, observation: Observation = "patterns") -> tuple[Problems, Problems]:
     """The training and the test problems.
 
     Raises:
         ValueError: a file holds none, or boards of another size; the message names it.
         OSError: a file cannot be read.
     """
-    make: Callable[[str], PuzzleWorld] = sokoban if settings.world == "sokoban" else sliding_tiles
-    worlds = make(settings.train), make(settings.test)
+    make: Callable[..., PuzzleWorld] = sokoban if settings.world == "sokoban" else sliding_tiles
+    worlds = [make(file, observation=observation) for file in (settings.train, settings.test)]
     expected, found = (list(world.shape) for world in worlds)
     if expected != found:
         raise ValueError(f"{settings.test}: boards of {expected} are expected, as in {settings.train}, not {found}")
@@ -135,7 +151,7 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
     Raises:
         RuntimeError: a solution does not solve its problem, or took more expansions than the bound allows.
     """
-    train, (test, problems) = problems_of(settings)
+    train, (test, problems) = problems_of(settings, "board" if job.prior == "board" else "patterns")
     fit_seconds, budget = 0.0, settings.budget
     if job.prior in SEARCHES:
         planner = SEARCHES[job.prior](test, budget)
@@ -174,9 +190,11 @@ def _prior(settings: Settings, folder: Path, job: Job, train: Problems) -> Prior
     solutions = read_solutions(folder)
     if job.prior == BOOTSTRAP:
         return load(folder / f"prior-{settings.sweeps}")
-    prior = LEARNED[job.prior](4, len(train.world.windows.windows))
+    prior = LEARNED[job.prior](train.world)
     state = _shuffled(train.boards, settings, job.seed)[torch.tensor(list(solutions))]
-    training = {"epochs": EPOCHS} if "epochs" in prior.fit_settings else {}
+    training: dict[str, Any] = {"epochs": EPOCHS} if "epochs" in prior.fit_settings else {}
+    if job.prior == "board":
+        training = {"epochs": BOARD_EPOCHS, "max_actions": BOARD_ACTIONS}
     generator = torch.Generator().manual_seed(job.seed)
     fit_solutions(prior, train.world, state, list(solutions.values()), generator=generator, **training)
     return prior

@@ -4,7 +4,6 @@ from typing import Any, Literal, Self
 
 import numpy as np
 import torch
-from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from neuroprior.priors.patterns.pattern_prior import PatternPrior, Steps, compiled_fit
@@ -69,6 +68,8 @@ class PatternCounts(PatternPrior):
             return self._count(steps, 1.0)
         self._count(Steps(*(x[~held_out] for x in steps)), 1.0)
         some = Steps(*(x[held_out] for x in steps))
+        from scipy.optimize import minimize_scalar  # slow to import
+
         prior = self.marginal.log()
         gains = self._logits(self.scores(some.patterns), some.last) - prior
 

@@ -29,18 +29,31 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
     test.write_text("########\n#@ $ . #\n########\n########\n\n########\n#.$   @#\n########\n########\n")
     arguments = [
         *("puzzles", "--train", train, "--num-train", "20", "--test", str(test), "--budget", "500", "--sweeps", "2"),
-        *("--priors", "bootstrap", "log-linear", "markov", "uniform", "greedy", "--processes", "1", "--out", str(out)),
+        *(
+            "--priors",
+            "bootstrap",
+            "log-linear",
+            "markov",
+            "backoff",
+            "board",
+            "uniform",
+            "greedy",
+            "--processes",
+            "1",
+            "--out",
+            str(out),
+        ),
     ]
     assert main(arguments) == 0
     found = json.loads((out / "results.json").read_text())
     rows = {row["prior"]: row for row in found["rows"]}
-    assert set(rows) == {"bootstrap", "log-linear", "markov", "uniform", "greedy"}
+    assert set(rows) == {"bootstrap", "log-linear", "markov", "backoff", "board", "uniform", "greedy"}
     assert all(row["problems"] == 2 and row["solved"] == 1 for row in rows.values())
     assert rows["bootstrap"]["mean_expansions"] < rows["uniform"]["mean_expansions"]
     assert all(row["seconds_per_problem"] > 0 and row["median_expansions"] >= 1 for row in rows.values())
     boards = sokoban(test).boards
     lines = [json.loads(line) for line in (out / "solutions.jsonl").read_text().splitlines()]
-    assert len(lines) == 5 * 2
+    assert len(lines) == 7 * 2
     world = sokoban(test)
     for line in lines:
         state = boards[line["problem"]][None]
