@@ -13,6 +13,7 @@ from neuroprior.planners.mcts import MCTSPlanner
 from neuroprior.planners.planner import Decision, Planner, PriorPlanner, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
+from neuroprior.planners.tuning import Tuned, best_sampling, sampling_for, search_weights
 
 __all__ = [
     "CrossEntropyPlanner",
@@ -28,6 +29,8 @@ __all__ = [
     "Planner",
     "PriorPlanner",
     "SamplingPlanner",
+    "Tuned",
+    "best_sampling",
     "collect",
     "execute",
     "expected_score",
@@ -35,4 +38,6 @@ __all__ = [
     "mean_scores",
     "oracle",
     "random_best",
+    "sampling_for",
+    "search_weights",
 ]
