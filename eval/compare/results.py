@@ -30,6 +30,9 @@ LEARNED = ("neural", "markov", "other")
 PRIOR = ["prior", "context", "rounds"]
 """Columns that name a prior: its label, its context, and its rounds of the horizon curriculum."""
 
+SAMPLING = ["temperature", "uniform_share"]
+"""How candidates were drawn; in tables, its mean over seeds."""
+
 CLOSE = 1e-9
 """Normalised scores that differ by less are the same."""
 
@@ -120,7 +123,11 @@ class Results:
             [None] if pd.isna(prior) else budgets[world]
             for world, prior in zip(frame["world"], frame["prior"], strict=True)
         ]
-        lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds"]
+        lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds", *SAMPLING]
+        for name in SAMPLING:
+            # There are none of planners without a prior.
+            given = frame.get(name, pd.Series(np.nan, frame.index))
+            frame[name] = given.where(given.notna(), frame["share"].map(lambda share: [np.nan] * len(share)))
         frame = frame[[*place, *lists]].explode(lists, ignore_index=True)
         return frame.astype(dict.fromkeys(lists, "float64") | {"num_plans": "Int64"})
 
@@ -139,7 +146,7 @@ class Results:
     def curves(self) -> pd.DataFrame:
         """The normalised score: a row a world, planner, prior and number of plans, with its interval over seeds."""
         by = ["world", "planner", *PRIOR, "num_plans"]
-        found = seed_means(self.scores, by, "share", ["model_steps", "at_oracle", "seconds"])
+        found = seed_means(self.scores, by, "share", ["model_steps", "at_oracle", "seconds", *SAMPLING])
         found["model_steps"] = found["model_steps"].convert_dtypes()
         return found.rename(columns={"share": "oracle_share", "seconds": "seconds_per_decision"})
 
