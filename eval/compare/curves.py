@@ -1,6 +1,6 @@
 """Normalised scores against the number of candidate plans: what a planner reaches that samples from a prior."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from time import perf_counter
@@ -40,6 +40,10 @@ class Sampling(NamedTuple):
 
 SETTINGS = tuple(Sampling(*both) for both in product(TEMPERATURES, UNIFORM_SHARES))
 """How priors may be sampled: an overconfident prior tries the same plans again and again."""
+
+
+FEWEST = 256
+"""At least so many candidates are drawn from each start, if any number is as large: small ones are tried repeatedly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +136,9 @@ def drawn(starts: Starts, prior: Prior, num_plans: int, temperature: float, gene
     return Drawn(torch.cat(estimates), torch.cat(scores))
 
 
-def drawn_uniformly(starts: Starts, most: int, shares: Iterable[float], generator: torch.Generator) -> Drawn | None:
-    """Uniform candidates, as many as the largest share of the most candidates; None where none are needed."""
-    number = max(uniform_plans(share, most) for share in shares)
+def drawn_uniformly(starts: Starts, sizes: Mapping[Sampling, int], generator: torch.Generator) -> Drawn | None:
+    """Uniform candidates for each start, enough for these numbers of candidates; None where none are needed."""
+    number = max(uniform_plans(one.uniform_share, size) for one, size in sizes.items())
     return drawn(starts, UniformPrior(starts.world.num_actions), number, 1.0, generator) if number else None
 
 
@@ -153,7 +157,7 @@ def tried(
 ) -> dict[int, dict[Sampling, float]]:
     """For each number of candidates the normalised score of each way of sampling them, all from the same draws."""
     most, found = max(numbers), {number: dict.fromkeys(settings, 0.0) for number in numbers}
-    uniform = drawn_uniformly(starts, most, {one.uniform_share for one in settings}, generator)
+    uniform = drawn_uniformly(starts, dict.fromkeys(settings, most), generator)
     for temperature in dict.fromkeys(one.temperature for one in settings):
         own = drawn(starts, prior, most, temperature, generator)
         for one in (one for one in settings if one.temperature == temperature):
@@ -178,17 +182,18 @@ def curve(
 ) -> dict[str, list[float]]:
     """What a sampling planner reaches with each number of candidates, each sampled in its way.
 
-    The largest number is drawn once from each start at each temperature, and of uniform plans the largest share.
-    Smaller numbers are blocks of these, each block a decision. The planner chooses by its own estimates; what counts
-    are exact scores.
+    At each temperature the largest number that is sampled at it is drawn once from each start, at least `FEWEST`, and
+    uniform plans likewise. Smaller numbers are blocks of these, each block a decision. The planner chooses by its own
+    estimates; what counts are exact scores.
 
     Returns:
         See `Starts.reached`, a list for all numbers.
     """
-    most = max(how)
-    uniform = drawn_uniformly(starts, most, {one.uniform_share for one in how.values()}, generator)
-    heats = dict.fromkeys(one.temperature for one in how.values())
-    own = {heat: drawn(starts, prior, most, heat, generator) for heat in heats}
+    least = min(FEWEST, max(how))
+    sizes = {one: max(least, *(number for number, other in how.items() if other == one)) for one in how.values()}
+    uniform = drawn_uniformly(starts, sizes, generator)
+    heats = {heat: max(sizes[one] for one in sizes if one.temperature == heat) for heat, _ in sizes}
+    own = {heat: drawn(starts, prior, size, heat, generator) for heat, size in heats.items()}
     found = [
         starts.reached(decided(own[one.temperature], uniform, number, one.uniform_share)) for number, one in how.items()
     ]

@@ -22,6 +22,7 @@ from eval.compare.curves import (
     starts_of,
     tried,
 )
+from eval.compare.results import PRIOR, Results
 from eval.compare.run import Contest, Settings, compare_run, curriculum_run
 from eval.worlds.mid_plan import MidPlanWorld
 from eval.worlds.runs import Run
@@ -305,3 +306,12 @@ def test_the_documentation_describes_the_worlds():
         lengths, contexts = ", ".join(map(str, task.lengths)), ", ".join(task.contexts)
         row = (f"`{name}`", task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
         assert f"| {' | '.join(map(str, row))} |" in text
+
+
+def test_tables_hold_how_candidates_were_drawn(run):
+    rows = Results([run], [4, 16]).rows
+    for one in run["entries"][1:]:
+        own = rows[[tuple(row) == (one["prior"], one["context"], one["rounds"]) for row in rows[PRIOR].to_numpy()]]
+        assert own["temperature"].tolist() == [one["temperature"][place] for place in (2, 4)]
+        assert own["uniform_share"].tolist() == [one["uniform_share"][place] for place in (2, 4)]
+    assert rows.loc[rows["prior"].isna(), "temperature"].isna().all()
