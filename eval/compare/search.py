@@ -9,7 +9,7 @@ from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
 from eval.compare.command import TrainingStarts
-from eval.compare.curves import CHOSEN_AT, Sampling, best, curve, tried
+from eval.compare.curves import CHOSEN_AT, Sampling, best, tried
 from eval.compare.planners import ORDERS, planner_document, planner_pairs
 from eval.compare.priors import NEURAL, TRAINING, chain, network
 from eval.compare.run import Contest, Contestant, Settings
@@ -40,6 +40,9 @@ LIMITED: dict[str, Callable[[Sampling], bool]] = {
 AT_MOST = "both, at {}"
 """As `BOTH`, chosen once, at the largest number of candidates."""
 
+FIRST = ", first plans"
+"""Behind the name of a prior that has learned from short plans alone, before the horizon curriculum."""
+
 SEARCHED = 64
 """Candidates of which one should be the plan that is learned from."""
 
@@ -67,10 +70,11 @@ def search(
 ) -> None:
     """What helps a planner that samples: temperature, uniform plans, or plans that count by how hard they are to find?
 
-    A chain of order 3 and a GRU are fitted to the plans of the last round of the horizon curriculum. Candidates are
-    drawn at a chosen temperature, with a chosen share of uniform plans, with both or neither; and from priors that
-    were fitted to plans drawn anew with weights. Prints the differences in the normalised score; writes tables (CSV),
-    results.json and report.html to a folder. Interrupted, the same command goes on.
+    A chain of order 3 and a GRU are fitted to the first, short plans, and to those of the last round of the horizon
+    curriculum. Candidates are drawn at a chosen temperature, with a chosen share of uniform plans, with both or
+    neither; and from priors that were fitted to the last plans drawn anew with weights. Prints the differences in the
+    normalised score; writes tables (CSV), results.json and report.html to a folder. Interrupted, the same command goes
+    on.
 
     Args:
         worlds: to plan in.
@@ -103,12 +107,15 @@ def search_run(run: runs.Run, settings: SearchSettings) -> dict[str, Any]:
     task = TASKS[run.world]
     contest = Contest(run, task, replace(settings, context=task.contexts[-1:]), ORDERS)
     entries = []
-    for one in contest.after_curriculum():
+    for one in contest.contestants():
         if one.plans is None:
             continue
-        learner = Learner(contest, one)
-        for name, prior in {BOTH: learner.fitted(one.plans), **learner.reweighted(one.plans)}.items():
-            entries += _entries(contest, one, name, prior)
+        if one.rounds == 0:
+            entries += _entries(contest, one, FIRST, one.prior)
+        if one.rounds == contest.rounds:
+            learner = Learner(contest, one)
+            for name, prior in {"": learner.fitted(one.plans), **learner.reweighted(one.plans)}.items():
+                entries += _entries(contest, one, name, prior)
     return run._asdict() | {"about": task.about, "entries": entries}
 
 
@@ -144,25 +151,29 @@ class Learner:
 
 
 def _entries(contest: Contest, one: Contestant, name: str, prior: Prior) -> list[dict[str, Any]]:
-    """What a prior reaches, sampled in every way; those with weights in one."""
+    """What a prior reaches, sampled in every way, all from the same draws; with weights, by whose name, in one way."""
     numbers, length = contest.settings.num_plans, contest.task.length
-    tables = tried(contest.validation_at[length], prior, contest.generator, numbers)
+    chances, reached = (
+        tried(starts[length], prior, contest.generator, numbers)
+        for starts in (contest.validation_at, contest.starts_at)
+    )
     ways = {
-        way if name == BOTH else name: {
+        way: {
             number: best({one: score for one, score in table.items() if allowed(one)})
-            for number, table in tables.items()
+            for number, table in chances.items()
         }
         for way, allowed in LIMITED.items()
-        if way == BOTH or name == BOTH
     }
-    if name == BOTH:
-        ways[AT_MOST.format(max(numbers))] = dict.fromkeys(numbers, ways[BOTH][max(numbers)])
-    named = {"prior": one.label, "context": one.context, "seconds": float("nan")}
+    ways[AT_MOST.format(max(numbers))] = dict.fromkeys(numbers, ways[BOTH][max(numbers)])
+    if name in WEIGHTS:
+        ways = {name: ways[BOTH]}
+    label = one.label + FIRST * (name == FIRST)
+    named = {"prior": label, "context": one.context, "seconds": float("nan")}
     return [
-        {"planner": way, **named, "num_plans": number, **how[number]._asdict(), "share": share}
+        {"planner": way, **named, "num_plans": number, **sampling._asdict(), "share": reached[number][sampling]}
         | {"model_steps": number * length}
         for way, how in ways.items()
-        for number, share in zip(how, curve(contest.starts, prior, contest.generator, how)["share"], strict=True)
+        for number, sampling in how.items()
     ]
 
 

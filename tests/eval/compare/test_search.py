@@ -9,7 +9,7 @@ import torch
 from eval.compare import search
 from eval.compare.curves import SETTINGS, Sampling
 from eval.compare.run import Contest
-from eval.compare.search import BOTH, LIMITED, WEIGHTS, Learner, SearchSettings, search_document, search_run
+from eval.compare.search import BOTH, FIRST, LIMITED, WEIGHTS, Learner, SearchSettings, search_document, search_run
 from eval.worlds.runs import Run
 from neuroprior import MarkovPrior
 from tests.eval.compare.test_run import TINY
@@ -30,16 +30,25 @@ def test_runs_hold_every_way(monkeypatch):
     worlds = partial(TINY.worlds, num_layouts=8)
     monkeypatch.setitem(search.TASKS, "tiny", replace(TINY, contexts=("per-step",), worlds=worlds))
     runs = [search_run(Run("tiny", seed), SMALL) for seed in (0, 1)]
-    ways = ["neither", "temperature", "uniform share", BOTH, "both, at 16", *WEIGHTS]
+    ways = ["neither", "temperature", "uniform share", BOTH, "both, at 16"]
     for run in runs:
         found = [(one["prior"], one["planner"], one["num_plans"]) for one in run["entries"]]
-        assert found == [(p, way, n) for p in ("markov-3", "gru") for way in ways for n in (4, 16)]
+        assert found == [
+            (prior + after, way, number)
+            for prior in ("markov-3", "gru")
+            for after, more in ((FIRST, ()), ("", WEIGHTS))
+            for way in (*ways, *more)
+            for number in (4, 16)
+        ]
+        same = {(one["prior"], one["num_plans"], one["temperature"], one["uniform_share"]) for one in run["entries"]}
+        drawn = {one["share"] for one in run["entries"] if one["planner"] in ways}
+        assert len(drawn) <= len(same)  # what is sampled alike is the same draw
         for one in run["entries"]:
             assert 0 < one["share"] <= 1 + 1e-9
             assert LIMITED.get(one["planner"], LIMITED[BOTH])(Sampling(one["temperature"], one["uniform_share"]))
     document = search_document(runs, {"num_plans": (4, 16)}, "search")
     gaps = document.frames["differences"]
-    assert len(gaps) == 2 * 6 * 2
+    assert len(gaps) == 2 * (4 + 6) * 2
     values = [
         {(e["prior"], e["num_plans"]): e["share"] for e in run["entries"] if e["planner"] == way}["gru", 4]
         for run in runs
