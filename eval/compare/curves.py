@@ -21,9 +21,6 @@ ROLLOUTS = 16
 ROWS = 2**15
 """Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
 
-CHOSEN_AT = (16, 64, 256)
-"""Numbers of candidates at which temperature and share are chosen; other numbers are sampled as the next larger."""
-
 DRAWN, AGAIN = 20, 9
 """For each start that is wanted so many are drawn, and, if too few of them are of use, so many times again."""
 
@@ -40,10 +37,6 @@ class Sampling(NamedTuple):
 
 SETTINGS = tuple(Sampling(*both) for both in product(TEMPERATURES, UNIFORM_SHARES))
 """How priors may be sampled: an overconfident prior tries the same plans again and again."""
-
-
-FEWEST = 256
-"""At least so many candidates are drawn from each start, if any number is as large: small ones are tried repeatedly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +129,9 @@ def drawn(starts: Starts, prior: Prior, num_plans: int, temperature: float, gene
     return Drawn(torch.cat(estimates), torch.cat(scores))
 
 
-def drawn_uniformly(starts: Starts, sizes: Mapping[Sampling, int], generator: torch.Generator) -> Drawn | None:
-    """Uniform candidates for each start, enough for these numbers of candidates; None where none are needed."""
-    number = max(uniform_plans(one.uniform_share, size) for one, size in sizes.items())
+def drawn_uniformly(starts: Starts, share: float, num_plans: int, generator: torch.Generator) -> Drawn | None:
+    """As many uniform candidates for each start as are among so many candidates; None where there are none."""
+    number = uniform_plans(share, num_plans)
     return drawn(starts, UniformPrior(starts.world.num_actions), number, 1.0, generator) if number else None
 
 
@@ -152,12 +145,12 @@ def tried(
     starts: Starts,
     prior: Prior,
     generator: torch.Generator,
-    numbers: Sequence[int] = CHOSEN_AT,
+    numbers: Sequence[int],
     settings: Sequence[Sampling] = SETTINGS,
 ) -> dict[int, dict[Sampling, float]]:
     """For each number of candidates the normalised score of each way of sampling them, all from the same draws."""
     most, found = max(numbers), {number: dict.fromkeys(settings, 0.0) for number in numbers}
-    uniform = drawn_uniformly(starts, dict.fromkeys(settings, most), generator)
+    uniform = drawn_uniformly(starts, max(one.uniform_share for one in settings), most, generator)
     for temperature in dict.fromkeys(one.temperature for one in settings):
         own = drawn(starts, prior, most, temperature, generator)
         for one in (one for one in settings if one.temperature == temperature):
@@ -172,40 +165,30 @@ def best(table: Mapping[Sampling, float]) -> Sampling:
     return max(table, key=lambda one: table[one])
 
 
-def chosen_for(number: int, chosen: Mapping[int, Sampling]) -> Sampling:
-    """How to sample so many candidates: as was chosen for the next larger number, or for the largest."""
-    return chosen[min((known for known in chosen if known >= number), default=max(chosen))]
-
-
 def curve(
-    starts: Starts, prior: Prior, generator: torch.Generator, how: Mapping[int, Sampling]
+    starts: Starts, prior: Prior, generator: torch.Generator, sampling: Sampling, budgets: Sequence[int]
 ) -> dict[str, list[float]]:
-    """What a sampling planner reaches with each number of candidates, each sampled in its way.
+    """What a sampling planner reaches with each number of candidates.
 
-    At each temperature the largest number that is sampled at it is drawn once from each start, at least `FEWEST`, and
-    uniform plans likewise. Smaller numbers are blocks of these, each block a decision. The planner chooses by its own
-    estimates; what counts are exact scores.
+    The largest number is drawn once from each start. Smaller numbers are blocks of it, each block a decision. The
+    planner chooses by its own estimates; what counts are exact scores, which differ in stochastic worlds.
 
     Returns:
         See `Starts.reached`, a list for all numbers.
     """
-    least = min(FEWEST, max(how))
-    sizes = {one: max(least, *(number for number, other in how.items() if other == one)) for one in how.values()}
-    uniform = drawn_uniformly(starts, sizes, generator)
-    heats = {heat: max(sizes[one] for one in sizes if one.temperature == heat) for heat, _ in sizes}
-    own = {heat: drawn(starts, prior, size, heat, generator) for heat, size in heats.items()}
-    found = [
-        starts.reached(decided(own[one.temperature], uniform, number, one.uniform_share)) for number, one in how.items()
-    ]
+    heat, share = sampling
+    uniform = drawn_uniformly(starts, share, max(budgets), generator)
+    own = drawn(starts, prior, max(budgets), heat, generator)
+    found = [starts.reached(decided(own, uniform, number, share)) for number in budgets]
     return {name: [one[name] for one in found] for name in found[0]}
 
 
 def seconds_per_decision(
-    starts: Starts, prior: Prior, generator: torch.Generator, how: Mapping[int, Sampling], number: int
+    starts: Starts, prior: Prior, generator: torch.Generator, sampling: Sampling, budgets: Sequence[int], number: int
 ) -> dict[int, tuple[float, int]]:
     """By number of candidates the seconds and model steps that a decision takes, at `number` starts together."""
     state, taken = starts.state[:number], {}
-    planners = [planner_of(starts, prior, budget, sampling) for budget, sampling in how.items()]
+    planners = [planner_of(starts, prior, budget, sampling) for budget in budgets]
     # The first call is slower than those that follow, and the largest makes room for all.
     largest = max(planners, key=lambda planner: planner.num_plans)
     largest.plan(starts.world, state, torch.Generator(generator.device).manual_seed(0))

@@ -123,12 +123,8 @@ class Results:
             [None] if pd.isna(prior) else budgets[world]
             for world, prior in zip(frame["world"], frame["prior"], strict=True)
         ]
-        lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds", *SAMPLING]
-        for name in SAMPLING:
-            # There are none of planners without a prior.
-            given = frame.get(name, pd.Series(np.nan, frame.index))
-            frame[name] = given.where(given.notna(), frame["share"].map(lambda share: [np.nan] * len(share)))
-        frame = frame[[*place, *lists]].explode(lists, ignore_index=True)
+        lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds"]
+        frame = frame.reindex(columns=[*place, *SAMPLING, *lists]).explode(lists, ignore_index=True)
         return frame.astype(dict.fromkeys(lists, "float64") | {"num_plans": "Int64"})
 
     @cached_property

@@ -9,12 +9,10 @@ from typing import Any, Literal, NamedTuple
 import torch
 
 from eval.compare.curves import (
-    CHOSEN_AT,
     ROLLOUTS,
     Sampling,
     Starts,
     best,
-    chosen_for,
     curve,
     seconds_per_decision,
     starts_of,
@@ -37,8 +35,8 @@ CONTEXTS: dict[Context, Literal["plan", "step"] | None] = {"none": None, "initia
 CURRICULUM_PLANS = 64
 """Candidate plans in the rounds of the horizon curriculum."""
 
-COMPARED_PLANS = 256
-"""Candidate plans with which rounds of the curriculum are compared."""
+VALIDATION_PLANS = 256
+"""Candidate plans with which ways of sampling are chosen, and rounds of the curriculum are compared."""
 
 VALIDATION_TIMES = 2
 """For each held-out start so many in the validation worlds, to choose there how to sample: differences are small."""
@@ -175,7 +173,7 @@ class Contest:
             )
         )
         self.starts = self.starts_at[task.length]
-        self._samplings: dict[tuple[str, str, int, int], dict[int, Sampling]] = {}
+        self._samplings: dict[tuple[str, str, int, int], Sampling] = {}
 
     def contestants(self) -> Iterator[Contestant]:
         """All priors, each after every round of its curriculum; the object is the same, and goes on learning."""
@@ -248,42 +246,39 @@ class Contest:
 
     def entry(self, one: Contestant) -> dict[str, Any]:
         """What a prior's plans reach in the held-out worlds, and how well it predicts those that were chosen there."""
-        chosen, numbers = self.samplings(one, self.task.length), self.settings.num_plans
-        how = {number: chosen_for(number, chosen) for number in self.settings.budgets}
-        reached = curve(self.starts, one.prior, self.generator, how)
-        some = {number: how[number] for number in numbers}
-        timed = seconds_per_decision(self.starts, one.prior, self.generator, some, TIMED_STARTS)
+        sampling, budgets = self.sampling(one, self.task.length), self.settings.budgets
+        how = self.starts, one.prior, self.generator, sampling
+        reached, timed = curve(*how, budgets), seconds_per_decision(*how, self.settings.num_plans, TIMED_STARTS)
         held_out = with_context(self.held_out_plans, one.context)
         return {
             "planner": "sampling",
             "prior": one.label,
             "context": one.context,
             "rounds": one.rounds,
-            "temperature": [sampling.temperature for sampling in how.values()],
-            "uniform_share": [sampling.uniform_share for sampling in how.values()],
+            **sampling._asdict(),
             **reached,
-            "seconds": [timed[number][0] if number in timed else None for number in how],
-            "model_steps": [timed[number][1] if number in timed else None for number in how],
+            "seconds": [timed[number][0] if number in timed else None for number in budgets],
+            "model_steps": [timed[number][1] if number in timed else None for number in budgets],
             "bits": score(one.label, one.prior, held_out).bits_per_action().mean,
             "actions": int(held_out.mask().sum()),
         }
 
     def curriculum_entry(self, one: Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""
-        number = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else COMPARED_PLANS
-        how = {number: chosen_for(number, self.samplings(one, length))}
-        share = curve(self.starts_at[length], one.prior, self.generator, how)["share"][0]
+        number = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else VALIDATION_PLANS
+        how = self.starts_at[length], one.prior, self.generator, self.sampling(one, length)
+        share = curve(*how, [number])["share"][0]
         named = {"prior": one.label, "context": one.context, "round": one.rounds}
         return named | {"length": length, "num_plans": number, "share": share}
 
-    def samplings(self, one: Contestant, length: int) -> dict[int, Sampling]:
-        """How to sample plans of `length` actions, by number of candidates; chosen once."""
+    def sampling(self, one: Contestant, length: int) -> Sampling:
+        """How to sample plans of `length` actions, chosen once; uniform plans are the same however they are drawn."""
         if one.label == "uniform":
-            return dict.fromkeys(CHOSEN_AT, Sampling())
+            return Sampling()
         key = one.label, one.context, one.rounds, length
         if key not in self._samplings:
-            tables = tried(self.validation_at[length], one.prior, self.generator)
-            self._samplings[key] = {number: best(table) for number, table in tables.items()}
+            tables = tried(self.validation_at[length], one.prior, self.generator, [VALIDATION_PLANS])
+            self._samplings[key] = best(tables[VALIDATION_PLANS])
         return self._samplings[key]
 
     def exhaustive(self) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from jsonargparse.typing import PositiveInt
 from torch import Tensor
 
 from eval.compare.command import TrainingStarts
-from eval.compare.curves import CHOSEN_AT, Sampling, best, tried
+from eval.compare.curves import Sampling, best, tried
 from eval.compare.planners import ORDERS, planner_document, planner_pairs
 from eval.compare.priors import NEURAL, TRAINING, chain, network
 from eval.compare.run import Contest, Contestant, Settings
@@ -59,7 +59,7 @@ Hard plans: in proportion to the logarithm of the number of candidates that it t
 def search(
     worlds: Sequence[WorldName] = WORLDS,
     seeds: PositiveInt = 5,
-    num_plans: Sequence[runs.PowerOfTwo] = CHOSEN_AT,
+    num_plans: Sequence[runs.PowerOfTwo] = (16, 64, 256),
     steps: PositiveInt = 600,
     starts: PositiveInt = 32,
     training_starts: TrainingStarts = 1000,

@@ -11,11 +11,9 @@ import torch
 
 from eval.compare import run as run_module
 from eval.compare.curves import (
-    CHOSEN_AT,
     SETTINGS,
     Sampling,
     best,
-    chosen_for,
     curve,
     planner_of,
     seconds_per_decision,
@@ -69,7 +67,7 @@ def test_the_curve_of_a_lottery():
     world = bandit(5)
     starts = starts_of(one_step(world), world, 50, 1, seeded(0))
     budgets = [1, 2, 4, 8, 16]
-    found = curve(starts, UniformPrior(5), seeded(1), dict.fromkeys([*budgets, 4096], Sampling()))
+    found = curve(starts, UniformPrior(5), seeded(1), Sampling(), [*budgets, 4096])
     for budget, share, at in zip(budgets, found["share"], found["at_oracle"], strict=False):
         truth = 1 - 0.8**budget
         error = (truth * (1 - truth) / (50 * 4096 // budget)) ** 0.5
@@ -82,7 +80,7 @@ def test_in_stochastic_worlds_plans_count_for_their_expected_score():
     """All plans gain 1 with probability 0.3, some seem to gain more: the best of many is worth 0.3 still."""
     world = bandit(4, 0.3)
     starts = starts_of(one_step(world), world, 20, 1, seeded(0))
-    found = curve(starts, UniformPrior(4), seeded(1), {1: Sampling(), 64: Sampling(2.0, 0.3)})
+    found = curve(starts, UniformPrior(4), seeded(1), Sampling(2.0, 0.3), [1, 64])
     assert found["share"] == pytest.approx([1.0, 1.0])
     assert found["score"] == pytest.approx([0.3, 0.3])
     decision = planner_of(starts, UniformPrior(4), 64, Sampling()).plan(world, starts.state, seeded(2))
@@ -127,12 +125,11 @@ def test_the_curve_of_uniform_plans_among_others():
     world = bandit(2)
     starts = starts_of(one_step(world), world, 50, 1, seeded(0))
     sure = MarkovPrior(2, 0, smoothing=1e-9, backoff="dirichlet").fit(torch.ones(99, 1, dtype=torch.long))
-    how = {2: Sampling(1.0, 0.5), 4: Sampling(2.0, 0.5), 1024: Sampling()}
-    found = curve(starts, sure, seeded(1), how)["share"]
+    found = curve(starts, sure, seeded(1), Sampling(1.0, 0.5), [2, 4, 1024])["share"]
     for share, number in zip(found, (2, 4), strict=False):
         truth = 1 - 0.5 ** (number / 2)
         assert share == pytest.approx(truth, abs=6 * (truth * (1 - truth) / (50 * 1024 // number)) ** 0.5)
-    assert found[2] == 0
+    assert curve(starts, sure, seeded(1), Sampling(), [1024])["share"] == [0]
 
 
 def test_the_best_way_of_sampling():
@@ -154,20 +151,14 @@ def test_settings_that_are_tried_score_as_in_the_curve():
     starts = starts_of(one_step(world), world, 40, 1, seeded(0))
     prior, one = MarkovPrior(4, 0).fit(torch.tensor([[1]] * 40 + [[0]] * 9)), Sampling(1.5, 0.3)
     table = tried(starts, prior, seeded(1), (4, 16), (one,))
-    found = curve(starts, prior, seeded(1), dict.fromkeys((4, 16), one))
+    found = curve(starts, prior, seeded(1), one, [4, 16])
     assert found["share"] == [table[number][one] for number in (4, 16)]
-
-
-def test_other_numbers_are_sampled_as_the_next_larger():
-    chosen = {number: Sampling(number) for number in (16, 64, 256)}
-    found = {number: int(chosen_for(number, chosen).temperature) for number in (1, 16, 32, 256, 4096)}
-    assert found == {1: 16, 16: 16, 32: 64, 256: 256, 4096: 256}
 
 
 def test_a_decision_is_timed_at_some_of_the_starts():
     world = bandit(3)
     starts = starts_of(one_step(world), world, 6, 1, seeded(0))
-    timed = seconds_per_decision(starts, UniformPrior(3), seeded(0), dict.fromkeys([2, 8], Sampling()), 2)
+    timed = seconds_per_decision(starts, UniformPrior(3), seeded(0), Sampling(), [2, 8], 2)
     assert [(budget, steps) for budget, (_, steps) in timed.items()] == [(2, 2), (8, 8)]
     assert all(0 < seconds < 5 for seconds, _ in timed.values())
 
@@ -186,8 +177,8 @@ def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
     assert json.loads(json.dumps(run))["budgets"] == [1, 2, 4, 8, 16]
     for one in run["entries"][1:]:
         assert len(one["share"]) == len(one["at_oracle"]) == len(one["seconds"]) == 5
-        assert len(one["temperature"]) == len(one["uniform_share"]) == 5
-        if one["prior"] == "uniform":
+        assert (one["temperature"], one["uniform_share"]) in SETTINGS
+        if not one["uniform_share"]:  # else larger blocks are not made of smaller ones
             assert one["share"] == sorted(one["share"])
         assert 0 < one["share"][0] <= one["share"][-1] <= 1 + 1e-12
         assert one["model_steps"] == [None, None, 20, None, 80]
@@ -288,9 +279,9 @@ def test_ways_of_sampling_are_chosen_where_priors_did_not_learn(monkeypatch):
     """Once for each prior and length, and neither in the worlds it learned in nor in those of the comparison."""
     chosen = []
 
-    def spy(starts, prior, generator):
+    def spy(starts, prior, generator, numbers):
         chosen.append(starts)
-        return {number: {Sampling(): 0.5} for number in CHOSEN_AT}
+        return {number: {Sampling(): 0.5} for number in numbers}
 
     worlds = TINY.worlds(0)
     monkeypatch.setattr(run_module, "tried", spy)
@@ -312,6 +303,6 @@ def test_tables_hold_how_candidates_were_drawn(run):
     rows = Results([run], [4, 16]).rows
     for one in run["entries"][1:]:
         own = rows[[tuple(row) == (one["prior"], one["context"], one["rounds"]) for row in rows[PRIOR].to_numpy()]]
-        assert own["temperature"].tolist() == [one["temperature"][place] for place in (2, 4)]
-        assert own["uniform_share"].tolist() == [one["uniform_share"][place] for place in (2, 4)]
+        assert own["temperature"].tolist() == [one["temperature"]] * 2
+        assert own["uniform_share"].tolist() == [one["uniform_share"]] * 2
     assert rows.loc[rows["prior"].isna(), "temperature"].isna().all()
