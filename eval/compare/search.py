@@ -47,12 +47,14 @@ SEARCHED = 64
 """Candidates of which one should be the plan that is learned from."""
 
 WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "even weights": torch.ones_like,
     "hard plans": lambda log_prob: -log_prob.double(),
     f"one of {SEARCHED}": lambda log_prob: search_weights(log_prob, SEARCHED),
 }
 """How much plans count that are learned from, by their log-probability under a prior that was fitted to others.
 
-Hard plans: in proportion to the logarithm of the number of candidates that it takes to find them.
+Even weights: what drawing plans with replacement does by itself, since fewer of them are different then. Hard plans: in
+proportion to the logarithm of the number of candidates that it takes to find them.
 """
 
 

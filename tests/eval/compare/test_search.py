@@ -48,7 +48,7 @@ def test_runs_hold_every_way(monkeypatch):
             assert LIMITED.get(one["planner"], LIMITED[BOTH])(Sampling(one["temperature"], one["uniform_share"]))
     document = search_document(runs, {"num_plans": (4, 16)}, "search")
     gaps = document.frames["differences"]
-    assert len(gaps) == 2 * (4 + 6) * 2
+    assert len(gaps) == 2 * (4 + 7) * 2
     values = [
         {(e["prior"], e["num_plans"]): e["share"] for e in run["entries"] if e["planner"] == way}["gru", 4]
         for run in runs
@@ -71,5 +71,6 @@ def test_plans_are_weighed_by_what_others_taught(monkeypatch):
     rare = [float(prior.log_prob(plans[:1]).exp()) for prior in (plain, *found.values())]
     assert isinstance(plain, MarkovPrior)
     assert rare[0] == pytest.approx(0.1, abs=0.03)
+    assert rare[1] == pytest.approx(0.1, abs=0.06)
     # Of weights -log p: 0.1 * 2.3 / (0.1 * 2.3 + 0.9 * 0.1) = 0.7; with the others nearly none.
-    assert 0.5 < rare[1] < rare[2]
+    assert 0.5 < rare[2] < rare[3]
