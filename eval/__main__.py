@@ -12,6 +12,7 @@ COMMANDS = {
     "compare": Command("eval.compare.command:compare", "priors, or planners, compared in many worlds at equal budget"),
     "grow": Command("eval.compare.curriculum:grow", "what priors gain from the horizon curriculum"),
     "depth": Command("eval.compare.depth:depth", "how deep to plan"),
+    "search": Command("eval.compare.search:search", "what helps a planner that samples"),
     "live": Command("eval.live.command:live", "priors that learn online while the world changes"),
     "quality": Command("eval.quality.command:quality", "how near priors come to sources of known entropy"),
     "puzzles": Command("eval.puzzles.command:puzzles", "Sokoban and sliding tiles solved by policy-guided search"),

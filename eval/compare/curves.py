@@ -1,15 +1,19 @@
 """Normalised scores against the number of candidate plans: what a planner reaches that samples from a prior."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from time import perf_counter
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from eval.worlds.suite import Task, best_score
-from neuroprior import Prior, SamplingPlanner, TabularWorld, World
+from neuroprior import Prior, SamplingPlanner, TabularWorld, UniformPrior, World
 from neuroprior.planners import expected_score
+from neuroprior.planners.sampling import uniform_plans
+from neuroprior.planners.tuning import TEMPERATURES, UNIFORM_SHARES, choices
 
 ROLLOUTS = 16
 """Simulations of each candidate in a stochastic world."""
@@ -17,14 +21,22 @@ ROLLOUTS = 16
 ROWS = 2**15
 """Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
 
-TEMPERATURES = (1.0, 1.5, 2.0)
-"""At which priors may be sampled: an overconfident prior tries the same plans again and again."""
-
 DRAWN, AGAIN = 20, 9
 """For each start that is wanted so many are drawn, and, if too few of them are of use, so many times again."""
 
 CLOSE = 1e-6
 """A score this near to the optimum is optimal."""
+
+
+class Sampling(NamedTuple):
+    """How candidates are drawn: at a temperature, and a share of them uniformly."""
+
+    temperature: float = 1.0
+    uniform_share: float = 0.0
+
+
+SETTINGS = tuple(Sampling(*both) for both in product(TEMPERATURES, UNIFORM_SHARES))
+"""How priors may be sampled: an overconfident prior tries the same plans again and again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,20 +99,74 @@ def starts_of(task: Task, world: World, number: int, length: int, generator: tor
     return Starts(task, world, state[:number], length, best[:number], reference)
 
 
-def planner_of(starts: Starts, prior: Prior, num_plans: int, temperature: float) -> SamplingPlanner:
+def planner_of(starts: Starts, prior: Prior, num_plans: int, sampling: Sampling) -> SamplingPlanner:
     """A planner that samples its candidates from a prior."""
-    how = starts.task.scoring | {"num_rollouts": ROLLOUTS, "temperature": temperature}
+    how = starts.task.scoring | {"num_rollouts": ROLLOUTS} | sampling._asdict()
     return SamplingPlanner(prior, starts.length, num_plans, **how)
 
 
-def best_temperature(starts: Starts, prior: Prior, num_plans: int, generator: torch.Generator) -> float:
-    """The one of `TEMPERATURES` at which a prior's plans reach the most from these starts."""
-    shares = {t: curve(starts, prior, generator, t, [num_plans])["share"][0] for t in TEMPERATURES}
-    return max(shares, key=lambda t: shares[t])
+class Drawn(NamedTuple):
+    """What M candidates of each start are worth.
+
+    Attributes:
+        estimated: `[B, M]`, as the planner finds it, which chooses by it.
+        exact: `[B, M]`: what counts; it differs in stochastic worlds.
+    """
+
+    estimated: Tensor
+    exact: Tensor
+
+
+def drawn(starts: Starts, prior: Prior, num_plans: int, temperature: float, generator: torch.Generator) -> Drawn:
+    """So many candidates of a prior for each start."""
+    planner, estimates, scores = planner_of(starts, prior, num_plans, Sampling(temperature)), [], []
+    for state in starts.state.split(max(ROWS // num_plans, 1)):
+        plans, score, _ = planner.candidates(starts.world, state, generator)
+        if score.dim() == 3:  # any prefix may win
+            score = score.amax(-1)
+        estimates.append(score)
+        scores.append(worth(starts.task, starts.world, state, plans) if starts.world.stochastic else score)
+    return Drawn(torch.cat(estimates), torch.cat(scores))
+
+
+def drawn_uniformly(starts: Starts, share: float, num_plans: int, generator: torch.Generator) -> Drawn | None:
+    """As many uniform candidates for each start as are among so many candidates; None where there are none."""
+    number = uniform_plans(share, num_plans)
+    return drawn(starts, UniformPrior(starts.world.num_actions), number, 1.0, generator) if number else None
+
+
+def decided(own: Drawn, uniform: Drawn | None, num_plans: int, share: float) -> Tensor:
+    """The exact scores `[B, D]` of D decisions of each start, each for the best of a block of candidates."""
+    whole = own if uniform is None else Drawn(*(torch.cat(pair, 1) for pair in zip(own, uniform, strict=True)))
+    return whole.exact.gather(1, choices(whole.estimated, own.exact.shape[1], num_plans, share))
+
+
+def tried(
+    starts: Starts,
+    prior: Prior,
+    generator: torch.Generator,
+    numbers: Sequence[int],
+    settings: Sequence[Sampling] = SETTINGS,
+) -> dict[int, dict[Sampling, float]]:
+    """For each number of candidates the normalised score of each way of sampling them, all from the same draws."""
+    most, found = max(numbers), {number: dict.fromkeys(settings, 0.0) for number in numbers}
+    uniform = drawn_uniformly(starts, max(one.uniform_share for one in settings), most, generator)
+    for temperature in dict.fromkeys(one.temperature for one in settings):
+        own = drawn(starts, prior, most, temperature, generator)
+        for one in (one for one in settings if one.temperature == temperature):
+            for number in numbers:
+                score = decided(own, uniform, number, one.uniform_share)
+                found[number][one] = starts.reached(score)["share"]
+    return found
+
+
+def best(table: Mapping[Sampling, float]) -> Sampling:
+    """The way of sampling with the highest score, of equals the first."""
+    return max(table, key=lambda one: table[one])
 
 
 def curve(
-    starts: Starts, prior: Prior, generator: torch.Generator, temperature: float, budgets: Sequence[int]
+    starts: Starts, prior: Prior, generator: torch.Generator, sampling: Sampling, budgets: Sequence[int]
 ) -> dict[str, list[float]]:
     """What a sampling planner reaches with each number of candidates.
 
@@ -110,29 +176,19 @@ def curve(
     Returns:
         See `Starts.reached`, a list for all numbers.
     """
-    planner, estimates, scores = planner_of(starts, prior, max(budgets), temperature), [], []
-    for state in starts.state.split(max(ROWS // planner.num_plans, 1)):
-        plans, score, _ = planner.candidates(starts.world, state, generator)
-        if score.dim() == 3:  # any prefix may win
-            score = score.amax(-1)
-        estimates.append(score)
-        scores.append(worth(starts.task, starts.world, state, plans) if starts.world.stochastic else score)
-    estimated, exact = torch.cat(estimates), torch.cat(scores)
-    found = []
-    for budget in budgets:
-        blocks = estimated.shape[1] // budget
-        shape = (len(estimated), blocks, budget)
-        chosen = estimated[:, : blocks * budget].view(shape).argmax(-1, keepdim=True)
-        found.append(starts.reached(exact[:, : blocks * budget].view(shape).gather(-1, chosen)[..., 0]))
+    heat, share = sampling
+    uniform = drawn_uniformly(starts, share, max(budgets), generator)
+    own = drawn(starts, prior, max(budgets), heat, generator)
+    found = [starts.reached(decided(own, uniform, number, share)) for number in budgets]
     return {name: [one[name] for one in found] for name in found[0]}
 
 
 def seconds_per_decision(
-    starts: Starts, prior: Prior, generator: torch.Generator, temperature: float, budgets: Sequence[int], number: int
+    starts: Starts, prior: Prior, generator: torch.Generator, sampling: Sampling, budgets: Sequence[int], number: int
 ) -> dict[int, tuple[float, int]]:
     """By number of candidates the seconds and model steps that a decision takes, at `number` starts together."""
     state, taken = starts.state[:number], {}
-    planners = [planner_of(starts, prior, budget, temperature) for budget in budgets]
+    planners = [planner_of(starts, prior, budget, sampling) for budget in budgets]
     # The first call is slower than those that follow, and the largest makes room for all.
     largest = max(planners, key=lambda planner: planner.num_plans)
     largest.plan(starts.world, state, torch.Generator(generator.device).manual_seed(0))

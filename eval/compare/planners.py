@@ -10,7 +10,7 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
-from eval.compare.curves import ROLLOUTS, TEMPERATURES, Starts, worth
+from eval.compare.curves import ROLLOUTS, Starts, worth
 from eval.compare.figures import View, score_panels
 from eval.compare.run import Contest, Contestant, Settings
 from eval.worlds import runs
@@ -24,6 +24,7 @@ from neuroprior.planners import (
     SamplingPlanner,
     execute,
 )
+from neuroprior.planners.tuning import TEMPERATURES
 from neuroprior.report.document import Document
 from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.worlds import World

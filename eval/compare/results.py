@@ -30,6 +30,9 @@ LEARNED = ("neural", "markov", "other")
 PRIOR = ["prior", "context", "rounds"]
 """Columns that name a prior: its label, its context, and its rounds of the horizon curriculum."""
 
+SAMPLING = ["temperature", "uniform_share"]
+"""How candidates were drawn; in tables, its mean over seeds."""
+
 CLOSE = 1e-9
 """Normalised scores that differ by less are the same."""
 
@@ -121,7 +124,7 @@ class Results:
             for world, prior in zip(frame["world"], frame["prior"], strict=True)
         ]
         lists = ["num_plans", "share", "at_oracle", "model_steps", "seconds"]
-        frame = frame[[*place, *lists]].explode(lists, ignore_index=True)
+        frame = frame.reindex(columns=[*place, *SAMPLING, *lists]).explode(lists, ignore_index=True)
         return frame.astype(dict.fromkeys(lists, "float64") | {"num_plans": "Int64"})
 
     @cached_property
@@ -139,7 +142,7 @@ class Results:
     def curves(self) -> pd.DataFrame:
         """The normalised score: a row a world, planner, prior and number of plans, with its interval over seeds."""
         by = ["world", "planner", *PRIOR, "num_plans"]
-        found = seed_means(self.scores, by, "share", ["model_steps", "at_oracle", "seconds"])
+        found = seed_means(self.scores, by, "share", ["model_steps", "at_oracle", "seconds", *SAMPLING])
         found["model_steps"] = found["model_steps"].convert_dtypes()
         return found.rename(columns={"share": "oracle_share", "seconds": "seconds_per_decision"})
 

@@ -10,12 +10,13 @@ import torch
 
 from eval.compare.curves import (
     ROLLOUTS,
-    TEMPERATURES,
+    Sampling,
     Starts,
-    best_temperature,
+    best,
     curve,
     seconds_per_decision,
     starts_of,
+    tried,
 )
 from eval.compare.priors import COMBINED, NEURAL, ORDERS, TRAINING, chain, combined, digests, load_for, macro, network
 from eval.worlds.runs import Run
@@ -24,6 +25,7 @@ from neuroprior import ExhaustivePlanner, Plans, Prior, UniformPrior, World, col
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
 from neuroprior.planners import extend_horizon
+from neuroprior.planners.tuning import TEMPERATURES, UNIFORM_SHARES
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import GridWorld
 
@@ -34,10 +36,10 @@ CURRICULUM_PLANS = 64
 """Candidate plans in the rounds of the horizon curriculum."""
 
 VALIDATION_PLANS = 256
-"""Candidate plans with which temperatures are chosen, and rounds of the curriculum are compared."""
+"""Candidate plans with which ways of sampling are chosen, and rounds of the curriculum are compared."""
 
 VALIDATION_TIMES = 2
-"""For each held-out start so many in the validation worlds, to choose temperatures at: differences are small."""
+"""For each held-out start so many in the validation worlds, to choose there how to sample: differences are small."""
 
 TIMED_STARTS = 4
 """Starts planned from together when a decision is timed."""
@@ -139,7 +141,7 @@ def with_context(plans: Plans, context: Context) -> Plans:
 class Contestant(NamedTuple):
     """A prior after some rounds of the horizon curriculum, the last of which had plans of `length` actions.
 
-    `length` is None for priors that do not take part in the curriculum.
+    `length` and `plans`, what it was fitted to last, are None for priors that do not take part in the curriculum.
     """
 
     label: str
@@ -147,6 +149,7 @@ class Contestant(NamedTuple):
     prior: Prior
     rounds: int
     length: int | None
+    plans: Plans | None = None
 
 
 class Contest:
@@ -170,7 +173,7 @@ class Contest:
             )
         )
         self.starts = self.starts_at[task.length]
-        self._temperatures: dict[tuple[str, str, int, int], float] = {}
+        self._samplings: dict[tuple[str, str, int, int], Sampling] = {}
 
     def contestants(self) -> Iterator[Contestant]:
         """All priors, each after every round of its curriculum; the object is the same, and goes on learning."""
@@ -218,12 +221,14 @@ class Contest:
             min_score=self.task.min_score,
             num_rollouts=ROLLOUTS,
             temperatures=TEMPERATURES,
+            uniform_shares=UNIFORM_SHARES,
             generator=self.generator,
             **self.task.scoring,
             **training,
         )
-        for number, _ in enumerate(rounds):
-            yield Contestant(label, context, prior, number, (self.task.depth, *self.longer)[number])
+        for number, turn in enumerate(rounds):
+            length = (self.task.depth, *self.longer)[number]
+            yield Contestant(label, context, prior, number, length, turn.plans)
 
     @cached_property
     def first(self) -> Plans:
@@ -241,17 +246,16 @@ class Contest:
 
     def entry(self, one: Contestant) -> dict[str, Any]:
         """What a prior's plans reach in the held-out worlds, and how well it predicts those that were chosen there."""
-        temperature = self._temperature(one, self.task.length)
-        how = self.starts, one.prior, self.generator, temperature
-        reached, budgets = curve(*how, self.settings.budgets), self.settings.budgets
-        timed = seconds_per_decision(*how, self.settings.num_plans, TIMED_STARTS)
+        sampling, budgets = self.sampling(one, self.task.length), self.settings.budgets
+        how = self.starts, one.prior, self.generator, sampling
+        reached, timed = curve(*how, budgets), seconds_per_decision(*how, self.settings.num_plans, TIMED_STARTS)
         held_out = with_context(self.held_out_plans, one.context)
         return {
             "planner": "sampling",
             "prior": one.label,
             "context": one.context,
             "rounds": one.rounds,
-            "temperature": temperature,
+            **sampling._asdict(),
             **reached,
             "seconds": [timed[number][0] if number in timed else None for number in budgets],
             "model_steps": [timed[number][1] if number in timed else None for number in budgets],
@@ -262,20 +266,20 @@ class Contest:
     def curriculum_entry(self, one: Contestant, length: int) -> dict[str, Any]:
         """What a prior's plans of `length` actions reach."""
         number = self.settings.num_plans[0] if len(self.settings.num_plans) == 1 else VALIDATION_PLANS
-        temperature = self._temperature(one, length)
-        share = curve(self.starts_at[length], one.prior, self.generator, temperature, [number])["share"][0]
+        how = self.starts_at[length], one.prior, self.generator, self.sampling(one, length)
+        share = curve(*how, [number])["share"][0]
         named = {"prior": one.label, "context": one.context, "round": one.rounds}
         return named | {"length": length, "num_plans": number, "share": share}
 
-    def _temperature(self, one: Contestant, length: int) -> float:
-        """The temperature to sample plans of `length` actions at, chosen once; uniform plans are the same at all."""
+    def sampling(self, one: Contestant, length: int) -> Sampling:
+        """How to sample plans of `length` actions, chosen once; uniform plans are the same however they are drawn."""
         if one.label == "uniform":
-            return 1.0
+            return Sampling()
         key = one.label, one.context, one.rounds, length
-        if key not in self._temperatures:
-            starts = self.validation_at[length]
-            self._temperatures[key] = best_temperature(starts, one.prior, VALIDATION_PLANS, self.generator)
-        return self._temperatures[key]
+        if key not in self._samplings:
+            tables = tried(self.validation_at[length], one.prior, self.generator, [VALIDATION_PLANS])
+            self._samplings[key] = best(tables[VALIDATION_PLANS])
+        return self._samplings[key]
 
     def exhaustive(self) -> list[dict[str, Any]]:
         """What all short plans reach, one entry; none where longer plans cost more, which would favour the short."""

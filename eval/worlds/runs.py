@@ -57,8 +57,8 @@ class Run(NamedTuple):
 
 
 def runs_of(worlds: Sequence[str], seeds: int) -> list[Run]:
-    """A run for each of the worlds and each of `seeds` seeds."""
-    return [Run(world, seed) for world in worlds for seed in range(seeds)]
+    """A run for each of `seeds` seeds and each of the worlds; an experiment that is cut off has some of all worlds."""
+    return [Run(world, seed) for seed in range(seeds) for world in worlds]
 
 
 def run_experiment(

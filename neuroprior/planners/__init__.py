@@ -15,6 +15,7 @@ from neuroprior.planners.mcts import MCTSPlanner
 from neuroprior.planners.planner import Decision, Planner, PriorPlanner, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
+from neuroprior.planners.tuning import Tuned, best_sampling, sampling_for, search_weights
 
 __all__ = [
     "AStarPlanner",
@@ -36,6 +37,8 @@ __all__ = [
     "Search",
     "Sweep",
     "bootstrap",
+    "Tuned",
+    "best_sampling",
     "collect",
     "execute",
     "expected_score",
@@ -43,4 +46,6 @@ __all__ = [
     "mean_scores",
     "oracle",
     "random_best",
+    "sampling_for",
+    "search_weights",
 ]

@@ -8,12 +8,13 @@ import torch
 from neuroprior.planners.execution import collect
 from neuroprior.planners.planner import Objective
 from neuroprior.planners.sampling import SamplingPlanner
+from neuroprior.planners.tuning import best_sampling, check_tried
 from neuroprior.plans import Plans
 from neuroprior.priors.prior import Prior
 from neuroprior.worlds.world import World
 
-STARTS_PER_TEMPERATURE = 128
-"""Starts from which each temperature is tried before a round."""
+STARTS_TRIED = 128
+"""Starts from which temperatures and shares of uniform plans are tried before a round."""
 
 
 class HorizonRound(NamedTuple):
@@ -42,6 +43,7 @@ def extend_horizon(
     min_score: float | None = None,
     num_rollouts: int = 1,
     temperatures: Sequence[float] = (1.0,),
+    uniform_shares: Sequence[float] = (0.0,),
     generator: torch.Generator | None = None,
     **settings: Any,
 ) -> Iterator[HorizonRound]:
@@ -62,9 +64,9 @@ def extend_horizon(
         objective, discount, any_prefix: see `Planner`.
         min_score: the prior is fitted to plans with a higher score only, see `collect`.
         num_rollouts: see `SamplingPlanner`.
-        temperatures: candidates are drawn at one of these: before each round, the one with the highest mean score from
-            some starts is chosen. A prior fitted to few plans is often overconfident, and finds longer plans only at a
-            temperature above 1.
+        temperatures, uniform_shares: candidates are drawn at one of these temperatures, with one of these shares of
+            uniform plans: before each round, what finds most from some starts (`best_sampling`). A prior fitted to few
+            plans is often overconfident, and finds longer plans only at a temperature above 1.
         generator: draws starts and candidates, and is passed on to the prior's `fit`.
         **settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
 
@@ -76,28 +78,35 @@ def extend_horizon(
     """
     if any(length < 1 for length in lengths):
         raise ValueError(f"lengths: at least 1 is expected each, not {list(lengths)}")
-    if not temperatures:
-        raise ValueError("temperatures: at least one is expected")
+    check_tried(temperatures, uniform_shares)
     goal: Objective = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
     prior.fit(plans, generator=generator, **settings)
     yield HorizonRound(plans.max_length, plans)
     for length in lengths:
-        planners = [
-            SamplingPlanner(prior, length, num_plans, num_rollouts=num_rollouts, temperature=temperature, **goal)
-            for temperature in temperatures
-        ]
-        planner = _best(planners, world, min(num_starts, STARTS_PER_TEMPERATURE), generator)
+        if len(temperatures) * len(uniform_shares) == 1:
+            planner = SamplingPlanner(
+                prior,
+                length,
+                num_plans,
+                num_rollouts=num_rollouts,
+                temperature=temperatures[0],
+                uniform_share=uniform_shares[0],
+                **goal,
+            )
+        else:
+            state = world.reset(min(num_starts, STARTS_TRIED), generator)
+            planner = best_sampling(
+                prior,
+                world,
+                state,
+                length,
+                num_plans,
+                temperatures=temperatures,
+                uniform_shares=uniform_shares,
+                num_rollouts=num_rollouts,
+                generator=generator,
+                **goal,
+            ).planner
         plans = collect(planner, world, num_starts, context=prior.context_per, min_score=min_score, generator=generator)
         prior.fit(plans, generator=generator, **settings)
         yield HorizonRound(length, plans)
-
-
-def _best(
-    planners: Sequence[SamplingPlanner], world: World, number: int, generator: torch.Generator | None
-) -> SamplingPlanner:
-    """The planner with the highest mean score from `number` starts, the same for all; the first of equals."""
-    if len(planners) == 1:
-        return planners[0]
-    state = world.reset(number, generator)
-    scores = [float(planner.plan(world, state, generator).score.double().mean()) for planner in planners]
-    return planners[scores.index(max(scores))]

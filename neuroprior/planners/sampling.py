@@ -1,5 +1,6 @@
 """The sampling planner: draws candidate plans from a prior and decides for the best of them."""
 
+from numbers import Real
 from typing import Unpack
 
 import torch
@@ -8,9 +9,10 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
 from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
+from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.ancestral import sample, sample_in_world
 from neuroprior.sampling.stepping import Steppable, Stepper
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import Rollout, World
 
 
 class SamplingPlanner(PriorPlanner):
@@ -31,6 +33,8 @@ class SamplingPlanner(PriorPlanner):
         halving: spend as many rollouts unequally: after each of several rounds the worse half of the plans is dropped,
             so that the better ones are tried more often (see `planners.rollouts.halved_scores`).
         temperature: divides the prior's logits.
+        uniform_share: the share, from 0 to 1, of the candidates that are uniform plans instead, rounded to a whole
+            number of them: what the prior holds to be impossible is tried, too (a defensive mixture: Hesterberg 1995).
         **goal: objective, discount, value, any_prefix: see `Planner`.
 
     Raises:
@@ -46,11 +50,13 @@ class SamplingPlanner(PriorPlanner):
         num_rollouts: int = 1,
         halving: bool = False,
         temperature: float = 1.0,
+        uniform_share: float = 0.0,
         **goal: Unpack[Objective],
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
         check_sizes(num_rollouts=num_rollouts)
-        self.num_rollouts, self.halving = num_rollouts, halving
+        check_share(uniform_share)
+        self.num_rollouts, self.halving, self.uniform_share = num_rollouts, halving, uniform_share
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         generator = self._check(world, state, generator)
@@ -65,29 +71,50 @@ class SamplingPlanner(PriorPlanner):
         Scores and final states are `[B, P]`, those of all prefixes `[B, P, L]` with `any_prefix`; final states have the
         state's own dimensions behind these. With halving, only the plans of the last round are returned.
         """
-        if Stepper(self.prior).context_per is None and world.all_legal:
-            plans = sample(
-                self.prior,
-                len(state) * self.num_plans,
-                self.length,
-                temperature=self.temperature,
-                generator=generator,
-            ).view(len(state), self.num_plans, self.length)
-        else:
-            plans, rollout = sample_in_world(
-                self.prior,
-                world,
-                state,
-                self.num_plans,
-                self.length,
-                temperature=self.temperature,
-                generator=generator,
-                keep_states=self.any_prefix and not world.stochastic,
+        uniform = uniform_plans(self.uniform_share, self.num_plans)
+        drawn = []
+        if uniform < self.num_plans:
+            number = self.num_plans - uniform
+            drawn.append(self._drawn(self.prior, number, self.temperature, world, state, generator))
+        if uniform:
+            even = UniformPrior(world.num_actions).to(Stepper(self.prior).device)
+            drawn.append(self._drawn(even, uniform, 1.0, world, state, generator))
+        if not world.stochastic:
+            scored = [self._scored(plans, rollout, world, state, generator) for plans, rollout in drawn]
+            plans, score, ends = (
+                column[0] if len(column) == 1 else torch.cat(column, 1) for column in zip(*scored, strict=True)
             )
-            if not world.stochastic:
-                return plans, *self.score_rollout(rollout)
-        if self.halving and world.stochastic:
+            return plans, score, ends
+        # Together, so that all plans of a start meet the same random numbers.
+        plans = drawn[0][0] if len(drawn) == 1 else torch.cat([plans for plans, _ in drawn], 1)
+        if self.halving:
             return halved_scores(self, world, state, plans, self.num_rollouts, generator)
+        return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
+
+    def _drawn(
+        self, prior: Steppable, number: int, temperature: float, world: World, state: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Rollout | None]:
+        """Plans `[B, number, L]`, and their rollout where they were drawn together with the world."""
+        if Stepper(prior).context_per is None and world.all_legal:
+            plans = sample(prior, len(state) * number, self.length, temperature=temperature, generator=generator)
+            return plans.view(len(state), number, self.length), None
+        return sample_in_world(
+            prior,
+            world,
+            state,
+            number,
+            self.length,
+            temperature=temperature,
+            generator=generator,
+            keep_states=self.any_prefix and not world.stochastic,
+        )
+
+    def _scored(
+        self, plans: Tensor, rollout: Rollout | None, world: World, state: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The plans, their scores and final states in a deterministic world."""
+        if rollout is not None:
+            return plans, *self.score_rollout(rollout)
         return plans, *mean_scores(self, world, state, plans, self.num_rollouts, generator)
 
     def model_steps(self, world: World) -> int:
@@ -98,4 +125,16 @@ class SamplingPlanner(PriorPlanner):
         if self.halving:
             tries = sum(kept * times for kept, times in halving_rounds(self.num_plans, self.num_rollouts))
         drawn_in_world = Stepper(self.prior).context_per is not None
-        return (tries + self.num_plans * drawn_in_world) * self.length
+        own = self.num_plans - uniform_plans(self.uniform_share, self.num_plans)
+        return (tries + own * drawn_in_world) * self.length
+
+
+def uniform_plans(share: float, num_plans: int) -> int:
+    """How many of so many candidates are uniform plans."""
+    return round(share * num_plans)
+
+
+def check_share(share: object) -> None:
+    """Raise ValueError unless `share` is a number from 0 to 1."""
+    if isinstance(share, bool) or not isinstance(share, Real) or not 0 <= float(share) <= 1:
+        raise ValueError(f"uniform_share: a number from 0 to 1 is expected, not {share!r}")

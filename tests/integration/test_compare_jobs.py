@@ -36,7 +36,7 @@ def jobs_in(folder: Path, run=made_up, **changes) -> JobRun:
 
 
 def test_runs_are_worlds_times_seeds():
-    assert [(*run,) for run in RUNS] == [(world, seed) for world in ("maze", "grid") for seed in range(3)]
+    assert [(*run,) for run in RUNS] == [(world, seed) for seed in range(3) for world in ("maze", "grid")]
     assert len({run.name for run in RUNS}) == 6
 
 

@@ -139,6 +139,7 @@ def test_all_plans_have_common_random_numbers_in_whatever_chunks(prefix, rollout
         lambda **rest: ExhaustivePlanner(3, **rest),
         lambda **rest: SamplingPlanner(UniformPrior(3), 3, 9, **rest),
         lambda **rest: SamplingPlanner(MarkovPrior(3, num_contexts=5), 3, 9, **rest),
+        lambda **rest: SamplingPlanner(MarkovPrior(3, num_contexts=5), 3, 9, uniform_share=1 / 3, **rest),
     ],
 )
 def test_a_decision_is_what_the_first_rollout_says(make, prefix, monkeypatch):
@@ -154,8 +155,10 @@ def test_a_decision_is_what_the_first_rollout_says(make, prefix, monkeypatch):
     ((final, _, states),) = tried
     first = (final if states is None else states)[::50].flatten(1)
     assert (first == many.final_state[:, None]).any(1).all()
-    times = 51 if isinstance(planner, SamplingPlanner) and planner.prior.takes_context else 50
-    assert many.model_steps == times * 3 * (27 if isinstance(planner, ExhaustivePlanner) else 9)
+    drawn_in_world = 0
+    if isinstance(planner, SamplingPlanner) and planner.prior.takes_context:
+        drawn_in_world = 6 if planner.uniform_share else 9
+    assert many.model_steps == 3 * (50 * (27 if isinstance(planner, ExhaustivePlanner) else 9) + drawn_in_world)
     if many.lengths is not None:
         assert not many.plan[torch.arange(3) >= many.lengths[:, None]].any()
         exact = expected_score(world, torch.arange(10).repeat(20), many.plan[:, None], lengths=many.lengths[:, None])

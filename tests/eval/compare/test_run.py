@@ -9,9 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from eval.compare import curves
 from eval.compare import run as run_module
-from eval.compare.curves import TEMPERATURES, best_temperature, curve, planner_of, seconds_per_decision, starts_of
+from eval.compare.curves import (
+    SETTINGS,
+    Sampling,
+    best,
+    curve,
+    planner_of,
+    seconds_per_decision,
+    starts_of,
+    tried,
+)
+from eval.compare.results import PRIOR, Results
 from eval.compare.run import Contest, Settings, compare_run, curriculum_run
 from eval.worlds.mid_plan import MidPlanWorld
 from eval.worlds.runs import Run
@@ -58,7 +67,7 @@ def test_the_curve_of_a_lottery():
     world = bandit(5)
     starts = starts_of(one_step(world), world, 50, 1, seeded(0))
     budgets = [1, 2, 4, 8, 16]
-    found = curve(starts, UniformPrior(5), seeded(1), 1.0, [*budgets, 4096])
+    found = curve(starts, UniformPrior(5), seeded(1), Sampling(), [*budgets, 4096])
     for budget, share, at in zip(budgets, found["share"], found["at_oracle"], strict=False):
         truth = 1 - 0.8**budget
         error = (truth * (1 - truth) / (50 * 4096 // budget)) ** 0.5
@@ -71,10 +80,10 @@ def test_in_stochastic_worlds_plans_count_for_their_expected_score():
     """All plans gain 1 with probability 0.3, some seem to gain more: the best of many is worth 0.3 still."""
     world = bandit(4, 0.3)
     starts = starts_of(one_step(world), world, 20, 1, seeded(0))
-    found = curve(starts, UniformPrior(4), seeded(1), 1.0, [1, 64])
+    found = curve(starts, UniformPrior(4), seeded(1), Sampling(2.0, 0.3), [1, 64])
     assert found["share"] == pytest.approx([1.0, 1.0])
     assert found["score"] == pytest.approx([0.3, 0.3])
-    decision = planner_of(starts, UniformPrior(4), 64, 1.0).plan(world, starts.state, seeded(2))
+    decision = planner_of(starts, UniformPrior(4), 64, Sampling()).plan(world, starts.state, seeded(2))
     assert float(decision.score.mean()) > 0.3  # as the planner estimates
 
 
@@ -107,34 +116,49 @@ def test_the_optimum_of_the_cube():
     assert torch.allclose(best_score(task, world, state, 3), found)
 
 
-def test_the_best_temperature():
-    """A prior that is nearly sure of a plan that fails finds the other one at a high temperature."""
+def nearly_sure_of(action: int) -> MarkovPrior:
+    return MarkovPrior(2, 0).fit(torch.tensor([[action]] * 97 + [[1 - action]] * 3))
+
+
+def test_the_curve_of_uniform_plans_among_others():
+    """Of n candidates half are uniform: one wins with 1 - 0.5 ** (n / 2), as the others hardly do."""
+    world = bandit(2)
+    starts = starts_of(one_step(world), world, 50, 1, seeded(0))
+    sure = MarkovPrior(2, 0, smoothing=1e-9, backoff="dirichlet").fit(torch.ones(99, 1, dtype=torch.long))
+    found = curve(starts, sure, seeded(1), Sampling(1.0, 0.5), [2, 4, 1024])["share"]
+    for share, number in zip(found, (2, 4), strict=False):
+        truth = 1 - 0.5 ** (number / 2)
+        assert share == pytest.approx(truth, abs=6 * (truth * (1 - truth) / (50 * 1024 // number)) ** 0.5)
+    assert curve(starts, sure, seeded(1), Sampling(), [1024])["share"] == [0]
+
+
+def test_the_best_way_of_sampling():
+    """A prior that is nearly sure of a plan that fails finds the other one when it is hot, or by uniform plans."""
     world = bandit(2)
     starts = starts_of(one_step(world), world, 40, 1, seeded(0))
-    sure = MarkovPrior(2, 0).fit(torch.tensor([[1]] * 97 + [[0]] * 3))
-    assert best_temperature(starts, sure, 8, seeded(1)) == max(TEMPERATURES)
-    right = MarkovPrior(2, 0).fit(torch.tensor([[0]] * 97 + [[1]] * 3))
-    assert best_temperature(starts, right, 1, seeded(1)) == 1.0
+    tables = tried(starts, nearly_sure_of(1), seeded(1), (1, 8))
+    assert {tuple(table) for table in tables.values()} == {SETTINGS}
+    assert best(tables[8]) == Sampling(2.0, 0.3)
+    assert tables[8][2.0, 0.0] > tables[8][1.0, 0.0]
+    assert tables[8][1.0, 0.3] > tables[8][1.0, 0.0]
+    # A share of a single plan is none: of equals the first.
+    assert best(tables[1]).uniform_share == 0
+    assert best(tried(starts, nearly_sure_of(0), seeded(1), (1,))[1]) == Sampling(1.0, 0.0)
 
 
-def test_every_temperature_is_tried_with_as_many_plans(monkeypatch):
-    asked = []
-
-    def share(starts, prior, generator, temperature, budgets):
-        asked.append((temperature, budgets))
-        return {"share": [-abs(temperature - 1.5)]}
-
-    monkeypatch.setattr(curves, "curve", share)
-    world = bandit(2)
-    starts = starts_of(one_step(world), world, 4, 1, seeded(0))
-    assert best_temperature(starts, MarkovPrior(2, 0), 8, seeded(1)) == 1.5
-    assert asked == [(temperature, [8]) for temperature in TEMPERATURES]
+def test_settings_that_are_tried_score_as_in_the_curve():
+    world = bandit(4)
+    starts = starts_of(one_step(world), world, 40, 1, seeded(0))
+    prior, one = MarkovPrior(4, 0).fit(torch.tensor([[1]] * 40 + [[0]] * 9)), Sampling(1.5, 0.3)
+    table = tried(starts, prior, seeded(1), (4, 16), (one,))
+    found = curve(starts, prior, seeded(1), one, [4, 16])
+    assert found["share"] == [table[number][one] for number in (4, 16)]
 
 
 def test_a_decision_is_timed_at_some_of_the_starts():
     world = bandit(3)
     starts = starts_of(one_step(world), world, 6, 1, seeded(0))
-    timed = seconds_per_decision(starts, UniformPrior(3), seeded(0), 1.0, [2, 8], 2)
+    timed = seconds_per_decision(starts, UniformPrior(3), seeded(0), Sampling(), [2, 8], 2)
     assert [(budget, steps) for budget, (_, steps) in timed.items()] == [(2, 2), (8, 8)]
     assert all(0 < seconds < 5 for seconds, _ in timed.values())
 
@@ -153,7 +177,9 @@ def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
     assert json.loads(json.dumps(run))["budgets"] == [1, 2, 4, 8, 16]
     for one in run["entries"][1:]:
         assert len(one["share"]) == len(one["at_oracle"]) == len(one["seconds"]) == 5
-        assert one["share"] == sorted(one["share"])
+        assert (one["temperature"], one["uniform_share"]) in SETTINGS
+        if not one["uniform_share"]:  # else larger blocks are not made of smaller ones
+            assert one["share"] == sorted(one["share"])
         assert 0 < one["share"][0] <= one["share"][-1] <= 1 + 1e-12
         assert one["model_steps"] == [None, None, 20, None, 80]
         assert 0 < one["bits"] < 3
@@ -249,16 +275,16 @@ def test_worlds_of_the_suite(name):
     assert all(later > earlier for earlier, later in zip((task.depth, *task.lengths), task.lengths, strict=False))
 
 
-def test_temperatures_are_chosen_where_priors_did_not_learn(monkeypatch):
+def test_ways_of_sampling_are_chosen_where_priors_did_not_learn(monkeypatch):
     """Once for each prior and length, and neither in the worlds it learned in nor in those of the comparison."""
     chosen = []
 
-    def spy(starts, prior, budget, generator):
+    def spy(starts, prior, generator, numbers):
         chosen.append(starts)
-        return 1.0
+        return {number: {Sampling(): 0.5} for number in numbers}
 
     worlds = TINY.worlds(0)
-    monkeypatch.setattr(run_module, "best_temperature", spy)
+    monkeypatch.setattr(run_module, "tried", spy)
     run_in(replace(TINY, worlds=lambda seed: worlds), 0, SMALL)
     assert all(starts.world is worlds.validation for starts in chosen)
     # Five chains and a network with two contexts: before the curriculum at lengths 3 and 5, after it at 5.
@@ -271,3 +297,12 @@ def test_the_documentation_describes_the_worlds():
         lengths, contexts = ", ".join(map(str, task.lengths)), ", ".join(task.contexts)
         row = (f"`{name}`", task.about, task.num_actions, task.depth, lengths, contexts, task.start_factor)
         assert f"| {' | '.join(map(str, row))} |" in text
+
+
+def test_tables_hold_how_candidates_were_drawn(run):
+    rows = Results([run], [4, 16]).rows
+    for one in run["entries"][1:]:
+        own = rows[[tuple(row) == (one["prior"], one["context"], one["rounds"]) for row in rows[PRIOR].to_numpy()]]
+        assert own["temperature"].tolist() == [one["temperature"]] * 2
+        assert own["uniform_share"].tolist() == [one["uniform_share"]] * 2
+    assert rows.loc[rows["prior"].isna(), "temperature"].isna().all()

@@ -1,0 +1,256 @@
+"""What helps a planner that samples: the temperature and the share of uniform plans, and plans that are hard to find.
+
+The likeliest plans are not the best candidates: those are likely and different. `best_sampling` chooses by what is
+found in a world, `sampling_for` without one, and `search_weights` says which plans to learn from.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from math import inf, log
+from typing import Any, NamedTuple, Unpack
+
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
+from neuroprior.planners.planner import Objective
+from neuroprior.planners.rollouts import mean_scores
+from neuroprior.planners.sampling import SamplingPlanner, check_share, uniform_plans
+from neuroprior.plans import Plans
+from neuroprior.priors.prior import Prior
+from neuroprior.priors.uniform import UniformPrior
+from neuroprior.sampling.draws import check_temperature
+from neuroprior.sampling.stepping import Steppable
+from neuroprior.worlds.world import World
+
+TEMPERATURES = (1.0, 1.5, 2.0)
+"""At which priors are tried: an overconfident prior tries the same plans again and again."""
+
+UNIFORM_SHARES = (0.0, 0.1, 0.3)
+"""Shares of uniform plans that are tried."""
+
+SMALLEST = -600.0
+"""The logarithm of a probability below which `num_plans` times it is as good as exact, and its `exp` may be 0."""
+
+DIGITS = 9
+"""Logarithms that agree to so many digits after the point are equal."""
+
+
+class Tuned(NamedTuple):
+    """What `best_sampling` chose.
+
+    Attributes:
+        planner: samples at this temperature and with this share.
+        temperature: divides the prior's logits.
+        uniform_share: the share of uniform plans.
+        scores: of each (temperature, uniform share) that was tried, the mean score of its decisions.
+    """
+
+    planner: SamplingPlanner
+    temperature: float
+    uniform_share: float
+    scores: Mapping[tuple[float, float], float]
+
+
+def best_sampling(
+    prior: Steppable,
+    world: World,
+    state: Tensor,
+    length: int,
+    num_plans: int,
+    *,
+    temperatures: Sequence[float] = TEMPERATURES,
+    uniform_shares: Sequence[float] = UNIFORM_SHARES,
+    num_rollouts: int = 1,
+    generator: torch.Generator | None = None,
+    **goal: Unpack[Objective],
+) -> Tuned:
+    """The temperature and the share of uniform plans whose decisions score highest from some starts.
+
+    Candidates are drawn once at each temperature, and uniform ones once: each setting decides among some of both.
+    In a stochastic world what is chosen is scored by new rollouts, so that varied candidates do not win by luck.
+
+    Args:
+        prior, length, num_plans, num_rollouts, **goal: see `SamplingPlanner`.
+        world: a world that the prior did not learn from: where it did, it is overconfident.
+        state: starts `[B, ...]` in it, at least one; with hundreds the best setting is told from the others.
+        temperatures, uniform_shares: what is tried; of settings with equal scores, the first.
+        generator: draws the candidates and the steps of a stochastic world.
+
+    Raises:
+        ValueError: an argument is out of range, or there is nothing to try.
+    """
+    check_tried(temperatures, uniform_shares)
+    if len(state) == 0:
+        raise ValueError("state: at least one start is expected; from none, no setting is better than another")
+    generator = generator_on(generator, state.device)
+
+    def planner(prior: Steppable, number: int, temperature: float = 1.0, share: float = 0.0) -> SamplingPlanner:
+        how: dict[str, Any] = {"num_rollouts": num_rollouts, "temperature": temperature, "uniform_share": share}
+        return SamplingPlanner(prior, length, number, **how, **goal)
+
+    own = {heat: planner(prior, num_plans, heat) for heat in temperatures}
+    uniform = max(uniform_plans(share, num_plans) for share in uniform_shares)
+    even = planner(UniformPrior(world.num_actions), uniform) if uniform else None
+    totals = dict.fromkeys(product(temperatures, uniform_shares), 0.0)
+    steps = next(iter(own.values())).model_steps(world)
+    for some in planner(prior, num_plans).chunks(state, steps):
+        others = None if even is None else even.candidates(world, some, generator)[:2]
+        for heat in own:
+            drawn = own[heat].candidates(world, some, generator)[:2]
+            for share in uniform_shares:
+                scores = _decided(own[heat], world, some, drawn, others, share, generator)
+                totals[heat, share] += float(scores.double().sum())
+    best = max(totals, key=lambda setting: totals[setting])
+    means = {setting: total / len(state) for setting, total in totals.items()}
+    return Tuned(planner(prior, num_plans, *best), *best, means)
+
+
+def _decided(
+    planner: SamplingPlanner,
+    world: World,
+    state: Tensor,
+    drawn: tuple[Tensor, Tensor],
+    uniform: tuple[Tensor, Tensor] | None,
+    share: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """The scores `[B]` of the best of some plans that were drawn and some uniform ones, each with their scores."""
+    plans, estimates = drawn if uniform is None else (torch.cat(pair, 1) for pair in zip(drawn, uniform, strict=True))
+    prefix = None
+    if estimates.dim() == 3:  # any prefix may win
+        estimates, prefix = estimates.max(-1)
+    best = choices(estimates, planner.num_plans, planner.num_plans, share)
+    if not world.stochastic:
+        return estimates.gather(1, best)[:, 0]
+    row = torch.arange(len(plans), device=plans.device)[:, None]
+    scores, _ = mean_scores(planner, world, state, plans[row, best], planner.num_rollouts, generator)
+    return scores[:, 0] if prefix is None else scores[:, 0].gather(1, prefix.gather(1, best))[:, 0]
+
+
+def choices(score: Tensor, drawn: int, num_plans: int, share: float) -> Tensor:
+    """The best of each block of `num_plans` candidates, a share of which are uniform plans.
+
+    Args:
+        score: `[B, M + U]`: of M candidates of a prior, and of U uniform plans behind them.
+        drawn: M.
+        num_plans: P.
+        share: of uniform plans among the P.
+
+    Returns:
+        The columns `[B, D]` of the best in each of the D blocks that there are enough candidates for.
+    """
+    uniform = uniform_plans(share, num_plans)
+    sizes, numbers = (num_plans - uniform, uniform), (drawn, score.shape[1] - drawn)
+    blocks = min(number // size for size, number in zip(sizes, numbers, strict=True) if size)
+    parts = [
+        first + torch.arange(blocks * size, device=score.device).view(blocks, size)
+        for first, size in zip((0, drawn), sizes, strict=True)
+    ]
+    column = torch.cat(parts, 1)
+    best = score[:, column].argmax(-1)
+    return column.expand(len(score), -1, -1).gather(2, best[..., None])[..., 0]
+
+
+@torch.no_grad()
+def sampling_for(
+    prior: Prior,
+    plans: Plans,
+    num_plans: int,
+    temperatures: Sequence[float] = TEMPERATURES,
+    uniform_shares: Sequence[float] = UNIFORM_SHARES,
+) -> tuple[float, float]:
+    """The temperature and the share of uniform plans to sample with, where there are plans but no world to try.
+
+    With both, a plan of L actions is drawn with probability q = (1 - share) p + share / A^L, where p is the prior's at
+    the temperature. One of P candidates is that plan with probability 1 - (1 - q)^P, whose mean over held-out plans is
+    highest: where plans have groups the mean of the group in which it is lowest, so that least is lost in the worst
+    case; of equals, the mean over all plans.
+
+    Args:
+        prior: fitted to other plans.
+        plans: held-out plans, at least one. The probability is that of whole plans: cut them to the length to be
+            planned.
+        num_plans: P.
+        temperatures, uniform_shares: what is tried; of settings that are equal in both, the first.
+
+    Returns:
+        The temperature and the share.
+
+    Raises:
+        ValueError: an argument is out of range, there is nothing to try, or plans that the prior does not know.
+    """
+    check_tried(temperatures, uniform_shares)
+    check_sizes(num_plans=num_plans)
+    if len(plans) == 0:
+        raise ValueError("plans: at least one is expected; from none, no setting is better than another")
+    parts: dict[float, list[Tensor]] = {heat: [] for heat in temperatures}
+    for part, log_probs in prior.forecasts(plans):
+        action, beyond = part.actions.long()[..., None], ~part.mask()
+        for heat, found in parts.items():
+            taken = (log_probs.double() / heat).log_softmax(-1).gather(-1, action)[..., 0]
+            found.append(taken.masked_fill(beyond, 0).sum(1).cpu())
+    at = {heat: torch.cat(found) for heat, found in parts.items()}
+    even = -plans.mask().sum(1).double().cpu() * log(plans.num_actions)
+    group = torch.zeros(len(plans), dtype=torch.long) if plans.group is None else plans.group.cpu()
+    members = group.unique(return_inverse=True)[1]
+
+    def worth(setting: tuple[float, float]) -> tuple[float, float]:
+        heat, share = setting
+        ways = [at[heat] + (log(1 - share) if share < 1 else -inf), even + (log(share) if share else -inf)]
+        found = log_chance(torch.logaddexp(*ways), num_plans)
+        groups = [_log_mean(found[members == number]) for number in range(int(members.max()) + 1)]
+        return round(min(groups), DIGITS), round(_log_mean(found), DIGITS)
+
+    return max(product(temperatures, uniform_shares), key=worth)
+
+
+def search_weights(log_prob: Tensor, num_plans: int) -> Tensor:
+    """How much each plan should count for a prior of which one of P samples is to be that plan.
+
+    The loss -log(1 - (1 - p)^P) falls with log p by w = P p (1 - p)^(P - 1) / (1 - (1 - p)^P), as that of a plan of
+    weight w does: 1 for plans that are hardly ever found, near 0 for those that P candidates contain anyway. With P = 1
+    all weights are 1.
+
+    Args:
+        log_prob: `[N]`, of plans under a prior that did not learn from them, at most 0.
+        num_plans: P.
+
+    Returns:
+        Weights from 0 to 1, float64 `[N]`.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    check_sizes(num_plans=num_plans)
+    if not bool((log_prob <= 0).all()):
+        raise ValueError("log_prob: logarithms of probabilities, at most 0, are expected")
+    log_prob = log_prob.double()
+    others = torch.special.xlog1py(torch.tensor(num_plans - 1.0), -log_prob.exp())
+    # Where a plan is impossible, the limit.
+    weight: Tensor = (log(num_plans) + log_prob + others - log_chance(log_prob, num_plans)).exp()
+    return weight.masked_fill(log_prob == -inf, 1.0).clamp(0, 1)
+
+
+def log_chance(log_prob: Tensor, num_plans: int) -> Tensor:
+    """log(1 - (1 - q)^P), float64, of log q: that one of P samples is a plan of probability q, however small."""
+    log_prob = log_prob.double().clamp(max=0)
+    never = torch.special.xlog1py(torch.tensor(float(num_plans)), -log_prob.exp())
+    return torch.where(log_prob < SMALLEST, log(num_plans) + log_prob, (-torch.expm1(never)).log())
+
+
+def _log_mean(values: Tensor) -> float:
+    """The logarithm of the mean of what has these logarithms."""
+    return float(values.logsumexp(0)) - log(len(values))
+
+
+def check_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) -> None:
+    """Raise ValueError where there are no temperatures or shares to try, or one is out of range."""
+    for name, values in (("temperatures", temperatures), ("uniform_shares", uniform_shares)):
+        if not len(values):
+            raise ValueError(f"{name}: at least one is expected")
+    for temperature in temperatures:
+        check_temperature(temperature)
+    for share in uniform_shares:
+        check_share(share)

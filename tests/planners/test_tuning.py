@@ -1,0 +1,240 @@
+"""Uniform shares, and how temperature and share are chosen: by enumeration, and in worlds with one good plan."""
+
+from itertools import product
+from math import log
+
+import pytest
+import torch
+
+from neuroprior import MarkovPrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
+from neuroprior.planners import best_sampling, sampling_for, search_weights
+from neuroprior.planners.tuning import choices, log_chance
+from neuroprior.testing import check_planner
+from neuroprior.worlds import gridworld
+from tests.support.sources import refuses, seeded, stochastic_world
+
+
+def bandit(probability: float | None = None) -> TabularWorld:
+    """One step: action 0 is rewarded, always or with a probability."""
+    if probability is None:
+        return TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.tensor([[[1.0, 0.0]]]))
+    outcomes = torch.tensor([[[[1.0, 0.0], [0.0, 0.0]]]])
+    chances = torch.tensor([[[probability, 1 - probability], [1.0, 0.0]]])
+    return TabularWorld(torch.zeros(1, 2, 2, dtype=torch.long), outcomes, probability=chances)
+
+
+def sure_of(action: int, order: int = 0) -> MarkovPrior:
+    """Nearly sure that all actions are this one of two."""
+    return MarkovPrior(2, order).fit(torch.tensor([[action] * 4] * 500 + [[1 - action] * 4]))
+
+
+def candidates(planner: SamplingPlanner, world: TabularWorld, starts: int = 20) -> torch.Tensor:
+    return planner.candidates(world, torch.zeros(starts, dtype=torch.long), seeded(0))[0]
+
+
+@pytest.mark.parametrize(("share", "number"), [(0.0, 0), (0.1, 2), (0.3, 6), (1.0, 20)])
+def test_so_many_candidates_are_uniform(share, number):
+    """A prior of ones: of P uniform plans of 8 moves, 2 ** -8 are all ones, in 20 starts at most 3 (p < 1e-3)."""
+    prior = MarkovPrior(2, 0, smoothing=1e-9, backoff="dirichlet").fit(torch.ones(500, 8, dtype=torch.long))
+    world = gridworld(5, 5)
+    world = TabularWorld(world.next_state[:, :2], torch.zeros(25))
+    plans = candidates(SamplingPlanner(prior, 8, 20, uniform_share=share), world)
+    assert plans.shape == (20, 20, 8)
+    assert bool((plans[:, : 20 - number] == 1).all())
+    assert int((plans[:, 20 - number :] == 1).all(-1).sum()) <= 3 * (number + 1)
+    assert float(plans[:, 20 - number :].float().mean()) == pytest.approx(0.5, abs=0.2) or not number
+
+
+def test_without_a_share_nothing_changes():
+    world, prior = gridworld(6, 6), MarkovPrior(4, 1).fit(torch.randint(4, (50, 3), generator=seeded(0)))
+    state = torch.arange(36)
+    one, two = (
+        SamplingPlanner(prior, 5, 8, **how).plan(world, state, seeded(1)) for how in ({}, {"uniform_share": 0.0})
+    )
+    assert torch.equal(one.plan, two.plan)
+    # What is drawn from the prior comes first, and with the same numbers.
+    few = candidates(SamplingPlanner(prior, 5, 1), world)
+    more = candidates(SamplingPlanner(prior, 5, 2, uniform_share=0.5), world)
+    assert torch.equal(few[:, 0], more[:, 0])
+
+
+def test_a_share_conforms():
+    check_planner(lambda prior, length, number: SamplingPlanner(prior, length, number, uniform_share=0.3))
+
+
+@pytest.mark.parametrize("halving", [False, True])
+@pytest.mark.parametrize("contexts", [None, 5])
+def test_a_share_in_a_stochastic_world(contexts, halving):
+    """All plans of a start meet the same random numbers: equal plans have equal scores, whoever drew them."""
+    world, prior = stochastic_world(1, "WS"), MarkovPrior(3, 0, num_contexts=contexts)
+    planner = SamplingPlanner(prior, 2, 60, num_rollouts=8, halving=halving, uniform_share=0.5)
+    plans, score, _ = planner.candidates(world, torch.arange(10), seeded(0))
+    number = plans.long() @ torch.tensor([3, 1])
+    same = number[:, :, None] == number[:, None]
+    assert float(((score[:, :, None] - score[:, None]).abs() * same).max()) == 0
+    assert int(same.sum()) > plans.shape[:2].numel()
+
+
+def test_uniform_plans_are_legal():
+    """Where not all actions are legal, uniform plans take those alone that are."""
+    legal = torch.tensor([[False, True]])
+    world = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.zeros(1, 1), legal_actions=legal)
+    plans = candidates(SamplingPlanner(sure_of(0), 4, 10, uniform_share=0.5), world)
+    assert bool((plans == 1).all())
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan"), "0.1", True])
+def test_shares_out_of_range(share):
+    with refuses("uniform_share: a number from 0 to 1"):
+        SamplingPlanner(UniformPrior(2), 1, 1, uniform_share=share)
+
+
+def test_a_prior_that_is_wrong_needs_heat_or_uniform_plans():
+    """The one that is right needs neither; of equals the first wins."""
+    world, state = bandit(), torch.zeros(200, dtype=torch.long)
+    wrong = best_sampling(
+        sure_of(1), world, state, 1, 4, uniform_shares=(0, 0.5), temperatures=(1,), generator=seeded(0)
+    )
+    assert (wrong.temperature, wrong.uniform_share) == (1, 0.5)
+    assert wrong.planner.uniform_share == 0.5
+    # Two uniform plans and two that fail, but for 2 in 1,000: 3/4; four draws from 200 starts, 5 errors.
+    assert wrong.scores[1, 0.5] == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 200) ** 0.5)
+    assert wrong.scores[1, 0] < 0.1
+    hot = best_sampling(sure_of(1), world, state, 1, 4, uniform_shares=(0,), generator=seeded(0))
+    assert (hot.temperature, hot.planner.temperature) == (2.0, 2.0)
+    right = best_sampling(sure_of(0), world, state, 1, 4, uniform_shares=(0, 1.0), generator=seeded(0))
+    assert (right.temperature, right.uniform_share) == (1.0, 0)
+    assert set(right.scores) == set(product((1.0, 1.5, 2.0), (0, 1.0)))
+
+
+def test_luck_does_not_win_in_a_stochastic_world():
+    """Action 0 is worth 0.3, 1 nothing. Of 64 tries of it one succeeds, whichever setting: by new rollouts 0.3."""
+    world, state = bandit(0.3), torch.zeros(400, dtype=torch.long)
+    found = best_sampling(sure_of(0), world, state, 1, 64, temperatures=(1.0,), generator=seeded(0), objective="return")
+    # A mean over 400 starts of one rollout each: 5 errors.
+    assert list(found.scores.values()) == pytest.approx([0.3] * 3, abs=5 * (0.21 / 400) ** 0.5)
+
+
+@pytest.mark.parametrize("rewards", [None, "WS"])
+def test_best_sampling_takes_prefixes_and_contexts(rewards):
+    world = gridworld(3, 3) if rewards is None else stochastic_world(1, rewards, actions=4)
+    prior = MarkovPrior(4, 1, num_contexts=world.num_states)
+    state = world.reset(30, seeded(0))
+    first, again = (best_sampling(prior, world, state, 4, 10, generator=seeded(0), any_prefix=True) for _ in range(2))
+    assert first.scores == again.scores
+    assert len(first.scores) == 9
+    whole = best_sampling(prior, world, state, 4, 10, generator=seeded(0))
+    assert sum(whole.scores.values()) < sum(first.scores.values())
+
+
+def test_choices_are_the_best_of_blocks():
+    score = torch.tensor([[0.0, 3, 1, 2, 9, 4, 8]])
+    assert choices(score, 4, 2, 0.0).tolist() == [[1, 3]]
+    assert choices(score, 4, 2, 0.5).tolist() == [[4, 5, 6]]
+    assert choices(score, 4, 3, 1.0).tolist() == [[4]]
+    assert choices(score, 4, 7, 3 / 7).tolist() == [[4]]
+
+
+def chance(prior: MarkovPrior, plan: list[int], heat: float, share: float, number: int) -> float:
+    """That one of `number` candidates is a plan, from the prior's steps."""
+    prob, logits, state = 1.0, *prior.start(1)
+    for at, action in enumerate(plan):
+        prob *= float((logits.double() / heat).softmax(-1)[0, action])
+        if at + 1 < len(plan):
+            logits, state = prior.step(torch.tensor([action]), state)
+    return 1 - (1 - (1 - share) * prob - share / prior.num_actions ** len(plan)) ** number
+
+
+@pytest.mark.parametrize("number", [1, 8, 64])
+def test_sampling_for_is_the_best_by_enumeration(number):
+    prior = MarkovPrior(3, 1).fit(torch.tensor([[0, 1, 2], [0, 1, 1], [0, 0, 1]] * 10))
+    tried = list(product((0.5, 1.0, 1.5, 2.0, 4.0), (0.0, 0.1, 0.3, 0.9)))
+    for plans in ([[0, 1, 2]], [[2, 2, 0]], [[0, 1, 2], [2, 2, 0], [1, 0, 0]], [[0, 1, 2]] * 3 + [[2, 0, 2]]):
+        worth = {
+            setting: sum(chance(prior, plan, *setting, number) for plan in plans) / len(plans) for setting in tried
+        }
+        found = sampling_for(
+            prior, Plans(torch.tensor(plans), 3), number, (0.5, 1.0, 1.5, 2.0, 4.0), (0.0, 0.1, 0.3, 0.9)
+        )
+        assert worth[found] == pytest.approx(max(worth.values()), rel=1e-6)
+        assert found == max(tried, key=lambda setting: worth[setting])
+
+
+def test_the_worst_group_counts():
+    """Nine plans are what the prior says, one of another group is not: for their mean no uniform plans, for it some."""
+    plans = torch.tensor([[0] * 4] * 9 + [[1, 0, 1, 1]])
+    group = torch.tensor([3] * 9 + [7])
+    how = 1, (1.0,), (0.0, 0.3)
+    assert sampling_for(sure_of(0), Plans(plans, 2), *how) == (1.0, 0.0)
+    assert sampling_for(sure_of(0), Plans(plans, 2, group=group), *how) == (1.0, 0.3)
+
+
+def test_of_equal_settings_the_first():
+    even = Plans(torch.tensor([[0, 1], [1, 1]]), 2)
+    assert sampling_for(UniformPrior(2), even, 4, (2.0, 1.0), (0.5, 0.0)) == (2.0, 0.5)
+
+
+def test_the_mean_breaks_ties():
+    """The worst plan, 0 0, has a probability of 1/4 at any temperature; 1 1 has 1/2, and less when it is hot."""
+    training = torch.tensor([[0, 0], [0, 1], [1, 1], [1, 1]] * 10)
+    prior = MarkovPrior(2, 1, smoothing=1e-9, backoff="dirichlet").fit(training)
+    plans = Plans(torch.tensor([[0, 0], [1, 1]]), 2, group=torch.tensor([0, 1]))
+    assert sampling_for(prior, plans[:1], 4, (8.0, 1.0), (0.0,)) == (8.0, 0.0)
+    assert sampling_for(prior, plans, 4, (8.0, 1.0), (0.0,)) == (1.0, 0.0)
+
+
+def test_tiny_probabilities_are_told_apart():
+    """Plans of 2,000 actions: their probability is 0 in float64, and its logarithm is not."""
+    plans = Plans(torch.ones(3, 2000, dtype=torch.long), 2)
+    assert sampling_for(sure_of(0), plans, 16, (1.0, 2.0, 8.0), (0.0,)) == (8.0, 0.0)
+    assert sampling_for(sure_of(0), plans, 16, (1.0,), (0.0, 0.3)) == (1.0, 0.3)
+    small = torch.tensor([-50.0, -599.0, -601.0, -5000.0], dtype=torch.float64)
+    assert torch.allclose(log_chance(small, 64), small + log(64), rtol=1e-12)
+
+
+def test_plans_of_several_lengths():
+    plans = Plans(torch.tensor([[0, 1, 0], [1, 0, 0]]), 2, lengths=torch.tensor([3, 1]))
+    prior, number = sure_of(0), 4
+    worth = {
+        share: chance(prior, [0, 1, 0], 1.0, share, number) + chance(prior, [1], 1.0, share, number)
+        for share in (0.0, 0.2, 0.6)
+    }
+    assert sampling_for(prior, plans, number, (1.0,), tuple(worth))[1] == max(worth, key=lambda share: worth[share])
+
+
+@pytest.mark.parametrize("number", [1, 2, 64, 4096])
+def test_weights_are_the_gradient(number):
+    """Of -log(1 - (1 - p) ** P), with respect to log p."""
+    log_prob = torch.tensor([-1e-3, -0.1, -0.5, -3.0, -9.0, -25.0], dtype=torch.float64, requires_grad=True)
+    loss = -(-torch.expm1(number * torch.log1p(-log_prob.exp()))).log()
+    (slope,) = torch.autograd.grad(loss.sum(), log_prob)
+    assert torch.allclose(search_weights(log_prob.detach(), number), -slope, rtol=1e-7, atol=1e-12)
+
+
+def test_weights_at_the_ends():
+    ends = torch.tensor([0.0, -1000.0, -float("inf")])
+    assert search_weights(ends, 64).tolist() == pytest.approx([0.0, 1.0, 1.0])
+    assert search_weights(ends, 1).tolist() == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_nothing_to_try():
+    world, plans, prior = bandit(), Plans(torch.zeros(2, 1, dtype=torch.long), 2), UniformPrior(2)
+    state = torch.zeros(2, dtype=torch.long)
+    with refuses("temperatures: at least one"):
+        best_sampling(prior, world, state, 1, 4, temperatures=())
+    with refuses("uniform_shares: at least one"):
+        sampling_for(prior, plans, 4, uniform_shares=())
+    with refuses("uniform_share: a number from 0 to 1"):
+        sampling_for(prior, plans, 4, uniform_shares=(2,))
+    with refuses("temperature: a positive"):
+        best_sampling(prior, world, state, 1, 4, temperatures=(0,))
+    with refuses("state: at least one start"):
+        best_sampling(prior, world, state[:0], 1, 4)
+    with refuses("plans: at least one"):
+        sampling_for(prior, plans[:0], 4)
+    with refuses("num_plans"):
+        sampling_for(prior, plans, 0)
+    with refuses("at most 0"):
+        search_weights(torch.tensor([0.1]), 4)
+    with refuses("at most 0"):
+        search_weights(torch.tensor([float("nan")]), 4)
