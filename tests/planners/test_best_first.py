@@ -12,7 +12,7 @@ from torch import Tensor
 from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, UniformPrior
 from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
 from neuroprior.priors import LogLinearPrior, PatternCounts, PatternNetwork, Prior
-from neuroprior.worlds import World, cube, gridworld, sliding_tiles, sokoban
+from neuroprior.worlds import World, cube, format_sokoban, gridworld, sliding_tiles, sokoban
 from tests.worlds.test_sokoban import LEVELS
 
 
@@ -129,14 +129,14 @@ def test_no_solution_takes_more_expansions_than_its_bound() -> None:
 
 def test_a_star_finds_shortest_plans() -> None:
     world = cube()
-    state = world.reset(6, torch.Generator().manual_seed(0))
+    state = world.reset(4, torch.Generator().manual_seed(0))
     found = AStarPlanner(world.distance, 1.0, 2000).search(world, state)
     assert found.solved.all()
     assert found.lengths.equal(world.distance(state))
     # With an exact heuristic greedy search expands the nodes on its way and no others.
     greedy = AStarPlanner(world.distance, math.inf, 2000).search(world, state)
     assert greedy.expansions.equal(world.distance(state))
-    breadth = AStarPlanner(None, 1.0, 2000).search(world, state)
+    breadth = AStarPlanner(None, 1.0, 300).search(world, state)
     assert bool((breadth.lengths[breadth.solved] == world.distance(state)[breadth.solved]).all())
 
 
@@ -150,11 +150,11 @@ def puzzle_plans(world: Any, state: Tensor) -> Plans:
     return Plans(actions, 4, context=torch.stack(seen, 1))
 
 
+EASY = "##########\n#@ $ .   #\n" + 8 * "##########\n"
+
 PUZZLES = {
-    "sokoban": lambda: sokoban(sokoban(LEVELS).boards[:12]),
-    "tiles": lambda: sliding_tiles(
-        sliding_tiles(shape=(3, 4), scramble=14).reset(12, torch.Generator().manual_seed(3))
-    ),
+    "sokoban": lambda: sokoban([*map(format_sokoban, sokoban(LEVELS).boards[:5]), EASY]),
+    "tiles": lambda: sliding_tiles(sliding_tiles(shape=(3, 4), scramble=14).reset(6, torch.Generator().manual_seed(3))),
 }
 
 
@@ -166,12 +166,12 @@ def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
     generator = torch.Generator().manual_seed(0)
     learned = [LogLinearPrior(4, patterns), PatternCounts(4, patterns), PatternNetwork(4, patterns, size=4)]
     planners: list[BestFirstPlanner] = [
-        LevinPlanner(prior, 200)
+        LevinPlanner(prior, 80)
         for prior in (UniformPrior(4), *(prior.fit(plans, generator=generator) for prior in learned))
     ]
-    planners += [LevinPlanner(learned[0], 200, heuristic=world.lower_bound)]
-    planners += [AStarPlanner(world.lower_bound, weight, 200) for weight in (1.0, 3.0, math.inf)]
-    planners += [AStarPlanner(None, 1.0, 200)]
+    planners += [LevinPlanner(learned[0], 80, heuristic=world.lower_bound)]
+    planners += [AStarPlanner(world.lower_bound, weight, 80) for weight in (1.0, 3.0, math.inf)]
+    planners += [AStarPlanner(None, 1.0, 80)]
     solved = 0
     for planner in planners:
         compiled = planner.search(world, state)
@@ -182,7 +182,7 @@ def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
             assert getattr(compiled, name).equal(getattr(stepped, name)), (planner, name)
         assert torch.allclose(compiled.log_bound, stepped.log_bound)
         solved += int(compiled.solved.sum())
-    assert solved > 5
+    assert solved > 3
 
 
 def test_an_unsolved_problem_gets_the_plan_to_its_best_node() -> None:
