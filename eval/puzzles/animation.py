@@ -52,7 +52,8 @@ def _boxes(states: list[Tensor]) -> list[list[int]]:
 
 
 def _rectangle(x: int, y: int, size: int, colour: str) -> str:
-    return f'<rect x="{x}" y="{y}" width="{size}" height="{size}" rx="2" fill="{colour}"/>'
+    rounded = 0 if size == CELL else 3  # walls join
+    return f'<rect x="{x}" y="{y}" width="{size}" height="{size}" rx="{rounded}" fill="{colour}"/>'
 
 
 def _tile(number: int) -> str:
