@@ -49,7 +49,7 @@ def puzzles(
     num_train: PositiveInt = 1000,
     test: str | None = None,
     num_test: PositiveInt | None = None,
-    budget: PositiveInt = 100_000,
+    budget: PositiveInt = 50_000,
     priors: Sequence[PriorName] = (BOOTSTRAP, "log-linear", "network", "product", "uniform", "greedy"),
     guided: bool | None = None,
     sweeps: PositiveInt = 8,
