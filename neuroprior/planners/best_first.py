@@ -72,8 +72,8 @@ class BestFirstPlanner(Planner):
             for more at once, and up to so many times more nodes are expanded.
         temperature: divides the prior's logits.
         compile: search by a compiled loop where numba is installed and it knows the world, the prior and the heuristic
-            (puzzles on the CPU, uniform priors and those of patterns, `lower_bound`): it finds the same, and is some
-            hundred times as fast.
+            (puzzles on the CPU, uniform priors and those of patterns, `lower_bound`): it finds the same, tens of
+            times as fast.
 
     Raises:
         ValueError: an argument is out of range. `plan` and `search` raise it for a stochastic world, a world without
