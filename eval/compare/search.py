@@ -1,7 +1,7 @@
 """`python -m eval search`: what helps a planner that samples, beside predicting well."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -22,9 +22,8 @@ from neuroprior.plans.folds import folds
 from neuroprior.report.document import Document
 from neuroprior.report.page import Section
 
-WORLDS = ("grid", "egocentric", "taxi", "cliff")
-
-KINDS = ("markov", "gru")
+WORLDS, KINDS = ("grid", "egocentric", "taxi", "cliff"), ("markov", "gru")
+"""Worlds that are tried where no others are asked for, and kinds of priors."""
 
 BOTH = "both"
 """Temperature and uniform share, chosen together at each number of candidates; what all else is compared with."""
@@ -91,17 +90,14 @@ def search(
         out: folder for the report and for finished runs.
     """
     runs.check_distinct(worlds=worlds, num_plans=num_plans)
-    settings = SearchSettings(tuple(num_plans), KINDS, (), 4, steps, starts, training_starts, seed)
+    settings = Settings(tuple(num_plans), KINDS, (), 4, steps, starts, training_starts, seed)
     runs.run_experiment("search", search_run, search_document, settings, worlds, seeds, out, processes, dask)
 
 
-@dataclass(frozen=True)
-class SearchSettings(Settings):
-    """As `Settings`; each world has the last of its contexts."""
-
-
-def search_run(run: runs.Run, settings: SearchSettings) -> dict[str, Any]:
+def search_run(run: runs.Run, settings: Settings) -> dict[str, Any]:
     """Collect plans, extend horizons, fit priors to the last plans in each way, and sample from them in each way.
+
+    Each world has the last of its contexts.
 
     Returns:
         `entries`, one of each way (`planner`), prior and number of candidates: `share` (the normalised score).
@@ -161,7 +157,7 @@ def _entries(contest: Contest, one: Contestant, name: str, prior: Prior) -> list
     )
     ways = {
         way: {
-            number: best({one: score for one, score in table.items() if allowed(one)})
+            number: best({setting: score for setting, score in table.items() if allowed(setting)})
             for number, table in chances.items()
         }
         for way, allowed in LIMITED.items()

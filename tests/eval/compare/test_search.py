@@ -8,13 +8,13 @@ import torch
 
 from eval.compare import search
 from eval.compare.curves import SETTINGS, Sampling
-from eval.compare.run import Contest
-from eval.compare.search import BOTH, FIRST, LIMITED, WEIGHTS, Learner, SearchSettings, search_document, search_run
+from eval.compare.run import Contest, Settings
+from eval.compare.search import BOTH, FIRST, LIMITED, WEIGHTS, Learner, search_document, search_run
 from eval.worlds.runs import Run
 from neuroprior import MarkovPrior
 from tests.eval.compare.test_run import TINY
 
-SMALL = SearchSettings((4, 16), ("markov", "gru"), ("per-step",), 1, 3, 4, 40, 0)
+SMALL = Settings((4, 16), ("markov", "gru"), ("per-step",), 1, 3, 4, 40, 0)
 
 
 def test_ways_of_sampling_differ_in_what_may_be_chosen():
