@@ -24,6 +24,9 @@ Array = np.ndarray[Any, Any]
 SOKOBAN, TILES = 0, 1
 WALL, GOAL, BOX, BOX_ON_GOAL = 1, 2, 3, 4
 
+ACTIONS = 4
+"""A constant lets the compiler unroll loops over actions."""
+
 LONGEST = 4096
 """Actions of a solution for which there is room at first."""
 
@@ -85,8 +88,11 @@ def _patterns(board: Board, cells: Array, mover: int, padded: Array, rows: Array
     """
     r, width = board.radius, board.width
     n, across = 2 * r + 1, width + 2 * r
-    for cell in range(len(cells)):
-        padded[(cell // width + r) * across + cell % width + r] = board.kinds[cells[cell], cell]
+    cell = 0
+    for y in range(len(cells) // width):
+        for x in range(width):
+            padded[(y + r) * across + x + r] = board.kinds[cells[cell], cell]
+            cell += 1
     first = mover // width * across + mover % width
     for y in range(n):
         for x in range(n):
@@ -106,19 +112,33 @@ def _patterns(board: Board, cells: Array, mover: int, padded: Array, rows: Array
 
 
 @njit(cache=True, nogil=True)
-def _log_probs(tables: Tables, codes: Array, last: int, hidden: Array, more: Array, out: Array) -> None:
-    """Write the log-probabilities of the actions at a position with these patterns to `out [A]` (float64)."""
-    actions = len(out)
-    for a in range(actions):
+def _log_probs(
+    tables: Tables, codes: Array, last: int, places: Array, there: Array, hidden: Array, more: Array, out: Array
+) -> None:
+    """Write the log-probabilities of the actions at a position with these patterns to `out [A]` (float64).
+
+    `places` and `there`, int64 `[F]`, are room for where the patterns should stand in the hash table, and what does.
+    """
+    for a in range(ACTIONS):
         out[a] = tables.after[last, a]
+    size = len(hidden)
     hidden[:] = 0
-    for code in codes:
-        at = place(tables.codes, code)
-        if tables.codes[at] == code:
-            for a in range(actions):
+    # Loads that do not wait for one another: most of the time goes to waiting for memory.
+    mask = np.uint64(len(tables.codes) - 1)
+    for j in range(len(codes)):
+        places[j] = ((np.uint64(codes[j]) * np.uint64(MIXER)) >> np.uint64(32)) & mask
+    for j in range(len(codes)):
+        there[j] = tables.codes[places[j]]
+    for j in range(len(codes)):
+        code, at = codes[j], places[j]
+        if there[j] != code and there[j] != -1:
+            at = place(tables.codes, code)
+            there[j] = tables.codes[at]
+        if there[j] == code:
+            for a in range(ACTIONS):
                 out[a] += tables.weights[at, a]
-            for e in range(len(hidden)):
-                hidden[e] += tables.weights[at, actions + e]
+            for e in range(size):
+                hidden[e] += tables.weights[at, ACTIONS + e]
     for layer in range(tables.layers.shape[0]):
         for i in range(len(more)):
             total = tables.biases[layer, i]
@@ -127,12 +147,12 @@ def _log_probs(tables: Tables, codes: Array, last: int, hidden: Array, more: Arr
             more[i] = total
         hidden[:] = more
     if len(hidden):
-        for a in range(actions):
+        for a in range(ACTIONS):
             for e in range(len(hidden)):
                 out[a] += tables.out[a, e] * max(hidden[e], np.float32(0))
     top = out.max()
     total = 0.0
-    for a in range(actions):
+    for a in range(ACTIONS):
         total += np.exp(out[a] - top)
     out -= top + np.log(total)
 
@@ -290,16 +310,17 @@ def search(
         The expansions, the length of the solution or, where there is none, of the path to the node with the least
         heuristic (the first such), the solution's log(d / pi) (infinite without one), and the steps that were taken.
     """
-    num, high, actions = len(start), len(start) // board.width, 4
+    num, high, actions = len(start), len(start) // board.width, ACTIONS
     informed = len(distances) > 0
     best = np.zeros(2 ** len(distances) if board.puzzle == SOKOBAN and len(distances) <= MATCHED else 1)
-    patterned = order == LEVIN
+    patterned = order == LEVIN and (len(tables.codes) > 2 or np.any(tables.after != 0))  # else all are alike
     across = board.width + 2 * board.radius
     padded = np.full((high + 2 * board.radius) * across, board.outside, dtype=np.int64)
     square = 2 * board.radius + 1
     rows = np.zeros((max(board.windows[:, 3].max(), 1) if len(board.windows) else 1, square, square), dtype=np.int64)
     codes, hidden = np.zeros(len(board.windows), dtype=np.int64), np.zeros(tables.biases.shape[1], dtype=np.float32)
     more = np.zeros(tables.biases.shape[1], dtype=np.float32)
+    places_of, there = np.zeros_like(codes), np.zeros_like(codes)
     room = max_nodes + 1
     boards, movers, hashes = (
         np.empty((room, num), dtype=np.uint8),
@@ -375,7 +396,8 @@ def search(
                 nearest, least = node, left
         if patterned:
             _patterns(board, cells, mover, padded, rows, codes)
-            _log_probs(tables, codes, edge % actions if edge >= 0 else actions, hidden, more, own[node])
+            last = edge % actions if edge >= 0 else actions
+            _log_probs(tables, codes, last, places_of, there, hidden, more, own[node])
         else:
             own[node] = -np.log(float(actions))
         for action in range(actions):
@@ -408,7 +430,7 @@ def can_search(world: World, prior: Any) -> bool:
         return False
     if isinstance(prior, UniformPrior):
         return True
-    patterned = world.observation == "patterns" and getattr(prior, "num_patterns", None) == len(world.windows.windows)
+    patterned = order == LEVIN and (len(tables.codes) > 2 or np.any(tables.after != 0))  # else all are alike
     return patterned and type(prior) in KNOWN and getattr(prior, "combine", "product") == "product"
 
 

@@ -225,3 +225,15 @@ def test_bad_input_is_refused() -> None:
         LevinPlanner(UniformPrior(9), heuristic=lambda state: state.double() * math.nan).search(
             cube(), torch.tensor([5])
         )
+
+
+def test_last_actions_count_where_no_pattern_is_known() -> None:
+    """The compiled search leaves out what makes no difference, and nothing else."""
+    world = PUZZLES["tiles"]()
+    prior = LogLinearPrior(4, len(world.windows.windows))
+    prior.after[:, 0] = 1.0
+    planner = LevinPlanner(prior, 60)
+    compiled = planner.search(world, world.boards)
+    planner.compile = False
+    assert compiled.expansions.equal(planner.search(world, world.boards).expansions)
+    assert not compiled.expansions.equal(LevinPlanner(UniformPrior(4), 60).search(world, world.boards).expansions)
