@@ -430,7 +430,7 @@ def can_search(world: World, prior: Any) -> bool:
         return False
     if isinstance(prior, UniformPrior):
         return True
-    patterned = order == LEVIN and (len(tables.codes) > 2 or np.any(tables.after != 0))  # else all are alike
+    patterned = world.observation == "patterns" and getattr(prior, "num_patterns", None) == len(world.windows.windows)
     return patterned and type(prior) in KNOWN and getattr(prior, "combine", "product") == "product"
 
 
