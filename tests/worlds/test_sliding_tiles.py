@@ -159,3 +159,15 @@ def test_planners_solve_an_easy_board() -> None:
         decision = planner.plan(world, state, torch.Generator().manual_seed(0))
         assert world.solved(decision.final_state).all()
         assert decision.plan.tolist() == [[2, 2]] * 3
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (6, 6), (7, 7), (2, 30), (15, 15)])
+def test_boards_of_all_sizes_have_patterns(shape: tuple[int, int]) -> None:
+    world = sliding_tiles(shape=shape, scramble=10)
+    state = world.reset(4, torch.Generator().manual_seed(0))
+    codes = world.observe(state)
+    assert codes.dtype == torch.int32
+    assert int(codes.min()) >= 0
+    assert int(codes.max()) < world.windows.num_codes < 2**31
+    large = max(height * width for _, _, height, width in world.windows.windows)
+    assert large == (4 if shape in ((2, 2), (6, 6)) else 2)

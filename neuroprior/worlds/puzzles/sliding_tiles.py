@@ -11,7 +11,7 @@ from neuroprior._checks import check_count, is_integer
 from neuroprior._random import generator_on
 from neuroprior.worlds.puzzles.puzzle import Observation, PuzzleWorld, reflected
 from neuroprior.worlds.puzzles.reading import read_tiles
-from neuroprior.worlds.puzzles.windows import Window, Windows, windows_within
+from neuroprior.worlds.puzzles.windows import CODES, Window, Windows, windows_within
 
 
 class SlidingTilesWorld(PuzzleWorld):
@@ -40,7 +40,7 @@ class SlidingTilesWorld(PuzzleWorld):
         scramble: int,
     ) -> None:
         height, width = goal.shape
-        kinds = (2 * height - 1) * (2 * width - 1) + 1
+        kinds = _num_kinds(height, width)
         super().__init__(boards, (height, width), Windows(windows, kinds, 0), observation)
         self.goal, self.scramble, self.num_planes = goal, scramble, height * width
         if boards is not None:
@@ -161,13 +161,20 @@ class SlidingTilesWorld(PuzzleWorld):
 
 
 def tile_windows(height: int, width: int) -> tuple[Window, ...]:
-    """All single cells of the board, pairs of neighbours at most two from the blank, and 2 x 2 squares with it."""
-    return (
-        *windows_within(1, 1, max(height, width) - 1),
-        *windows_within(1, 2, 2),
-        *windows_within(2, 1, 2),
-        *windows_within(2, 2, 1),
-    )
+    """All single cells of the board, pairs of neighbours at most two from the blank, and 2 x 2 squares with it.
+
+    On boards of 7 x 7 and more, which have too many such squares to be numbered, there are none.
+    """
+    pairs = (*windows_within(1, 2, 2), *windows_within(2, 1, 2))
+    squares = windows_within(2, 2, 1)
+    if len(squares) * _num_kinds(height, width) ** 4 >= CODES // 2:
+        squares = ()
+    return *windows_within(1, 1, max(height, width) - 1), *pairs, *squares
+
+
+def _num_kinds(height: int, width: int) -> int:
+    """How far a tile can be from its place, in rows and columns, and what lies outside of the board."""
+    return (2 * height - 1) * (2 * width - 1) + 1
 
 
 def sliding_tiles(
