@@ -1,6 +1,8 @@
 """`python -m eval puzzles`: Sokoban and sliding tiles by policy-guided search."""
 
 import json
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
@@ -128,11 +130,13 @@ def report(
         tables.append(_sweep_table(frames["sweeps"]))
     best = rows.sort_values(["solved", "mean_expansions"], ascending=[False, True], kind="stable").iloc[0]
     lead = (
-        f"{best['prior']} solves {100 * best['solved']:.1f} % of {best['problems']} problems within"
+        f"{best['prior']} solves {100 * best['solved']:.1f} % of {best['problems']:,} problems within"
         f" {best['budget']:,} expansions, with {best['mean_expansions']:,.0f} on average."
     )
-    sections = [Section("Puzzles", tables=tables)]
-    return Document("Puzzles", lead, sections, frames, asdict(settings), "", keys={"puzzles": "rows"})
+    sections = [Section(one.title, tables=[one]) for one in tables]
+    given = sys.argv[1:] if sys.argv[1:2] == ["puzzles"] else ["puzzles"]
+    command = "python -m eval " + shlex.join(given)
+    return Document("Puzzles", lead, sections, frames, asdict(settings), command, keys={"puzzles": "rows"})
 
 
 def _walls(problems: Problems) -> list[int]:
