@@ -76,8 +76,8 @@ def bootstrap(
     Intelligence, 2011); with a prior, that of Orseau and Lelis (AAAI 2021).
 
     The first `first` problems are tried first. When three quarters of them are solved, four times as many are tried.
-    The budget doubles then, and when fewer than a quarter of the solutions are new. Each problem's latest solution
-    counts. In puzzles the prior learns from reflections and rotations of the solutions, too.
+    The budget doubles then, and when fewer than a quarter of the solutions, or none, are new. Each problem's latest
+    solution counts. In puzzles the prior learns from reflections and rotations of the solutions, too.
 
     Args:
         world: with goals; see `LevinPlanner`.
@@ -99,7 +99,7 @@ def bootstrap(
         Each sweep, when the prior has learned from it; finished ones of `folder` at once.
 
     Raises:
-        ValueError: an argument is out of range, nothing is solved at first, or the folder is of another call.
+        ValueError: an argument is out of range, nothing is solved in any sweep, or the folder is of another call.
     """
     check_sizes(max_nodes=max_nodes, sweeps=sweeps, first=first, max_actions=max_actions)
     world.check_state(problems)
@@ -121,11 +121,17 @@ def bootstrap(
         found = planner.search(world, problems[:tried])
         run.take(found)
         searched = time.perf_counter()
-        actions = run.learn(max_actions, settings)
+        actions = run.learn(max_actions, settings) if run.plans else 0
         seconds = searched - begin, time.perf_counter() - searched
         share, mean = float(found.solved.double().mean()), float(found.expansions.double().mean())
         run.end(Sweep(len(run.done) + 1, tried, planner.max_nodes, share, len(run.plans), mean, actions, *seconds))
         yield run.done[-1]
+    if not run.plans:
+        last = run.done[-1]
+        raise ValueError(
+            f"problems: none of {last.problems} was solved within {last.max_nodes} expansions; give a larger max_nodes,"
+            " more sweeps, a teacher or easier problems"
+        )
 
 
 class _Bootstrap:
@@ -154,7 +160,7 @@ class _Bootstrap:
             more = sweep.solved >= ENOUGH and tried < len(self.problems)
             if more:
                 tried = min(MORE * tried, len(self.problems))
-            if more or gained < NEW * sweep.solutions:
+            if more or gained < NEW * sweep.solutions or sweep.solutions == 0:
                 budget *= 2
         return tried, budget
 
@@ -162,10 +168,6 @@ class _Bootstrap:
         """Keep the solutions of a search."""
         for number in found.solved.nonzero()[:, 0].tolist():
             self.plans[number] = found.plan[number, : int(found.lengths[number])].cpu()
-        if not self.plans:
-            raise ValueError(
-                f"problems: none of {len(found.solved)} was solved; give a larger max_nodes, a teacher or easier ones"
-            )
 
     def learn(self, max_actions: int, settings: dict[str, Any]) -> int:
         """Fit the prior to the solutions; returns the number of their actions."""

@@ -78,6 +78,17 @@ def test_the_budget_and_the_problems_grow() -> None:
     assert sweeps[-1].solutions > 90
 
 
+def test_where_nothing_is_solved_the_budget_grows(tmp_path: Path) -> None:
+    world = tiles(10)
+    sweeps = list(
+        bootstrap(world, prior_for(world), world.boards, max_nodes=2, sweeps=12, folder=tmp_path, generator=seeded())
+    )
+    assert sweeps[0].solutions == sweeps[0].actions == 0
+    assert [sweep.max_nodes for sweep in sweeps[:3]] == [2, 4, 8]
+    assert sweeps[-1].solutions > 0
+    assert len(read_solutions(tmp_path)) == sweeps[-1].solutions
+
+
 def test_a_teacher_and_a_heuristic_help() -> None:
     world = tiles(30)
     teacher = AStarPlanner(world.lower_bound, 3.0, 2000)
@@ -123,8 +134,8 @@ def test_bad_input_is_refused() -> None:
     for change, message in (({"sweeps": 0}, "sweeps"), ({"max_nodes": 0}, "max_nodes"), ({"epochs": 0}, "epochs")):
         with pytest.raises(ValueError, match=message):
             list(bootstrap(world, prior_for(world), world.boards, generator=seeded(), **change))
-    with pytest.raises(ValueError, match="none of 3 was solved"):
-        list(bootstrap(hard, prior_for(hard), hard.reset(3, seeded()), max_nodes=5, generator=seeded()))
+    with pytest.raises(ValueError, match="none of 3 was solved within 20 expansions"):
+        list(bootstrap(hard, prior_for(hard), hard.reset(3, seeded()), max_nodes=5, sweeps=3, generator=seeded()))
     with pytest.raises(ValueError, match="at least one"):
         list(bootstrap(world, prior_for(world), world.boards[:0]))
     with pytest.raises(ValueError, match="lower_bound"):
