@@ -10,6 +10,7 @@ from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.patterns import BoardNetwork, LogLinearPrior, PatternCounts, PatternNetwork, PatternPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
+from neuroprior.priors.switching import ModePosterior, SwitchingNetwork, SwitchingPrior
 from neuroprior.priors.uniform import UniformPrior
 
 __all__ = [
@@ -25,12 +26,15 @@ __all__ = [
     "MacroPrior",
     "MarkovPrior",
     "MixturePrior",
+    "ModePosterior",
     "PatternCounts",
     "PatternNetwork",
     "PatternPrior",
     "Prior",
     "SemiMarkovPrior",
     "StackedPrior",
+    "SwitchingNetwork",
+    "SwitchingPrior",
     "TransformerPrior",
     "UniformPrior",
     "decode",

@@ -1,0 +1,85 @@
+"""Chains of modes from expected counts, interpolated with shorter histories and with all modes together."""
+
+import torch
+from torch import Tensor
+
+from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
+
+
+class ModeChains:
+    """What K modes do after each of the histories that occurred, from how often each mode is expected there.
+
+    Expected counts are numbers `[P, K]`, one for each of the P entries (a row and an action) of `counts`.
+
+    Args:
+        tree, counts: of `count_histories`.
+        num_contexts: number of contexts that are counted apart, or None.
+        num_actions: A.
+        smoothing, sharing: see `SwitchingPrior`.
+    """
+
+    def __init__(
+        self, tree: Tree, counts: Counts, num_contexts: int | None, num_actions: int, smoothing: float, sharing: float
+    ) -> None:
+        self.tree, self.counts, self.num_actions = tree, counts, num_actions
+        self.smoothing, self.sharing, self.contexts = smoothing, sharing, num_contexts or 1
+        self.pooled = num_contexts is not None
+        self.parent = parent_rows(tree, counts, self.contexts)
+        self.kinds = torch.bincount(counts.row, minlength=len(counts.row_code)).double()
+        self.code = counts.row * num_actions + counts.action
+        ends = torch.tensor(level_bounds(tree, counts, self.contexts), device=counts.row.device)
+        self.levels = torch.searchsorted(counts.row, ends).tolist()
+
+    def entries(self, row: Tensor, action: Tensor) -> Tensor:
+        """The entries of actions after these rows; both must have occurred."""
+        return torch.searchsorted(self.code, row * self.num_actions + action)
+
+    def totals(self, longest: Tensor) -> Tensor:
+        """Expected counts `[P, K]` after all histories, from those after the longest alone."""
+        counts, total = self.counts, longest.clone()
+        for first, until in list(zip(self.levels, self.levels[1:], strict=False))[:0:-1]:
+            above = self.entries(self.parent[counts.row[first:until]], counts.action[first:until])
+            total.index_add_(0, above, total[first:until].clone())
+        return total
+
+    def log_probs(self, expected: Tensor) -> Tensor:
+        """The log-probabilities `[R + 1, K, A]`, float64, after each row; last: in contexts without counts.
+
+        Args:
+            expected: `[P, K]`, counts after all histories, as `totals` returns them.
+        """
+        counts, modes, number = self.counts, expected.shape[1], len(self.counts.row_code)
+        own = expected.new_full((number + 1, modes, self.num_actions), 1 / self.num_actions)
+        whole = own[:, 0].clone()  # of all modes together
+        if self.pooled:
+            first = self._dense(0, int(torch.searchsorted(counts.row_code, self.contexts)), expected).sum(0)
+            kinds = (first.sum(0) > 0).sum()[None]
+            whole[-1] = self._blend(first.sum(0), whole[-1], kinds)
+            own[-1] = self._blend(first, whole[-1].expand(modes, -1), kinds)
+        for _, first_row, until in row_blocks(self.tree, counts, self.contexts, self.num_actions * modes):
+            here, above, n = (
+                slice(first_row, until),
+                self.parent[first_row:until],
+                self._dense(first_row, until, expected),
+            )
+            kinds = self.kinds[here, None]
+            whole[here] = self._blend(n.sum(1), whole[above], kinds)
+            # With nothing but the place to go by, what all modes do there says more than what the mode does elsewhere.
+            share = torch.where(above == number, 1.0, self.sharing)[:, None, None].to(n)
+            base = (1 - share) * own[above] + share * whole[here, None]
+            own[here] = self._blend(n, base, kinds[:, None])
+        return own.clamp(min=1e-300).log()
+
+    def _blend(self, n: Tensor, base: Tensor, kinds: Tensor) -> Tensor:
+        """Probabilities `[..., A]` from counts and what they are interpolated with; `kinds [..., 1]` of actions."""
+        weight = self.smoothing * kinds
+        total = n.sum(-1, keepdim=True) + weight
+        # Where a fold is left out, rounding leaves counts that are hardly 0.
+        return torch.where(total > 1e-9, (n + weight * base) / total.clamp(min=1e-9), base)
+
+    def _dense(self, first: int, until: int, expected: Tensor) -> Tensor:
+        """The expected counts of some rows, `[until - first, K, A]`."""
+        at, end = torch.searchsorted(self.counts.row, torch.tensor([first, until], device=expected.device)).tolist()
+        table = expected.new_zeros(until - first, expected.shape[1], self.num_actions)
+        table[self.counts.row[at:end] - first, :, self.counts.action[at:end]] = expected[at:end].clamp(min=0)
+        return table

@@ -1,0 +1,323 @@
+"""The switching prior against enumeration of all mode paths, a plain Baum-Welch, and sources whose modes are known."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import nbinom
+
+from neuroprior import Plans, load, save
+from neuroprior.priors import SwitchingNetwork, SwitchingPrior
+from neuroprior.testing import check_prior
+from tests.support.sources import refuses, seeded
+
+STICKY = torch.tensor([[0.9, 0.1], [0.2, 0.8]], dtype=torch.double)
+"""Transitions of the source of two modes."""
+
+
+def some_plans(seed=0, num=40, length=6, actions=3, contexts=None):
+    generator = seeded(seed)
+    context = None if contexts is None else torch.randint(contexts, (num, length), generator=generator)
+    return Plans(torch.randint(actions, (num, length), generator=generator), actions, context=context)
+
+
+def switching_source(num, length, seed=0, matrix=STICKY):
+    """Plans of two modes, 0 1 2 0 1 2 ... and 2 1 0 2 1 0 ..., a fifth of the actions random; and their modes."""
+    rng = np.random.default_rng(seed)
+    modes, actions = np.zeros((num, length), dtype=int), np.zeros((num, length), dtype=int)
+    mode, action = rng.integers(2, size=num), rng.integers(3, size=num)
+    for t in range(length):
+        modes[:, t], wild = mode, rng.random(num) < 0.2
+        action = np.where(wild, rng.integers(3, size=num), (action + np.where(mode == 0, 1, 2)) % 3)
+        actions[:, t] = action
+        mode = np.where(rng.random(num) < np.asarray(matrix)[mode, 0], 0, 1)
+    return torch.from_numpy(actions), torch.from_numpy(modes)
+
+
+def enumerated(prior, plans):
+    """Of each plan its likelihood, the probabilities of the mode of each action, and the best path: over all paths."""
+    rows, cells = prior.cells(plans.actions, plans.context)
+    num, length = plans.actions.shape
+    paths = list(itertools.product(range(prior.num_modes), repeat=length))
+    joint = torch.ones(num, len(paths), dtype=torch.double)
+    for number, path in enumerate(paths):
+        for t, mode in enumerate(path):
+            before = prior.first[mode] if t == 0 else prior.transitions[cells[:, t], path[t - 1], mode]
+            joint[:, number] *= before * prior.log_probs[rows[:, t], mode, plans.actions[:, t].long()].double().exp()
+    where = torch.tensor(paths)
+    smoothed = torch.stack([(joint[:, :, None] * (where == k)).sum(1) for k in range(prior.num_modes)], -1)
+    return joint.sum(1), smoothed / joint.sum(1)[:, None, None], where[joint.argmax(1)]
+
+
+@pytest.mark.parametrize(("contexts", "order"), [(None, 0), (None, 1), (4, 0), (4, 2)])
+def test_inference_equals_enumeration(contexts, order):
+    plans = some_plans(contexts=contexts)
+    prior = SwitchingPrior(3, 3, order, contexts, smoothing=0.5).fit(plans, generator=seeded(0))
+    some = plans[:8]
+    likelihood, smoothed, path = enumerated(prior, some)
+    torch.testing.assert_close(prior.log_prob(some).double(), likelihood.log(), atol=2e-6, rtol=0)
+    found = prior.posterior(some)
+    torch.testing.assert_close(found.smoothed, smoothed, atol=1e-6, rtol=0)
+    assert found.path.equal(path)
+    for t in range(1, 7):  # what is known after t actions is what whole plans of t actions say
+        short = replace(some, actions=some.actions[:, :t], context=None if contexts is None else some.context[:, :t])
+        torch.testing.assert_close(found.filtered[:, t - 1], enumerated(prior, short)[1][:, -1], atol=1e-6, rtol=0)
+
+
+def baum_welch(sequences, first, moves, emit, iterations):
+    """The formulas of Rabiner 1989, section III.C, in plain loops."""
+    for _ in range(iterations):
+        new_first, new_moves, new_emit = np.zeros_like(first), np.zeros_like(moves), np.zeros_like(emit)
+        for actions in sequences:
+            length = len(actions)
+            alpha, beta = np.zeros((length, len(first))), np.ones((length, len(first)))
+            alpha[0] = first * emit[:, actions[0]]
+            for t in range(1, length):
+                alpha[t] = alpha[t - 1] @ moves * emit[:, actions[t]]
+            for t in range(length - 2, -1, -1):
+                beta[t] = moves @ (emit[:, actions[t + 1]] * beta[t + 1])
+            gamma = alpha * beta / alpha[-1].sum()
+            new_first += gamma[0]
+            for t in range(length):
+                new_emit[:, actions[t]] += gamma[t]
+                if t:
+                    new_moves += np.outer(alpha[t - 1], emit[:, actions[t]] * beta[t]) * moves / alpha[-1].sum()
+        first, moves, emit = (x / x.sum(-1, keepdims=True) for x in (new_first, new_moves, new_emit))
+    return first, moves, emit
+
+
+def test_em_is_that_of_baum_and_welch():
+    actions = switching_source(30, 20)[0]
+    rng = np.random.default_rng(1)
+    start = rng.dirichlet(np.ones(2)), rng.dirichlet(np.ones(2), 2), rng.dirichlet(np.ones(3), 2)
+    prior = SwitchingPrior(3, 2, order=0, smoothing=0, stay=0, sharing=0, folds=1, max_iterations=7, tolerance=0)
+    prior.learn(*prior.count(actions))
+    prior.first.copy_(torch.from_numpy(start[0]))
+    prior.transitions[0] = torch.from_numpy(start[1])
+    prior.log_probs[:] = torch.from_numpy(start[2]).log()
+    prior.fit(actions, warm_start=True)
+    expected = baum_welch(actions.tolist(), *start, iterations=7)
+    found = prior.first, prior.transitions[0], prior.log_probs[0].exp()
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one.numpy(), other, atol=1e-6)
+
+
+def test_em_never_lowers_the_likelihood():
+    actions = switching_source(40, 25)[0]
+    totals = []
+    for iterations in range(1, 12):
+        prior = SwitchingPrior(
+            3, 2, 1, smoothing=0, stay=0, folds=1, restarts=1, tolerance=0, max_iterations=iterations
+        )
+        totals.append(float(prior.fit(actions, generator=seeded(3)).log_prob(actions).double().sum()))
+    assert np.diff(totals).min() > -1e-2  # single precision
+    assert totals[-1] > totals[0] + 10
+
+
+def test_long_sequences_are_inferred_in_chunks_as_in_steps():
+    actions = switching_source(2, 700)[0]
+    prior = SwitchingPrior(3, 2).fit(actions, generator=seeded(0))
+    logits, state = prior.start(2)
+    found = []
+    for t in range(700):
+        found.append(logits.log_softmax(-1).gather(1, actions[:, t, None])[:, 0])
+        logits, state = prior.step(actions[:, t], state)
+    torch.testing.assert_close(prior.action_log_probs(actions), torch.stack(found, 1), atol=1e-5, rtol=0)
+    # one by one, where a chunk is shorter still
+    whole, single = prior.posterior(actions), [prior.posterior(actions[i : i + 1]) for i in range(2)]
+    for what in range(3):
+        torch.testing.assert_close(whole[what], torch.cat([one[what] for one in single]), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_modes_are_recovered_as_well_as_the_true_source_allows(order):
+    training, _ = switching_source(60, 200, seed=1)
+    actions, modes = switching_source(30, 200, seed=2)
+    true = SwitchingPrior(3, 2, 1, folds=1, max_iterations=1).fit(training, generator=seeded(0))
+    true.first.fill_(0.5)
+    true.transitions[0] = STICKY
+    successor = torch.tensor([[(a + 1) % 3 for a in range(3)], [(a + 2) % 3 for a in range(3)]])
+    for a in range(3):
+        row = int(prior_row(true, a))
+        true.log_probs[row] = torch.full((2, 3), 0.2 / 3).scatter_(1, successor[:, a, None], 0.8 + 0.2 / 3).log()
+    learned = SwitchingPrior(3, 2, order).fit(training, generator=seeded(1))
+    best = (true.posterior(actions).smoothed.argmax(-1) == modes).double().mean()
+    agree = (learned.posterior(actions).smoothed.argmax(-1) == modes).double().mean()
+    assert 0.9 < best < 1
+    assert max(agree, 1 - agree) > best - 0.01
+    late = (slice(None), slice(1, None))
+    loss = [-float(prior.action_log_probs(actions)[late].mean()) for prior in (true, learned)]
+    assert loss[1] < 1.01 * loss[0]
+    plain = SwitchingPrior(3, 1, order).fit(training)
+    assert -float(plain.action_log_probs(actions)[late].mean()) > loss[1] + 0.005
+
+
+def prior_row(prior, action):
+    """The row of the table after one action, in the middle of a plan."""
+    return prior.cells(torch.tensor([[0, 0, action, 0]]), None)[0][0, 3]
+
+
+def test_one_mode_is_the_chain_that_its_docstring_says():
+    plans = some_plans(num=30, length=8)
+    prior = SwitchingPrior(3, 1, 1, smoothing=2.0, sharing=0.3).fit(plans)
+    counts, after = torch.zeros(3), torch.zeros(3, 3)
+    for row in plans.actions.tolist():
+        for t, action in enumerate(row):
+            counts[action] += 1
+            if t:
+                after[row[t - 1], action] += 1
+    all_modes = (counts + 2 * 3 / 3) / (counts.sum() + 2 * 3)
+    lower = (counts + 2 * 3 * all_modes) / (counts.sum() + 2 * 3)
+    whole = (after + 2 * 3 * all_modes) / (after.sum(1, keepdim=True) + 2 * 3)
+    expected = (after + 2 * 3 * (0.7 * lower + 0.3 * whole)) / (after.sum(1, keepdim=True) + 2 * 3)
+    for action in range(3):
+        torch.testing.assert_close(prior.log_probs[prior_row(prior, action), 0].exp(), expected[action])
+
+
+@pytest.mark.parametrize("sharing", [0.0, 0.25, 1.0])
+def test_a_mode_does_in_strange_places_what_the_others_do(sharing):
+    """The mode of 0 1 0 1 never met 2: there it does what the others do, as far as `sharing` says."""
+    actions = torch.tensor([[0, 1] * 10, [2, 3] * 10] * 20)
+    prior = SwitchingPrior(4, 2, 1, sharing=sharing, smoothing=1.0, stay=0, folds=1, max_iterations=1)
+    prior.learn(*prior.count(actions))
+    prior.transitions[0] = torch.eye(2)
+    prior.log_probs[:] = torch.tensor([[0.5, 0.5, 1e-30, 1e-30], [1e-30, 1e-30, 0.5, 0.5]]).log()
+    prior.fit(actions, warm_start=True)
+    of_first = prior.log_probs[prior_row(prior, 2), 0].exp()
+    alone, together = (200 + 1.0) / 404 / 2, 1.0  # 3 without history: hardly ever; all modes after 2: always
+    assert float(of_first[3]) == pytest.approx(sharing * together, abs=0.02)
+    assert float(of_first[0]) == pytest.approx((1 - sharing) * 2 * alone, abs=0.02)
+
+
+def test_groups_are_not_divided_between_folds():
+    actions = switching_source(20, 30)[0]
+    one, two = (Plans(actions, 3, group=torch.arange(20) % number) for number in (1, 2))
+    fitted = [
+        SwitchingPrior(3, 2, folds=folds).fit(plans, generator=seeded(0)) for plans in (one, two) for folds in (1, 4)
+    ]
+    assert fitted[0].log_probs.equal(fitted[1].log_probs)  # one group is one fold
+    assert not fitted[2].log_probs.allclose(fitted[3].log_probs, atol=1e-4)
+
+
+def test_where_modes_switch_is_learned():
+    """The mode changes in context 1 alone."""
+    rng = np.random.default_rng(0)
+    context = torch.from_numpy(rng.choice(2, size=(60, 100), p=[0.9, 0.1]))
+    mode = (context.cumsum(1) + torch.from_numpy(rng.integers(2, size=(60, 1)))) % 2
+    actions = torch.where(torch.from_numpy(rng.random((60, 100)) < 0.1), 1 - mode, mode)
+    prior = SwitchingPrior(2, 2, 0, num_contexts=2).fit(Plans(actions, 2, context=context), generator=seeded(0))
+    stays = prior.transitions.diagonal(dim1=1, dim2=2)
+    assert stays[0].min() > 0.95
+    assert stays[1].max() < 0.1
+    constant = SwitchingPrior(2, 2, 0, num_contexts=2, switching="constant")
+    constant.fit(Plans(actions, 2, context=context), generator=seeded(0))
+    assert constant.transitions.shape == (1, 2, 2)
+
+
+def test_phases_make_durations_negative_binomial():
+    """Two modes that always do the same: runs of actions are durations, of three phases each left with chance 1/4."""
+    runs = nbinom(3, 0.25).rvs((60, 40), random_state=0) + 3  # failures, and the three that end it
+    actions = torch.stack([torch.arange(40).repeat_interleave(torch.from_numpy(row))[:200] % 2 for row in runs])
+    prior = SwitchingPrior(2, 2, 0, phases=3, smoothing=1e-3).fit(actions, generator=seeded(0))
+    assert prior.transitions[0].diagonal().tolist() == pytest.approx([0.75, 0.75], abs=0.02)
+    geometric = SwitchingPrior(2, 2, 0, smoothing=1e-3).fit(actions, generator=seeded(0))
+    assert float(prior.log_prob(actions).mean()) > float(geometric.log_prob(actions).mean()) + 5
+
+
+def test_actions_beyond_the_end_say_nothing():
+    actions, lengths = switching_source(30, 20)[0], torch.randint(1, 21, (30,), generator=seeded(0))
+    plans = Plans(actions, 3, lengths=lengths)
+    other = replace(plans, actions=torch.where(plans.mask(), actions, 2 - actions))
+    one, two = (SwitchingPrior(3, 2).fit(some, generator=seeded(0)) for some in (plans, other))
+    assert one.transitions.equal(two.transitions)
+    torch.testing.assert_close(one.log_prob(plans), two.log_prob(other))
+    cut = one.posterior(actions[:1, : int(lengths[0])]).smoothed
+    torch.testing.assert_close(one.posterior(plans).smoothed[:1, : int(lengths[0])], cut)
+
+
+def test_modes_are_numbered_by_how_often_they_occur():
+    actions, modes = switching_source(60, 100, matrix=torch.tensor([[0.7, 0.3], [0.05, 0.95]]))
+    prior = SwitchingPrior(3, 2).fit(actions, generator=seeded(4))
+    found = prior.posterior(actions).smoothed.argmax(-1)
+    assert (found == 0).double().mean() > 0.6
+    assert ((found == 0) == (modes == 1)).double().mean() > 0.8
+
+
+def test_counting_anew_keeps_the_modes():
+    training = switching_source(60, 100)[0]
+    prior = SwitchingPrior(3, 2).fit(training, generator=seeded(0))
+    before = prior.posterior(training).smoothed
+    more = torch.cat([training, switching_source(60, 100, seed=9)[0]])
+    after = prior.recount(Plans(more, 3)).posterior(training).smoothed
+    assert float((before - after).abs().mean()) < 0.02
+
+
+@pytest.mark.parametrize(("phases", "contexts"), [(1, None), (2, 3)])
+def test_it_is_a_prior(phases, contexts):
+    plans = some_plans(contexts=contexts)
+    check_prior(SwitchingPrior(3, 2, 2, contexts, phases=phases, max_iterations=10).fit(plans, generator=seeded(0)))
+
+
+@pytest.mark.parametrize("contexts", [None, 3])
+def test_the_network_is_a_prior(contexts):
+    plans = some_plans(contexts=contexts)
+    prior = SwitchingNetwork(3, 2, hidden_size=8, num_contexts=contexts)
+    check_prior(prior.fit(plans, generator=seeded(0), progress=False, max_steps=5))
+
+
+def test_the_network_learns_modes_that_persist():
+    actions = switching_source(120, 40)[0]
+    held_out = switching_source(60, 40, seed=5)[0]
+    settings = {"generator": seeded(0), "progress": False, "max_steps": 150, "learning_rate": 1e-2}
+    prior = SwitchingNetwork(3, 2, hidden_size=8).fit(actions, **settings)
+    chain = SwitchingPrior(3, 2).fit(actions, generator=seeded(0))
+    loss = [-float(p.log_prob(held_out).detach().mean()) / 40 for p in (prior, chain)]
+    assert loss[0] < loss[1] + 0.02
+
+
+def test_the_same_seed_gives_the_same_modes(tmp_path):
+    plans = some_plans(contexts=3)
+    one, two = (SwitchingPrior(3, 2, num_contexts=3).fit(plans, generator=seeded(7)) for _ in range(2))
+    assert one.log_probs.equal(two.log_probs)
+    again = load(save(one, tmp_path))
+    assert isinstance(again, SwitchingPrior)
+    assert again.posterior(plans).smoothed.equal(one.posterior(plans).smoothed)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"num_modes": 0}, "num_modes"),
+        ({"order": -1}, "order"),
+        ({"order": 1.5}, "order"),
+        ({"smoothing": float("nan")}, "smoothing"),
+        ({"sharing": 1.1}, "sharing"),
+        ({"stay": -1}, "stay"),
+        ({"switching": "never"}, "switching"),
+        ({"phases": 0}, "phases"),
+        ({"folds": 0}, "folds"),
+        ({"restarts": 0}, "restarts"),
+        ({"max_iterations": 2.5}, "max_iterations"),
+        ({"tolerance": float("inf")}, "tolerance"),
+        ({"num_modes": 10**6}, "num_modes"),
+    ],
+)
+def test_wrong_arguments_are_named(wrong, message):
+    with refuses(message):
+        SwitchingPrior(3, **wrong)
+
+
+def test_wrong_plans_are_refused():
+    prior = SwitchingPrior(3, 2)
+    with refuses("actions"):
+        prior.fit(some_plans(actions=4))
+    with refuses("max_steps"):
+        prior.fit(some_plans(), max_steps=3)
+    with refuses("context"):
+        SwitchingPrior(3, 2, num_contexts=2).fit(some_plans())
+    with refuses("actions"):
+        prior.posterior(some_plans(actions=4))
+    with refuses("num_modes"):
+        SwitchingNetwork(3, 0)
