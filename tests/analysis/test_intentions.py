@@ -119,3 +119,11 @@ def test_forecast(within):
     limit = stats.norm.isf(FALSE_ALARM / 16)
     assert ((found - exact).abs() <= limit * error + 1e-6).all()
     assert float(error.max()) < 1 / (2 * sqrt(number))
+
+
+def test_what_is_impossible():
+    """An intention without weight never gets any; one has to have some."""
+    sure = infer(PRIORS, ACTIONS, weights=[0.0, 1.0, 0.0], switch=0.5).log_probs.exp()
+    assert torch.equal(sure, torch.tensor([0.0, 1.0, 0.0]).double().expand_as(sure))
+    with refuses("weights"):
+        infer(PRIORS, ACTIONS, weights=[0.0, 0.0, 0.0])
