@@ -21,6 +21,7 @@ from neuroprior.analysis.drift import (
     by_plan,
     by_position,
 )
+from neuroprior.analysis.intentions import Posterior, forecast, infer
 from neuroprior.analysis.lags import LagInformation, bits_by_position, mutual_information, pieces
 from neuroprior.analysis.motifs import Motif, motifs
 from neuroprior.analysis.orders import OrderFit, order_selection
@@ -56,6 +57,7 @@ __all__ = [
     "PermutationDesign",
     "PlanDrift",
     "PositionDrift",
+    "Posterior",
     "Reliability",
     "Score",
     "Transitions",
@@ -69,7 +71,9 @@ __all__ = [
     "by_plan",
     "by_position",
     "compare_conditions",
+    "forecast",
     "holm",
+    "infer",
     "interquartile_mean",
     "mean_interval",
     "mean_intervals",

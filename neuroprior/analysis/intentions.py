@@ -1,0 +1,207 @@
+"""Which of several known intentions an observed agent follows, one prior each, and where it will go."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import log
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
+from neuroprior.plans import Plans
+from neuroprior.priors.matching import match_plans
+from neuroprior.priors.prior import Prior
+from neuroprior.sampling import sample_in_world
+from neuroprior.worlds.world import World
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """How probable each of K intentions is after each number of observed actions.
+
+    Attributes:
+        names: K names.
+        log_probs: float64 `[B, L + 1, K]`, nats, on the CPU: at t the intention of action t, given the actions up to
+            it; at 0 the weights given in advance. Beyond a plan's length the last values go on.
+        plans: the B plans of up to L actions that were observed.
+    """
+
+    names: tuple[str, ...]
+    log_probs: Tensor
+    plans: Plans
+
+    def to_frame(self) -> Any:
+        """A pandas frame: `plan`, `group` (where there are any), `step` (0 up to the plan's length), `intention`,
+        `probability`."""
+        import pandas as pd
+
+        plans = self.plans
+        lengths = plans.mask().sum(1).cpu()
+        there = torch.arange(self.log_probs.shape[1]) <= lengths[:, None]
+        plan, step, which = there[:, :, None].expand_as(self.log_probs).nonzero(as_tuple=True)
+        columns: dict[str, Any] = {"plan": plan.tolist()}
+        if plans.plan_names is not None:
+            columns["plan"] = [plans.plan_names[i] for i in columns["plan"]]
+        if plans.group is not None:
+            group = plans.group.cpu()[plan].tolist()
+            columns["group"] = group if plans.group_names is None else [plans.group_names[g] for g in group]
+        columns |= {"step": step.tolist(), "intention": [self.names[k] for k in which.tolist()]}
+        return pd.DataFrame(columns | {"probability": self.log_probs[plan, step, which].exp().tolist()})
+
+
+@torch.no_grad()
+def infer(
+    priors: Mapping[str, Prior] | Sequence[Prior],
+    plans: Plans | Tensor,
+    *,
+    context: Tensor | None = None,
+    weights: Tensor | Sequence[float] | None = None,
+    switch: float = 0.0,
+) -> Posterior:
+    """The posterior over known intentions, exactly, by Bayes' rule (Baker, Saxe and Tenenbaum 2009).
+
+    Before each action the intention is drawn anew from `weights` with probability `switch`; otherwise it stays. With
+    `switch` the posterior is that of the forward filter of a hidden Markov model (Rabiner 1989, section III A); each
+    prior knows all the actions before, also those of other intentions.
+
+    Args:
+        priors: one fitted prior for each intention, by name or in order; a prior without context ignores that of plans.
+        plans: B plans without an end symbol, or integers `[B, L]`. An end is not observed: plans may be under way.
+        context: of integers `[B, L]`, see `Plans`; `Plans` have their own.
+        weights: how probable each intention is in advance, `[K]` or `[B, K]`, in any unit; None: all the same.
+        switch: from 0 to 1.
+
+    Raises:
+        ValueError: an argument is out of range, a prior cannot score the plans, or an action is impossible under every
+            intention.
+    """
+    named = _named(priors)
+    observed = _observed(plans, context, next(iter(named.values())))
+    if isinstance(switch, bool) or not isinstance(switch, int | float) or not 0 <= switch <= 1:
+        raise ValueError(f"switch: a probability from 0 to 1 is expected, not {switch!r}")
+    batch, length = len(observed), observed.max_length
+    prior_log = _log_weights(weights, batch, len(named))
+    scores = [
+        prior.action_log_probs(match_plans(observed, prior, name))[:, :length].double().cpu()
+        for name, prior in named.items()
+    ]
+    mask = observed.mask().cpu()
+    log_likelihood = torch.stack(scores, -1)
+    now, found = prior_log, [prior_log]
+    for t in range(length):
+        before = now
+        if switch:
+            stay = now + (log(1 - switch) if switch < 1 else -torch.inf)
+            before = torch.logaddexp(stay, prior_log + log(switch))
+        joint = before + log_likelihood[:, t]
+        total = joint.logsumexp(-1, keepdim=True)
+        impossible = mask[:, t] & ~(total[:, 0] > -torch.inf)
+        if impossible.any():
+            plan = int(impossible.nonzero()[0, 0])
+            raise ValueError(
+                f"actions[{plan}, {t}]: action {int(observed.actions[plan, t])} has probability 0 under every intention"
+                " that is still possible; priors that smooth their counts give every action some"
+            )
+        now = torch.where(mask[:, t, None], joint - total, now)
+        found.append(now)
+    return Posterior(tuple(named), torch.stack(found, 1), observed)
+
+
+@torch.no_grad()
+def forecast(
+    priors: Mapping[str, Prior] | Sequence[Prior],
+    world: World,
+    state: Tensor,
+    posterior: Posterior | Tensor,
+    length: int,
+    num_plans: int,
+    *,
+    targets: Tensor,
+    within: bool = False,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """How probably agents will be in each of some states, from samples of each intention's prior in the world.
+
+    The priors begin anew in `state`: one whose predictions depend on actions before it does not know these. The
+    intention stays what it is.
+
+    Args:
+        priors: one fitted prior for each of K intentions, as in `infer`.
+        world: in which the agents act.
+        state: `[B, ...]`: where they are.
+        posterior: that of `infer`, of which the last is taken, or probabilities `[B, K]`.
+        length: number of steps ahead.
+        num_plans: samples for each agent and intention, P; a share of them has a standard error of at most
+            1 / (2 sqrt(P)).
+        targets: states `[S, ...]`.
+        within: count those that are in the state after any of the steps, not after the last alone.
+        generator: draws actions and the world's steps.
+
+    Returns:
+        Probabilities `[B, S]`, float64, on the CPU.
+
+    Raises:
+        ValueError: an argument is out of range, or shapes do not fit one another.
+    """
+    named = _named(priors)
+    check_sizes(length=length, num_plans=num_plans)
+    world.check_state(state)
+    probs = posterior.log_probs[:, -1].exp() if isinstance(posterior, Posterior) else torch.as_tensor(posterior)
+    probs = probs.double().cpu()
+    if probs.shape != (len(state), len(named)):
+        raise ValueError(
+            f"posterior: shape [B, K] = {[len(state), len(named)]} is expected (a row for each state, a column for"
+            f" each prior), not {list(probs.shape)}"
+        )
+    if not bool(((probs >= 0).all(-1) & ((probs.sum(-1) - 1).abs() < 1e-3)).all()):
+        raise ValueError("posterior: probabilities that sum to 1 in each row are expected; of log_probs take exp()")
+    targets = torch.as_tensor(targets, device=state.device)
+    if targets.dim() != state.dim() or targets.shape[1:] != state.shape[1:]:
+        raise ValueError(f"targets: states of shape {['S', *state.shape[1:]]} are expected, not {list(targets.shape)}")
+    generator = generator_on(generator, state.device)
+    shares = []
+    for prior in named.values():
+        _, rollout = sample_in_world(prior, world, state, num_plans, length, generator=generator, keep_states=within)
+        reached = rollout.final_state[:, :, None] if rollout.states is None else rollout.states
+        # One target at a time bounds memory: [B, P, L] (and the state's own dimensions).
+        hits = [(reached == target).flatten(3).all(-1) if state.dim() > 1 else reached == target for target in targets]
+        none = torch.zeros(len(state), 0)
+        shares.append(torch.stack([hit.any(2).double().mean(1) for hit in hits], -1).cpu() if hits else none.double())
+    return (torch.stack(shares, -1) * probs[:, None]).sum(-1)
+
+
+def _named(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:
+    """The priors by name; those of a list have their numbers."""
+    if not isinstance(priors, Mapping | Sequence) or not priors:
+        raise ValueError("priors: at least one prior for each intention is expected, by name or in a list")
+    named = dict(priors) if isinstance(priors, Mapping) else {str(k): prior for k, prior in enumerate(priors)}
+    for name, prior in named.items():
+        if not isinstance(prior, Prior):
+            raise ValueError(f"priors[{name!r}]: a fitted prior is expected, not {type(prior).__name__}")
+    known = {name: prior.num_actions - (prior.end is not None) for name, prior in named.items()}
+    if len(set(known.values())) > 1:
+        raise ValueError(f"priors: all must know the same number of actions, not {known}")
+    return named
+
+
+def _observed(plans: Plans | Tensor, context: Tensor | None, prior: Prior) -> Plans:
+    """The plans that were observed, without an end symbol."""
+    if not isinstance(plans, Plans):
+        known = prior.num_actions - (prior.end is not None)
+        return Plans(torch.as_tensor(plans), known, context=context)
+    if context is not None:
+        raise ValueError("context: Plans have their own; give it with actions [B, L] alone")
+    return plans if plans.end is None else plans.without_end()
+
+
+def _log_weights(weights: Tensor | Sequence[float] | None, batch: int, number: int) -> Tensor:
+    """The logarithms `[B, K]` of the probabilities in advance."""
+    given = torch.ones(number) if weights is None else torch.as_tensor(weights)
+    given = given.double().cpu()
+    if given.shape not in ((number,), (batch, number)):
+        raise ValueError(f"weights: shape [{number}] or [{batch}, {number}] is expected, not {list(given.shape)}")
+    if not bool(given.isfinite().all()) or bool((given < 0).any()) or bool((given.sum(-1) <= 0).any()):
+        raise ValueError("weights: finite numbers from 0 are expected, with one above 0 in each row")
+    return (given / given.sum(-1, keepdim=True)).log().expand(batch, number)
