@@ -26,9 +26,9 @@ def options(
     worlds: Sequence[OptionWorld] = WORLDS,
     seeds: PositiveInt = 5,
     lengths: Sequence[PositiveInt] = (8, 16, 32, 64),
-    num_plans: Sequence[PositiveInt] = (4, 16, 64, 256),
+    num_plans: Sequence[PositiveInt] = (4, 16, 64),
     modes: Sequence[PositiveInt] = (2, 3, 5),
-    starts: PositiveInt = 126,
+    starts: PositiveInt = 63,
     training_starts: PositiveInt = 1000,
     seed: runs.Seed = 0,
     processes: PositiveInt | None = None,
@@ -48,7 +48,7 @@ def options(
         lengths: moves in a plan in the labyrinth; in other worlds it is the world's.
         num_plans: numbers of candidate plans.
         modes: numbers of modes.
-        starts: to plan from.
+        starts: nodes of the labyrinth to plan from, drawn anew in each repeat; in other worlds four times as many.
         training_starts: plans to learn from are collected from so many starts, and from several times as many in worlds
             where most starts lead nowhere; of the mice's plans four fifths are always learned from.
         seed: of everything random.

@@ -38,6 +38,7 @@ def options_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
     """The tables of the results of `options_run`, and a figure of each world."""
     frame = runs.frame_of(results)
     rows = runs.seed_means(frame, ["world", "prior", "context", "length", "num_plans"], "share", ["bits"])
+    rows = rows.assign(low=rows["low"].clip(lower=0), high=rows["high"].clip(upper=1))
     compared = compared_pairs(frame, settings["modes"])
     names = ["world", "first_prior", "second_prior", "context", "length", "num_plans"]
     gaps = runs.paired_differences(compared, names)
@@ -47,7 +48,7 @@ def options_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
         for length in sorted(own["length"].unique()):
             tables.append(share_table(own[own["length"] == length], world, length))
         if len(differences):
-            tables.append(gap_table(differences, world))
+            tables += [gap_table(differences, world, number) for number in fewest_and_middling(settings["num_plans"])]
             leads.append(finding(differences, world))
         caption = f"{world}: {one['about']}. Bands: Student's 95 % intervals over seeds. {WHAT}"
         alt = f"What is reached in {world} against the number of candidates, a line a prior; the numbers are in tables."
@@ -82,9 +83,8 @@ def share_table(rows: pd.DataFrame, world: str, length: int) -> Table:
     )
 
 
-def gap_table(gaps: pd.DataFrame, world: str) -> Table:
-    """Paired differences with a middling number of candidates, a row a pair and a column a length."""
-    number = _middling(gaps)
+def gap_table(gaps: pd.DataFrame, world: str, number: int) -> Table:
+    """Paired differences with one number of candidates, a row a pair and a column a length."""
     some = gaps[gaps["num_plans"] == number]
     cells = [runs.plus_minus(row, "difference", 100, sign="+").replace(" ", "") for _, row in some.iterrows()]
     names = {"context": "context", "first": "first_prior", "minus": "second_prior"}
@@ -104,9 +104,10 @@ def finding(gaps: pd.DataFrame, world: str) -> str:
     return f"{world}, switching minus flat of equal likelihood (95 % intervals): {'; '.join(sums)}."
 
 
-def _middling(rows: pd.DataFrame) -> int:
-    numbers = sorted(rows["num_plans"].unique())
-    return int(numbers[len(numbers) // 2])
+def fewest_and_middling(num_plans: Sequence[int]) -> list[int]:
+    """The numbers of candidates for which differences are shown."""
+    numbers = sorted(num_plans)
+    return sorted({numbers[0], numbers[len(numbers) // 2]})
 
 
 @drawn
@@ -124,7 +125,10 @@ def reached_figure(rows: pd.DataFrame, modes: Sequence[int]) -> Figure:
                 points = own[["num_plans", "share", "low", "high"]].to_numpy(float)
                 points[:, 1:] *= 100
                 band(panel, points, color, name.format(number), style)
-        panel.set_xscale("log", base=2)
+        numbers = sorted(rows["num_plans"].unique())
+        panel.set_xscale("log")
+        panel.set_xticks(numbers, [f"{number:,}" for number in numbers])
+        panel.minorticks_off()
         panel.set_title(f"{length} actions, context: {context}")
         panel.grid(axis="both")
     at_edges(axes, len(places), len(lengths), "candidates", "reached, %")

@@ -27,6 +27,9 @@ HELD_OUT = 0.2
 MICE_ORDERS, ORDERS = {"none": 4, "per-step": 1}, {"none": 2, "per-step": 1}
 """Orders of the chains of modes, by context: in the labyrinth, and in the other worlds."""
 
+MORE_STARTS = 4
+"""So many times as many starts in other worlds as in the labyrinth, where plans are longer."""
+
 ROWS = 2**14
 """Candidates drawn together."""
 
@@ -76,7 +79,7 @@ def _in_labyrinth(settings: OptionSettings, generator: torch.Generator) -> Itera
 def _in_world(run: Run, settings: OptionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
     task = TASKS[run.world]
     worlds = task.worlds(settings.seed * 10_000 + run.seed)
-    starts = starts_of(task, worlds.held_out, settings.starts, task.length, generator)
+    starts = starts_of(task, worlds.held_out, MORE_STARTS * settings.starts, task.length, generator)
     searching = ExhaustivePlanner(task.depth, **task.scoring)
 
     def searched(world: World, number: int) -> Plans:

@@ -31,6 +31,8 @@ def test_a_small_run(tmp_path, capsys):
     out = tmp_path / "out"
     assert main([*SMALL, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
+    for number in (2, 8):
+        assert f"goal_maze: differences with {number} candidates" in " ".join(printed.split())
     results = json.loads((out / "results.json").read_text())
     own = ["flat", "switching-2", "flat-2", "options-2", "kept-2"]
     expected = {("none", label) for label in [*own, "uniform", "macro"]}
