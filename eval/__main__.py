@@ -16,6 +16,7 @@ COMMANDS = {
     "live": Command("eval.live.command:live", "priors that learn online while the world changes"),
     "quality": Command("eval.quality.command:quality", "how near priors come to sources of known entropy"),
     "puzzles": Command("eval.puzzles.command:puzzles", "Sokoban and sliding tiles solved by policy-guided search"),
+    "options": Command("eval.options.command:options", "modes that persist as options of a planner that samples"),
     "study": Command("eval.study.command:study", "the tests of conditions in simulated studies: false alarms, power"),
     "bench": Command("eval.bench.command:bench", "speed against plain code and other packages"),
 }

@@ -7,10 +7,10 @@ from typing import Any
 
 from jsonargparse.typing import PositiveInt
 
-from eval.compare.curves import starts_of
 from eval.compare.planners import ORDERS, planned, planner_document
 from eval.compare.run import Contest, Settings
 from eval.worlds import runs
+from eval.worlds.starts import starts_of
 from eval.worlds.suite import TASKS, WorldName
 from neuroprior.planners import HorizonPlanner, Planner, SamplingPlanner
 

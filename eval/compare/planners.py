@@ -10,10 +10,11 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
-from eval.compare.curves import ROLLOUTS, Starts, worth
+from eval.compare.curves import ROLLOUTS
 from eval.compare.figures import View, score_panels
 from eval.compare.run import Contest, Contestant, Settings
 from eval.worlds import runs
+from eval.worlds.starts import Starts, worth
 from eval.worlds.suite import TASKS
 from neuroprior.planners import (
     CrossEntropyPlanner,

@@ -11,15 +11,14 @@ import torch
 from eval.compare.curves import (
     ROLLOUTS,
     Sampling,
-    Starts,
     best,
     curve,
     seconds_per_decision,
-    starts_of,
     tried,
 )
 from eval.compare.priors import COMBINED, NEURAL, ORDERS, TRAINING, chain, combined, digests, load_for, macro, network
 from eval.worlds.runs import Run
+from eval.worlds.starts import Starts, starts_of
 from eval.worlds.suite import TASKS, Context, Task
 from neuroprior import ExhaustivePlanner, Plans, Prior, UniformPrior, World, collect
 from neuroprior._random import draw_seed

@@ -20,6 +20,7 @@ from eval.mice.experiment import (
     reached_table,
     simulate,
 )
+from eval.worlds.labyrinth import DATA
 from eval.worlds.runs import FORMER_NAMES, check_distinct, plus_minus, table_by
 from neuroprior import read_plans
 from neuroprior._files import write_json
@@ -28,7 +29,6 @@ from neuroprior.report.document import Column, Document, results_of, show, table
 from neuroprior.report.page import Section, Table
 from neuroprior.worlds import labyrinth
 
-DATA = Path(__file__).parents[1] / "data" / "labyrinth" / "plans.jsonl"
 NODES, LONGEST = 126, 500
 
 

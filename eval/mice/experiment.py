@@ -1,13 +1,14 @@
 """The experiment of `python -m eval mice`: what priors learn in the maze, and how often they find the water."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import pandas as pd
 import torch
 from torch import Tensor
 
+from eval.worlds.labyrinth import cut_plans, reaching_planner, shares_reached
 from eval.worlds.runs import paired_differences, seed_means
 from neuroprior import (
     ExhaustivePlanner,
@@ -25,13 +26,10 @@ from neuroprior import (
 )
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
-from neuroprior.sampling import sample_in_world
 from neuroprior.worlds.labyrinth import WATER
 
 ORDERS = range(9)
 DEPTH, SHOTS, SHOT_LENGTH = 6, 256, 16
-ROWS = 2048
-"""Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
 
 SOURCES = {
     "mice": "the mice's moves, cut into plans as long as the longest that is tried",
@@ -160,7 +158,8 @@ def simulate(
             priors[name] = prior.fit(plans, generator=drawn, progress=False, max_steps=settings.steps)
             finished(f"training {name}, repeat {repeat}")
         for name in PRIORS:
-            shares = shares_reached(priors[name], world, start, settings.lengths, settings.num_plans, drawn)
+            planner = reaching_planner(priors[name], max(settings.lengths), max(settings.num_plans))
+            shares = shares_reached(planner, world, start, settings.lengths, settings.num_plans, drawn)
             rows += [
                 name._asdict() | {"seed": repeat, "length": length, "num_plans": number, "reached": share}
                 for length, some in zip(settings.lengths, shares.tolist(), strict=True)
@@ -171,38 +170,6 @@ def simulate(
             best = float(oracle(world, start, length, objective="return").mean())
             rows.append(ORACLE._asdict() | {"seed": repeat, "length": length, "reached": best})
     return pd.DataFrame(rows).astype({"num_plans": "Int64"}), priors, learned
-
-
-def shares_reached(
-    prior: Prior,
-    world: TabularWorld,
-    start: Tensor,
-    lengths: tuple[int, ...],
-    num_plans: tuple[int, ...],
-    generator: torch.Generator,
-) -> Tensor:
-    """The share of starts at which a sampling planner reaches the water.
-
-    Candidates are drawn once, as many and as long as the most asked for. Fewer are blocks of them, each block a
-    planner's decision; shorter ones are their beginnings.
-
-    Returns:
-        `[T, P]`, float64, for T `lengths` and P `num_plans`.
-    """
-    most = max(num_plans)
-    found = torch.empty(len(start), most, len(lengths), dtype=torch.bool)
-    ends = torch.tensor(lengths) - 1
-    size = max(ROWS // most, 1)
-    for at in range(0, len(start), size):
-        some = start[at : at + size]
-        _, rollout = sample_in_world(prior, world, some, most, max(lengths), generator=generator)
-        found[at : at + size] = (rollout.rewards.cumsum(-1) > 0)[..., ends]
-    shares = []
-    for number in num_plans:
-        blocks = most // number
-        block = found[:, : blocks * number].view(len(start), blocks, number, len(lengths))
-        shares.append(block.any(2).double().mean((0, 1)))
-    return torch.stack(shares, 1)
 
 
 def collected(
@@ -222,19 +189,7 @@ def collected(
     shot = chosen(SamplingPlanner(UniformPrior(4), SHOT_LENGTH, SHOTS, objective="return"), 0.0)
     if len(shot) < 20:
         raise ValueError(f"training_plans: {len(shot)} plans reached the water; at least 20 are needed")
-    return {"mice": _cut(mice_plans, max(settings.lengths)), "planner": searched, "reached": shot}
-
-
-def _cut(plans: Plans, length: int) -> Plans:
-    """Plans in pieces of `length` moves; what is left over at the end is dropped. A plan's pieces are a group."""
-    assert plans.context is not None
-    pieces = plans.max_length // length
-
-    def cut(values: Tensor) -> Tensor:
-        return values[:, : pieces * length].reshape(-1, length)
-
-    group = torch.arange(len(plans)).repeat_interleave(pieces)
-    return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group, plan_names=None)
+    return {"mice": cut_plans(mice_plans, max(settings.lengths)), "planner": searched, "reached": shot}
 
 
 def _count_based(sources: dict[str, Plans], generator: torch.Generator) -> tuple[dict[PriorName, Prior], pd.DataFrame]:

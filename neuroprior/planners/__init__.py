@@ -12,6 +12,7 @@ from neuroprior.planners.frontier import FrontierPlanner
 from neuroprior.planners.horizon import HorizonPlanner
 from neuroprior.planners.horizon_curriculum import HorizonRound, extend_horizon
 from neuroprior.planners.mcts import MCTSPlanner
+from neuroprior.planners.options import OptionPlanner
 from neuroprior.planners.planner import Decision, Planner, PriorPlanner, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
@@ -31,6 +32,7 @@ __all__ = [
     "HorizonRound",
     "LevinPlanner",
     "MCTSPlanner",
+    "OptionPlanner",
     "Planner",
     "PriorPlanner",
     "SamplingPlanner",

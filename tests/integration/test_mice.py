@@ -10,9 +10,9 @@ import torch
 from scipy import stats
 
 from eval.__main__ import main
-from eval.mice.command import DATA
-from eval.mice.experiment import MiceSettings, PriorName, _count_based, collected, shares_reached
+from eval.mice.experiment import MiceSettings, PriorName, _count_based, collected
 from eval.mice.figures import ENTRANCE, coordinates, far_from_water, left_turns, passages
+from eval.worlds.labyrinth import DATA, reaching_planner, shares_reached
 from neuroprior import MarkovPrior, Plans, SamplingPlanner, UniformPrior, oracle, read_plans
 from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import WATER
@@ -124,7 +124,7 @@ def test_uniform_candidates_reach_what_they_must(node):
     """P independent candidates reach it with probability 1 - (1 - q) ** P; as a planner decides, and as is counted."""
     world, times, lengths, numbers = labyrinth(absorbing=True), 500, (6, 10), (1, 5, 16)
     start = torch.full((times,), node)
-    shares = shares_reached(UniformPrior(4), world, start, lengths, numbers, seeded(node))
+    shares = shares_reached(reaching_planner(UniformPrior(4), 10, 16), world, start, lengths, numbers, seeded(node))
     for t, length in enumerate(lengths):
         for p, number in enumerate(numbers):
             expected = 1 - (1 - float(reaching(length)[node])) ** number

@@ -1,6 +1,7 @@
 """The switching prior: hidden modes, each a chain of its own, that persist and switch, fitted by exact EM."""
 
 from collections.abc import Iterator
+from copy import copy
 from math import inf
 from typing import Any, Literal, NamedTuple, Self
 
@@ -298,6 +299,28 @@ class SwitchingPrior(HistoryPrior):
             modes = smooth(self.first, steps, likelihood)
             found.append(ModePosterior(self._summed(modes.filtered), self._summed(modes.smoothed), path))
         return ModePosterior(*(torch.cat(some) for some in zip(*found, strict=True)))
+
+    def beginning_in(self, mode: int, keep: bool = False) -> "SwitchingPrior":
+        """This prior where the first mode is known; what it learned is shared, not copied.
+
+        Args:
+            mode: from 0.
+            keep: whether the mode never ends.
+
+        Raises:
+            ValueError: there is no such mode.
+        """
+        if not isinstance(mode, int) or not 0 <= mode < self.num_modes:
+            raise ValueError(f"mode: an integer from 0 to {self.num_modes - 1} is expected, not {mode!r}")
+        phases = self.first.view(self.num_modes, self.phases)[mode]
+        first = torch.zeros_like(self.first).view(self.num_modes, self.phases)
+        first[mode] = phases / phases.sum() if phases.sum() > 0 else 1 / self.phases
+        made = copy(self)
+        made._buffers = self._buffers | {"first": first.flatten()}
+        if keep:
+            made.switching = "constant"
+            made.transitions = torch.eye(self.num_modes, dtype=first.dtype, device=self.device)[None]
+        return made
 
     @property
     def _elements(self) -> int:

@@ -8,7 +8,6 @@ import torch
 
 from eval.compare.priors import (
     MANY,
-    ContextIndex,
     ContextMarkov,
     Renumbered,
     UnlimitedGRU,
@@ -19,6 +18,7 @@ from eval.compare.priors import (
     load_for,
     network,
 )
+from eval.worlds.contexts import ContextIndex
 from eval.worlds.suite import TASKS
 from neuroprior import ExhaustivePlanner, GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, collect, gridworld, save
 from neuroprior.sampling import sample_in_world

@@ -17,7 +17,6 @@ from eval.compare.curves import (
     curve,
     planner_of,
     seconds_per_decision,
-    starts_of,
     tried,
 )
 from eval.compare.results import PRIOR, Results
@@ -25,6 +24,7 @@ from eval.compare.run import Contest, Settings, compare_run, curriculum_run
 from eval.worlds.mid_plan import MidPlanWorld
 from eval.worlds.runs import Run
 from eval.worlds.splits import Worlds, from_seeds
+from eval.worlds.starts import starts_of
 from eval.worlds.suite import TASKS, Task, best_score
 from neuroprior import ExhaustivePlanner, MarkovPrior, TabularWorld, UniformPrior, collect, save
 from neuroprior.worlds import cube, four_rooms, goal_direction, local_view, maze

@@ -1,0 +1,1 @@
+"""Do modes as options help a planner that samples?"""
