@@ -23,6 +23,14 @@ from neuroprior.analysis.drift import (
 )
 from neuroprior.analysis.intentions import Posterior, forecast, infer
 from neuroprior.analysis.lags import LagInformation, bits_by_position, mutual_information, pieces
+from neuroprior.analysis.modes import (
+    ModeChoice,
+    choose_modes,
+    match_modes,
+    mode_frame,
+    mode_plans,
+    mode_table,
+)
 from neuroprior.analysis.motifs import Motif, motifs
 from neuroprior.analysis.orders import OrderFit, order_selection
 from neuroprior.analysis.permutation_design import PermutationDesign
@@ -52,6 +60,7 @@ __all__ = [
     "GroupDrift",
     "Interval",
     "LagInformation",
+    "ModeChoice",
     "Motif",
     "OrderFit",
     "PermutationDesign",
@@ -75,7 +84,12 @@ __all__ = [
     "holm",
     "infer",
     "interquartile_mean",
+    "choose_modes",
+    "match_modes",
     "mean_interval",
+    "mode_frame",
+    "mode_plans",
+    "mode_table",
     "mean_intervals",
     "motifs",
     "mutual_information",
