@@ -12,17 +12,22 @@ from typing import Any
 import torch
 import yaml
 from jsonargparse import ArgumentError
+from jsonargparse.typing import PositiveInt
 from lightning import Trainer
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning_utilities.core.rank_zero import rank_zero_only
+from rich.console import Console
 
 from neuroprior._files import write_whole
+from neuroprior.analysis import choose_modes
 from neuroprior.cli.fit_recipe import PlansData, PriorModel, recipe_path, recipes
 from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import one_line
 from neuroprior.plans import write_plans
+from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.neural import NeuralPrior
+from neuroprior.report.document import Column, printed, table, write_frames
 from neuroprior.training import Settings, make_trainer, quiet, run_training
 
 USAGE = """{0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
@@ -32,8 +37,14 @@ LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 """What a checkpoint must hold for a training to go on from it."""
 
-DEFAULT = "combined"
-"""The recipe where plans are given and no other."""
+DEFAULT, OF_MODES = "combined", "switching"
+"""The recipes where plans are given and no other, without `--modes` and with it."""
+
+MODE_FOLDS = 5
+"""Of the cross-validation that chooses a number of modes, at most."""
+
+OF_PLANS = ("num_modes", "num_actions", "num_contexts")
+"""Arguments of a switching prior that are found, or follow from the plans."""
 
 OTHERWISE = {
     "--config",
@@ -115,6 +126,13 @@ class FitCLI(LightningCLI):
             default=None,
             help="Folder of a run to go on with; only --trainer options may change.",
         )
+        parser.add_argument(
+            "--modes",
+            type=PositiveInt,
+            nargs="+",
+            default=None,
+            help="Numbers of hidden modes to choose from: the fewest that predict held-out plans as well as the best.",
+        )
         parser.link_arguments("seed_everything", "data.seed")
         parser.link_arguments(("out", "resume"), "trainer.folder", compute_fn=lambda out, resume: resume or out)
         parser.link_arguments("trainer.max_steps", "data.max_steps")
@@ -148,6 +166,8 @@ class FitCLI(LightningCLI):
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
         neural, many = isinstance(model.prior, NeuralPrior), datamodule.folds > 1
+        if self.config.fit.modes:
+            self._choose_modes(model, datamodule)
         settings = {} if neural and not many else self._settings(model, datamodule)
         fresh = deepcopy(model.prior) if many else None
         if isinstance(model.prior, NeuralPrior):
@@ -165,6 +185,37 @@ class FitCLI(LightningCLI):
         if self.trainer.is_global_zero:
             with self._saying_how_to_go_on(lambda: "the prior is saved"):
                 report(self.folder, model, datamodule, fresh, settings | {"progress": False} if settings else {})
+
+    def _choose_modes(self, model: PriorModel, data: PlansData) -> None:
+        """Choose the number of modes on the plans that the prior learns from; print and write what speaks for it."""
+        prior, plans = model.prior, data.plans if data.folds > 1 else data.learned_from
+        if not isinstance(prior, SwitchingPrior):
+            raise ValueError(f"modes: of a SwitchingPrior (--config switching), not of a {type(prior).__name__}")
+        config = {name: value for name, value in prior.config.items() if name not in OF_PLANS}
+        groups = len(plans) if plans.group is None else len(plans.group.unique())
+        choice = choose_modes(
+            plans,
+            self.config.fit.modes,
+            number_of_folds=min(MODE_FOLDS, groups),
+            use_context=prior.takes_context,
+            generator=torch.Generator().manual_seed(data.seed),
+            **config,
+        )
+        frame = choice.frame()
+        write_frames(self.folder, {"modes": frame})
+        columns: dict[str, Column] = {"modes": "modes", "bits per action": "bits:.3f"}
+        columns |= {
+            "more": "more:.4f",
+            "error": "error:.4f",
+            "stable": "stable",
+            "": lambda row: "chosen" if row["chosen"] else "",
+        }
+        caption = (
+            f"Held-out bits in {min(MODE_FOLDS, groups)} folds; more: than the best, with the standard error of this,"
+            " paired; stable: modes that come back in all folds."
+        )
+        Console().print(printed("Hidden modes", table(frame, columns, caption)))
+        model.prior = SwitchingPrior(**prior.config | {"num_modes": choice.chosen})
 
     def _settings(self, model: PriorModel, data: PlansData) -> dict[str, Any]:
         """The settings of the recipe that the `fit` of a prior takes which trains networks inside, or none."""
@@ -186,7 +237,7 @@ class FitCLI(LightningCLI):
         }
         # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
         default = vars(Settings()) | {"progress": None}
-        return {name: settings[name] for name in prior.fit_settings if settings[name] != default[name]}
+        return {name: settings[name] for name in prior.fit_settings if settings.get(name) != default.get(name)}
 
     def _check_checkpoints(self, model: PriorModel, data: PlansData) -> None:
         last = self.folder / LAST
@@ -247,14 +298,15 @@ def _check(checkpoint: Path, model: PriorModel) -> dict[str, Any]:
 def _in_full(arguments: list[str]) -> list[str]:
     """The arguments, with the paths of recipes that are given by name, and the sections of short options.
 
-    The first argument may be the file of plans. With plans and no recipe, the recipe is that of the combined prior.
+    The first argument may be the file of plans. With plans and no recipe, the recipe is that of the combined prior,
+    or with `--modes` of a switching prior.
     """
     if arguments[:1] == ["fit"]:
         if len(arguments) > 1 and not arguments[1].startswith("-"):
             arguments = ["fit", "--data.file", *arguments[1:]]
         given = {argument.partition("=")[0] for argument in arguments}
         if "--data.file" in given and not given & OTHERWISE:
-            arguments = ["fit", "--config", DEFAULT, *arguments[1:]]
+            arguments = ["fit", "--config", OF_MODES if "--modes" in given else DEFAULT, *arguments[1:]]
     out: list[str] = []
     for argument in arguments:
         if out and out[-1] in ("--config", "-c"):

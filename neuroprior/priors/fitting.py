@@ -14,6 +14,7 @@ from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrio
 from neuroprior.priors.ensembles.candidates import Effort
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior, as_actions, construct, context_arguments
+from neuroprior.priors.switching import SwitchingPrior
 from neuroprior.priors.uniform import UniformPrior
 
 MakePrior = Callable[..., Prior]
@@ -93,6 +94,7 @@ NAMES: dict[str, MakePrior] = {
     "stacked": StackedPrior,
     "mixture": _mixture,
     "semi-markov": SemiMarkovPrior,
+    "switching": SwitchingPrior,
 }
 """Priors that `fit` knows by name."""
 

@@ -257,7 +257,7 @@ def test_a_recipe_by_name(plans_file, tmp_path, capsys, monkeypatch):
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         assert "'markof'" in said
-        assert "gru, markov, semi-markov, transformer" in said
+        assert "gru, markov, semi-markov, switching, transformer" in said
 
 
 LONG = ["--data.check_every", "5", "--trainer.max_steps", "100", "--trainer.patience", "100"]
