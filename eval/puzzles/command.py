@@ -18,6 +18,7 @@ from eval.puzzles.animation import animation
 from eval.puzzles.contest import (
     BOOTSTRAP,
     LEARNED,
+    PLANNERS,
     SEARCHES,
     Job,
     Problems,
@@ -42,7 +43,7 @@ FILES = {
 }
 """Training and test problems by world."""
 
-PriorName = Literal[BOOTSTRAP, *LEARNED, *SEARCHES]  # type: ignore[valid-type]
+PriorName = Literal[BOOTSTRAP, *LEARNED, *PLANNERS, *SEARCHES]  # type: ignore[valid-type]
 
 
 def puzzles(
@@ -74,8 +75,9 @@ def puzzles(
         num_test: so many of them, the first; all by default.
         budget: expansions for each test problem.
         priors: bootstrap (the log-linear prior after all sweeps); fitted to its solutions: log-linear, network, product
-            and, for 50 problems and 2,000 expansions at most, as they are slow, backoff, markov, board; without any
-            learning: uniform, a-star, weighted-a-star (weight 5), greedy, breadth-first.
+            and, for 50 problems and 2,000 expansions at most, as they are slow, backoff, markov, board; as slow, with
+            the bootstrapped prior: frontier, mcts (these planners, not Levin tree search); without any learning:
+            uniform, a-star, weighted-a-star (weight 5), greedy, breadth-first.
         guided: search with the heuristic, too (PHS*); by default in tiles alone.
         sweeps: of solving and learning.
         seeds: repeats; each takes the training problems in another order.

@@ -10,7 +10,16 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, bootstrap
+from neuroprior.planners import (
+    AStarPlanner,
+    BestFirstPlanner,
+    FrontierPlanner,
+    LevinPlanner,
+    MCTSPlanner,
+    Planner,
+    Search,
+    bootstrap,
+)
 from neuroprior.planners.bootstrap import fit_solutions, read_solutions
 from neuroprior.priors import (
     BoardNetwork,
@@ -50,8 +59,14 @@ SEARCHES: dict[str, Callable[[PuzzleWorld, int], BestFirstPlanner]] = {
 }
 """Searches that learn nothing."""
 
-SLOW, SLOW_BUDGET = ("markov", "backoff", "board"), (50, 2000)
-"""Priors that the compiled search does not know, and problems and expansions at most for these."""
+PLANNERS: dict[str, Callable[..., Planner]] = {"frontier": FrontierPlanner, "mcts": MCTSPlanner}
+"""Planners that maximise the reward, which is 1 for the move that solves a problem, with the bootstrapped prior."""
+
+PLAN_LENGTH = {"sokoban": 100, "tiles": 300}
+"""Moves of their plans: more than nearly all solutions need. As many plans are tried as the budget allows."""
+
+SLOW, SLOW_BUDGET = ("markov", "backoff", "board", *PLANNERS), (50, 2000)
+"""What the compiled search does not know, and problems and expansions at most for these."""
 
 EPOCHS, BOARD_EPOCHS = 12, 3
 """Passes over the solutions of priors that are trained on them at once; the bootstrapped one had some in each sweep."""
@@ -153,6 +168,7 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
     """
     train, (test, problems) = problems_of(settings, "board" if job.prior == "board" else "patterns")
     fit_seconds, budget = 0.0, settings.budget
+    planner: Planner
     if job.prior in SEARCHES:
         planner = SEARCHES[job.prior](test, budget)
     else:
@@ -161,10 +177,16 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
         fit_seconds = time.perf_counter() - begin
         if job.prior in SLOW:
             problems, budget = problems[: SLOW_BUDGET[0]], min(budget, SLOW_BUDGET[1])
-        planner = LevinPlanner(prior, budget, heuristic=test.lower_bound if settings.guided else None)
-    planner.search(test, problems[:1])  # compiled loops are loaded
+        heuristic = test.lower_bound if settings.guided else None
+        planner = LevinPlanner(prior, budget, heuristic=heuristic)
+        if job.prior in PLANNERS:
+            value = None if heuristic is None else lambda state: -test.lower_bound(state).double()
+            length = min(PLAN_LENGTH[settings.world], budget)
+            planner = PLANNERS[job.prior](prior, length, budget // length, objective="return", value=value)
+    generator = torch.Generator().manual_seed(job.seed)
+    _search(planner, test, problems[:1], generator)  # compiled loops are loaded
     begin = time.perf_counter()
-    found = planner.search(test, problems)
+    found = _search(planner, test, problems, generator)
     seconds = time.perf_counter() - begin
     if not bool((test.solved(found.final_state) == found.solved).all()):
         raise RuntimeError(f"{job.name}: a plan does not do what the search says")
@@ -185,10 +207,27 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
     }
 
 
+def _search(planner: Planner, world: PuzzleWorld, state: torch.Tensor, generator: torch.Generator) -> Search:
+    """What a planner finds; of one that searches for no goal, its plan up to the move that solves the problem.
+
+    Its expansions are simulator steps: the prior is asked for the actions after each.
+    """
+    if isinstance(planner, BestFirstPlanner):
+        return planner.search(world, state)
+    decision = planner.plan(world, state, generator)
+    states = world.rollout(state, decision.plan[:, None], keep_states=True).states
+    assert states is not None
+    reached = world.solved(states.flatten(0, 2)).view(len(state), -1)
+    solved, steps = reached.any(1), torch.full((len(state),), decision.model_steps)
+    lengths = torch.where(solved, reached.int().argmax(1) + 1, reached.shape[1])
+    unbounded = torch.full((len(state),), inf, dtype=torch.float64)
+    return Search(solved, decision.plan, lengths, decision.score, decision.final_state, steps, unbounded, steps)
+
+
 def _prior(settings: Settings, folder: Path, job: Job, train: Problems) -> Prior:
     """The bootstrapped prior, or another that learns from its solutions."""
     solutions = read_solutions(folder)
-    if job.prior == BOOTSTRAP:
+    if job.prior in (BOOTSTRAP, *PLANNERS):
         return load(folder / f"prior-{settings.sweeps}")
     prior = LEARNED[job.prior](train.world)
     state = _shuffled(train.boards, settings, job.seed)[torch.tensor(list(solutions))]

@@ -36,6 +36,8 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
             "markov",
             "backoff",
             "board",
+            "frontier",
+            "mcts",
             "uniform",
             "greedy",
             "--processes",
@@ -47,13 +49,23 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
     assert main(arguments) == 0
     found = json.loads((out / "results.json").read_text())
     rows = {row["prior"]: row for row in found["rows"]}
-    assert set(rows) == {"bootstrap", "log-linear", "markov", "backoff", "board", "uniform", "greedy"}
+    assert set(rows) == {
+        "bootstrap",
+        "log-linear",
+        "markov",
+        "backoff",
+        "board",
+        "frontier",
+        "mcts",
+        "uniform",
+        "greedy",
+    }
     assert all(row["problems"] == 2 and row["solved"] == 1 for row in rows.values())
     assert rows["bootstrap"]["mean_expansions"] < rows["uniform"]["mean_expansions"]
     assert all(row["seconds_per_problem"] > 0 and row["median_expansions"] >= 1 for row in rows.values())
     boards = sokoban(test).boards
     lines = [json.loads(line) for line in (out / "solutions.jsonl").read_text().splitlines()]
-    assert len(lines) == 7 * 2
+    assert len(lines) == 9 * 2
     world = sokoban(test)
     for line in lines:
         state = boards[line["problem"]][None]
@@ -62,6 +74,9 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
         assert world.solved(state).all()
     by_prior = [line["expansions"] for line in lines if line["prior"] == "uniform"]
     assert sum(by_prior) / 2 == rows["uniform"]["mean_expansions"]
+    # Planners that do not search for the goal spend their budget, five plans of 100 moves, and stop at no solution.
+    assert rows["frontier"]["mean_expansions"] == 500 >= rows["mcts"]["mean_expansions"] > 400
+    assert all(len(line["moves"]) < 100 for line in lines if line["prior"] in ("frontier", "mcts"))
     assert ElementTree.fromstring((out / "solution.svg").read_text()).tag.endswith("svg")
     assert "Solve and learn" in capsys.readouterr().out
     kept = {path: path.stat().st_mtime_ns for path in out.rglob("*-0.json")}
@@ -80,17 +95,19 @@ def test_tiles_with_two_seeds(tmp_path):
     arguments = [
         *("puzzles", "--world", "tiles", "--train", str(tmp_path / "train"), "--num-train", "20", "--sweeps", "2"),
         *("--test", str(tmp_path / "test"), "--num-test", "8", "--budget", "1000", "--seeds", "2"),
-        *("--priors", "bootstrap", "log-linear", "a-star", "--processes", "1", "--out", str(out)),
+        *("--priors", "bootstrap", "log-linear", "mcts", "a-star", "--processes", "1", "--out", str(out)),
     ]
     assert main(arguments) == 0
     found = json.loads((out / "results.json").read_text())
     rows = {row["prior"]: row for row in found["rows"]}
-    assert {prior: row["seeds"] for prior, row in rows.items()} == {"bootstrap": 2, "log-linear": 2, "a-star": 1}
+    assert {prior: row["seeds"] for prior, row in rows.items()} == {
+        "bootstrap": 2, "log-linear": 2, "mcts": 2, "a-star": 1,
+    }  # fmt: skip
     assert rows["bootstrap"]["solved"] == 1.0
     # A* finds the shortest solutions.
     assert rows["bootstrap"]["mean_length"] >= rows["a-star"]["mean_length"]
     assert {(row["seed"], row["number"]) for row in found["sweeps"]} == {(0, 1), (0, 2), (1, 1), (1, 2)}
-    assert {row["prior"] for row in found["pairs"]} == {"bootstrap", "a-star"}
+    assert {row["prior"] for row in found["pairs"]} == {"bootstrap", "mcts", "a-star"}
 
 
 @pytest.mark.parametrize(
