@@ -2,6 +2,7 @@
 
 import os
 from functools import cache
+from numbers import Real
 
 import torch
 from torch import Tensor
@@ -48,6 +49,12 @@ def check_count(name: str, count: object, bytes_each: int = 8) -> None:
     if not isinstance(count, int) or isinstance(count, bool) or count < 0:
         raise ValueError(f"{name}: an integer of at least 0 is expected, not {count!r}")
     check_memory(bytes_each * count, **{name: count})
+
+
+def check_share(name: str, share: object) -> None:
+    """Raise ValueError, naming the argument, unless it is a number from 0 to 1."""
+    if isinstance(share, bool) or not isinstance(share, Real) or not 0 <= float(share) <= 1:
+        raise ValueError(f"{name}: a number from 0 to 1 is expected, not {share!r}")
 
 
 def check_memory(needed: int, **arguments: object) -> None:

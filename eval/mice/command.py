@@ -20,7 +20,7 @@ from eval.mice.experiment import (
     reached_table,
     simulate,
 )
-from eval.worlds.labyrinth import DATA
+from eval.worlds.labyrinth import DATA, NODES, check_fits
 from eval.worlds.runs import FORMER_NAMES, check_distinct, plus_minus, table_by
 from neuroprior import read_plans
 from neuroprior._files import write_json
@@ -28,8 +28,6 @@ from neuroprior._jobs import Progress
 from neuroprior.report.document import Column, Document, results_of, show, table, write_figures, write_frames
 from neuroprior.report.page import Section, Table
 from neuroprior.worlds import labyrinth
-
-NODES, LONGEST = 126, 500
 
 
 def mice(
@@ -60,9 +58,7 @@ def mice(
     """
     if seeds < 2:
         raise ValueError(f"seeds: at least 2 are expected, for intervals, not {seeds}")
-    for name, values, most in (("starts", [starts], NODES), ("lengths", lengths, LONGEST)):
-        if max(values) > most:
-            raise ValueError(f"{name}: integers from 1 to {most} are expected, not {max(values)}")
+    check_fits(starts, lengths)
     check_distinct(num_plans=num_plans, lengths=lengths)
     settings = MiceSettings(seeds, starts, tuple(num_plans), tuple(lengths), training_plans, steps, seed)
     folder, console = Path(out), Console()

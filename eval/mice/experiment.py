@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from eval.worlds.labyrinth import cut_plans, reaching_planner, shares_reached
+from eval.worlds.labyrinth import cut_plans, dry_nodes, reaching_planner, shares_reached
 from eval.worlds.runs import paired_differences, seed_means
 from neuroprior import (
     ExhaustivePlanner,
@@ -26,7 +26,6 @@ from neuroprior import (
 )
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import score
-from neuroprior.worlds.labyrinth import WATER
 
 ORDERS = range(9)
 DEPTH, SHOTS, SHOT_LENGTH = 6, 256, 16
@@ -142,7 +141,7 @@ def simulate(
         and the orders that were chosen for the Markov priors.
     """
     generator = torch.Generator().manual_seed(settings.seed)
-    dry = torch.tensor([node for node in range(world.num_states) if node != WATER])
+    dry = dry_nodes(world)
     sources = collected(settings, world, mice_plans, dry, generator)
     finished("collecting plans")
     priors, learned = _count_based(sources, generator)

@@ -9,6 +9,7 @@ from jsonargparse.typing import PositiveInt
 from eval.options.report import options_document
 from eval.options.run import LABYRINTH, OptionSettings, options_run
 from eval.worlds import runs
+from eval.worlds.labyrinth import check_fits
 from eval.worlds.suite import TASKS
 from neuroprior.report.document import write_figures
 
@@ -19,7 +20,6 @@ OFFERED = (LABYRINTH, *(name for name, task in TASKS.items() if task.feature_set
 """Worlds in which features are observed that can be numbered."""
 
 OptionWorld: TypeAlias = Literal[OFFERED]  # type: ignore[valid-type]
-NODES, LONGEST = 126, 500
 
 
 def options(
@@ -57,9 +57,8 @@ def options(
         out: folder for the report and for finished runs.
     """
     runs.check_distinct(worlds=worlds, lengths=lengths, num_plans=num_plans, modes=modes)
-    for name, values, most in (("lengths", lengths, LONGEST), ("starts", [starts], NODES)):
-        if LABYRINTH in worlds and max(values) > most:
-            raise ValueError(f"{name}: integers from 1 to {most} are expected, not {max(values)}")
+    if LABYRINTH in worlds:
+        check_fits(starts, lengths)
     numbers, own, kinds = (tuple(map(int, sorted(given))) for given in (num_plans, lengths, modes))
     settings = OptionSettings(numbers, own, kinds, int(starts), int(training_starts), int(seed))
     how = worlds, seeds, out, processes, dask

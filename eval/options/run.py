@@ -10,13 +10,13 @@ from torch import Tensor
 
 from eval.options.priors import Entrant, entrants
 from eval.worlds.contexts import ContextIndex
-from eval.worlds.labyrinth import DATA, cut_plans, shares_reached
+from eval.worlds.labyrinth import DATA, cut_plans, dry_nodes, reaching_planner, shares_reached
 from eval.worlds.runs import Run
 from eval.worlds.starts import Starts, starts_of
 from eval.worlds.suite import TASKS
 from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, World, collect, read_plans
+from neuroprior.planners.tuning import choices
 from neuroprior.worlds import labyrinth
-from neuroprior.worlds.labyrinth import WATER
 
 LABYRINTH = "labyrinth"
 """The world whose plans are the mice's; the others are those of `eval.worlds.suite`."""
@@ -63,14 +63,14 @@ def options_run(run: Run, settings: OptionSettings) -> dict[str, Any]:
 
 def _in_labyrinth(settings: OptionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
     world = labyrinth(absorbing=True)
-    dry = torch.tensor([node for node in range(world.num_states) if node != WATER])
+    dry = dry_nodes(world)
     start = dry[torch.randperm(len(dry), generator=generator)[: settings.starts]]
     parts = cut_plans(read_plans(DATA), max(settings.lengths)).split(HELD_OUT, generator)
     for context, contexts in (("none", None), ("per-step", world.num_states)):
         training, held_out = parts if contexts else (part.without_context() for part in parts)
         for one in entrants(training, held_out, contexts, settings.modes, MICE_ORDERS[context], generator):
             most = max(settings.lengths), max(settings.num_plans)
-            planner = one.planner(one.prior, *most, objective="return", any_prefix=True)
+            planner = reaching_planner(one.prior, *most, make=one.planner)
             shares = shares_reached(planner, world, start, settings.lengths, settings.num_plans, generator)
             for length, some in zip(settings.lengths, shares.tolist(), strict=True):
                 yield from _entries(one, context, length, settings.num_plans, some)
@@ -137,7 +137,6 @@ def scores_reached(
     score = torch.cat([planner.candidates(starts.world, state, generator)[1] for state in parts])
     shares = []
     for number in num_plans:
-        blocks = planner.num_plans // number
-        best = score[:, : blocks * number].view(len(score), blocks, number).amax(2)
+        best = score.gather(1, choices(score, planner.num_plans, number, 0.0))
         shares.append(starts.normalised(best.mean(1)))
     return shares

@@ -1,6 +1,6 @@
 """What experiments in the mice's labyrinth share: the moves, cut into plans, and how often the water is found."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,10 +8,26 @@ import torch
 from torch import Tensor
 
 from neuroprior import Plans, Prior, SamplingPlanner, TabularWorld
+from neuroprior.worlds.labyrinth import WATER
 
 DATA = Path(__file__).parents[1] / "data" / "labyrinth" / "plans.jsonl"
+NODES, LONGEST = 126, 500
+"""Nodes without water, and moves in a sequence of the mice."""
+
 ROWS = 2048
 """Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
+
+
+def check_fits(starts: int, lengths: Sequence[int]) -> None:
+    """Raise ValueError unless there are so many nodes to start from, and sequences of such lengths."""
+    for name, most_asked, most in (("starts", starts, NODES), ("lengths", max(lengths), LONGEST)):
+        if most_asked > most:
+            raise ValueError(f"{name}: integers from 1 to {most} are expected, not {most_asked}")
+
+
+def dry_nodes(world: TabularWorld) -> Tensor:
+    """The nodes without water."""
+    return torch.tensor([node for node in range(world.num_states) if node != WATER])
 
 
 def cut_plans(plans: Plans, length: int) -> Plans:
@@ -26,9 +42,11 @@ def cut_plans(plans: Plans, length: int) -> Plans:
     return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group, plan_names=None)
 
 
-def reaching_planner(prior: Prior, length: int, num_plans: int) -> SamplingPlanner:
-    """A planner for `shares_reached` that samples its candidates from a prior."""
-    return SamplingPlanner(prior, length, num_plans, objective="return", any_prefix=True)
+def reaching_planner(
+    prior: Prior, length: int, num_plans: int, make: Callable[..., SamplingPlanner] = SamplingPlanner
+) -> SamplingPlanner:
+    """A planner for `shares_reached` that samples its candidates from a prior; `make`: its class, or what makes it."""
+    return make(prior, length, num_plans, objective="return", any_prefix=True)
 
 
 def shares_reached(

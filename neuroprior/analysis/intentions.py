@@ -13,6 +13,7 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.matching import match_plans
 from neuroprior.priors.prior import Prior
+from neuroprior.priors.scoring import plan_frame
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds.world import World
 
@@ -35,20 +36,20 @@ class Posterior:
     def to_frame(self) -> Any:
         """A pandas frame: `plan`, `group` (where there are any), `step` (0 up to the plan's length), `intention`,
         `probability`."""
-        import pandas as pd
-
         plans = self.plans
         lengths = plans.mask().sum(1).cpu()
         there = torch.arange(self.log_probs.shape[1]) <= lengths[:, None]
         plan, step, which = there[:, :, None].expand_as(self.log_probs).nonzero(as_tuple=True)
-        columns: dict[str, Any] = {"plan": plan.tolist()}
-        if plans.plan_names is not None:
-            columns["plan"] = [plans.plan_names[i] for i in columns["plan"]]
-        if plans.group is not None:
-            group = plans.group.cpu()[plan].tolist()
-            columns["group"] = group if plans.group_names is None else [plans.group_names[g] for g in group]
-        columns |= {"step": step.tolist(), "intention": [self.names[k] for k in which.tolist()]}
-        return pd.DataFrame(columns | {"probability": self.log_probs[plan, step, which].exp().tolist()})
+        about = plan_frame(plans).drop(columns="condition", errors="ignore")
+        return (
+            about.iloc[plan.numpy()]
+            .assign(
+                step=step.tolist(),
+                intention=[self.names[k] for k in which.tolist()],
+                probability=self.log_probs[plan, step, which].exp().tolist(),
+            )
+            .reset_index(drop=True)
+        )
 
 
 @torch.no_grad()

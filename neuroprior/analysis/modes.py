@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from math import log
+from operator import le
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,13 @@ from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior._random import draw_seed, generator_on
-from neuroprior.analysis.comparison import Score, score_bits
-from neuroprior.plans import Plans
+from neuroprior.analysis.comparison import Score, action_bits, score_bits
+from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import divisible, folds
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.fitting import make_prior
+from neuroprior.priors.prior import context_arguments
+from neuroprior.priors.scoring import plan_frame
 
 STABLE = 0.7
 """Correlation of a mode with its like in another fold from which it is said to come back."""
@@ -107,9 +109,8 @@ def choose_modes(
     for number in numbers:
         check_sizes(num_modes=number)
     plans = divisible(plans)
-    if plans.context is not None and (plans.context.is_floating_point() or plans.context.dim() == 3):
-        use_context = False  # features and patterns cannot be counted
-    given = plans if use_context else plans.without_context()
+    # Features and patterns cannot be counted.
+    given = plans if use_context and "num_contexts" in context_arguments(plans) else plans.without_context()
     generator = generator_on(generator, "cpu")
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)
     mask = given.mask() & (torch.arange(given.max_length) >= skip)
@@ -128,12 +129,12 @@ def choose_modes(
         bits, agreement = torch.zeros(given.actions.shape, dtype=torch.double), []
         for learned, held_out in parts:
             prior = fitted(divisible(given[learned]))
-            bits[held_out] = -prior.action_log_probs(given[held_out]).double() / log(2)
+            bits[held_out] = action_bits(prior, given[held_out])
             agreement.append(agreements(reference, prior.posterior(given).smoothed, given.mask()))
         scores[number] = score_bits(f"{number} modes", inputs, bits, given, mask)
         priors[number], stability[number] = whole, torch.stack(agreement)
     best = scores[_best(scores)]
-    chosen = next(n for n in numbers if _excess(scores[n], best)[0] <= _excess(scores[n], best)[1])
+    chosen = next(number for number in numbers if le(*_excess(scores[number], best)))
     return ModeChoice(scores, chosen, priors, stability)
 
 
@@ -205,8 +206,6 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
     Raises:
         ValueError: plans that the prior cannot score.
     """
-    import pandas as pd
-
     given = plans if prior.takes_context else plans.without_context()
     found, mask = prior.posterior(given), plans.mask()
     which, step = (index.numpy() for index in mask.nonzero(as_tuple=True))
@@ -214,20 +213,16 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
     def named(names: Sequence[str] | None, numbers: Tensor) -> Any:
         return numbers.numpy() if names is None else np.asarray(names, dtype=object)[numbers.numpy()]
 
-    columns: dict[str, Any] = {"plan": which if plans.plan_names is None else np.asarray(plans.plan_names)[which]}
-    for what in ("group", "condition"):
-        if getattr(plans, what) is not None:
-            columns[what] = named(getattr(plans, f"{what}_names"), getattr(plans, what)[which].long())
-    columns["step"] = step
+    columns: dict[str, Any] = {"step": step}
     context = plans.context
-    if context is not None and not context.is_floating_point() and context.dim() < 3:
-        each = context if context.dim() == 2 else context[:, None].expand(plans.actions.shape)
+    if context is not None and "num_contexts" in context_arguments(plans):
+        each = context if is_per_step(context) else context[:, None].expand(plans.actions.shape)
         columns["context"] = named(plans.context_names, each[mask].long())
     columns["action"] = named(plans.action_names, plans.actions[mask].long())
     columns["mode"] = found.path.cpu()[mask].numpy() + 1
     for what, values in (("filtered", found.filtered), ("smoothed", found.smoothed)):
         columns |= {f"{what}_{k + 1}": values[..., k].cpu()[mask].numpy() for k in range(prior.num_modes)}
-    return pd.DataFrame(columns)
+    return plan_frame(plans).iloc[which].assign(**columns).reset_index(drop=True)
 
 
 def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
@@ -253,16 +248,16 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     changed = (path[:, 1:] != path[:, :-1]) & mask[:, 1:]
     context = plans.context
     places = None
-    if context is not None and not context.is_floating_point() and context.dim() == 2:
+    if context is not None and is_per_step(context) and "num_contexts" in context_arguments(plans):
         places = plans.context_names or tuple(map(str, range(int(context.max()) + 1)))
     rows = []
-    for k, runs in enumerate(_runs(path, mask, prior.num_modes)):
+    for k, dwell in enumerate(_runs(path, mask, prior.num_modes)):
         own = taken[k] / taken[k].sum().clamp(min=1e-12)
         most = (own - overall).argsort(descending=True, stable=True)[:3].tolist()
         row: dict[str, Any] = {
             "mode": k + 1,
             "share": float(weights[:, k].mean()),
-            "dwell": runs,
+            "dwell": dwell,
             "visits": float((((path == k) & mask)[:, :1].sum() + (changed & (path[:, 1:] == k)).sum()) / len(plans)),
             "actions": ", ".join(f"{names[a]} {own[a]:.2f}" for a in most),
         }

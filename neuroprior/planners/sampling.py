@@ -1,12 +1,11 @@
 """The sampling planner: draws candidate plans from a prior and decides for the best of them."""
 
-from numbers import Real
 from typing import Unpack
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_share, check_sizes
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
 from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
 from neuroprior.priors.uniform import UniformPrior
@@ -55,7 +54,7 @@ class SamplingPlanner(PriorPlanner):
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
         check_sizes(num_rollouts=num_rollouts)
-        check_share(uniform_share)
+        check_share("uniform_share", uniform_share)
         self.num_rollouts, self.halving, self.uniform_share = num_rollouts, halving, uniform_share
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
@@ -132,9 +131,3 @@ class SamplingPlanner(PriorPlanner):
 def uniform_plans(share: float, num_plans: int) -> int:
     """How many of so many candidates are uniform plans."""
     return round(share * num_plans)
-
-
-def check_share(share: object) -> None:
-    """Raise ValueError unless `share` is a number from 0 to 1."""
-    if isinstance(share, bool) or not isinstance(share, Real) or not 0 <= float(share) <= 1:
-        raise ValueError(f"uniform_share: a number from 0 to 1 is expected, not {share!r}")

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_share, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Objective
 from neuroprior.planners.rollouts import mean_scores
-from neuroprior.planners.sampling import SamplingPlanner, check_share, uniform_plans
+from neuroprior.planners.sampling import SamplingPlanner, uniform_plans
 from neuroprior.plans import Plans
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
@@ -253,4 +253,4 @@ def check_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) 
     for temperature in temperatures:
         check_temperature(temperature)
     for share in uniform_shares:
-        check_share(share)
+        check_share("uniform_share", share)

@@ -61,17 +61,24 @@ def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:
         found = frame.agg(plans=("plan", "nunique"), actions=("plan", "size"), bits=("bits", "sum")).reset_index()
         found["action"] = [names[action] for action in found["action"]]
     else:
-        own = {what: _names(plans, what) for what in ("group", "condition")}
-        found = pd.DataFrame(
-            {"plan": plans.plan_names or range(len(plans))} | {what: names for what, names in own.items() if names}
-        )
-        found = found.assign(actions=mask.sum(1).tolist(), bits=bits.sum(1).tolist())
+        found = plan_frame(plans).assign(actions=mask.sum(1).tolist(), bits=bits.sum(1).tolist())
         if by != "plan":
             sums = found.groupby(by, sort=False, as_index=False)
             found = sums.agg(plans=("plan", "size"), actions=("actions", "sum"), bits=("bits", "sum"))
     found["log_likelihood"] = -log(2) * found["bits"]
     found["bits_per_action"] = found["bits"] / found["actions"].where(found["actions"] > 0)
     return found.drop(columns="bits")
+
+
+def plan_frame(plans: Plans) -> Any:
+    """A pandas frame with a row a plan: `plan`, and `group` and `condition` where there are any; names, or numbers."""
+    import pandas as pd
+
+    own = {what: _names(plans, what) for what in ("group", "condition")}
+    return pd.DataFrame(
+        {"plan": plans.plan_names or range(len(plans))}
+        | {what: names for what, names in own.items() if names is not None}
+    )
 
 
 def _names(plans: Plans, what: str) -> list[Any] | None:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_count, check_sizes
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
 
@@ -92,8 +92,7 @@ class ContextTreePrior(HistoryPrior):
         base: Literal["frequencies", "uniform"] = "frequencies",
         num_contexts: int | None = None,
     ) -> None:
-        if not isinstance(depth, int) or isinstance(depth, bool) or depth < 0:
-            raise ValueError(f"depth: an integer of at least 0 is expected, not {depth!r}")
+        check_count("depth", depth, 0)
         if depth > MOST_DEPTH:
             raise ValueError(f"depth: at most {MOST_DEPTH} is expected, not {depth}")
         if beta is not None and not 0 < beta < 1:

@@ -61,12 +61,15 @@ class HistoryPrior(Prior):
         return self._at(node, state % contexts if context is None else context.long())
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
-        num, length = plans.shape
+        return self.log_probs[self._places(plans, context)[0]]
+
+    def _places(self, plans: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Of each action of `plans [N, L]` the row of `log_probs` that holds for it, and the context: `[N, L]` each."""
         node = self._nodes(plans.long())
         each = torch.zeros_like(node)
         if context is not None:
-            each = context.long() if is_per_step(context) else context.long()[:, None].expand(num, length)
-        return self.log_probs[self._row(node.flatten(), each.flatten())].view(num, length, self.num_actions)
+            each = context.long() if is_per_step(context) else context.long()[:, None].expand(plans.shape)
+        return self._row(node.flatten(), each.flatten()).view(plans.shape), each
 
     def _nodes(self, actions: Tensor) -> Tensor:
         """The node before each action of `actions [N, L]`."""

@@ -6,6 +6,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_count
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
@@ -77,8 +78,7 @@ class MarkovPrior(HistoryPrior):
         num_contexts: int | None = None,
         backoff: Backoff = "kneser-ney",
     ) -> None:
-        if not isinstance(order, int) or isinstance(order, bool) or order < 0:
-            raise ValueError(f"order: an integer of at least 0 is expected, not {order!r}")
+        check_count("order", order, 0)
         if not 0 < smoothing < float("inf"):
             raise ValueError(f"smoothing: a positive finite number is expected, not {smoothing!r}")
         if initial not in ("joint", "lower"):

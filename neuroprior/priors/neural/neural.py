@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_count, check_memory, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.prior import Prior
@@ -107,8 +107,8 @@ class NeuralPrior(Prior):
         seed: int,
     ) -> None:
         super().__init__(num_actions, num_contexts, context_size)
-        if window is not None and (not isinstance(window, int) or isinstance(window, bool) or window < 0):
-            raise ValueError(f"window: an integer of at least 0 is expected, not {window!r}")
+        if window is not None:
+            check_count("window", window, 0)
         if dropout is not None and not 0 <= dropout < 1:
             raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
         self._given_window = self.window = window
@@ -139,8 +139,8 @@ class NeuralPrior(Prior):
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
         window = learned["window"]
-        if window is not None and (not isinstance(window, int) or isinstance(window, bool) or window < 0):
-            raise ValueError(f"window: an integer of at least 0 is expected, not {window!r}")
+        if window is not None:
+            check_count("window", window, 0)
         self.window = window
         sizes = learned.get("sizes")
         if sizes is not None:

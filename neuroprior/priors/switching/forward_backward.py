@@ -44,45 +44,14 @@ def predict(initial: Tensor, steps: Tensor, likelihood: Tensor) -> tuple[Tensor,
         `[N, L, K]`: the modes given the actions before each; `[N, L, K]`: given this action, too; and `[N, L]`: the
         log-likelihood of each action given those before it, nats.
     """
-    num, length, modes = likelihood.shape
-    before, chunks = initial.expand(num, modes), _number_of_chunks(num, length)
-    if chunks > 1:
-        steps, likelihood = _cut(steps, likelihood, chunks)
-        products, starts = _products(steps, likelihood).unflatten(0, (num, chunks)), [before]
-        for chunk in range(chunks - 1):
-            starts.append(_normalised((starts[-1][:, :, None] * products[:, chunk]).sum(1)))
-        before = torch.stack(starts, 1).flatten(0, 1)
-    predicted, after = torch.empty_like(likelihood), torch.empty_like(likelihood)
-    totals = torch.empty_like(likelihood[..., 0])
-    for t in range(likelihood.shape[1]):
-        predicted[:, t] = (before[:, :, None] * steps[:, t]).sum(1)
-        joint = predicted[:, t] * likelihood[:, t]
-        totals[:, t] = joint.sum(-1).clamp(min=TINY)
-        before = joint / totals[:, t, None]
-        after[:, t] = before
-    parts = predicted, after, totals.log()
-    predicted, after, log_likelihood = (part.reshape(num, -1, *part.shape[2:])[:, :length] for part in parts)
-    return predicted, after, log_likelihood
+    return _forward(initial, _cut(steps, likelihood), *likelihood.shape[:2])
 
 
 def smooth(initial: Tensor, steps: Tensor, likelihood: Tensor) -> Smoothed:
     """The modes given whole sequences; see the module for the arguments."""
-    num, length, modes = likelihood.shape
-    _, after, log_likelihood = predict(initial, steps, likelihood)
-    cut_steps, cut, chunks = steps, likelihood, _number_of_chunks(num, length)
-    behind = likelihood.new_ones(num, modes)
-    if chunks > 1:
-        cut_steps, cut = _cut(steps, likelihood, chunks)
-        products, ends = _products(cut_steps, cut).unflatten(0, (num, chunks)), [behind]
-        for chunk in range(chunks - 1, 0, -1):
-            ends.append(_normalised((products[:, chunk] * ends[-1][:, None]).sum(-1)))
-        behind = torch.stack(ends[::-1], 1).flatten(0, 1)
-    # What the actions behind each one say about its mode, up to a factor.
-    later = torch.empty_like(cut)
-    for t in range(cut.shape[1] - 1, -1, -1):
-        later[:, t] = behind
-        behind = _normalised((cut_steps[:, t] * (cut[:, t] * behind)[:, None]).sum(-1))
-    later = later.reshape(num, -1, modes)[:, :length]
+    chunks, (num, length) = _cut(steps, likelihood), likelihood.shape[:2]
+    _, after, log_likelihood = _forward(initial, chunks, num, length)
+    later = _backward(chunks, num, length)
     moved = after[:, :-1, :, None] * steps[:, 1:] * (likelihood[:, 1:] * later[:, 1:])[:, :, None]
     moved = moved / moved.sum((-1, -2), keepdim=True).clamp(min=TINY)
     return Smoothed(log_likelihood, after, _normalised(after * later), moved)
@@ -105,19 +74,73 @@ def most_probable_path(initial: Tensor, steps: Tensor, likelihood: Tensor) -> Te
     return path
 
 
-def _number_of_chunks(num: int, length: int) -> int:
-    """Into how many chunks each sequence is cut: at most the square root of its length."""
-    return max(min(int(length**0.5), -(-ROWS // max(num, 1))), 1)
+class _Chunks(NamedTuple):
+    """N sequences in C chunks of S steps each.
+
+    Attributes:
+        steps: `[N * C, S, K, K]`.
+        likelihood: `[N * C, S, K]`.
+        products: `[N, C, K, K]`: what each chunk does to distributions over modes, up to a factor; None: C is 1.
+    """
+
+    steps: Tensor
+    likelihood: Tensor
+    products: Tensor | None
 
 
-def _cut(steps: Tensor, likelihood: Tensor, chunks: int) -> tuple[Tensor, Tensor]:
-    """Sequences in chunks, `[N * chunks, S, ...]`; steps beyond the end keep the mode."""
+def _cut(steps: Tensor, likelihood: Tensor) -> _Chunks:
+    """Sequences in at most the square root of their length of chunks; steps beyond the end keep the mode."""
     num, length, modes = likelihood.shape
+    chunks = max(min(int(length**0.5), -(-ROWS // max(num, 1))), 1)
+    if chunks == 1:
+        return _Chunks(steps, likelihood, None)
     size = -(-length // chunks)
     missing = chunks * size - length
     keep = torch.eye(modes, dtype=steps.dtype, device=steps.device).expand(num, missing, modes, modes)
-    likelihood = torch.cat([likelihood, likelihood.new_ones(num, missing, modes)], 1)
-    return torch.cat([steps, keep], 1).view(-1, size, modes, modes), likelihood.view(-1, size, modes)
+    likelihood = torch.cat([likelihood, likelihood.new_ones(num, missing, modes)], 1).view(-1, size, modes)
+    steps = torch.cat([steps, keep], 1).view(-1, size, modes, modes)
+    return _Chunks(steps, likelihood, _products(steps, likelihood).unflatten(0, (num, chunks)))
+
+
+def _forward(initial: Tensor, chunks: _Chunks, num: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
+    """What `predict` returns."""
+    steps, likelihood, products = chunks
+    before = initial.expand(num, likelihood.shape[-1])
+    if products is not None:
+        starts = [before]
+        for chunk in range(products.shape[1] - 1):
+            starts.append(_normalised((starts[-1][:, :, None] * products[:, chunk]).sum(1)))
+        before = torch.stack(starts, 1).flatten(0, 1)
+    predicted, after = torch.empty_like(likelihood), torch.empty_like(likelihood)
+    totals = torch.empty_like(likelihood[..., 0])
+    for t in range(likelihood.shape[1]):
+        predicted[:, t] = (before[:, :, None] * steps[:, t]).sum(1)
+        joint = predicted[:, t] * likelihood[:, t]
+        totals[:, t] = joint.sum(-1).clamp(min=TINY)
+        before = joint / totals[:, t, None]
+        after[:, t] = before
+    return _joined(predicted, num, length), _joined(after, num, length), _joined(totals.log(), num, length)
+
+
+def _backward(chunks: _Chunks, num: int, length: int) -> Tensor:
+    """`[N, L, K]`: what the actions behind each one say about its mode, up to a factor."""
+    steps, likelihood, products = chunks
+    behind = likelihood.new_ones(num, likelihood.shape[-1])
+    if products is not None:
+        ends = [behind]
+        for chunk in range(products.shape[1] - 1, 0, -1):
+            ends.append(_normalised((products[:, chunk] * ends[-1][:, None]).sum(-1)))
+        behind = torch.stack(ends[::-1], 1).flatten(0, 1)
+    later = torch.empty_like(likelihood)
+    for t in range(likelihood.shape[1] - 1, -1, -1):
+        later[:, t] = behind
+        behind = _normalised((steps[:, t] * (likelihood[:, t] * behind)[:, None]).sum(-1))
+    return _joined(later, num, length)
+
+
+def _joined(values: Tensor, num: int, length: int) -> Tensor:
+    """Values of chunks, `[N * C, S, ...]`, as those of sequences, `[N, L, ...]`."""
+    return values.reshape(num, -1, *values.shape[2:])[:, :length]
 
 
 def _products(steps: Tensor, likelihood: Tensor) -> Tensor:

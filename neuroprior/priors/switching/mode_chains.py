@@ -1,5 +1,7 @@
 """Chains of modes from expected counts, interpolated with shorter histories and with all modes together."""
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
@@ -28,7 +30,12 @@ class ModeChains:
         self.kinds = torch.bincount(counts.row, minlength=len(counts.row_code)).double()
         self.code = counts.row * num_actions + counts.action
         ends = torch.tensor(level_bounds(tree, counts, self.contexts), device=counts.row.device)
-        self.levels = torch.searchsorted(counts.row, ends).tolist()
+        levels = torch.searchsorted(counts.row, ends).tolist()
+        # Of the entries of each level but the first, the longest histories first, those of their shorter histories.
+        self.above = [
+            (first, until, self.entries(self.parent[counts.row[first:until]], counts.action[first:until]))
+            for first, until in list(pairwise(levels))[:0:-1]
+        ]
 
     def entries(self, row: Tensor, action: Tensor) -> Tensor:
         """The entries of actions after these rows; both must have occurred."""
@@ -36,9 +43,8 @@ class ModeChains:
 
     def totals(self, longest: Tensor) -> Tensor:
         """Expected counts `[P, K]` after all histories, from those after the longest alone."""
-        counts, total = self.counts, longest.clone()
-        for first, until in list(zip(self.levels, self.levels[1:], strict=False))[:0:-1]:
-            above = self.entries(self.parent[counts.row[first:until]], counts.action[first:until])
+        total = longest.clone()
+        for first, until, above in self.above:
             total.index_add_(0, above, total[first:until].clone())
         return total
 

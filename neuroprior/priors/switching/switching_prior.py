@@ -8,11 +8,12 @@ from typing import Any, Literal, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_count, check_memory, check_share, check_sizes
 from neuroprior._random import generator_on
-from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree
 from neuroprior.priors.counts.history_prior import HistoryPrior
+from neuroprior.priors.ensembles.mixture import taken_of
 from neuroprior.priors.switching.forward_backward import TINY, Smoothed, most_probable_path, predict, smooth
 from neuroprior.priors.switching.mode_chains import ModeChains
 
@@ -118,14 +119,12 @@ class SwitchingPrior(HistoryPrior):
         tolerance: float = 1e-4,
     ) -> None:
         check_sizes(num_modes=num_modes, phases=phases, folds=folds, restarts=restarts)
-        for name, number in (("order", order), ("max_iterations", max_iterations)):
-            if not isinstance(number, int) or isinstance(number, bool) or number < 0:
-                raise ValueError(f"{name}: an integer of at least 0 is expected, not {number!r}")
+        check_count("order", order, 0)
+        check_count("max_iterations", max_iterations, 0)
         for name, value in (("smoothing", smoothing), ("stay", stay), ("tolerance", tolerance)):
             if not 0 <= value < float("inf"):
                 raise ValueError(f"{name}: a finite number of at least 0 is expected, not {value!r}")
-        if not 0 <= sharing <= 1:
-            raise ValueError(f"sharing: a share from 0 to 1 is expected, not {sharing!r}")
+        check_share("sharing", sharing)
         if switching not in ("context", "constant"):
             raise ValueError(f'switching: "context" or "constant" is expected, not {switching!r}')
         self.num_modes, self.order, self.phases, self.folds, self.restarts = num_modes, order, phases, folds, restarts
@@ -156,8 +155,7 @@ class SwitchingPrior(HistoryPrior):
         contexts, action = self.num_contexts or 1, action.long()
         modes, code = state[:, :-1], state[:, -1].long()
         node, last = code.div(contexts, rounding_mode="floor"), code % contexts
-        emitted = self.log_probs[self._row(node, last)].gather(2, action[:, None, None].expand(-1, self.num_modes, 1))
-        modes = modes * self._by_phase(emitted[..., 0].double().exp())
+        modes = modes * self._likelihood(self.log_probs[self._row(node, last)], action)
         modes = modes / modes.sum(-1, keepdim=True).clamp(min=TINY)
         context = last if context is None else context.long()
         modes = (modes[:, :, None] * self._matrices()[self._cell(context)]).sum(1)
@@ -178,31 +176,26 @@ class SwitchingPrior(HistoryPrior):
         if plans.numel() == 0:
             return torch.zeros(num, length, self.num_actions, device=self.device)
         rows, cells = self.cells(plans, context)
-        log_probs, taken = self.log_probs[rows], plans.long()[..., None, None].expand(-1, -1, self.num_modes, 1)
-        likelihood = self._by_phase(log_probs.gather(3, taken)[..., 0].double().exp())
-        before, _, _ = predict(self.first, self._steps(self._matrices(), cells), likelihood)
+        log_probs = self.log_probs[rows]
+        before, _, _ = predict(self.first, self._steps(cells), self._likelihood(log_probs, plans))
         return self._mixed(before, log_probs)
 
     def cells(self, plans: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
         """Of each action of `plans [N, L]` the row of `log_probs` and that of `transitions` which hold for it."""
-        num, length = plans.shape
-        node = self._nodes(plans.long())
-        each = torch.zeros_like(node)
-        if context is not None:
-            each = context.long() if is_per_step(context) else context.long()[:, None].expand(num, length)
-        return self._row(node.flatten(), each.flatten()).view(num, length), self._cell(each)
+        rows, each = self._places(plans, context)
+        return rows, self._cell(each)
 
     def _cell(self, context: Tensor) -> Tensor:
         return context if len(self.transitions) > 1 else torch.zeros_like(context)
 
-    def _by_phase(self, values: Tensor) -> Tensor:
-        """Values of modes `[..., K]` for each of their phases, `[..., K * D]`."""
-        return values if self.phases == 1 else values.repeat_interleave(self.phases, -1)
+    def _likelihood(self, log_probs: Tensor, actions: Tensor) -> Tensor:
+        """Of actions `[...]` in each mode and phase, `[..., K * D]`, from `log_probs [..., K, A]`."""
+        likelihood = taken_of(log_probs, actions).double().exp()
+        return likelihood if self.phases == 1 else likelihood.repeat_interleave(self.phases, -1)
 
-    def _matrices(self, transitions: Tensor | None = None) -> Tensor:
+    def _matrices(self) -> Tensor:
         """The transitions `[C, K * D, K * D]` of modes with their phases: out of the last phase, into a first one."""
-        transitions = self.transitions if transitions is None else transitions
-        modes, phases = self.num_modes, self.phases
+        transitions, modes, phases = self.transitions, self.num_modes, self.phases
         if phases == 1:
             return transitions
         matrix = transitions.new_zeros(len(transitions), modes, phases, modes, phases)
@@ -218,20 +211,19 @@ class SwitchingPrior(HistoryPrior):
                 matrix[:, k, -1, k, -1] = 1.0
         return matrix.view(-1, modes * phases, modes * phases)
 
-    def _steps(self, matrices: Tensor, cells: Tensor) -> Tensor:
+    def _steps(self, cells: Tensor) -> Tensor:
         """The matrices `[N, L, K * D, K * D]` that lead to each action, the first the identity."""
-        steps = matrices[cells]
-        steps[:, 0] = torch.eye(matrices.shape[-1], dtype=steps.dtype, device=steps.device)
+        steps = self._matrices()[cells]
+        steps[:, 0] = torch.eye(steps.shape[-1], dtype=steps.dtype, device=steps.device)
         return steps
 
     # Learning.
 
     def learn(self, tree: Tree, counts: Counts) -> None:
         size = self.num_modes * self.phases
-        contexts = self.num_contexts or 1 if self.switching == "context" else 1
         even = torch.full((self.num_modes, self.num_modes), 1 / self.num_modes, dtype=torch.double)
         self.register_buffer("first", torch.full((size,), 1 / size, dtype=torch.double, device=self.device))
-        self.register_buffer("transitions", even.expand(contexts, -1, -1).contiguous().to(self.device))
+        self.register_buffer("transitions", even.expand(self._num_cells, -1, -1).contiguous().to(self.device))
         super().learn(tree, counts)
 
     def estimate(self, tree: Tree, counts: Counts) -> Tensor:
@@ -292,9 +284,7 @@ class SwitchingPrior(HistoryPrior):
         plans = self._as_plans(plans)
         self._check_scored(plans)
         found = []
-        for indices in _parts(plans, self._elements):
-            part = plans[indices]
-            steps, likelihood = self._inputs(part, *self.cells(part.actions, part.context))
+        for _, steps, likelihood in self._in_parts(plans):
             path = most_probable_path(self.first, steps, likelihood).div(self.phases, rounding_mode="floor")
             modes = smooth(self.first, steps, likelihood)
             found.append(ModePosterior(self._summed(modes.filtered), self._summed(modes.smoothed), path))
@@ -323,6 +313,11 @@ class SwitchingPrior(HistoryPrior):
         return made
 
     @property
+    def _num_cells(self) -> int:
+        """C, of `transitions`."""
+        return self.num_contexts or 1 if self.switching == "context" else 1
+
+    @property
     def _elements(self) -> int:
         """Numbers that inference holds for an action."""
         return (self.num_modes * self.phases) ** 2
@@ -334,26 +329,24 @@ class SwitchingPrior(HistoryPrior):
 
     def _known(self, plans: Plans) -> list[tuple[Tensor, Smoothed]]:
         """What is known about the modes of plans: indices of some, and of these."""
-        found = []
+        return [(indices, smooth(self.first, *inputs)) for indices, *inputs in self._in_parts(plans)]
+
+    def _in_parts(self, plans: Plans) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Indices of plans that are inferred together, and the `steps` and the `likelihood` of inference in them."""
         for indices in _parts(plans, self._elements):
             part = plans[indices]
-            inputs = self._inputs(part, *self.cells(part.actions, part.context))
-            found.append((indices, smooth(self.first, *inputs)))
-        return found
+            yield indices, *self._inputs(part, *self.cells(part.actions, part.context))
 
     def _inputs(self, plans: Plans, rows: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
         """The `steps` and the `likelihood` of inference in plans."""
-        taken = plans.actions.long()[..., None, None].expand(-1, -1, self.num_modes, 1)
-        likelihood = self.log_probs[rows].gather(3, taken)[..., 0].double().exp()
-        likelihood = likelihood.masked_fill(~plans.mask()[..., None], 1.0)
-        return self._steps(self._matrices(), cells), self._by_phase(likelihood)
+        likelihood = self._likelihood(self.log_probs[rows], plans.actions)
+        return self._steps(cells), likelihood.masked_fill(~plans.mask()[..., None], 1.0)
 
     def tables_fit(self) -> bool:
         modes, whole = self.num_modes, self.log_probs
-        contexts = self.num_contexts or 1 if self.switching == "context" else 1
         if whole.dim() != 3 or whole.shape[1] != modes or self.first.shape != (modes * self.phases,):
             return False
-        if self.transitions.shape != (contexts, modes, modes):
+        if self.transitions.shape != (self._num_cells, modes, modes):
             return False
         self.log_probs = whole[:, 0]
         fit = super().tables_fit()

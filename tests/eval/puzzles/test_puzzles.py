@@ -27,39 +27,15 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
     train = level_file(tmp_path / "train.txt")
     out, test = tmp_path / "out", tmp_path / "test.txt"
     test.write_text("########\n#@ $ . #\n########\n########\n\n########\n#.$   @#\n########\n########\n")
+    priors = ("bootstrap", "log-linear", "markov", "backoff", "board", "frontier", "mcts", "uniform", "greedy")
     arguments = [
         *("puzzles", "--train", train, "--num-train", "20", "--test", str(test), "--budget", "500", "--sweeps", "2"),
-        *(
-            "--priors",
-            "bootstrap",
-            "log-linear",
-            "markov",
-            "backoff",
-            "board",
-            "frontier",
-            "mcts",
-            "uniform",
-            "greedy",
-            "--processes",
-            "1",
-            "--out",
-            str(out),
-        ),
+        *("--priors", *priors, "--processes", "1", "--out", str(out)),
     ]
     assert main(arguments) == 0
     found = json.loads((out / "results.json").read_text())
     rows = {row["prior"]: row for row in found["rows"]}
-    assert set(rows) == {
-        "bootstrap",
-        "log-linear",
-        "markov",
-        "backoff",
-        "board",
-        "frontier",
-        "mcts",
-        "uniform",
-        "greedy",
-    }
+    assert set(rows) == set(priors)
     assert all(row["problems"] == 2 and row["solved"] == 1 for row in rows.values())
     assert rows["bootstrap"]["mean_expansions"] < rows["uniform"]["mean_expansions"]
     assert all(row["seconds_per_problem"] > 0 and row["median_expansions"] >= 1 for row in rows.values())
