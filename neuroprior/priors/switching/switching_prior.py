@@ -16,9 +16,13 @@ from neuroprior.priors.counts.history_prior import HistoryPrior
 from neuroprior.priors.ensembles.mixture import taken_of
 from neuroprior.priors.switching.forward_backward import TINY, Smoothed, most_probable_path, predict, smooth
 from neuroprior.priors.switching.mode_chains import ModeChains
+from neuroprior.priors.switching.spectral_start import spectral_modes
 
 SEGMENT = 20
 """Mean length of the random segments, a mode each, that a fit starts from."""
+
+SURE = 0.8
+"""Share of the spectral start that is its modes; the rest is even."""
 
 SHORT_RUN = 8
 """Iterations after which the best of the restarts goes on alone (Biernacki, Celeux and Govaert 2003)."""
@@ -66,10 +70,11 @@ class SwitchingPrior(HistoryPrior):
     mode's distribution after the history without its oldest action, mixed with a share `sharing` of what all modes
     together did after h. So a mode that was hardly ever in a place does there what the others do.
 
-    EM starts from random modes, and from those of a prior of half the order; the most likely after a few iterations go
-    on. Ordinary EM infers the modes of a sequence with counts that hold its own actions, and so learns modes that
-    explain these very sequences. Here the plans are divided into folds, and the modes of each are inferred with the
-    counts of the others (`folds`; of groups, where plans have them).
+    EM starts from random modes, from those whose deviations from the average policy go together (`spectral_modes`), and
+    from those of a prior of half the order; the most likely after a few iterations go on. Ordinary EM infers the modes
+    of a sequence with counts that hold its own actions, and so learns modes that explain these very sequences. Here the
+    plans are divided into folds, and the modes of each are inferred with the counts of the others (`folds`; of groups,
+    where plans have them).
 
     Args:
         num_actions: A.
@@ -249,6 +254,8 @@ class SwitchingPrior(HistoryPrior):
             return self._go_on(plans, generator, self.max_iterations)
         learner = _Learner(self, plans, generator)
         starts = [learner.random_start(generator) for _ in range(self.restarts)]
+        spectral = learner.spectral_start(plans, generator) if self.num_modes > 1 else None
+        starts += [] if spectral is None else [spectral]
         if self.order and self.num_modes > 1:
             # Short histories leave more to the modes: those found with them are often better to start from.
             lower = SwitchingPrior(**self.config | {"order": self.order // 2}).to(self.device)
@@ -389,8 +396,22 @@ class _Learner:
         new = torch.rand(self.shape, generator=generator, device=device) < 1 / SEGMENT
         first = torch.where(new, torch.arange(self.shape[1], device=device), 0).cummax(1).values
         logits = 3 * torch.rand((*self.shape, size), generator=generator, device=device, dtype=torch.double)
-        smoothed = logits.gather(1, first[..., None].expand(-1, -1, size)).softmax(-1)
-        modes = self._empty()
+        return self._from_segments(logits.gather(1, first[..., None].expand(-1, -1, size)).softmax(-1))
+
+    def spectral_start(self, plans: Plans, generator: torch.Generator) -> Modes | None:
+        """Modes that deviate from the average policy together; see `spectral_modes`."""
+        modes = spectral_modes(plans, self.prior.num_modes, SEGMENT / 2, generator)
+        if modes is None:
+            return None
+        size = self.prior.num_modes * self.prior.phases
+        sure = torch.nn.functional.one_hot(modes, self.prior.num_modes).double().to(self.prior.device)
+        return self._from_segments(
+            (SURE * sure.repeat_interleave(self.prior.phases, -1) / self.prior.phases) + (1 - SURE) / size
+        )
+
+    def _from_segments(self, smoothed: Tensor) -> Modes:
+        """Modes that begin as often, each for a segment; from those of all actions, `[N, L, K * D]`."""
+        size, modes = self.prior.num_modes * self.prior.phases, self._empty()
         for part in self.parts:
             self._count(modes, part, smoothed[part.indices])
         transitions = modes.transitions + 1 / SEGMENT / max(self.prior.num_modes - 1, 1)
