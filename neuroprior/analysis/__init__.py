@@ -30,6 +30,7 @@ from neuroprior.analysis.modes import (
     mode_frame,
     mode_plans,
     mode_table,
+    mode_transitions,
 )
 from neuroprior.analysis.motifs import Motif, motifs
 from neuroprior.analysis.orders import OrderFit, order_selection
@@ -90,6 +91,7 @@ __all__ = [
     "mode_frame",
     "mode_plans",
     "mode_table",
+    "mode_transitions",
     "mean_intervals",
     "motifs",
     "mutual_information",

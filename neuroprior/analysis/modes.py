@@ -23,6 +23,9 @@ from neuroprior.priors.scoring import plan_frame
 STABLE = 0.7
 """Correlation of a mode with its like in another fold from which it is said to come back."""
 
+FOLDS = 5
+"""In which the number of modes is chosen, at most."""
+
 
 @dataclass(frozen=True)
 class ModeChoice:
@@ -76,7 +79,7 @@ def choose_modes(
     plans: Plans,
     num_modes: Sequence[int] = (1, 2, 3, 4),
     *,
-    number_of_folds: int = 5,
+    number_of_folds: int | None = None,
     use_context: bool = True,
     skip: int = 0,
     generator: torch.Generator | None = None,
@@ -92,9 +95,10 @@ def choose_modes(
     Kuhn 1955). Those that do not come back in all folds are an accident of the plans that they were learned from.
 
     Args:
-        plans: at least as many groups (or plans) as folds.
+        plans: at least two.
         num_modes: the numbers of modes that are tried.
-        number_of_folds: F; at most as many as there are groups (or plans).
+        number_of_folds: F; at most as many as there are groups (plans, where there are no two groups); None: so many,
+            but no more than `FOLDS`.
         use_context: whether the prior takes the context of the plans, if that is an index.
         skip: actions at the beginning of each plan that do not count in the bits.
         generator: draws the folds and what EM starts from.
@@ -112,6 +116,8 @@ def choose_modes(
     # Features and patterns cannot be counted.
     given = plans if use_context and "num_contexts" in context_arguments(plans) else plans.without_context()
     generator = generator_on(generator, "cpu")
+    if number_of_folds is None:
+        number_of_folds = min(FOLDS, len(given) if given.group is None else len(given.group.unique()))
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)
     mask = given.mask() & (torch.arange(given.max_length) >= skip)
     scores, priors, stability = {}, {}, {}
@@ -194,6 +200,20 @@ def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
     given = plans if prior.takes_context else plans.without_context()
     path = prior.posterior(given).path.cpu()
     return replace(plans, actions=path, num_actions=prior.num_modes, action_names=mode_names(prior.num_modes), end=None)
+
+
+def mode_transitions(prior: SwitchingPrior, plans: Plans) -> Tensor:
+    """How often each mode took each action after each, in expectation: `[K, A, A]`, float64, last by next action.
+
+    Raises:
+        ValueError: plans that the prior cannot score.
+    """
+    given, size = plans if prior.takes_context else plans.without_context(), plans.num_actions
+    both, actions = plans.mask()[:, 1:], plans.actions.long()
+    pair = (actions[:, :-1] * size + actions[:, 1:])[both]
+    weights = prior.posterior(given).smoothed.cpu()[:, 1:][both]
+    counts = weights.new_zeros(prior.num_modes, size * size)
+    return counts.index_add_(1, pair, weights.T).view(-1, size, size)
 
 
 def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:

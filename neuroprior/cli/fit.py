@@ -27,7 +27,8 @@ from neuroprior.cli.program import one_line
 from neuroprior.plans import write_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.neural import NeuralPrior
-from neuroprior.report.document import Column, printed, table, write_frames
+from neuroprior.report.document import printed, write_frames
+from neuroprior.report.modes import choice_table
 from neuroprior.training import Settings, make_trainer, quiet, run_training
 
 USAGE = """{0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
@@ -39,9 +40,6 @@ STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops",
 
 DEFAULT, OF_MODES = "combined", "switching"
 """The recipes where plans are given and no other, without `--modes` and with it."""
-
-MODE_FOLDS = 5
-"""Of the cross-validation that chooses a number of modes, at most."""
 
 OF_PLANS = ("num_modes", "num_actions", "num_contexts")
 """Arguments of a switching prior that are found, or follow from the plans."""
@@ -192,29 +190,15 @@ class FitCLI(LightningCLI):
         if not isinstance(prior, SwitchingPrior):
             raise ValueError(f"modes: of a SwitchingPrior (--config switching), not of a {type(prior).__name__}")
         config = {name: value for name, value in prior.config.items() if name not in OF_PLANS}
-        groups = len(plans) if plans.group is None else len(plans.group.unique())
         choice = choose_modes(
             plans,
             self.config.fit.modes,
-            number_of_folds=min(MODE_FOLDS, groups),
             use_context=prior.takes_context,
             generator=torch.Generator().manual_seed(data.seed),
             **config,
         )
-        frame = choice.frame()
-        write_frames(self.folder, {"modes": frame})
-        columns: dict[str, Column] = {"modes": "modes", "bits per action": "bits:.3f"}
-        columns |= {
-            "more": "more:.4f",
-            "error": "error:.4f",
-            "stable": "stable",
-            "": lambda row: "chosen" if row["chosen"] else "",
-        }
-        caption = (
-            f"Held-out bits in {min(MODE_FOLDS, groups)} folds; more: than the best, with the standard error of this,"
-            " paired; stable: modes that come back in all folds."
-        )
-        Console().print(printed("Hidden modes", table(frame, columns, caption)))
+        write_frames(self.folder, {"modes": choice.frame()})
+        Console().print(printed("Hidden modes", choice_table(choice)))
         model.prior = SwitchingPrior(**prior.config | {"num_modes": choice.chosen})
 
     def _settings(self, model: PriorModel, data: PlansData) -> dict[str, Any]:

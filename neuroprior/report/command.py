@@ -18,6 +18,7 @@ def plans(
     folds: int | None = None,
     models: list[ModelName] = list(MODELS),  # noqa: B006
     inputs: list[InputName] = list(INPUTS[:2]),  # noqa: B006
+    modes: list[int] | None = None,
     skip: int = 0,
     max_steps: int | None = None,
     num_actions: int | None = None,

@@ -615,6 +615,26 @@ def distribution_figure(distributions: Mapping[str, tuple[Sequence[Number], Sequ
 
 
 @drawn
+def occupancy_figure(occupancy: pd.DataFrame) -> Figure:
+    """The share of each hidden mode over the parts of plans, with bands.
+
+    Args:
+        occupancy: columns `mode`, `part` (from 1), `share`, `low`, `high`.
+    """
+    expect_columns("occupancy", occupancy, "mode part share low high")
+    expect_some("occupancy", occupancy)
+    figure, (axes,) = panels(1, 1, (WIDTH, 2.8))
+    names = list(occupancy["mode"].unique())
+    for number, name in enumerate(names):
+        own = occupancy[occupancy["mode"] == name]
+        band(axes, own[["part", "share", "low", "high"]].to_numpy(float), STRIPS[number % len(STRIPS)], name, "-")
+    whole_numbers(axes, f"part of the plan, of {occupancy['part'].max()}", "share of the actions")
+    axes.set_ylim(bottom=0)
+    legend(figure, axes.get_legend_handles_labels()[0])
+    return figure
+
+
+@drawn
 def drift_figure(drift: pd.DataFrame, plans: pd.DataFrame) -> Figure:
     """Bits per action within plans, from plan to plan, and from group to group: three panels.
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import torch
 
+from neuroprior._checks import check_sizes
 from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
 from neuroprior.plans import Columns, Missing, Plans, read_plans
@@ -45,6 +46,7 @@ def report(
     folds: int | None = None,
     models: Sequence[ModelName] = MODELS,
     inputs: Sequence[InputName] = INPUTS[:2],
+    modes: Sequence[int] | None = None,
     skip: int = 0,
     max_steps: int | None = None,
     num_actions: int | None = None,
@@ -73,6 +75,8 @@ def report(
         inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, transformer
             and combined, durations: how long the last action took, beside the actions. Each in turn; durations, with
             which these take as long again, are left out by default.
+        modes: numbers of hidden modes that are tried, such as `[1, 2, 3]`; None: no section on modes, which takes about
+            as long for each number as the counts.
         skip: actions at the beginning of each plan that do not count in scores.
         max_steps: gradient steps of a neural prior; None: by the plans, see `neuroprior.training.Settings`.
         num_actions: number of actions, where a file does not say.
@@ -106,12 +110,14 @@ def report(
         if not given or set(given) - set(known):
             raise ValueError(f"{name}: some of {', '.join(known)} are expected, not {', '.join(given) or 'none'}")
     _check(skip, max_steps, seed, processes)
+    for number in modes or ():
+        check_sizes(modes=number)
     file = "" if isinstance(plans, Plans) else str(plans)
     reading: dict[str, Any] = {"num_actions": num_actions, "action_names": action_names, "columns": columns}
     reading |= {"missing": missing, "merge_repeats": merge_repeats, "max_gap": max_gap}
     if priors is not None:
-        if test is not None or folds is not None:
-            raise ValueError("priors: they are scored on the plans as they are; leave test and folds out")
+        if test is not None or folds is not None or modes is not None:
+            raise ValueError("priors: they are scored on the plans as they are; leave test, folds and modes out")
         if isinstance(priors, Prior | str) or any(isinstance(one, Prior) for one in priors):
             raise ValueError("priors: a dict of fitted priors by name, or a list of folders, is expected")
         if not priors:
@@ -159,6 +165,7 @@ def report(
             results = run.do(todo, processes=processes, dask=dask, title="fits")
         found = evaluate(learned, other, design, todo, results)
         settings: dict[str, Any] = {"models": ", ".join(kinds)} | found.settings
+        settings |= {} if modes is None else {"modes": sorted(set(modes))}
         settings |= {"plans without actions, left out": empty} if empty else {}
         settings |= {} if test is None else {"test": str(test) if not isinstance(test, Plans) else "plans"}
         found = replace(found, plans=whole, settings=settings)

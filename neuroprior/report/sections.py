@@ -28,6 +28,7 @@ from neuroprior.report.conditions import condition_section
 from neuroprior.report.document import Column, table
 from neuroprior.report.durations import duration_section
 from neuroprior.report.fits import ACTIONS, CONTEXT
+from neuroprior.report.modes import mode_section
 from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.report.part import LISTED, SIGNIFICANT, Part, action_names, group_names, p_text
 from neuroprior.report.scores import Evaluation, Model
@@ -524,6 +525,7 @@ SECTIONS: dict[str, Callable[[Evaluation], Part | None]] = {
     "motifs": motif_section,
     "macros": macro_section,
     "durations": duration_section,
+    "modes": mode_section,
     "likeness": likeness_section,
     "drift": drift_section,
 }

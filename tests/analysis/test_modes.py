@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from neuroprior import Plans
-from neuroprior.analysis import ModeChoice, choose_modes, match_modes, mode_frame, mode_plans, mode_table
+from neuroprior.analysis import (
+    ModeChoice,
+    choose_modes,
+    match_modes,
+    mode_frame,
+    mode_plans,
+    mode_table,
+    mode_transitions,
+)
 from neuroprior.analysis.modes import agreements
 from neuroprior.priors import SwitchingPrior
 from tests.support.sources import refuses, seeded
@@ -154,3 +162,23 @@ def test_wrong_arguments_are_named():
     with refuses("order"):
         choose_modes(plans, [1], order=-1)
     assert isinstance(choose_modes(plans, [1], number_of_folds=2, generator=seeded(0)), ModeChoice)
+
+
+def test_transitions_of_modes_are_expected_counts():
+    plans, _ = source(5, 12, seed=3)
+    plans = replace(plans, lengths=torch.tensor([12, 3, 1, 7, 12]))
+    prior = SwitchingPrior(4, 2, 1).fit(plans, generator=seeded(0))
+    smoothed, expected = prior.posterior(plans).smoothed, torch.zeros(2, 4, 4, dtype=torch.double)
+    for n, length in enumerate(plans.lengths.tolist()):
+        for t in range(1, length):
+            expected[:, int(plans.actions[n, t - 1]), int(plans.actions[n, t])] += smoothed[n, t]
+    torch.testing.assert_close(mode_transitions(prior, plans), expected)
+    assert float(expected.sum()) == pytest.approx(11 + 2 + 0 + 6 + 11)
+
+
+def test_as_many_folds_as_groups_where_these_are_few():
+    plans, _ = source(9, 20, seed=1)
+    how = {"order": 0, "restarts": 1, "max_iterations": 2}
+    for group, expected in ((torch.arange(9) // 3, 3), (torch.zeros(9, dtype=torch.long), 5)):
+        choice = choose_modes(replace(plans, group=group), [2], generator=seeded(0), **how)
+        assert len(choice.stability[2]) == expected

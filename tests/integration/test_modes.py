@@ -9,7 +9,10 @@ import torch
 from neuroprior import Plans, load, write_plans
 from neuroprior.cli.__main__ import main
 from neuroprior.priors import SwitchingPrior
+from neuroprior.report import report
 from tests.support.sources import seeded
+
+QUICK: dict = {"models": ["counts"], "sections": ["modes"], "folds": 2, "processes": 1}
 
 
 @pytest.fixture
@@ -54,3 +57,48 @@ def test_what_is_wrong_is_named_in_one_line(file, tmp_path, capsys, arguments, m
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert message in said
+
+
+def test_the_report_describes_the_modes(file, tmp_path):
+    """The commonest takes action 0 or 1 alone, and comes back; the runs are the modes' own."""
+    made = report(file, modes=[1, 2], out=tmp_path / "report", **QUICK)
+    assert [section.title for section in made.sections] == ["Hidden modes"]
+    frames = made.frames
+    assert frames["modes"].loc[frames["modes"]["chosen"], "modes"].tolist() == [2]
+    assert frames["mode_table"]["stable"].tolist() == ["yes", "yes"]
+    assert sum(frames["mode_table"]["share"]) == pytest.approx(1)
+    assert "mode 1, mode 2" in made.sections[0].text[1]
+    occupancy = frames["mode_occupancy"]
+    assert occupancy.groupby("part")["share"].sum().tolist() == pytest.approx([1.0] * 10)
+    assert len(frames["mode_actions"]) == 30 * 60
+    assert set(made.figures) == {"mode_ethogram", "mode_occupancy", "mode_transitions"}
+    assert (tmp_path / "report" / "mode_table.csv").is_file()
+
+
+def test_the_report_compares_conditions_by_modes():
+    """Six animals that are hardly ever in the second mode against six that often are."""
+    often = (torch.arange(36) % 2)[:, None]
+    mode = (torch.rand(36, 8, generator=seeded(3)) < 0.15 + 0.5 * often).long().repeat_interleave(10, 1)
+    wild = torch.rand(36, 80, generator=seeded(1)) < 0.2
+    actions = torch.where(wild, torch.randint(3, (36, 80), generator=seeded(2)), mode)
+    group = torch.arange(36) % 12
+    plans = Plans(actions, 3, group=group, condition=often[:, 0], condition_names=("control", "treated"))
+    made = report(plans, modes=[2], **QUICK)
+    tests = made.frames["mode_condition_tests"].set_index("test")
+    assert tests.loc["actions", "p_value"] < 0.05
+    assert "mode_conditions" in made.figures
+    features = made.frames["mode_conditions"]
+    assert any("mode 2" in str(name) for name in features["feature"])
+
+
+def test_the_report_says_where_there_is_no_sign_of_modes():
+    actions = torch.randint(3, (20, 40), generator=seeded(0))
+    made = report(Plans(actions, 3), modes=[1, 2], **QUICK)
+    assert "no sign" in made.sections[0].text[-1]
+    assert list(made.frames) == ["modes"]
+
+
+@pytest.mark.parametrize("given", [{"modes": [0]}, {"modes": [2], "priors": {"one": SwitchingPrior(3)}}])
+def test_the_report_refuses_modes_that_cannot_be(given):
+    with pytest.raises(ValueError, match="modes"):
+        report(Plans(torch.zeros(4, 4, dtype=torch.long), 3), models=["counts"], **given)
