@@ -37,7 +37,7 @@ def intentions(
 
     Observers see agents walk to one of some goals in a grid: one with a prior for each goal, learned from plans toward
     it, and one who knows how agents act (exact inverse planning). In the labyrinth the goal is the water. Prints
-    tables; writes them (CSV), results.json, report.html and a figure to a folder. Interrupted, the same command goes on.
+    tables; writes them (CSV), results.json, report.html and a figure. Interrupted, the same command goes on.
 
     Args:
         worlds: to observe agents in.

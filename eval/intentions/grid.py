@@ -2,12 +2,15 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
+from math import log
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neuroprior import MarkovPrior, Plans, Prior, TabularWorld
+from neuroprior._random import draw_seed
 from neuroprior.analysis import forecast, infer
 from neuroprior.analysis.calibration import reliability
 from neuroprior.priors.counts.markov import chains
@@ -20,6 +23,9 @@ WORLDS = {"four_rooms": four_rooms, "maze": maze}
 
 MOVES, STAY, ACTIONS = 4, 4, 5
 """Moves, the action that is taken at the goal alone, and both."""
+
+DISCOUNT = 0.9
+"""Of the values from which distances are read."""
 
 LONGEST = 128
 """Actions after which a walk is cut off."""
@@ -39,7 +45,7 @@ VALIDATION = 0.2
 ORDERS = {"cell": range(2), "blind": range(4)}
 """Orders of the chains that are tried: with the cell as context, and of past moves alone."""
 
-SCALES = [2.0 ** (k / 2) for k in range(-10, 7)]
+SCALES: list[float] = [2.0 ** (k / 2) for k in range(-10, 7)]
 """Weights of a step of progress, and powers of likelihoods, from which the best is chosen."""
 
 
@@ -80,21 +86,21 @@ class Key(NamedTuple):
     plans: int
 
 
-class Seen(NamedTuple):
-    """What an observer makes of B walks: logits `[B, L + 1, K]` after each number of moves, the goals, and lengths."""
+class Agents(NamedTuple):
+    """Agents that were observed: their goals and numbers of moves, `[B]` each."""
 
-    logits: Tensor
     goal: Tensor
     length: Tensor
 
-    def scores(self, times: tuple[int, ...], scale: float = 1.0) -> list[dict[str, Any]]:
-        """What is thought of the true goal after each number of moves, of the walks that have as many."""
+    def scores(self, logits: Tensor, times: tuple[int, ...], scale: float = 1.0) -> list[dict[str, Any]]:
+        """What an observer, by its `logits [B, L + 1, K]`, thinks of goals after so many moves, where there were."""
         there = [(self.length >= time, time) for time in times]
-        return [{"at": t, **scores(scale * self.logits[rows, t], self.goal[rows])} for rows, t in there if rows.any()]
+        return [{"at": t, **scores(scale * logits[rows, t], self.goal[rows])} for rows, t in there if rows.any()]
 
-    def best_scale(self, times: tuple[int, ...]) -> float:
+    def best_scale(self, logits: Tensor, times: tuple[int, ...]) -> float:
         """The factor of the logits under which the goals are likeliest."""
-        return min(SCALES, key=lambda scale: sum(row["loss"] for row in self.scores(times, scale)))
+        losses = [sum(row["loss"] for row in self.scores(logits, times, scale)) for scale in SCALES]
+        return SCALES[losses.index(min(losses))]
 
 
 def scores(logits: Tensor, goal: Tensor) -> dict[str, float]:
@@ -107,14 +113,18 @@ def scores(logits: Tensor, goal: Tensor) -> dict[str, float]:
     return {"agents": len(goal)} | {name: float(values.mean()) for name, values in means.items()}
 
 
-def make_scene(grid: GridWorld, goals: Tensor, temperature: float, discount: float = 0.9) -> Scene:
-    """Agents that take moves by a softmax of their optimal values: each move costs 1, and at the goal they stay."""
+def make_scene(grid: GridWorld, settings: IntentionSettings, generator: torch.Generator) -> Scene:
+    """Goals at random, and agents that take moves by a softmax of their optimal values.
+
+    Each move costs 1; who is at the goal stays, at no cost.
+    """
     cells, free = torch.arange(grid.num_states), (~grid.walls).flatten().nonzero()[:, 0]
-    values = torch.cat([value_iteration(grid, discount=discount, goal=goal) for goal in goals.tolist()])
-    # A cell at distance d has the value discount ** (d - 1); a wall has none.
-    path = (values.clamp(min=1e-100).log() / torch.tensor(discount).log() + 1).round()
+    goals = free[torch.randperm(len(free), generator=generator)[: settings.goals]]
+    values = torch.cat([value_iteration(grid, discount=DISCOUNT, goal=goal) for goal in goals.tolist()])
+    # A cell at distance d has the value DISCOUNT ** (d - 1); a wall has none.
+    path = (values.clamp(min=1e-100).log() / log(DISCOUNT) + 1).round()
     policies = torch.zeros(len(goals), grid.num_states, ACTIONS, dtype=torch.double)
-    policies[..., :MOVES] = (-path[:, grid.next_state] / temperature).softmax(-1)
+    policies[..., :MOVES] = (-path[:, grid.next_state] / settings.temperature).softmax(-1)
     policies[torch.arange(len(goals)), goals] = torch.eye(ACTIONS, dtype=torch.double)[STAY]
     place = grid.coordinates(cells)
     straight = (place[goals][:, None] - place).abs().sum(-1).double()
@@ -149,30 +159,29 @@ def walk(scene: Scene, goals: Tensor, generator: torch.Generator) -> tuple[Plans
 
 
 def learned(
-    scene: Scene, plans: Plans, goal: Tensor, settings: IntentionSettings
+    scene: Scene, taught: Agents, plans: Plans, settings: IntentionSettings
 ) -> Iterator[tuple[Key, list[Prior], float]]:
-    """Observers that learned from walks `plans`, as many toward each goal; from fewer: the first of them.
+    """Observers that learned from walks, as many toward each goal; from fewer: the first of them.
 
-    Each knows a prior for each goal, a Markov chain whose order and back-off predict held-out walks best; and the
-    power of the likelihoods under which the goals of these are likeliest.
+    Each has a prior for each goal, a Markov chain whose order and back-off predict held-out walks best, and the power
+    of the likelihoods under which the goals of these are likeliest.
     """
-    moves = plans.mask().sum(1)
+    place = torch.arange(len(plans) // settings.goals).repeat(settings.goals)
     # What an agent does at the goal is learned, too.
     actions = plans.actions.masked_fill(~plans.mask(), STAY)
-    closed = replace(plans, actions=actions, lengths=(moves + 1).clamp(max=LONGEST)).steps(stop=int(moves.max()) + 1)
-    place = torch.arange(len(plans) // settings.goals).repeat(settings.goals)
-    for number in settings.num_plans:
-        some = place < number
+    closed = replace(plans, actions=actions, lengths=(taught.length + 1).clamp(max=LONGEST))
+    closed = closed.steps(stop=int(taught.length.max()) + 1)
+    for number, kind in product(settings.num_plans, ORDERS):
+        some, contexts = place < number, scene.world.num_states if kind == "cell" else None
         held_out = some & (place >= number - max(round(VALIDATION * number), 1))
-        for kind, contexts in (("cell", scene.world.num_states), ("blind", None)):
-            own, best = closed if contexts else closed.without_context(), []
-            for k in range(settings.goals):
-                counted, others = (own[(goal == k) & part] for part in (some & ~held_out, held_out))
-                tried = [prior for order in ORDERS[kind] for prior in chains(counted, order, contexts)]
-                best.append(max(tried, key=lambda prior: float(prior.log_prob(others).sum())))  # noqa: B023
-            seen = Seen(infer(best, closed[held_out]).log_probs, goal[held_out], moves[held_out])
-            power = seen.best_scale(settings.observed)
-            yield Key(kind, number), [prior.fit(own[(goal == k) & some]) for k, prior in enumerate(best)], power
+        own, best = closed if contexts else closed.without_context(), []
+        for k in range(settings.goals):
+            counted, others = (own[(taught.goal == k) & part] for part in (some & ~held_out, held_out))
+            tried = [prior for order in ORDERS[kind] for prior in chains(counted, order, contexts)]
+            best.append(tried[int(torch.stack([prior.log_prob(others).sum() for prior in tried]).argmax())])
+        posterior = infer(best, closed[held_out]).log_probs
+        power = Agents(taught.goal[held_out], taught.length[held_out]).best_scale(posterior, settings.observed)
+        yield Key(kind, number), [prior.fit(own[(taught.goal == k) & some]) for k, prior in enumerate(best)], power
 
 
 def progress(distance: Tensor, plans: Plans) -> Tensor:
@@ -184,44 +193,40 @@ def progress(distance: Tensor, plans: Plans) -> Tensor:
 
 def grid_entries(world: str, settings: IntentionSettings, generator: torch.Generator) -> Iterator[dict[str, Any]]:
     """What each observer makes of the same agents in one layout; see `eval.intentions.run.intentions_run`."""
-    grid = WORLDS[world](seed=int(torch.randint(2**31, (1,), generator=generator)))
-    free = (~grid.walls).flatten().nonzero()[:, 0]
-    goals = free[torch.randperm(len(free), generator=generator)[: settings.goals]]
-    scene = make_scene(grid, goals, settings.temperature)
+    scene = make_scene(WORLDS[world](seed=draw_seed(generator)), settings, generator)
 
-    def walks(goal: Tensor) -> tuple[Plans, Tensor, Tensor]:
+    def walks(goal: Tensor) -> tuple[Plans, Tensor, Agents]:
         plans, cells = walk(scene, goal[:, None].expand(-1, LONGEST), generator)
-        return plans, cells, plans.mask().sum(1)
+        return plans, cells, Agents(goal, plans.mask().sum(1))
 
-    taught = torch.arange(settings.goals).repeat_interleave(max(settings.num_plans))
-    training, _, training_length = walks(taught)
+    training, _, taught = walks(torch.arange(settings.goals).repeat_interleave(max(settings.num_plans)))
+    plans, cells, seen = walks(torch.randint(settings.goals, (settings.agents,), generator=generator))
     priors: dict[Key, list[Prior]] = {Key("exact", 0): [*map(policy_prior, scene.policies)]}
-    goal = torch.randint(settings.goals, (settings.agents,), generator=generator)
-    plans, cells, length = walks(goal)
     found = {Key("uniform", 0): torch.zeros(settings.agents, LONGEST + 1, settings.goals).double()}
     for name, table in (("path", scene.path), ("straight", scene.straight)):
-        scale = Seen(progress(table, training), taught, training_length).best_scale(settings.observed)
+        scale = taught.best_scale(progress(table, training), settings.observed)
         found[Key(name, 0)] = scale * progress(table, plans)
     found[Key("exact", 0)] = infer(priors[Key("exact", 0)], plans).log_probs
-    for key, own, power in learned(scene, training, taught, settings):
-        priors[key] = own
-        found[key] = infer(own, plans).log_probs
+    for key, own, power in learned(scene, taught, training, settings):
+        priors[key], found[key] = own, infer(own, plans).log_probs
         found[Key(f"{key.kind}, tempered", key.plans)] = power * found[key]
     for key, logits in found.items():
-        for row in Seen(logits, goal, length).scores(settings.observed):
-            yield key._asdict() | {"measure": "moves"} | row
+        named = key._asdict()
+        for row in seen.scores(logits, settings.observed):
+            yield named | {"measure": "moves"} | row
         for share in SHARES:
-            now = logits[torch.arange(len(plans)), (share * length).long()]
-            yield key._asdict() | {"measure": "way", "at": share} | scores(now, goal)
-        there = [(length >= time, time) for time in settings.observed]
-        now = torch.cat([logits[rows, time] for rows, time in there]).log_softmax(-1)
-        true = torch.cat([goal[rows] for rows, _ in there])
-        sums = reliability(now, true, torch.zeros_like(true)).sums.sum(0)
-        yield key._asdict() | {"measure": "calibration", "sums": sums.tolist()}
+            now = logits[torch.arange(len(plans)), (share * seen.length).long()]
+            yield named | {"measure": "way", "at": share} | scores(now, seen.goal)
+        there, time = (seen.length[:, None] >= torch.tensor(settings.observed)).nonzero().T
+        if len(there):
+            now = logits[there, torch.tensor(settings.observed)[time]].log_softmax(-1)
+            sums = reliability(now, seen.goal[there], torch.zeros_like(there)).sums.sum(0)
+            yield named | {"measure": "calibration", "sums": sums.tolist()}
     yield from _switched(scene, priors, settings, generator)
-    under_way = (length >= FORECAST_AFTER).nonzero()[:FORECASTED, 0]
-    posteriors = {key: found[key][under_way, FORECAST_AFTER].exp() for key in priors}
-    yield from _forecasts(scene, priors, posteriors, cells[under_way, FORECAST_AFTER:], settings.ahead, generator)
+    under_way = (seen.length >= FORECAST_AFTER).nonzero()[:FORECASTED, 0]
+    if len(under_way):
+        posteriors = {key: found[key][under_way, FORECAST_AFTER].exp() for key in priors}
+        yield from _forecasts(scene, priors, posteriors, cells[under_way, FORECAST_AFTER:], settings.ahead, generator)
 
 
 def _switched(
@@ -237,8 +242,8 @@ def _switched(
         for switch in (0.0, SWITCH):
             logits = infer(own, plans, switch=switch).log_probs[kept]
             # After the last move before, the goal is still the first.
-            rows = Seen(logits, first[kept], length[kept]).scores((SWITCH_AT,))
-            rows += Seen(logits, second[kept], length[kept]).scores(tuple(SWITCH_AT + t for t in settings.observed))
+            rows = Agents(first[kept], length[kept]).scores(logits, (SWITCH_AT,))
+            rows += Agents(second[kept], length[kept]).scores(logits, tuple(SWITCH_AT + t for t in settings.observed))
             for row in rows:
                 row = row | {"at": row["at"] - SWITCH_AT, "loss": None}  # infinite where switches are excluded
                 yield key._asdict() | {"measure": "switched", "switch": switch} | row

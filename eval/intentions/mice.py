@@ -1,4 +1,4 @@
-"""Whether a mouse is on its way to the water: priors of moves that lead there and of others, tested on held-out moves."""
+"""Whether mice are on their way to the water, by priors of moves that lead there and of others."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -12,7 +12,7 @@ from eval.intentions.run import LABYRINTH
 from eval.worlds import runs
 from neuroprior.analysis.calibration import Reliability
 from neuroprior.analysis.statistics import mean_interval
-from neuroprior.report.document import Document, table
+from neuroprior.report.document import Column, Document, table
 from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
 from neuroprior.report.page import FigureBox, Section, Table
 
@@ -66,7 +66,11 @@ def intentions_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
             tables.append(gap_table(more, "moves", "differences in log-loss, by observed moves"))
             tables.append(score_table(own, "moves", "accuracy", "accuracy, by observed moves"))
             tables.append(score_table(own, "way", "loss", "log-loss of the goal, by % of the way"))
-            columns = {"observer": "kind", "plans": _number, "error, %": lambda row: runs.plus_minus(row, "error", 100)}
+            columns: dict[str, Column] = {
+                "observer": "kind",
+                "plans": _number,
+                "error, %": lambda row: runs.plus_minus(row, "error", 100),
+            }
             caption = f"Expected calibration error, all numbers of moves together; jackknife over seeds. {WHAT}"
             some = errors[errors["world"] == world]
             tables.append(table(some, columns, caption, f"{world}: calibration of the goal's probability"))
