@@ -32,9 +32,9 @@ SMOOTHING = 4.0
 
 FEATURES = {
     "node": (0,),
-    "node and last move": (1,),
+    "node, move": (1,),
     "node, posterior": (0, 2),
-    "node and last move, posterior": (1, 2),
+    "node, move, posterior": (1, 2),
 }
 """What the chance of arriving is regressed on, by kind: columns of `_features`."""
 

@@ -7,7 +7,7 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 
-from eval.intentions.grid import SWITCH_AT
+from eval.intentions.grid import FORECAST_AFTER, SWITCH_AT
 from eval.intentions.run import LABYRINTH
 from eval.worlds import runs
 from neuroprior.analysis.calibration import Reliability
@@ -31,7 +31,7 @@ KINDS = {
 
 PAIRS = [(kind, "exact") for kind in KINDS if kind != "exact"]
 PAIRS += [(f"{kind}, tempered", kind) for kind in ("blind", "cell")]
-PAIRS += [(f"{kind}, posterior", kind) for kind in ("node", "node and last move")]
+PAIRS += [(f"{kind}, posterior", kind) for kind in ("node", "node, move")]
 """What is compared: the first minus the second."""
 
 WHAT = (
@@ -39,6 +39,16 @@ WHAT = (
     " blind, cell: a prior for each goal, of past moves alone or of the cell, too. tempered: likelihoods to a power"
     " chosen on held-out plans. exact: knows how agents act. plans: toward each goal."
 )
+
+SHOWN = [
+    ("moves", "loss", "log-loss of the goal (nats), by observed moves", 1, 2),
+    ("moves", "accuracy", "accuracy of the likeliest goal (%), by observed moves", 100, 1),
+    ("way", "loss", "log-loss of the goal (nats), by % of the way", 1, 2),
+    ("switched", "probability", f"probability (%) of the present goal, by moves after a switch at {SWITCH_AT}", 100, 1),
+    ("cell", "loss", f"log-loss of the cell (nats), forecast after {FORECAST_AFTER} moves, by moves ahead", 1, 2),
+    ("water", "loss", "log-loss (1/1000 nat) of reaching the water, by moves ahead", 1000, 1),
+]
+"""Measures, scores, titles of their tables, factors and digits."""
 
 PLACE = ["world", "measure", "kind", "plans", "switch", "at"]
 """What is the same for the numbers of all seeds."""
@@ -58,25 +68,18 @@ def intentions_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
     tables, leads = [], []
     for world in settings["worlds"]:
         own, more = (one[one["world"] == world] for one in (rows, gaps))
-        if world == LABYRINTH:
-            tables.append(score_table(own, "water", "loss", "log-loss of whether water is reached, by moves", 4))
-            tables.append(gap_table(more, "water", "differences in log-loss, by moves", 4))
-        else:
-            tables.append(score_table(own, "moves", "loss", "log-loss of the goal, by observed moves"))
-            tables.append(gap_table(more, "moves", "differences in log-loss, by observed moves"))
-            tables.append(score_table(own, "moves", "accuracy", "accuracy, by observed moves"))
-            tables.append(score_table(own, "way", "loss", "log-loss of the goal, by % of the way"))
-            columns: dict[str, Column] = {
-                "observer": "kind",
-                "plans": _number,
-                "error, %": lambda row: runs.plus_minus(row, "error", 100),
-            }
-            caption = f"Expected calibration error, all numbers of moves together; jackknife over seeds. {WHAT}"
+        for measure, score, title, factor, digits in SHOWN:
+            some, gap = own[(own["measure"] == measure) & (own["score"] == score)], more[more["measure"] == measure]
+            if len(some):
+                tables.append(shown(some, measure, "value", f"{world}: {title}", factor, digits))
+            if len(gap) and (measure, score) in (("moves", "loss"), ("water", "loss")):
+                tables.append(shown(gap, measure, "difference", f"{world}: differences in {title}", factor, digits))
+        if world != LABYRINTH:
+            columns: dict[str, Column] = {"observer": "kind", "plans": _number}
+            columns["error, %"] = lambda row: runs.plus_minus(row, "error", 100)
+            caption = "Expected calibration error, all numbers of moves together; ±: jackknife over seeds."
             some = errors[errors["world"] == world]
-            tables.append(table(some, columns, caption, f"{world}: calibration of the goal's probability"))
-            tables.append(score_table(own, "cell", "loss", "log-loss of the cell where an agent is, by moves ahead"))
-            title = f"probability of the present goal, by moves after a switch at {SWITCH_AT}"
-            tables.append(score_table(own, "switched", "probability", title))
+            tables.append(table(some, columns, caption, f"{world}: calibration of goals"))
         leads.append(finding(more, world, settings))
     grids = [world for world in settings["worlds"] if world != LABYRINTH]
     caption = f"Above: log-loss of the goal (bands: Student's 95 % intervals over seeds). Below: reliability. {WHAT}"
@@ -120,35 +123,20 @@ def _number(row: Any) -> str:
     return f"{row['plans']}" if row["plans"] else ""
 
 
-def _shown(rows: pd.DataFrame, measure: str) -> tuple[pd.DataFrame, dict[str, str]]:
-    """Rows of a measure with numbers as texts, and the columns that name them, by heading."""
-    some = rows[rows["measure"] == measure]
-    at = (some["at"] * (100 if measure == "way" else 1)).round().astype(int)
-    names = {"observer": "kind"} | ({"minus": "minus"} if "minus" in some else {})
-    if measure != "water":
-        names["plans"] = "number"
-    if measure == "switched":
-        names["assumed"] = "switch"
-    return some.assign(at=at, number=[_number(row) for _, row in some.iterrows()]), names
-
-
-def score_table(rows: pd.DataFrame, measure: str, score: str, title: str, digits: int = 2) -> Table:
-    """Means over seeds of one world, a row an observer and a column a number of moves."""
-    some, names = _shown(rows[rows["score"] == score], measure)
-    factor = 100 if score == "accuracy" else 1
-    cells = [runs.plus_minus(row, "value", factor, digits).replace(" ", "") for _, row in some.iterrows()]
-    unit = {"loss": "Nats.", "accuracy": "%.", "probability": ""}[score]
-    caption = f"{unit} {runs.over_seeds(some)} {'' if measure == 'water' else WHAT}"
-    return runs.table_by(some, names, "at", cells, caption.strip(), f"{rows['world'].iloc[0]}: {title}")
-
-
-def gap_table(gaps: pd.DataFrame, measure: str, title: str, digits: int = 2) -> Table:
-    """Paired differences in one world, a row a pair and a column a number of moves."""
-    some, names = _shown(gaps, measure)
-    cells = [runs.plus_minus(row, "difference", 1, digits, "+").replace(" ", "") for _, row in some.iterrows()]
-    caption = "Nats; ±: 95 % interval, paired by seed; other measures are in paired.csv."
-    world = gaps["world"].iloc[0] if len(gaps) else ""
-    return runs.table_by(some, names, "at", cells, caption, f"{world}: {title}")
+def shown(rows: pd.DataFrame, measure: str, value: str, title: str, factor: float, digits: int) -> Table:
+    """Means, or paired differences, of one measure in one world: a row an observer, a column a number of moves."""
+    if "score" in rows and rows["score"].iloc[0] == "accuracy":
+        rows = rows[~rows["kind"].str.endswith("tempered")]  # the same as of the likelihoods themselves
+    signed = "+" if value == "difference" else ""
+    cells = [runs.plus_minus(row, value, factor, digits, signed).replace(" ", "") for _, row in rows.iterrows()]
+    at = (rows["at"] * (100 if measure == "way" else 1)).round().astype(int)
+    names = {"observer": "kind"} | ({"minus": "minus"} if signed else {})
+    names |= {"plans": "number"} if measure != "water" else {}
+    names |= {"assumed": "switch"} if measure == "switched" else {}
+    caption = "±: 95 % interval, paired by seed; more in paired.csv." if signed else runs.over_seeds(rows)
+    what = WHAT if measure == "moves" and not signed else ""
+    some = rows.assign(at=at, number=[_number(row) for _, row in rows.iterrows()])
+    return runs.table_by(some, names, "at", cells, f"{caption} {what}".strip(), title)
 
 
 def finding(gaps: pd.DataFrame, world: str, settings: Mapping[str, Any]) -> str:
@@ -189,9 +177,9 @@ def observers_figure(rows: pd.DataFrame, counted: pd.DataFrame, worlds: Sequence
                 band(below, points, KINDS[kind], name, style)
         above.set_xscale("log", base=2)
         above.set_xticks(sorted(own["at"].unique()), [f"{at:.0f}" for at in sorted(own["at"].unique())])
-        above.set(title=world, ylim=(0, None), xlabel="observed moves")
+        above.set(title=world, ylim=(0, None))
         below.plot([0, 1], [0, 1], color="#aaaaaa", lw=1, zorder=0)
-        below.set(xlim=(0, 1), ylim=(0, 1), xlabel="forecast probability of a goal")
+        below.set(xlim=(0, 1), ylim=(0, 1))
     at_edges(axes[: len(worlds)], len(worlds), len(worlds), "observed moves", "log-loss of the goal, nats")
     at_edges(axes[len(worlds) :], len(worlds), len(worlds), "forecast probability of a goal", "how often it is true")
     legend(figure, axes[0].get_legend_handles_labels()[0])
