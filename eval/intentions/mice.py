@@ -1,8 +1,7 @@
 """Whether mice are on their way to the water, by priors of moves that lead there and of others."""
 
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -36,27 +35,14 @@ FEATURES = {
     "node, posterior": (0, 2),
     "node, move, posterior": (1, 2),
 }
-"""What the chance of arriving is regressed on, by kind: columns of `_features`."""
+"""What the chance of arriving is regressed on, by kind: columns of `features_of`."""
 
 
-class Moves(NamedTuple):
-    """Sequences of moves `[N, L]`, and whether each arrives at the water."""
-
-    plans: Plans
-    arrives: Tensor
-
-    def part(self, rows: Tensor) -> "Moves":
-        """Some of the sequences."""
-        return Moves(self.plans[rows], self.arrives[rows])
-
-
-def read_moves() -> Moves:
-    """The mice's moves, in blocks of consecutive sequences: these may be of one mouse."""
-    plans, world = read_plans(DATA), labyrinth()
+def arrivals(plans: Plans) -> Tensor:
+    """`[N, L]` bool: the moves that arrive at the water."""
     assert plans.context is not None
-    block = torch.arange(len(plans)) * BLOCKS // len(plans)
-    after = world.next_state[plans.context, plans.actions.long()]
-    return Moves(replace(plans, group=block), (after == WATER) & (plans.context != WATER))
+    after = labyrinth().next_state[plans.context, plans.actions.long()]
+    return (after == WATER) & (plans.context != WATER)
 
 
 def arrives_within(arrives: Tensor, number: int) -> Tensor:
@@ -64,58 +50,52 @@ def arrives_within(arrives: Tensor, number: int) -> Tensor:
     return arrives.unfold(1, number, 1).any(-1)
 
 
-def stretches(moves: Moves) -> tuple[Plans, Plans]:
+def stretches(plans: Plans, arrives: Tensor) -> tuple[Plans, Plans]:
     """The moves that arrive at the water within `STRETCH`, and the others, as plans; each arrival ends one.
 
     The last moves of a sequence, of which this is not known, are left out, unless one of them arrives.
     """
-    plans, arrives = moves.plans, moves.arrives
     assert plans.context is not None
     length = arrives.shape[1]
-    padded = torch.cat([arrives, arrives.new_zeros(len(arrives), STRETCH - 1)], 1)
-    leads = arrives_within(padded, STRETCH)
+    leads = arrives_within(torch.cat([arrives, arrives.new_zeros(len(arrives), STRETCH - 1)], 1), STRETCH)
     known = leads | (torch.arange(length) <= length - STRETCH)
     new = torch.ones_like(leads)
     new[:, 1:] = (leads[:, 1:] != leads[:, :-1]) | (known[:, 1:] != known[:, :-1]) | arrives[:, :-1]
-    sizes = torch.cat([new.flatten().nonzero()[:, 0], torch.tensor([leads.numel()])]).diff()
-    first = sizes.cumsum(0) - sizes
+    first = new.flatten().nonzero()[:, 0]
+    sizes = torch.cat([first, torch.tensor([leads.numel()])]).diff()
     actions, nodes = (values.flatten().split(sizes.tolist()) for values in (plans.actions, plans.context))
     every = Plans(pad_sequence(actions, True), plans.num_actions, sizes, context=pad_sequence(nodes, True))
     leads, known = leads.flatten()[first], known.flatten()[first]
     return every[leads], every[known & ~leads]
 
 
-def _features(learned: Moves, moves: Moves, number: int, posterior: Tensor) -> tuple[Tensor, Tensor]:
-    """Log-odds of arriving within some moves by node, and by node and last move; and of the posterior: `[N, T, 3]`.
+def log_odds(learned: Plans, plans: Plans) -> Tensor:
+    """The posterior log-odds `[N, L + 1]` that a mouse is on its way to the water, given the moves before."""
+    parts = stretches(learned, arrivals(learned))
+    priors = [MarkovPrior(p.num_actions, ORDER, num_contexts=labyrinth().num_states).fit(p) for p in parts]
+    found = infer(priors, plans, weights=[float(p.mask().sum()) for p in parts], switch=1 / STRETCH).log_probs
+    return found[..., 0] - found[..., 1]
 
-    All but the posterior is counted in `learned`. Also whether they arrived, `[N, T]`. A sequence's first move, before
-    which there is none, does not count, nor its last ones.
+
+def features_of(learned: Plans, plans: Plans, number: int, posterior: Tensor) -> tuple[Tensor, Tensor]:
+    """Log-odds `[N, T, 3]` of arriving within some moves, by node, and by node and last move; and of the posterior.
+
+    All but the posterior is counted in `learned`. Also whether the mice arrived, `[N, T]`. A sequence's first move,
+    before which there is none, does not count, nor its last ones.
     """
-    happened, keys = [], []
-    for one in (learned, moves):
-        assert one.plans.context is not None
-        happened.append(arrives_within(one.arrives, number)[:, 1:])
-        node = one.plans.context[:, 1 : 1 + happened[-1].shape[1]].long()
-        keys.append((node, 4 * node + one.plans.actions[:, : node.shape[1]]))
-    share = happened[0].double().mean().expand(keys[1][0].shape)
-    columns = []
+    truth, keys = [], []
+    for own in (learned, plans):
+        assert own.context is not None
+        truth.append(arrives_within(arrivals(own), number)[:, 1:].double())
+        node = own.context[:, 1 : 1 + truth[-1].shape[1]].long()
+        keys.append((node, own.num_actions * node + own.actions[:, : node.shape[1]]))
+    share, columns = truth[0].mean().expand(truth[1].shape), []
     for own, others in zip(*keys, strict=True):
-        size = 4 * labyrinth().num_states
-        total = own.flatten().bincount(minlength=size)
-        found = own.flatten().bincount(happened[0].flatten().double(), minlength=size)
+        size = learned.num_actions * labyrinth().num_states
+        total, found = (own.flatten().bincount(values, minlength=size) for values in (None, truth[0].flatten()))
         share = (found[others] + SMOOTHING * share) / (total[others] + SMOOTHING)
         columns.append(share.logit())
-    columns.append(posterior[:, 1 : 1 + share.shape[1]])
-    return torch.stack(columns, -1), happened[1].double()
-
-
-def log_odds(learned: Moves, moves: Moves) -> Tensor:
-    """The posterior log-odds `[N, L + 1]` that a mouse is on its way to the water, given the moves before."""
-    parts = stretches(learned)
-    contexts, numbers = labyrinth().num_states, [int(part.mask().sum()) for part in parts]
-    priors = [MarkovPrior(part.num_actions, ORDER, num_contexts=contexts).fit(part) for part in parts]
-    found = infer(priors, moves.plans, weights=[float(n) for n in numbers], switch=1 / STRETCH).log_probs
-    return found[..., 0] - found[..., 1]
+    return torch.stack([*columns, posterior[:, 1 : 1 + share.shape[1]]], -1), truth[1]
 
 
 def regression(features: Tensor, happened: Tensor) -> Tensor:
@@ -131,20 +111,18 @@ def regression(features: Tensor, happened: Tensor) -> Tensor:
 
 def mice_entries(block: int, numbers: tuple[int, ...]) -> Iterator[dict[str, Any]]:
     """How well each kind of `FEATURES` predicts arrivals in one block, learned from the others alone."""
-    every = read_moves()
-    assert every.plans.group is not None
-    held_out = every.plans.group == block
-    learned, test = every.part(~held_out), every.part(held_out)
-    inner = torch.arange(len(learned.plans)) * INNER // len(learned.plans)
-    folds = [(learned.part(inner != k), learned.part(inner == k)) for k in range(INNER)]
-    folds.append((learned, test))
-    posteriors = [log_odds(own, others) for own, others in folds]
+    plans = read_plans(DATA)
+    held_out = torch.arange(len(plans)) * BLOCKS // len(plans) == block  # consecutive: they may be of one mouse
+    learned, test = plans[~held_out], plans[held_out]
+    inner = torch.arange(len(learned)) * INNER // len(learned)
+    folds = [*((learned[inner != k], learned[inner == k]) for k in range(INNER)), (learned, test)]
+    posteriors = [log_odds(*fold) for fold in folds]
     for number in numbers:
-        found = [_features(*fold, number, odds) for fold, odds in zip(folds, posteriors, strict=True)]
+        found = [features_of(*fold, number, odds) for fold, odds in zip(folds, posteriors, strict=True)]
         rows, happened = (torch.cat([pair[k].flatten(0, 1) for pair in found[:-1]]) for k in (0, 1))
         features, truth = found[-1]
         for kind, columns in FEATURES.items():
             weights = regression(rows[:, columns], happened)
             loss = binary_cross_entropy_with_logits(features[..., columns] @ weights[:-1] + weights[-1], truth)
-            row = {"kind": kind, "plans": 0, "measure": "water", "at": number, "agents": len(test.plans)}
+            row = {"kind": kind, "plans": 0, "measure": "water", "at": number, "agents": len(test)}
             yield row | {"loss": float(loss), "probability": float(truth.mean()), "weight": float(weights[-2])}

@@ -3,6 +3,7 @@
 import csv
 import json
 from collections import deque
+from dataclasses import replace
 from math import exp, log
 
 import pytest
@@ -10,7 +11,9 @@ import torch
 
 from eval.__main__ import main
 from eval.intentions.grid import STAY, Agents, IntentionSettings, make_scene, policy_prior, progress, walk
-from eval.intentions.mice import Moves, arrives_within, log_odds, read_moves, regression, stretches
+from eval.intentions.mice import arrives_within, log_odds, regression, stretches
+from eval.worlds.labyrinth import DATA
+from neuroprior import read_plans
 from neuroprior.analysis import infer
 from neuroprior.plans import Plans
 from neuroprior.worlds import maze
@@ -94,7 +97,7 @@ def test_stretches_lead_to_the_water():
     arrives[0, [9, 11, 70]] = True
     number = torch.arange(200).view(2, 100) % 4
     plans = Plans(number, 4, context=torch.arange(200).view(2, 100))
-    leads, others = stretches(Moves(plans, arrives))
+    leads, others = stretches(plans, arrives)
     found = [some.context[some.mask()].tolist() for some in (leads, others)]
     assert leads.mask().sum(1).tolist() == [10, 2, 32]
     assert found[0] == [*range(12), *range(39, 71)]
@@ -105,13 +108,12 @@ def test_stretches_lead_to_the_water():
 
 
 def test_the_posterior_knows_past_moves_alone():
-    moves = read_moves()
-    learned, test = moves.part(torch.arange(40, 60)), moves.part(torch.arange(2))
-    found = log_odds(learned, test)
-    plans = test.plans
-    changed = Plans(plans.actions.clone(), 4, context=plans.context.clone())
+    plans = read_plans(DATA)
+    learned, plans = plans[40:60], plans[:2]
+    found = log_odds(learned, plans)
+    changed = replace(plans, actions=plans.actions.clone(), context=plans.context.clone())
     changed.actions[:, 300:], changed.context[:, 300:] = 0, 5
-    other = log_odds(learned, Moves(changed, torch.zeros_like(test.arrives)))
+    other = log_odds(learned, changed)
     assert other[:, :301].equal(found[:, :301])
     assert not other[:, 301:].allclose(found[:, 301:])
 
