@@ -50,6 +50,8 @@ SHOWN = [
 ]
 """Measures, scores, titles of their tables, factors and digits."""
 
+SCORES = ["loss", "accuracy", "probability"]
+
 PLACE = ["world", "measure", "kind", "plans", "switch", "at"]
 """What is the same for the numbers of all seeds."""
 
@@ -59,9 +61,10 @@ def intentions_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
     frame = runs.frame_of(results)
     order = {kind: k for k, kind in enumerate(KINDS)}
     frame = frame.sort_values("kind", key=lambda kinds: kinds.map(order), kind="stable")
-    frame = frame.reindex(columns=[*frame.columns.union([*PLACE, "sums"], sort=False)])
+    # A column that no run has is empty.
+    frame = frame.reindex(columns=[*PLACE, "seed", "agents", *SCORES, "sums"])
     counted, scored = frame[frame["sums"].notna()], frame[frame["sums"].isna()]
-    long = scored.melt([*PLACE, "seed", "agents"], ["loss", "accuracy", "probability"], "score").dropna(subset="value")
+    long = scored.melt([*PLACE, "seed", "agents"], SCORES, "score").dropna(subset="value")
     rows = runs.seed_means(long, [*PLACE, "score"], "value", ["agents"])
     gaps = runs.paired_differences(compared(scored), ["world", "measure", "kind", "minus", "plans", "at"])
     errors = calibration_errors(counted)
