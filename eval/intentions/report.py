@@ -144,18 +144,17 @@ def shown(rows: pd.DataFrame, measure: str, value: str, title: str, factor: floa
 
 def finding(gaps: pd.DataFrame, world: str, settings: Mapping[str, Any]) -> str:
     """How near priors come to exact inference, or what the posterior adds, in one sentence."""
-    if gaps.empty:
+    some = gaps[gaps["measure"].isin(["moves", "water"])]
+    if some.empty:
         return f"{world}: differences need at least two seeds."
-    most, last = max(settings["num_plans"]), max(settings["observed"])
-    wanted = [("cell, tempered", most), ("blind, tempered", most)] if world != LABYRINTH else [(k, 0) for k, _ in PAIRS]
-    some = gaps[(gaps["at"] == last) & gaps["measure"].isin(["moves", "water"])]
+    last, most = some["at"].max(), max(settings["num_plans"])
+    tempered = some["kind"].str.endswith("tempered") & (some["minus"] == "exact") & (some["plans"] == most)
     rows = [
         f"{row['kind']} minus {row['minus']} {runs.plus_minus(row, 'difference', 1, 4, '+')}"
-        for kind, plans in wanted
-        for _, row in some[(some["kind"] == kind) & (some["plans"] == plans)].drop_duplicates("kind").iterrows()
+        for _, row in some[(some["at"] == last) & (tempered | (world == LABYRINTH))].iterrows()
     ]
     learned = "" if world == LABYRINTH else f" {most} plans toward each goal and"
-    return f"{world}, log-loss after{learned} {last} moves: {'; '.join(rows)}."
+    return f"{world}, log-loss after{learned} {last:.0f} moves: {'; '.join(rows)}."
 
 
 @drawn
