@@ -17,6 +17,9 @@ COMMANDS = {
     "quality": Command("eval.quality.command:quality", "how near priors come to sources of known entropy"),
     "puzzles": Command("eval.puzzles.command:puzzles", "Sokoban and sliding tiles solved by policy-guided search"),
     "options": Command("eval.options.command:options", "modes that persist as options of a planner that samples"),
+    "intentions": Command(
+        "eval.intentions.command:intentions", "what an observed agent is after, by priors toward known goals"
+    ),
     "study": Command("eval.study.command:study", "the tests of conditions in simulated studies: false alarms, power"),
     "bench": Command("eval.bench.command:bench", "speed against plain code and other packages"),
 }

@@ -1,0 +1,1 @@
+"""Do priors learned toward known goals tell what another agent is after?"""

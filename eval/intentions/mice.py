@@ -1,0 +1,128 @@
+"""Whether mice are on their way to the water, by priors of moves that lead there and of others."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+from torch.nn.utils.rnn import pad_sequence
+
+from eval.worlds.labyrinth import DATA
+from neuroprior import MarkovPrior, Plans, read_plans
+from neuroprior.analysis import infer
+from neuroprior.worlds import labyrinth
+from neuroprior.worlds.labyrinth import WATER
+
+BLOCKS = 10
+"""Blocks of consecutive sequences, each held out once."""
+
+STRETCH = 32
+"""Moves before an arrival at the water that lead there; it is assumed that intentions last as long on average."""
+
+INNER = 3
+"""Parts of the other blocks: of each the priors and counts of the rest say what the regressions learn from."""
+
+ORDER = 3
+"""Order of the chains, with the node as context."""
+
+SMOOTHING = 4.0
+"""Pseudo-counts of the baselines, distributed as without the last move, and as without the node."""
+
+FEATURES = {
+    "node": (0,),
+    "node, move": (1,),
+    "node, posterior": (0, 2),
+    "node, move, posterior": (1, 2),
+}
+"""What the chance of arriving is regressed on, by kind: columns of `features_of`."""
+
+
+def arrivals(plans: Plans) -> Tensor:
+    """`[N, L]` bool: the moves that arrive at the water."""
+    assert plans.context is not None
+    after = labyrinth().next_state[plans.context, plans.actions.long()]
+    return (after == WATER) & (plans.context != WATER)
+
+
+def arrives_within(arrives: Tensor, number: int) -> Tensor:
+    """`[N, L - number + 1]`: whether the water is reached by one of the next `number` moves."""
+    return arrives.unfold(1, number, 1).any(-1)
+
+
+def stretches(plans: Plans, arrives: Tensor) -> tuple[Plans, Plans]:
+    """The moves that arrive at the water within `STRETCH`, and the others, as plans; each arrival ends one.
+
+    The last moves of a sequence, of which this is not known, are left out, unless one of them arrives.
+    """
+    assert plans.context is not None
+    length = arrives.shape[1]
+    leads = arrives_within(torch.cat([arrives, arrives.new_zeros(len(arrives), STRETCH - 1)], 1), STRETCH)
+    known = leads | (torch.arange(length) <= length - STRETCH)
+    new = torch.ones_like(leads)
+    new[:, 1:] = (leads[:, 1:] != leads[:, :-1]) | (known[:, 1:] != known[:, :-1]) | arrives[:, :-1]
+    first = new.flatten().nonzero()[:, 0]
+    sizes = torch.cat([first, torch.tensor([leads.numel()])]).diff()
+    actions, nodes = (values.flatten().split(sizes.tolist()) for values in (plans.actions, plans.context))
+    every = Plans(pad_sequence(actions, True), plans.num_actions, sizes, context=pad_sequence(nodes, True))
+    leads, known = leads.flatten()[first], known.flatten()[first]
+    return every[leads], every[known & ~leads]
+
+
+def log_odds(learned: Plans, plans: Plans) -> Tensor:
+    """The posterior log-odds `[N, L + 1]` that a mouse is on its way to the water, given the moves before."""
+    parts = stretches(learned, arrivals(learned))
+    priors = [MarkovPrior(p.num_actions, ORDER, num_contexts=labyrinth().num_states).fit(p) for p in parts]
+    found = infer(priors, plans, weights=[float(p.mask().sum()) for p in parts], switch=1 / STRETCH).log_probs
+    return found[..., 0] - found[..., 1]
+
+
+def features_of(learned: Plans, plans: Plans, number: int, posterior: Tensor) -> tuple[Tensor, Tensor]:
+    """Log-odds `[N, T, 3]` of arriving within some moves, by node, and by node and last move; and of the posterior.
+
+    All but the posterior is counted in `learned`. Also whether the mice arrived, `[N, T]`. A sequence's first move,
+    before which there is none, does not count, nor its last ones.
+    """
+    truth, keys = [], []
+    for own in (learned, plans):
+        assert own.context is not None
+        truth.append(arrives_within(arrivals(own), number)[:, 1:].double())
+        node = own.context[:, 1 : 1 + truth[-1].shape[1]].long()
+        keys.append((node, own.num_actions * node + own.actions[:, : node.shape[1]]))
+    share, columns = truth[0].mean().expand(truth[1].shape), []
+    for own, others in zip(*keys, strict=True):
+        size = learned.num_actions * labyrinth().num_states
+        total, found = (own.flatten().bincount(values, minlength=size) for values in (None, truth[0].flatten()))
+        share = (found[others] + SMOOTHING * share) / (total[others] + SMOOTHING)
+        columns.append(share.logit())
+    return torch.stack([*columns, posterior[:, 1 : 1 + share.shape[1]]], -1), truth[1]
+
+
+def regression(features: Tensor, happened: Tensor) -> Tensor:
+    """The weights of a logistic regression on features `[M, C]` and a constant, by Newton's method: `[C + 1]`."""
+    rows = torch.cat([features, torch.ones_like(features[:, :1])], 1)
+    weights = rows.new_zeros(rows.shape[1])
+    for _ in range(25):
+        probs = (rows @ weights).sigmoid()
+        slope = rows.T @ (happened - probs)
+        weights = weights + torch.linalg.solve((rows * (probs * (1 - probs))[:, None]).T @ rows, slope)
+    return weights
+
+
+def mice_entries(block: int, numbers: tuple[int, ...]) -> Iterator[dict[str, Any]]:
+    """How well each kind of `FEATURES` predicts arrivals in one block, learned from the others alone."""
+    plans = read_plans(DATA)
+    held_out = torch.arange(len(plans)) * BLOCKS // len(plans) == block  # consecutive: they may be of one mouse
+    learned, test = plans[~held_out], plans[held_out]
+    inner = torch.arange(len(learned)) * INNER // len(learned)
+    folds = [*((learned[inner != k], learned[inner == k]) for k in range(INNER)), (learned, test)]
+    posteriors = [log_odds(*fold) for fold in folds]
+    for number in numbers:
+        found = [features_of(*fold, number, odds) for fold, odds in zip(folds, posteriors, strict=True)]
+        rows, happened = (torch.cat([pair[k].flatten(0, 1) for pair in found[:-1]]) for k in (0, 1))
+        features, truth = found[-1]
+        for kind, columns in FEATURES.items():
+            weights = regression(rows[:, columns], happened)
+            loss = binary_cross_entropy_with_logits(features[..., columns] @ weights[:-1] + weights[-1], truth)
+            row = {"kind": kind, "plans": 0, "measure": "water", "at": number, "agents": len(test)}
+            yield row | {"loss": float(loss), "probability": float(truth.mean()), "weight": float(weights[-2])}
