@@ -20,6 +20,7 @@ COMMANDS = {
     "intentions": Command(
         "eval.intentions.command:intentions", "what an observed agent is after, by priors toward known goals"
     ),
+    "modes": Command("eval.modes.command:modes", "hidden modes of mice in a labyrinth, and where they lead"),
     "study": Command("eval.study.command:study", "the tests of conditions in simulated studies: false alarms, power"),
     "bench": Command("eval.bench.command:bench", "speed against plain code and other packages"),
 }

@@ -1,4 +1,4 @@
-"""Whether mice are on their way to the water, by priors of moves that lead there and of others."""
+"""Whether mice are on their way to the water, by priors of moves that lead there and of others, and by hidden modes."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -8,9 +8,10 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.nn.utils.rnn import pad_sequence
 
-from eval.worlds.labyrinth import DATA
+from eval.worlds.labyrinth import DATA, arrives_within
 from neuroprior import MarkovPrior, Plans, read_plans
 from neuroprior.analysis import infer
+from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import WATER
 
@@ -26,6 +27,12 @@ INNER = 3
 ORDER = 3
 """Order of the chains, with the node as context."""
 
+MODES, MODE_ORDER = 2, 2
+"""Number of hidden modes, and the order of their chains, with the node as context."""
+
+EM: dict[str, Any] = {"restarts": 1, "max_iterations": 25}
+"""How the modes are fitted: fewer starts than by default, for time."""
+
 SMOOTHING = 4.0
 """Pseudo-counts of the baselines, distributed as without the last move, and as without the node."""
 
@@ -34,6 +41,8 @@ FEATURES = {
     "node, move": (1,),
     "node, posterior": (0, 2),
     "node, move, posterior": (1, 2),
+    "node, modes": (0, 3),
+    "node, move, modes": (1, 3),
 }
 """What the chance of arriving is regressed on, by kind: columns of `features_of`."""
 
@@ -43,11 +52,6 @@ def arrivals(plans: Plans) -> Tensor:
     assert plans.context is not None
     after = labyrinth().next_state[plans.context, plans.actions.long()]
     return (after == WATER) & (plans.context != WATER)
-
-
-def arrives_within(arrives: Tensor, number: int) -> Tensor:
-    """`[N, L - number + 1]`: whether the water is reached by one of the next `number` moves."""
-    return arrives.unfold(1, number, 1).any(-1)
 
 
 def stretches(plans: Plans, arrives: Tensor) -> tuple[Plans, Plans]:
@@ -77,11 +81,21 @@ def log_odds(learned: Plans, plans: Plans) -> Tensor:
     return found[..., 0] - found[..., 1]
 
 
-def features_of(learned: Plans, plans: Plans, number: int, posterior: Tensor) -> tuple[Tensor, Tensor]:
-    """Log-odds `[N, T, 3]` of arriving within some moves, by node, and by node and last move; and of the posterior.
+def mode_weights(learned: Plans, plans: Plans) -> tuple[Tensor, Tensor]:
+    """The modes of a switching prior that learned from `learned`, given the moves up to each, in both: `[N, L, K]`."""
+    prior = SwitchingPrior(learned.num_actions, MODES, MODE_ORDER, labyrinth().num_states, **EM)
+    prior.fit(learned, generator=torch.Generator().manual_seed(0))
+    return prior.posterior(learned).filtered, prior.posterior(plans).filtered
 
-    All but the posterior is counted in `learned`. Also whether the mice arrived, `[N, T]`. A sequence's first move,
-    before which there is none, does not count, nor its last ones.
+
+def features_of(
+    learned: Plans, plans: Plans, number: int, posterior: Tensor, modes: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Log-odds `[N, T, 4]` of arriving within some moves: by node, by node and last move, of the posterior, by modes.
+
+    All but the posterior is counted in `learned`. By modes: by node, counted in each mode before the move by how
+    probable that is. Also whether the mice arrived, `[N, T]`. A sequence's first move, before which there is none, does
+    not count, nor its last ones.
     """
     truth, keys = [], []
     for own in (learned, plans):
@@ -89,13 +103,21 @@ def features_of(learned: Plans, plans: Plans, number: int, posterior: Tensor) ->
         truth.append(arrives_within(arrivals(own), number)[:, 1:].double())
         node = own.context[:, 1 : 1 + truth[-1].shape[1]].long()
         keys.append((node, own.num_actions * node + own.actions[:, : node.shape[1]]))
-    share, columns = truth[0].mean().expand(truth[1].shape), []
+    times, columns = truth[0].shape[1], []
+    share = truth[0].mean().expand(truth[1].shape)
     for own, others in zip(*keys, strict=True):
         size = learned.num_actions * labyrinth().num_states
         total, found = (own.flatten().bincount(values, minlength=size) for values in (None, truth[0].flatten()))
         share = (found[others] + SMOOTHING * share) / (total[others] + SMOOTHING)
         columns.append(share.logit())
-    return torch.stack([*columns, posterior[:, 1 : 1 + share.shape[1]]], -1), truth[1]
+    before, now = (weights[:, :times] for weights in modes)
+    counts = torch.zeros(2, labyrinth().num_states, before.shape[-1], dtype=torch.double)
+    for count, weights in zip(counts, (before, before * truth[0][..., None]), strict=True):
+        count.index_add_(0, keys[0][0].flatten(), weights.flatten(0, 1))
+    total, found = (values[keys[1][0]] for values in counts)
+    by_mode = (found + SMOOTHING * columns[0].sigmoid()[..., None]) / (total + SMOOTHING)
+    columns += [posterior[:, 1 : 1 + times], (now * by_mode).sum(-1).logit()]
+    return torch.stack(columns, -1), truth[1]
 
 
 def regression(features: Tensor, happened: Tensor) -> Tensor:
@@ -116,9 +138,9 @@ def mice_entries(block: int, numbers: tuple[int, ...]) -> Iterator[dict[str, Any
     learned, test = plans[~held_out], plans[held_out]
     inner = torch.arange(len(learned)) * INNER // len(learned)
     folds = [*((learned[inner != k], learned[inner == k]) for k in range(INNER)), (learned, test)]
-    posteriors = [log_odds(*fold) for fold in folds]
+    known = [(log_odds(*fold), mode_weights(*fold)) for fold in folds]
     for number in numbers:
-        found = [features_of(*fold, number, odds) for fold, odds in zip(folds, posteriors, strict=True)]
+        found = [features_of(*fold, number, *one) for fold, one in zip(folds, known, strict=True)]
         rows, happened = (torch.cat([pair[k].flatten(0, 1) for pair in found[:-1]]) for k in (0, 1))
         features, truth = found[-1]
         for kind, columns in FEATURES.items():

@@ -31,7 +31,7 @@ KINDS = {
 
 PAIRS = [(kind, "exact") for kind in KINDS if kind != "exact"]
 PAIRS += [(f"{kind}, tempered", kind) for kind in ("blind", "cell")]
-PAIRS += [(f"{kind}, posterior", kind) for kind in ("node", "node, move")]
+PAIRS += [(f"{kind}, {more}", kind) for more in ("posterior", "modes") for kind in ("node", "node, move")]
 """What is compared: the first minus the second."""
 
 WHAT = (

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
 from matplotlib.axes import Axes
@@ -13,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
+from eval.worlds.labyrinth_drawing import coordinates, corridors, signs
 from neuroprior import Plans, Prior, TabularWorld, oracle
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import labyrinth
@@ -24,32 +24,7 @@ COLORS = {"uniform": "#7f7f7f", "markov": "#2171b5", "gru": "#e6550d", "transfor
 STYLES: dict[str, Any] = {"": "-", "node": "-", "moves": (0, (4, 2))}
 TITLES = {"mice": "from mice", "planner": "from exhaustive search", "reached": "from random search"}
 
-ENTRANCE = (-8.0, 0.0)
-"""Where the corridor from the home cage begins."""
-
-STAR: dict[str, Any] = {"color": "#00a5cf", "markeredgecolor": "black", "markersize": 15, "zorder": 7}
 START: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "markersize": 8, "zorder": 6}
-
-
-def coordinates(world: TabularWorld) -> Tensor:
-    """Where the nodes lie, in corridor cells from the first junction: `[127, 2]`, right and up.
-
-    A mouse comes from the left to node 0, in the middle. Every junction is a T: its branches leave at right angles,
-    4, 4, 2, 2, 1 and 1 cells long from level to level, so that the maze fills a square of 15 x 15 cells with its 64
-    ends in rows of eight (Rosenberg et al. 2021, figure 1). Which node lies to the left of one who walks in is what the
-    world's moves `in_left` and `in_right` say.
-    """
-    place = torch.zeros(world.num_states, 2)
-    heading = torch.zeros(world.num_states, 2)
-    heading[0, 0] = 1
-    for level in range(DEPTH):
-        node = torch.arange(2**level - 1, 2 ** (level + 1) - 1)
-        to_the_left = torch.stack([-heading[node, 1], heading[node, 0]], 1)
-        for move, way in ((0, to_the_left), (1, -to_the_left)):
-            child = world.next_state[node, move]
-            heading[child] = way
-            place[child] = place[node] + 2 ** (2 - level // 2) * way
-    return place
 
 
 def passages(plans: Plans) -> Tensor:
@@ -79,11 +54,11 @@ def maze(plans: Plans) -> Figure:
     visits, turns = figure.subplots(1, 2)
     walked = passages(plans)
     scale = LogNorm(int(walked.min().clamp(min=1)), int(walked.max()))
-    _corridors(visits, place, 8.5, walked, cmap="YlOrBr", norm=scale)
+    corridors(visits, place, 8.5, walked.clamp(min=1), cmap="YlOrBr", norm=scale)
     visits.set_title(f"how often mice walked through each corridor\n({len(plans)} x {plans.max_length} moves)")
     figure.colorbar(ScalarMappable(scale, "YlOrBr"), ax=visits, label="passages, in or out", shrink=0.75, pad=0.02)
     share, number = left_turns(plans)
-    _corridors(turns, place, 8.5)
+    corridors(turns, place, 8.5)
     even = Normalize(0, 1)
     junction = place[: len(share)].numpy()
     size = 30 + 190 * (number / number.max()).sqrt().numpy()
@@ -92,7 +67,7 @@ def maze(plans: Plans) -> Figure:
     bar = figure.colorbar(ScalarMappable(even, "PuOr"), ax=turns, shrink=0.75, pad=0.02, ticks=[0, 0.25, 0.5, 0.75, 1])
     bar.set_ticklabels(["always right", "25 % left", "equally often", "75 % left", "always left"])
     for axes in (visits, turns):
-        _signs(axes, place)
+        signs(axes, place)
     return figure
 
 
@@ -102,7 +77,7 @@ def plans_in_maze(priors: dict[str, Prior], world: TabularWorld, seed: int, numb
     figure = Figure(figsize=(4.3 * len(priors), 4.9))
     colors = (COLORS["uniform"], COLORS["markov"], COLORS["gru"])
     for axes, (name, prior), color in zip(figure.subplots(1, len(priors)), priors.items(), colors, strict=True):
-        _corridors(axes, place, 5.5)
+        corridors(axes, place, 5.5)
         generator = torch.Generator().manual_seed(seed)
         _, rollout = sample_in_world(prior, world, start, number, 16, generator=generator, keep_states=True)
         assert rollout.states is not None
@@ -113,7 +88,7 @@ def plans_in_maze(priors: dict[str, Prior], world: TabularWorld, seed: int, numb
         )
         axes.add_collection(lines)
         axes.plot(*place[start].T.numpy(), "o", label="start", **START)
-        _signs(axes, place)
+        signs(axes, place)
         reached = int((rollout.rewards.sum(-1) > 0).sum())
         axes.set_title(f"{name}\n{reached} of {number} plans reach the water", fontsize=10)
     figure.tight_layout()
@@ -127,29 +102,6 @@ def far_from_water(world: TabularWorld) -> Tensor:
     moves = torch.stack(short).sum(0) * (every != WATER)
     apart = (place - place[WATER]).norm(dim=1)
     return torch.where(moves == moves.max(), apart, -1).argmax()[None]
-
-
-def _corridors(axes: Axes, place: Tensor, width: float, value: Tensor | None = None, **colors: Any) -> None:
-    """The corridors as wide lines, light grey or coloured by `value [127]`."""
-    parent = (torch.arange(len(place)) - 1).div(2, rounding_mode="floor")
-    ends = torch.stack([place[parent.clamp(min=0)], place], 1).numpy()
-    ends[0, 0] = ENTRANCE
-    order = np.arange(len(place))[::-1]  # wide corridors meet at junctions: the inner ones last, on top
-    paint = {"colors": "#efefef"} if value is None else {"array": value.numpy()[order].clip(1), **colors}
-    line: dict[str, Any] = {"capstyle": "projecting"}
-    axes.add_collection(LineCollection(list(ends), colors="#9a9a9a", linewidths=width + 1.6, zorder=1, **line))
-    axes.add_collection(LineCollection(list(ends[order]), linewidths=width, zorder=2, **line, **paint))
-    axes.set(xlim=(-9.6, 8.1), ylim=(-8.1, 8.1), aspect="equal", xticks=[], yticks=[])
-    axes.spines[:].set_visible(False)
-
-
-def _signs(axes: Axes, place: Tensor) -> None:
-    """The water, the entrance and a legend."""
-    axes.plot(*place[WATER, :, None].numpy(), "*", label="water", **STAR)
-    x = ENTRANCE[0]
-    axes.annotate("home", ENTRANCE, xytext=(x - 1.5, 0.75), fontsize=9, va="center")
-    axes.annotate("", (x + 0.9, 0), xytext=(x - 0.9, 0), arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=8)
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, -0.05), ncols=2, frameon=False, handletextpad=0.1)
 
 
 def reached_against_candidates(rows: pd.DataFrame) -> Figure:

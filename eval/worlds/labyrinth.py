@@ -42,6 +42,11 @@ def cut_plans(plans: Plans, length: int) -> Plans:
     return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group, plan_names=None)
 
 
+def arrives_within(arrives: Tensor, number: int) -> Tensor:
+    """`[N, L - number + 1]`: whether one of the next `number` moves of `arrives [N, L]` arrives."""
+    return arrives.unfold(1, number, 1).any(-1)
+
+
 def reaching_planner(
     prior: Prior, length: int, num_plans: int, make: Callable[..., SamplingPlanner] = SamplingPlanner
 ) -> SamplingPlanner:

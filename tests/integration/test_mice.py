@@ -11,8 +11,9 @@ from scipy import stats
 
 from eval.__main__ import main
 from eval.mice.experiment import MiceSettings, PriorName, _count_based, collected
-from eval.mice.figures import ENTRANCE, coordinates, far_from_water, left_turns, passages
+from eval.mice.figures import far_from_water, left_turns, passages
 from eval.worlds.labyrinth import DATA, reaching_planner, shares_reached
+from eval.worlds.labyrinth_drawing import ENTRANCE, coordinates
 from neuroprior import MarkovPrior, Plans, SamplingPlanner, UniformPrior, oracle, read_plans
 from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import WATER

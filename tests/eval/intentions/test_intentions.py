@@ -11,8 +11,8 @@ import torch
 
 from eval.__main__ import main
 from eval.intentions.grid import STAY, Agents, IntentionSettings, make_scene, policy_prior, progress, walk
-from eval.intentions.mice import arrives_within, log_odds, regression, stretches
-from eval.worlds.labyrinth import DATA
+from eval.intentions.mice import log_odds, regression, stretches
+from eval.worlds.labyrinth import DATA, arrives_within
 from neuroprior import read_plans
 from neuroprior.analysis import infer
 from neuroprior.plans import Plans
