@@ -26,7 +26,7 @@ TITLES = {
 def maze_figure(shares: Mapping[str, Tensor]) -> Figure:
     """A row of mazes for each mode: what share of its moves at each node is what; see `node_shares`."""
     place, number = coordinates(labyrinth()), len(shares["moves"])
-    figure = Figure(figsize=(4.1 * len(shares), 4.3 * number))
+    figure = Figure(figsize=(4.1 * len(shares), 4.1 * number), layout="constrained")
     cells = figure.subplots(number, len(shares), squeeze=False)
     colors = colormaps["viridis"].with_extremes(bad="#dddddd")
     for column, (what, values) in enumerate(shares.items()):
@@ -35,7 +35,9 @@ def maze_figure(shares: Mapping[str, Tensor]) -> Figure:
             corridors(axes, place, 5.5, values[k], cmap=colors, norm=scale)
             signs(axes, place)
             axes.set_title(f"mode {k + 1}: {TITLES[what]}", fontsize=10)
-        figure.colorbar(ScalarMappable(scale, colors), ax=list(cells[:, column]), shrink=0.6 / number + 0.1, pad=0.02)
+        figure.colorbar(
+            ScalarMappable(scale, colors), ax=list(cells[:, column]), location="bottom", shrink=0.7, aspect=30
+        )
     return figure
 
 
