@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import log
+from math import inf, log
 from typing import Any
 
 import torch
@@ -60,6 +60,7 @@ def infer(
     context: Tensor | None = None,
     weights: Tensor | Sequence[float] | None = None,
     switch: float = 0.0,
+    power: float = 1.0,
 ) -> Posterior:
     """The posterior over known intentions, exactly, by Bayes' rule (Baker, Saxe and Tenenbaum 2009).
 
@@ -73,6 +74,8 @@ def infer(
         context: of integers `[B, L]`, see `Plans`; `Plans` have their own.
         weights: how probable each intention is in advance, `[K]` or `[B, K]`, in any unit; None: all the same.
         switch: from 0 to 1.
+        power: of the likelihoods, at least 0. Priors that learned from few plans multiply their mistakes action by
+            action, and are too sure of an intention; a power below 1, chosen on plans of known intentions, mends that.
 
     Raises:
         ValueError: an argument is out of range, a prior cannot score the plans, or an action is impossible under every
@@ -82,6 +85,8 @@ def infer(
     observed = _observed(plans, context, next(iter(named.values())))
     if isinstance(switch, bool) or not isinstance(switch, int | float) or not 0 <= switch <= 1:
         raise ValueError(f"switch: a probability from 0 to 1 is expected, not {switch!r}")
+    if isinstance(power, bool) or not isinstance(power, int | float) or not 0 <= power < inf:
+        raise ValueError(f"power: a finite number of at least 0 is expected, not {power!r}")
     batch, length = len(observed), observed.max_length
     prior_log = _log_weights(weights, batch, len(named))
     scores = [
@@ -96,7 +101,8 @@ def infer(
         if switch:
             stay = now + (log(1 - switch) if switch < 1 else -torch.inf)
             before = torch.logaddexp(stay, prior_log + log(switch))
-        joint = before + log_likelihood[:, t]
+        likely = log_likelihood[:, t]
+        joint = before + torch.where(likely > -torch.inf, power * likely, likely)  # what is impossible remains so
         total = joint.logsumexp(-1, keepdim=True)
         impossible = mask[:, t] & ~(total[:, 0] > -torch.inf)
         if impossible.any():

@@ -54,6 +54,15 @@ def test_all_paths_of_intentions(switch):
         torch.testing.assert_close(found[:, t], expected / expected.sum(-1, keepdim=True), atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.parametrize("power", [0.0, 0.5, 2.0])
+def test_tempered_likelihoods(power):
+    found = infer(PRIORS, ACTIONS, weights=[0.5, 0.2, 0.3], power=power).log_probs.exp()
+    joint = torch.tensor([0.5, 0.2, 0.3]).double() * likelihoods(ACTIONS).prod(1) ** power
+    torch.testing.assert_close(found[:, -1], joint / joint.sum(-1, keepdim=True), atol=1e-6, rtol=1e-5)
+    with refuses("power"):
+        infer(PRIORS, ACTIONS, power=-power - 1)
+
+
 def test_padding_says_nothing():
     """Beyond its length a plan keeps its posterior; the frame ends there."""
     plans = Plans(ACTIONS, 2, lengths=torch.tensor([2, 4]), group=torch.tensor([0, 1]))
