@@ -101,8 +101,11 @@ def test_a_teacher_and_a_heuristic_help() -> None:
 
 
 def test_symmetries_of_solutions_are_solutions() -> None:
-    for world in (tiles(), sokoban(LEVELS)):
-        state = world.boards[:30]
+    corner, side = ([[1, 2, 3], [4, 5, 6], [7, 8, 0]], [[1, 0, 2], [3, 4, 5], [6, 7, 8]])
+    others = [sliding_tiles(goal=goal, scramble=30) for goal in (corner, side)]
+    assert [world.symmetries() for world in others] == [2, 1]  # a blank beside the diagonal would go elsewhere
+    for world in (tiles(), *others, sokoban(LEVELS)):
+        state = world.reset(30, seeded()) if world.boards is None else world.boards[:30]
         found = AStarPlanner(world.lower_bound, 5.0, 3000).search(world, state)
         assert found.solved.sum() > 5
         kept = found.solved
