@@ -165,6 +165,7 @@ def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
     plans = puzzle_plans(world, state)
     generator = torch.Generator().manual_seed(0)
     learned = [LogLinearPrior(4, patterns), PatternCounts(4, patterns), PatternNetwork(4, patterns, size=4)]
+    learned.append(LogLinearPrior(4, patterns, use_last=False))
     planners: list[BestFirstPlanner] = [
         LevinPlanner(prior, 80)
         for prior in (UniformPrior(4), *(prior.fit(plans, generator=generator) for prior in learned))
