@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._hashing import row_hashes
 from neuroprior.planners.planner import Decision, Planner, value_of
 from neuroprior.plans import action_dtype
@@ -77,7 +77,8 @@ class BestFirstPlanner(Planner):
 
     Raises:
         ValueError: an argument is out of range. `plan` and `search` raise it for a stochastic world, a world without
-            goals, and a prior that cannot act in the world.
+            goals, a prior that cannot act in the world or gives NaN, and a heuristic that is below 0 or of a world with
+            other states.
     """
 
     steps_at_once = 2**20
@@ -97,9 +98,12 @@ class BestFirstPlanner(Planner):
     ) -> None:
         super().__init__("return")
         check_sizes(max_nodes=max_nodes, nodes_at_once=nodes_at_once)
+        check_memory(8 * max_nodes, max_nodes=max_nodes)
         check_temperature(temperature)
         if prior is not None and not isinstance(prior, Steppable):
             raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")
+        if heuristic is not None and not callable(heuristic):
+            raise ValueError(f"heuristic: a function of states is expected, not {heuristic!r}")
         self.prior, self.max_nodes, self.heuristic = prior, max_nodes, heuristic
         self.nodes_at_once, self.temperature, self.compile = nodes_at_once, temperature, compile
 
@@ -140,6 +144,11 @@ class BestFirstPlanner(Planner):
             raise ValueError(f"world: one with goals is expected (World.solved), not {type(world).__name__}")
         prior = UniformPrior(world.num_actions).to(state.device) if self.prior is None else self.prior
         check_in_world(prior, world, state)
+        if isinstance(of := getattr(self.heuristic, "__self__", None), World) and of is not world:
+            try:
+                of.check_state(state)
+            except ValueError as error:
+                raise ValueError(f"heuristic: it is that of another world ({error})") from None
         if (module := self._compiled(world, prior)) is not None:
             assert isinstance(world, PuzzleWorld)
             return self._search_compiled(module, world, prior, state)
@@ -280,7 +289,7 @@ class _Trees:
 
     def found(self) -> Search:
         """The results, once no tree grows any more."""
-        plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan
+        plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan[:, :0]
         return self.result._replace(plan=plans.to(action_dtype(self.actions)))
 
     def expand_best(self) -> None:
@@ -330,9 +339,11 @@ class _Trees:
         """Expand new nodes `[M]`: enter them, and their edges into the queue."""
         at = self.size[tree] + _rank(tree, torch.ones_like(tree, dtype=torch.bool))
         self.size.index_add_(0, tree, torch.ones_like(tree))
-        while int(self.size.max()) > self.capacity:
+        while bool((self.size > self.capacity).any()):
             self._grow()
         own = torch.log_softmax(logits.double() / self.planner.temperature, -1)
+        if bool(own.isnan().any()):
+            raise ValueError("prior: its logits are NaN")
         legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
         left, of_children = self._left(tree, state, legal)
         named = {"edge": edge, "depth": depth, "log_prob": log_prob, "gain": gain, "left": left}
@@ -359,6 +370,8 @@ class _Trees:
         self.steps.index_add_(0, tree[where], torch.ones_like(where))
         children = torch.zeros(legal.shape, dtype=torch.float64, device=state.device)
         children[where, action] = value_of(heuristic, reached).double()
+        if bool((children < 0).any()):
+            raise ValueError("heuristic: numbers of at least 0, of steps that are left, are expected")
         return value_of(heuristic, state).double(), children
 
     def _insert(self, tree: Tensor, hashes: Tensor) -> Tensor:

@@ -208,8 +208,9 @@ def test_any_prior_searches_any_world_with_goals() -> None:
         found = LevinPlanner(prior, 100).search(sokoban(level), sokoban(level).boards)
         assert found.solved.all()
         assert found.lengths.tolist() == [3, 3]
-    none = LevinPlanner(UniformPrior(4), 10).search(sokoban(level), sokoban(level).boards[:0])
-    assert none.plan.shape[0] == 0
+    for compile in (True, False):
+        planner = LevinPlanner(UniformPrior(4), 10, compile=compile)
+        assert planner.search(sokoban(level), sokoban(level).boards[:0]).plan.shape == (0, 0)
     assert LevinPlanner(UniformPrior(9), 10).plan(cube(), torch.tensor([0])).lengths.tolist() == [0]  # type: ignore[union-attr]
 
 
@@ -222,10 +223,36 @@ def test_bad_input_is_refused() -> None:
         AStarPlanner(weight=-1.0)
     with pytest.raises(ValueError, match="actions"):
         LevinPlanner(UniformPrior(3)).search(cube(), torch.tensor([1]))
+    with pytest.raises(ValueError, match="max_nodes: 1000000000000 would need"):
+        LevinPlanner(UniformPrior(4), 10**12)
+    with pytest.raises(ValueError, match="heuristic: a function"):
+        AStarPlanner("manhattan")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="value"):
         LevinPlanner(UniformPrior(9), heuristic=lambda state: state.double() * math.nan).search(
             cube(), torch.tensor([5])
         )
+
+
+def test_heuristics_of_other_worlds_are_refused() -> None:
+    small, large, levels = sliding_tiles(shape=(3, 3)), sliding_tiles(shape=(4, 4)), sokoban(["####\n#@.#\n#$ #\n####"])
+    pairs = [(small, large.lower_bound), (large, small.lower_bound), (large, levels.lower_bound)]
+    for world, heuristic in (*pairs, (levels, large.lower_bound), (small, cube().distance)):
+        for planner in (AStarPlanner(heuristic), LevinPlanner(UniformPrior(4), heuristic=heuristic)):
+            with pytest.raises(ValueError, match=r"heuristic: it is that of another world \(state"):
+                planner.search(world, world.reset(2))
+    # Another world with the same states may help.
+    assert AStarPlanner(sliding_tiles(shape=(3, 3)).lower_bound).search(small, small.goal[None]).solved.all()
+
+
+def test_numbers_that_order_nothing_are_refused() -> None:
+    world = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=9).reset(3, torch.Generator().manual_seed(0)))
+    prior = LogLinearPrior(4, len(world.windows.windows))
+    with pytest.raises(ValueError, match="heuristic: numbers of at least 0"):
+        LevinPlanner(prior, heuristic=lambda state: -world.lower_bound(state)).search(world, world.boards)
+    prior.after[:] = math.nan
+    for compile in (True, False):
+        with pytest.raises(ValueError, match=r"prior: .* are NaN"):
+            LevinPlanner(prior, compile=compile).search(world, world.boards)
 
 
 def test_last_actions_count_where_no_pattern_is_known() -> None:
