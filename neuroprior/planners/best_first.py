@@ -178,7 +178,7 @@ class BestFirstPlanner(Planner):
         return Search(torch.from_numpy(found.solved), plan, lengths, score, final, *numbers)
 
     def _search(self, world: World, prior: Steppable, state: Tensor) -> Search:
-        trees = _Trees(self, world, Stepper(prior, in_place=False), state)
+        trees = _Trees(self, world, _stepper(prior, world, state), state)
         while trees.active:
             trees.expand_best()
         return trees.found()
@@ -465,6 +465,60 @@ class _Trees:
         self.rows, self.size, self.steps = self.rows[kept], self.size[kept], self.steps[kept]
         self.queue, self.minima, self.seen = self.queue[kept], self.minima[kept], self.seen[kept]
         self.nodes = {name: values[kept] for name, values in self.nodes.items()}
+
+
+class _ByDepth(Stepper):
+    """Steps a prior whose states change their size, as those of networks that read a window, along with the actions.
+
+    Rows of its states can only be stepped together with as many actions behind them. States are kept here, by depth;
+    what is given out in their place is their depth and their row there, int64 `[N, 2]`.
+    """
+
+    def __init__(self, prior: Steppable) -> None:
+        super().__init__(prior, in_place=False)
+        self._states, self._used = list[Tensor](), list[int]()
+
+    def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
+        logits, own = super().start_in(world, state)
+        return logits, self._keep(0, own)
+
+    def step_in(
+        self, world: World, action: Tensor, state: Tensor, reached: Tensor, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        parts, places = [], torch.empty_like(state)
+        for depth in state[:, 0].unique().tolist():
+            rows = (state[:, 0] == depth).nonzero()[:, 0]
+            own = self._states[depth][state[rows, 1]]
+            logits, after = super().step_in(world, action[rows], own, reached[rows])
+            places[rows] = self._keep(depth + 1, after)
+            parts.append((rows, logits))
+        order = torch.cat([rows for rows, _ in parts]).argsort()
+        return torch.cat([logits for _, logits in parts])[order], places
+
+    def _keep(self, depth: int, own: Tensor) -> Tensor:
+        """Where states `[M, ...]` are kept: `[M, 2]`."""
+        if depth == len(self._states):
+            self._states.append(own[:0])
+            self._used.append(0)
+        first, last = self._used[depth], self._used[depth] + len(own)
+        if last > len(self._states[depth]):
+            room = own.new_empty(2 * last, *own.shape[1:])
+            room[:first] = self._states[depth][:first]
+            self._states[depth] = room
+        self._states[depth][first:last] = own
+        self._used[depth] = last
+        row = torch.arange(first, last, device=own.device)
+        return torch.stack([torch.full_like(row, depth), row], 1)
+
+
+def _stepper(prior: Steppable, world: World, state: Tensor) -> Stepper:
+    """How a search steps a prior from `state [B, ...]`, whose nodes have different depths."""
+    stepper = Stepper(prior, in_place=False)
+    _, before = stepper.start_in(world, state[:1])
+    if len(before) == 0:
+        return stepper
+    _, after = stepper.step_in(world, torch.zeros(1, dtype=torch.long, device=state.device), before, state[:1])
+    return stepper if after.shape == before.shape else _ByDepth(prior)
 
 
 def _rank(tree: Tensor, counted: Tensor) -> Tensor:

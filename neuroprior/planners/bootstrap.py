@@ -114,7 +114,7 @@ def bootstrap(
     prior.check_settings(settings)
     Stepper(prior).start_in(world, problems[:1])  # a teacher would ask it for nothing before it has searched
     generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
-    digest = sha256(problems.cpu().contiguous().numpy().tobytes()).hexdigest()
+    digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
     asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
     run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
     yield from run.done

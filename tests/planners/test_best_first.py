@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, UniformPrior
+from neuroprior import GRUPrior, MarkovPrior, MixturePrior, Plans, TabularWorld, TransformerPrior, UniformPrior
 from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
 from neuroprior.priors import LogLinearPrior, PatternCounts, PatternNetwork, Prior
 from neuroprior.worlds import World, cube, format_sokoban, gridworld, sliding_tiles, sokoban
@@ -98,6 +98,31 @@ def test_searches_are_those_of_a_heap(kind: str, heuristic: Any) -> None:
                 assert float(found.log_bound[n]) == pytest.approx(bound)
                 if plan is not None:
                     assert found.plan[n, : int(found.lengths[n])].tolist() == plan
+
+
+GROWING: dict[str, Callable[[], Prior]] = {
+    "gru": lambda: GRUPrior(3, hidden_size=8, window=3, seed=1),
+    "transformer": lambda: TransformerPrior(3, width=16, num_layers=1, num_heads=2, seed=1),
+    "mixture": lambda: MixturePrior(3, [GRUPrior(3, hidden_size=8, window=5, seed=2), MarkovPrior(3, 2)]),
+}
+
+
+@pytest.mark.parametrize("name", GROWING)
+def test_priors_whose_states_grow_search_as_others(name: str) -> None:
+    prior, world = GROWING[name]().eval(), random_table(0)
+    state = torch.randint(200, (8,), generator=torch.Generator().manual_seed(0))
+    state[0] = 199  # solved already
+    for at_once in (1, 4):
+        found = LevinPlanner(prior, 120, nodes_at_once=at_once).search(world, state)
+        check_found(world, state, found)
+        assert bool((found.expansions <= at_once * found.log_bound.exp() + 1e-6).all())
+        for n, start in enumerate(state if at_once == 1 else ()):
+            expansions, plan, bound = plain(world, prior, start, 120, levin, None)
+            assert int(found.expansions[n]) == expansions
+            assert float(found.log_bound[n]) == pytest.approx(bound, rel=1e-5)
+            if plan is not None:
+                assert found.plan[n, : int(found.lengths[n])].tolist() == plan
+    assert found.solved.sum() > 2
 
 
 def check_found(world: World, state: Tensor, found: Search) -> None:

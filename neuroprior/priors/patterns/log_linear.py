@@ -17,7 +17,7 @@ ADAGRAD = 1.0
 class LogLinearPrior(PatternPrior):
     """The probability of an action is proportional to exp of a sum of weights, one of each active pattern.
 
-    It is a product of experts, one a pattern (Orseau, Hutter and Leis, *Levin tree search with context models*, IJCAI
+    It is a product of experts, one a pattern (Orseau, Hutter and Lelis, *Levin tree search with context models*, IJCAI
     2023, have such a policy). The log-loss is convex in the weights; they are learned by Adagrad, one step of a plan
     after the other. A fit that follows another continues from its weights.
 
