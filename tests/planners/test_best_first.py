@@ -9,7 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuroprior import GRUPrior, MarkovPrior, MixturePrior, Plans, TabularWorld, TransformerPrior, UniformPrior
+from neuroprior import (
+    GRUPrior,
+    MarkovPrior,
+    MixturePrior,
+    Plans,
+    TabularWorld,
+    TransformerPrior,
+    UniformPrior,
+    collect,
+)
 from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
 from neuroprior.priors import LogLinearPrior, PatternCounts, PatternNetwork, Prior
 from neuroprior.worlds import World, cube, format_sokoban, gridworld, sliding_tiles, sokoban
@@ -267,6 +276,19 @@ def test_heuristics_of_other_worlds_are_refused() -> None:
                 planner.search(world, world.reset(2))
     # Another world with the same states may help.
     assert AStarPlanner(sliding_tiles(shape=(3, 3)).lower_bound).search(small, small.goal[None]).solved.all()
+
+
+def test_plans_of_no_actions_are_collected() -> None:
+    world = sliding_tiles(shape=(2, 2))
+    start = world.goal[None].repeat(3, 1, 1)
+    for context in (None, "step"):
+        plans = collect(LevinPlanner(UniformPrior(4)), world, state=start, context=context)  # type: ignore[arg-type]
+        assert plans.actions.shape == (3, 0)
+    turned = cube()
+    plans = collect(LevinPlanner(UniformPrior(9)), turned, state=torch.zeros(2, dtype=torch.long), context="plan")
+    assert plans.actions.shape == (2, 0)
+    assert plans.context is not None
+    assert plans.context.equal(turned.observe(torch.zeros(2, dtype=torch.long)))
 
 
 def test_numbers_that_order_nothing_are_refused() -> None:
