@@ -121,10 +121,11 @@ def report(
     tables = [_table(rows, "Test problems", settings)]
     if settings.world == "sokoban":
         known, walls = (_walls(problems) for problems in both)
-        own = [number for number, layout in enumerate(walls) if layout not in set(known)]
-        apart = _rows(each[each["problem"].isin(own)], seconds).drop(columns=["seconds_per_problem", "fit_seconds"])
-        if len(own) < len(both[1].boards):
-            frames["own_walls"] = apart
+        among = set(known)
+        own = [number for number, layout in enumerate(walls) if layout not in among]
+        if 0 < len(own) < len(both[1].boards):
+            apart = _rows(each[each["problem"].isin(own)], seconds)
+            frames["own_walls"] = apart = apart.drop(columns=["seconds_per_problem", "fit_seconds"])
             tables.append(_table(apart, "Test problems whose walls are those of no training problem", settings))
     if len(frames["pairs"]):
         tables.append(_pair_table(frames["pairs"]))

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from torch.nn.functional import pad
 
 from neuroprior.planners import (
     AStarPlanner,
@@ -33,6 +34,7 @@ from neuroprior.priors import (
 )
 from neuroprior.worlds import PuzzleWorld, sliding_tiles, sokoban
 from neuroprior.worlds.puzzles.puzzle import Observation
+from neuroprior.worlds.puzzles.sokoban import WALL
 
 BOOTSTRAP = "bootstrap"
 """The log-linear prior that found the solutions, from which all others learn."""
@@ -121,16 +123,21 @@ class Problems(NamedTuple):
 
 
 def problems_of(settings: Settings, observation: Observation = "patterns") -> tuple[Problems, Problems]:
-    """The training and the test problems.
+    """The training and the test problems; where Sokoban levels are of two sizes, walls make the smaller ones larger.
 
     Raises:
-        ValueError: a file holds none, or boards of another size; the message names it.
+        ValueError: a file holds none, or sliding tiles of another size; the message names it.
         OSError: a file cannot be read.
     """
     make: Callable[..., PuzzleWorld] = sokoban if settings.world == "sokoban" else sliding_tiles
     worlds = [make(file, observation=observation) for file in (settings.train, settings.test)]
     expected, found = (list(world.shape) for world in worlds)
-    if expected != found:
+    if expected != found and settings.world == "sokoban":
+        high, wide = map(max, zip(expected, found, strict=True))
+        boards = [world.boards for world in worlds if world.boards is not None]
+        padded = [pad(some, (0, wide - some.shape[2], 0, high - some.shape[1]), value=WALL) for some in boards]
+        worlds = [sokoban(some, observation=observation) for some in padded]
+    elif expected != found:
         raise ValueError(f"{settings.test}: boards of {expected} are expected, as in {settings.train}, not {found}")
     numbers = settings.num_train, settings.num_test
     train, test = (

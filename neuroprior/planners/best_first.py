@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._hashing import row_hashes
 from neuroprior.planners.planner import Decision, Planner, value_of
 from neuroprior.plans import action_dtype
@@ -77,7 +77,8 @@ class BestFirstPlanner(Planner):
 
     Raises:
         ValueError: an argument is out of range. `plan` and `search` raise it for a stochastic world, a world without
-            goals, and a prior that cannot act in the world.
+            goals, a prior that cannot act in the world or gives NaN, and a heuristic that is below 0 or of a world with
+            other states.
     """
 
     steps_at_once = 2**20
@@ -97,9 +98,12 @@ class BestFirstPlanner(Planner):
     ) -> None:
         super().__init__("return")
         check_sizes(max_nodes=max_nodes, nodes_at_once=nodes_at_once)
+        check_memory(8 * max_nodes, max_nodes=max_nodes)
         check_temperature(temperature)
         if prior is not None and not isinstance(prior, Steppable):
             raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")
+        if heuristic is not None and not callable(heuristic):
+            raise ValueError(f"heuristic: a function of states is expected, not {heuristic!r}")
         self.prior, self.max_nodes, self.heuristic = prior, max_nodes, heuristic
         self.nodes_at_once, self.temperature, self.compile = nodes_at_once, temperature, compile
 
@@ -140,6 +144,11 @@ class BestFirstPlanner(Planner):
             raise ValueError(f"world: one with goals is expected (World.solved), not {type(world).__name__}")
         prior = UniformPrior(world.num_actions).to(state.device) if self.prior is None else self.prior
         check_in_world(prior, world, state)
+        if isinstance(of := getattr(self.heuristic, "__self__", None), World) and of is not world:
+            try:
+                of.check_state(state)
+            except ValueError as error:
+                raise ValueError(f"heuristic: it is that of another world ({error})") from None
         if (module := self._compiled(world, prior)) is not None:
             assert isinstance(world, PuzzleWorld)
             return self._search_compiled(module, world, prior, state)
@@ -169,7 +178,7 @@ class BestFirstPlanner(Planner):
         return Search(torch.from_numpy(found.solved), plan, lengths, score, final, *numbers)
 
     def _search(self, world: World, prior: Steppable, state: Tensor) -> Search:
-        trees = _Trees(self, world, Stepper(prior, in_place=False), state)
+        trees = _Trees(self, world, _stepper(prior, world, state), state)
         while trees.active:
             trees.expand_best()
         return trees.found()
@@ -280,7 +289,7 @@ class _Trees:
 
     def found(self) -> Search:
         """The results, once no tree grows any more."""
-        plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan
+        plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan[:, :0]
         return self.result._replace(plan=plans.to(action_dtype(self.actions)))
 
     def expand_best(self) -> None:
@@ -330,9 +339,11 @@ class _Trees:
         """Expand new nodes `[M]`: enter them, and their edges into the queue."""
         at = self.size[tree] + _rank(tree, torch.ones_like(tree, dtype=torch.bool))
         self.size.index_add_(0, tree, torch.ones_like(tree))
-        while int(self.size.max()) > self.capacity:
+        while bool((self.size > self.capacity).any()):
             self._grow()
         own = torch.log_softmax(logits.double() / self.planner.temperature, -1)
+        if bool(own.isnan().any()):
+            raise ValueError("prior: its logits are NaN")
         legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
         left, of_children = self._left(tree, state, legal)
         named = {"edge": edge, "depth": depth, "log_prob": log_prob, "gain": gain, "left": left}
@@ -359,6 +370,8 @@ class _Trees:
         self.steps.index_add_(0, tree[where], torch.ones_like(where))
         children = torch.zeros(legal.shape, dtype=torch.float64, device=state.device)
         children[where, action] = value_of(heuristic, reached).double()
+        if bool((children < 0).any()):
+            raise ValueError("heuristic: numbers of at least 0, of steps that are left, are expected")
         return value_of(heuristic, state).double(), children
 
     def _insert(self, tree: Tensor, hashes: Tensor) -> Tensor:
@@ -452,6 +465,60 @@ class _Trees:
         self.rows, self.size, self.steps = self.rows[kept], self.size[kept], self.steps[kept]
         self.queue, self.minima, self.seen = self.queue[kept], self.minima[kept], self.seen[kept]
         self.nodes = {name: values[kept] for name, values in self.nodes.items()}
+
+
+class _ByDepth(Stepper):
+    """Steps a prior whose states change their size, as those of networks that read a window, along with the actions.
+
+    Rows of its states can only be stepped together with as many actions behind them. States are kept here, by depth;
+    what is given out in their place is their depth and their row there, int64 `[N, 2]`.
+    """
+
+    def __init__(self, prior: Steppable) -> None:
+        super().__init__(prior, in_place=False)
+        self._states, self._used = list[Tensor](), list[int]()
+
+    def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
+        logits, own = super().start_in(world, state)
+        return logits, self._keep(0, own)
+
+    def step_in(
+        self, world: World, action: Tensor, state: Tensor, reached: Tensor, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        parts, places = [], torch.empty_like(state)
+        for depth in state[:, 0].unique().tolist():
+            rows = (state[:, 0] == depth).nonzero()[:, 0]
+            own = self._states[depth][state[rows, 1]]
+            logits, after = super().step_in(world, action[rows], own, reached[rows])
+            places[rows] = self._keep(depth + 1, after)
+            parts.append((rows, logits))
+        order = torch.cat([rows for rows, _ in parts]).argsort()
+        return torch.cat([logits for _, logits in parts])[order], places
+
+    def _keep(self, depth: int, own: Tensor) -> Tensor:
+        """Where states `[M, ...]` are kept: `[M, 2]`."""
+        if depth == len(self._states):
+            self._states.append(own[:0])
+            self._used.append(0)
+        first, last = self._used[depth], self._used[depth] + len(own)
+        if last > len(self._states[depth]):
+            room = own.new_empty(2 * last, *own.shape[1:])
+            room[:first] = self._states[depth][:first]
+            self._states[depth] = room
+        self._states[depth][first:last] = own
+        self._used[depth] = last
+        row = torch.arange(first, last, device=own.device)
+        return torch.stack([torch.full_like(row, depth), row], 1)
+
+
+def _stepper(prior: Steppable, world: World, state: Tensor) -> Stepper:
+    """How a search steps a prior from `state [B, ...]`, whose nodes have different depths."""
+    stepper = Stepper(prior, in_place=False)
+    _, before = stepper.start_in(world, state[:1])
+    if len(before) == 0:
+        return stepper
+    _, after = stepper.step_in(world, torch.zeros(1, dtype=torch.long, device=state.device), before, state[:1])
+    return stepper if after.shape == before.shape else _ByDepth(prior)
 
 
 def _rank(tree: Tensor, counted: Tensor) -> Tensor:

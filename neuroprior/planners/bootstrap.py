@@ -2,11 +2,13 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from hashlib import sha256
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load as read_tensors
 from safetensors.torch import save as write_tensors
 from torch import Tensor
@@ -17,6 +19,7 @@ from neuroprior.planners.best_first import BestFirstPlanner, LevinPlanner, Searc
 from neuroprior.plans import Plans, action_dtype
 from neuroprior.priors import PatternPrior, Prior, load, save
 from neuroprior.priors.patterns import Steps
+from neuroprior.sampling.stepping import Stepper
 from neuroprior.worlds.puzzles import PuzzleWorld
 from neuroprior.worlds.world import World
 
@@ -91,7 +94,7 @@ def bootstrap(
         teacher: searches in the first sweep, such as an `AStarPlanner`; None: the prior as it is.
         guided: search with the world's `lower_bound` as heuristic (PHS*).
         folder: the prior, the solutions and the sweeps are kept there after each sweep, and an interrupted call goes on
-            from them; None: nothing is kept.
+            from them (or takes the first `sweeps` of them); None: nothing is kept.
         generator: draws symmetries, and what the prior's `fit` draws.
         **settings: of the prior's `fit`.
 
@@ -99,7 +102,8 @@ def bootstrap(
         Each sweep, when the prior has learned from it; finished ones of `folder` at once.
 
     Raises:
-        ValueError: an argument is out of range, nothing is solved in any sweep, or the folder is of another call.
+        ValueError: an argument is out of range, the prior cannot act in the world, nothing is solved in any sweep, or
+            the folder is damaged or of another call.
     """
     check_sizes(max_nodes=max_nodes, sweeps=sweeps, first=first, max_actions=max_actions)
     world.check_state(problems)
@@ -107,10 +111,13 @@ def bootstrap(
         raise ValueError("problems: at least one is expected")
     if guided and not hasattr(world, "lower_bound"):
         raise ValueError(f"guided: a world with a lower_bound is expected, not {type(world).__name__}")
+    prior.check_settings(settings)
+    Stepper(prior).start_in(world, problems[:1])  # a teacher would ask it for nothing before it has searched
     generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
-    asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided}
-    run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator)
-    yield from run.done[:sweeps]
+    digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
+    asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
+    run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
+    yield from run.done
     while len(run.done) < sweeps:
         tried, budget = run.next()
         with_teacher = teacher is not None and not run.done
@@ -145,11 +152,12 @@ class _Bootstrap:
         asked: dict[str, Any],
         folder: Path | None,
         generator: torch.Generator,
+        sweeps: int,
     ) -> None:
         self.world, self.prior, self.problems, self.asked, self.folder = world, prior, problems, asked, folder
         self.generator, self.plans, self.done = generator, dict[int, Tensor](), list[Sweep]()
         if folder is not None and (folder / "sweeps.json").exists():
-            self._restore(folder)
+            self._restore(folder, sweeps)
 
     def next(self) -> tuple[int, int]:
         """How many problems the next sweep tries, and its budget."""
@@ -190,29 +198,51 @@ class _Bootstrap:
         kept = {"asked": self.asked, "sweeps": rows, "generator": self.generator.get_state().tolist()}
         write_json(self.folder / "sweeps.json", kept)
 
-    def _restore(self, folder: Path) -> None:
-        kept = read_json(folder / "sweeps.json")
+    def _restore(self, folder: Path, sweeps: int) -> None:
+        kept = _read_sweeps(folder)
         if kept["asked"] != self.asked:
             raise ValueError(f"{folder}: holds sweeps of another call, with {kept['asked']}; give another folder")
-        self.done = [Sweep(**row) for row in kept["sweeps"]]
+        self.done = kept["sweeps"][:sweeps]
         last = self.done[-1].number
         saved = load(folder / f"prior-{last}")
         if type(saved) is not type(self.prior) or saved.config != self.prior.config:
             raise ValueError(f"{folder}: its prior is {saved}, not {self.prior}; give another folder")
         self.prior.load_state_dict(saved.state_dict())
         self.prior.restore(saved.learned)
-        self.plans = read_solutions(folder)
+        self.plans = read_solutions(folder, last)
         self.generator.set_state(torch.tensor(kept["generator"], dtype=torch.uint8))
 
 
-def read_solutions(folder: str | PathLike[str]) -> dict[int, Tensor]:
+def _read_sweeps(folder: Path) -> dict[str, Any]:
+    """What `sweeps.json` holds; ValueError for a damaged file."""
+    path = folder / "sweeps.json"
+    kept = read_json(path)
+    try:
+        found = {"asked": kept["asked"], "generator": kept["generator"], "sweeps": [Sweep(**s) for s in kept["sweeps"]]}
+    except (KeyError, TypeError):
+        found = {"sweeps": []}
+    if not found["sweeps"]:
+        raise ValueError(f"{path}: damaged; give another folder")
+    return found
+
+
+def read_solutions(folder: str | PathLike[str], sweep: int | None = None) -> dict[int, Tensor]:
     """The actions of each problem that was solved so far, by its number, from the folder of a call of `bootstrap`.
 
+    Args:
+        folder: of the call.
+        sweep: up to this one; None: the last.
+
     Raises:
-        OSError, KeyError: there is none.
+        OSError: there is none.
+        ValueError: a file is damaged.
     """
-    last = read_json(Path(folder) / "sweeps.json")["sweeps"][-1]["number"]
-    tensors = read_tensors((Path(folder) / f"solutions-{last}.safetensors").read_bytes())
+    number = _read_sweeps(Path(folder))["sweeps"][-1].number if sweep is None else sweep
+    path = Path(folder) / f"solutions-{number}.safetensors"
+    try:
+        tensors = read_tensors(path.read_bytes())
+    except SafetensorError as error:
+        raise ValueError(f"{path}: damaged ({error}); give another folder") from error
     return {int(name): plan for name, plan in sorted(tensors.items())}
 
 
@@ -236,9 +266,11 @@ def fit_solutions(
         max_actions, generator, settings: see `bootstrap`.
 
     Returns:
-        The number of actions that it learned from.
+        The number of actions that it learned from; with none it stays as it is.
     """
     some = [k for k, plan in enumerate(plans) if len(plan)]
+    if not some:
+        return 0
     state, plans = state[torch.tensor(some, dtype=torch.long)], [plans[k] for k in some]
     own = sum(map(len, plans))
     if isinstance(world, PuzzleWorld):

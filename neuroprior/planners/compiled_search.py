@@ -474,6 +474,8 @@ def compiled_tables(prior: Any) -> Tables:
     if isinstance(prior, PatternNetwork):
         weights = np.concatenate([weights, prior.embeddings[:-1].numpy()], 1)
         layers, biases, out = (table.numpy() for table in (prior.layers, prior.biases, prior.out))
+    if np.isnan(weights).any() or np.isnan(after).any():
+        raise ValueError("prior: its weights are NaN")
     network = (np.ascontiguousarray(table, np.float32) for table in (layers, biases, out))
     placed = hash_table(codes.astype(np.int64), np.ascontiguousarray(weights, np.float32))
     return Tables(*placed, np.ascontiguousarray(after, np.float32), *network)
@@ -519,8 +521,11 @@ def search_all(
         solved[number], log_bound[number], expansions[number], steps[number] = np.isfinite(bound), bound, nodes, taken
         plans[number] = path[:length].copy()
 
-    with ThreadPoolExecutor(max(torch.get_num_threads(), 1)) as pool:  # the loop releases Python's lock
-        list(pool.map(one, range(batch)))
+    try:
+        with ThreadPoolExecutor(max(torch.get_num_threads(), 1)) as pool:  # the loop releases Python's lock
+            list(pool.map(one, range(batch)))
+    except MemoryError:
+        raise ValueError(f"max_nodes: there is no memory for {max_nodes:,} nodes") from None
     return Found(solved, plans, log_bound, expansions, steps)
 
 

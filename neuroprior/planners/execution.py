@@ -108,7 +108,7 @@ def collect(
         state = world.reset(num_plans, generator)
     plan, score, _, _, lengths = planner.plan(world, state, generator)
     _, states = _step_through(world, state, plan, generator)
-    before = torch.cat([state[:, None], states[:, :-1]], 1)
+    before = torch.cat([state[:, None], states[:, :-1]], 1)[:, : plan.shape[1]]
     steps = executed_steps(world, before)
     if lengths is not None:
         lengths = torch.minimum(steps, lengths)
@@ -127,7 +127,7 @@ def collect(
             "observe: indices [N] or floating point features [N, C] are expected of a world; patterns [N, F] are a"
             ' context per step (context="step")'
         )
-    observed = observations(world, before, context)
+    observed = world.observe(state) if context == "plan" else observations(world, before, context)
     return Plans(plan, world.num_actions, lengths, world.action_names, observed, world.group(state))
 
 
@@ -181,6 +181,8 @@ def _step_through(
 ) -> tuple[Tensor, Tensor]:
     """The rewards `[N, L]`, and the states `[N, L, ...]` after each action, of `plans [N, L]` from `state [N, ...]`."""
     rewards, states = [], []
+    if plans.shape[1] == 0:
+        return torch.zeros(plans.shape, device=state.device), state[:, None][:, :0]
     for t in range(plans.shape[1]):
         state, reward = world.step(state, plans[:, t].long(), generator)
         state = state if change is None else change(state, generator)

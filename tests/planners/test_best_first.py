@@ -9,7 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, UniformPrior
+from neuroprior import (
+    GRUPrior,
+    MarkovPrior,
+    MixturePrior,
+    Plans,
+    TabularWorld,
+    TransformerPrior,
+    UniformPrior,
+    collect,
+)
 from neuroprior.planners import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
 from neuroprior.priors import LogLinearPrior, PatternCounts, PatternNetwork, Prior
 from neuroprior.worlds import World, cube, format_sokoban, gridworld, sliding_tiles, sokoban
@@ -100,6 +109,31 @@ def test_searches_are_those_of_a_heap(kind: str, heuristic: Any) -> None:
                     assert found.plan[n, : int(found.lengths[n])].tolist() == plan
 
 
+GROWING: dict[str, Callable[[], Prior]] = {
+    "gru": lambda: GRUPrior(3, hidden_size=8, window=3, seed=1),
+    "transformer": lambda: TransformerPrior(3, width=16, num_layers=1, num_heads=2, seed=1),
+    "mixture": lambda: MixturePrior(3, [GRUPrior(3, hidden_size=8, window=5, seed=2), MarkovPrior(3, 2)]),
+}
+
+
+@pytest.mark.parametrize("name", GROWING)
+def test_priors_whose_states_grow_search_as_others(name: str) -> None:
+    prior, world = GROWING[name]().eval(), random_table(0)
+    state = torch.randint(200, (8,), generator=torch.Generator().manual_seed(0))
+    state[0] = 199  # solved already
+    for at_once in (1, 4):
+        found = LevinPlanner(prior, 120, nodes_at_once=at_once).search(world, state)
+        check_found(world, state, found)
+        assert bool((found.expansions <= at_once * found.log_bound.exp() + 1e-6).all())
+        for n, start in enumerate(state if at_once == 1 else ()):
+            expansions, plan, bound = plain(world, prior, start, 120, levin, None)
+            assert int(found.expansions[n]) == expansions
+            assert float(found.log_bound[n]) == pytest.approx(bound, rel=1e-5)
+            if plan is not None:
+                assert found.plan[n, : int(found.lengths[n])].tolist() == plan
+    assert found.solved.sum() > 2
+
+
 def check_found(world: World, state: Tensor, found: Search) -> None:
     """Plans lead where the search says, and gain what it says."""
     now, score = state.clone(), torch.zeros(len(state), dtype=torch.float64)
@@ -165,6 +199,7 @@ def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
     plans = puzzle_plans(world, state)
     generator = torch.Generator().manual_seed(0)
     learned = [LogLinearPrior(4, patterns), PatternCounts(4, patterns), PatternNetwork(4, patterns, size=4)]
+    learned.append(LogLinearPrior(4, patterns, use_last=False))
     planners: list[BestFirstPlanner] = [
         LevinPlanner(prior, 80)
         for prior in (UniformPrior(4), *(prior.fit(plans, generator=generator) for prior in learned))
@@ -207,8 +242,9 @@ def test_any_prior_searches_any_world_with_goals() -> None:
         found = LevinPlanner(prior, 100).search(sokoban(level), sokoban(level).boards)
         assert found.solved.all()
         assert found.lengths.tolist() == [3, 3]
-    none = LevinPlanner(UniformPrior(4), 10).search(sokoban(level), sokoban(level).boards[:0])
-    assert none.plan.shape[0] == 0
+    for compile in (True, False):
+        planner = LevinPlanner(UniformPrior(4), 10, compile=compile)
+        assert planner.search(sokoban(level), sokoban(level).boards[:0]).plan.shape == (0, 0)
     assert LevinPlanner(UniformPrior(9), 10).plan(cube(), torch.tensor([0])).lengths.tolist() == [0]  # type: ignore[union-attr]
 
 
@@ -221,10 +257,49 @@ def test_bad_input_is_refused() -> None:
         AStarPlanner(weight=-1.0)
     with pytest.raises(ValueError, match="actions"):
         LevinPlanner(UniformPrior(3)).search(cube(), torch.tensor([1]))
+    with pytest.raises(ValueError, match="max_nodes: 1000000000000 would need"):
+        LevinPlanner(UniformPrior(4), 10**12)
+    with pytest.raises(ValueError, match="heuristic: a function"):
+        AStarPlanner("manhattan")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="value"):
         LevinPlanner(UniformPrior(9), heuristic=lambda state: state.double() * math.nan).search(
             cube(), torch.tensor([5])
         )
+
+
+def test_heuristics_of_other_worlds_are_refused() -> None:
+    small, large, levels = sliding_tiles(shape=(3, 3)), sliding_tiles(shape=(4, 4)), sokoban(["####\n#@.#\n#$ #\n####"])
+    pairs = [(small, large.lower_bound), (large, small.lower_bound), (large, levels.lower_bound)]
+    for world, heuristic in (*pairs, (levels, large.lower_bound), (small, cube().distance)):
+        for planner in (AStarPlanner(heuristic), LevinPlanner(UniformPrior(4), heuristic=heuristic)):
+            with pytest.raises(ValueError, match=r"heuristic: it is that of another world \(state"):
+                planner.search(world, world.reset(2))
+    # Another world with the same states may help.
+    assert AStarPlanner(sliding_tiles(shape=(3, 3)).lower_bound).search(small, small.goal[None]).solved.all()
+
+
+def test_plans_of_no_actions_are_collected() -> None:
+    world = sliding_tiles(shape=(2, 2))
+    start = world.goal[None].repeat(3, 1, 1)
+    for context in (None, "step"):
+        plans = collect(LevinPlanner(UniformPrior(4)), world, state=start, context=context)  # type: ignore[arg-type]
+        assert plans.actions.shape == (3, 0)
+    turned = cube()
+    plans = collect(LevinPlanner(UniformPrior(9)), turned, state=torch.zeros(2, dtype=torch.long), context="plan")
+    assert plans.actions.shape == (2, 0)
+    assert plans.context is not None
+    assert plans.context.equal(turned.observe(torch.zeros(2, dtype=torch.long)))
+
+
+def test_numbers_that_order_nothing_are_refused() -> None:
+    world = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=9).reset(3, torch.Generator().manual_seed(0)))
+    prior = LogLinearPrior(4, len(world.windows.windows))
+    with pytest.raises(ValueError, match="heuristic: numbers of at least 0"):
+        LevinPlanner(prior, heuristic=lambda state: -world.lower_bound(state)).search(world, world.boards)
+    prior.after[:] = math.nan
+    for compile in (True, False):
+        with pytest.raises(ValueError, match=r"prior: .* are NaN"):
+            LevinPlanner(prior, compile=compile).search(world, world.boards)
 
 
 def test_last_actions_count_where_no_pattern_is_known() -> None:

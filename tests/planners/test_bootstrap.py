@@ -59,10 +59,61 @@ def test_an_interrupted_call_goes_on(tmp_path: Path) -> None:
         for action in plan.tolist():
             state, _ = world.step(state, torch.tensor([action]))
         assert world.solved(state).all()
-    with pytest.raises(ValueError, match="another call"):
-        list(bootstrap(world, prior_for(world), world.boards[:10], folder=tmp_path, **how))
+    for others in (world.boards[:10], world.boards.flip(0)):
+        with pytest.raises(ValueError, match="another call"):
+            list(bootstrap(world, prior_for(world), others, folder=tmp_path, **how))
+    rarer = LogLinearPrior(4, len(world.windows.windows), min_count=3)
     with pytest.raises(ValueError, match="its prior is"):
-        list(bootstrap(world, LogLinearPrior(4, 3), world.boards, folder=tmp_path, **how))
+        list(bootstrap(world, rarer, world.boards, folder=tmp_path, **how))
+
+
+def test_fewer_sweeps_of_a_folder_are_those_of_a_call_with_fewer(tmp_path: Path) -> None:
+    world = tiles(40)
+    how: dict[str, Any] = {"max_nodes": 300, "epochs": 2}
+    short, first = prior_for(world), prior_for(world)
+    once = list(bootstrap(world, short, world.boards, sweeps=1, generator=seeded(), **how))
+    list(bootstrap(world, prior_for(world), world.boards, sweeps=2, generator=seeded(), folder=tmp_path, **how))
+    again = list(bootstrap(world, first, world.boards, sweeps=1, folder=tmp_path, **how))
+    assert [sweep.solutions for sweep in again] == [sweep.solutions for sweep in once]
+    assert first.weights.equal(short.weights)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"asked": {}, "sweeps": [], "generator": []}', '{"sweeps": [3]}'])
+def test_damaged_folders_are_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "sweeps.json").write_text(content)
+    world = tiles(2)
+    for read in (
+        lambda: read_solutions(tmp_path),
+        lambda: list(bootstrap(world, prior_for(world), world.boards, folder=tmp_path)),
+    ):
+        with pytest.raises(ValueError, match=r"sweeps\.json: (damaged|not JSON)"):
+            read()
+    (tmp_path / "solutions-1.safetensors").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"solutions-1\.safetensors: damaged"):
+        read_solutions(tmp_path, 1)
+
+
+def test_problems_that_are_solved_at_the_start_teach_nothing() -> None:
+    world, prior = tiles(4), prior_for(tiles(4))
+    state = torch.cat([world.goal[None], world.boards])
+    sweeps = list(bootstrap(world, prior, state, max_nodes=1, first=1, sweeps=2, generator=seeded()))
+    assert [(sweep.solutions, sweep.actions) for sweep in sweeps] == [(1, 0), (1, 0)]
+    assert not prior.after.any()
+
+
+def test_what_cannot_be_learned_is_refused_before_the_first_search() -> None:
+    world = tiles(4)
+
+    def unused(state: torch.Tensor) -> torch.Tensor:
+        raise AssertionError
+
+    for prior, settings, message in (
+        (prior_for(world), {"epoch": 2}, "epoch: not a setting"),
+        (LogLinearPrior(4, 3), {}, "3 patterns"),
+        (LogLinearPrior(3, 3), {}, "prior has 3 actions"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            next(bootstrap(world, prior, world.boards, teacher=AStarPlanner(unused), **settings))
 
 
 def test_the_budget_and_the_problems_grow() -> None:
@@ -101,8 +152,11 @@ def test_a_teacher_and_a_heuristic_help() -> None:
 
 
 def test_symmetries_of_solutions_are_solutions() -> None:
-    for world in (tiles(), sokoban(LEVELS)):
-        state = world.boards[:30]
+    corner, side = ([[1, 2, 3], [4, 5, 6], [7, 8, 0]], [[1, 0, 2], [3, 4, 5], [6, 7, 8]])
+    others = [sliding_tiles(goal=goal, scramble=30) for goal in (corner, side)]
+    assert [world.symmetries() for world in others] == [2, 1]  # a blank beside the diagonal would go elsewhere
+    for world in (tiles(), *others, sokoban(LEVELS)):
+        state = world.reset(30, seeded()) if world.boards is None else world.boards[:30]
         found = AStarPlanner(world.lower_bound, 5.0, 3000).search(world, state)
         assert found.solved.sum() > 5
         kept = found.solved

@@ -142,6 +142,12 @@ def test_wrong_arguments_are_refused() -> None:
         ({"boards": torch.zeros(2, 2, 2, dtype=torch.long)}, r"boards\[0\]: each of 0 to 3 once"),
         ({"shape": (2, 2), "goal": torch.arange(4)}, "goal: shape"),
         ({"shape": (1, 1)}, "2 to 256 cells"),
+        ({"shape": 3}, "shape: height and width, integers"),
+        ({"shape": (3.0, 3)}, "shape: height and width, integers"),
+        ({"boards": ["1 0 2 3"]}, "boards: a file or boards"),
+        ({"boards": "0 1 2 3\n", "shape": (10**5, 10**5)}, "at most 256 cells"),
+        ({"boards": "0 1 2 3\n", "shape": (-2, -2)}, "shape: height and width"),
+        ({"boards": [[*range(1, 16), 0]], "shape": (4, 4)}, r"cannot be reached.*without goal="),
         ({"shape": (2, 2), "observation": "picture"}, "observation"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -171,3 +177,16 @@ def test_boards_of_all_sizes_have_patterns(shape: tuple[int, int]) -> None:
     assert int(codes.max()) < world.windows.num_codes < 2**31
     large = max(height * width for _, _, height, width in world.windows.windows)
     assert large == (4 if shape in ((2, 2), (6, 6)) else 2)
+    single = [window for window in world.windows.windows if window[2:] == (1, 1)]
+    assert len(single) == (2 * shape[0] - 1) * (2 * shape[1] - 1)
+
+
+def test_a_shape_may_be_a_list() -> None:
+    boards = torch.arange(6).view(1, 6)
+    assert sliding_tiles(boards, shape=[2, 3]).goal.equal(sliding_tiles(boards, shape=(2, 3)).goal)  # type: ignore[arg-type]
+
+
+def test_no_boards_are_a_batch() -> None:
+    for observation in ("patterns", "board"):
+        world = sliding_tiles(shape=(2, 2), observation=observation)  # type: ignore[arg-type]
+        assert len(world.observe(world.reset(0))) == len(world.lower_bound(world.reset(0))) == 0

@@ -220,6 +220,7 @@ def test_usual_files_are_read() -> None:
         (b"", r"there is no level"),
         (b"; 0\n; 1\n", r"there is no level"),
         (b"####\n\xff\n", r"line 2: UTF-8 is expected, not byte 0xff"),
+        (b"Title\n7#\n#@-$-.#\n7#\n", r"line 2: rows of repeated symbols, such as '7#', are not understood"),
     ],
 )
 def test_wrong_files_are_refused_in_one_line(tmp_path: Path, content: bytes, message: str) -> None:
@@ -229,6 +230,12 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path, content: bytes, mes
             sokoban(tmp_path / name)
         assert name in str(error.value)
         assert "\n" not in str(error.value)
+
+
+def test_a_mark_of_the_byte_order_is_no_title(tmp_path: Path) -> None:
+    (tmp_path / "levels.txt").write_text(EASY, encoding="utf-8-sig")
+    for levels in (tmp_path / "levels.txt", (tmp_path / "levels.txt").read_text(encoding="utf-8")):
+        assert read_sokoban(levels).shape == (1, 3, 7)
 
 
 def test_broken_packing_is_refused(tmp_path: Path) -> None:
@@ -245,10 +252,35 @@ def test_wrong_arguments_are_refused(world: SokobanWorld) -> None:
         sokoban(torch.zeros(1, 3, 3, dtype=torch.uint8))
     with pytest.raises(ValueError, match=r"levels.*out of range"):
         sokoban(torch.full((1, 3, 3), 7))
-    with pytest.raises(ValueError, match="state: uint8"):
-        world.rollout(world.boards[:1].long(), torch.zeros(1, 1, 1, dtype=torch.long))
-    with pytest.raises(ValueError, match=r"state\[0\]: a board with one player"):
-        world.rollout(torch.zeros(1, 10, 10, dtype=torch.uint8), torch.zeros(1, 1, 1, dtype=torch.long))
+    for levels in (None, [Path("levels.txt")], [[[1, 2], [1]]], EASY.encode()):
+        with pytest.raises(ValueError, match="levels: a file or boards of one size"):
+            sokoban(levels)
+    for empty in ("", [], ["", ""]):
+        with pytest.raises(ValueError, match="there is no level"):
+            sokoban(empty)
+    for texts, found in ((["", EASY], 1), ([EASY + "\n" + EASY], 2)):
+        with pytest.raises(ValueError, match=f"one in each of {len(texts)} texts is expected, not {found}"):
+            sokoban(texts)
+    for window in ((0, 0, 0, 1), (0, 0, -1, 1), (0, 0, 1), (0.5, 0, 1, 1), (10**6, 0, 1, 1)):
+        with pytest.raises(ValueError, match=r"windows\[1\]: integers"):
+            sokoban([EASY], windows=[(0, 0, 1, 1), window])  # type: ignore[list-item]
+
+
+def test_wrong_states_are_refused() -> None:
+    world = sokoban([EASY])
+    unknown, boxes, goals = (world.boards.clone() for _ in range(3))
+    unknown[unknown == 5] = 9
+    boxes[0, 1, 2], goals[0, 1, 2] = 3, 2
+    empty = torch.zeros(1, 3, 7, dtype=torch.uint8)
+    for state, message in (
+        (world.boards.long(), "state: uint8"),
+        (empty, r"state\[0\]: a board with one player"),
+        (unknown, r"state\[0, 1, 1\]: 9 is out of range"),
+        (boxes, r"state\[0\]: .* as many boxes as goals"),
+        (goals, r"state\[0\]: .* as many boxes as goals"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            world.rollout(state, torch.zeros(1, 1, 1, dtype=torch.long))
 
 
 def test_planners_solve_an_easy_level() -> None:

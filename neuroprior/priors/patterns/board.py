@@ -1,7 +1,7 @@
 """A convolutional network on a board, which needs no memory of past actions."""
 
 from collections.abc import Sequence
-from math import prod
+from math import inf, prod
 from typing import Any, Self
 
 import torch
@@ -45,6 +45,7 @@ class BoardNetwork(Prior):
         check_sizes(planes=planes, height=height, width=width, channels=channels, depth=depth)
         super().__init__(num_actions, context_size=prod(board))
         check_memory(4 * 18 * channels * channels * depth, channels=channels, depth=depth)
+        check_memory(4 * num_actions * channels * height * width, channels=channels, board=list(board))
         self.board, self.channels, self.depth = tuple(board), channels, depth
         sizes = [planes] + [channels] * (2 * depth)
         self.kernels = nn.ParameterList([torch.zeros(channels, size, 3, 3) for size in sizes])
@@ -80,7 +81,8 @@ class BoardNetwork(Prior):
 
     def board_logits(self, context: Tensor) -> Tensor:
         """Logits `[M, A]` of boards `[M, C]`."""
-        values = functional.conv2d(context.float().view(-1, *self.board), self.kernels[0], self.biases[0], padding=1)
+        boards = context.float().reshape(len(context), *self.board)
+        values = functional.conv2d(boards, self.kernels[0], self.biases[0], padding=1)
         for at in range(1, len(self.kernels), 2):
             inner = functional.conv2d(values.relu(), self.kernels[at], self.biases[at], padding=1)
             values = values + functional.conv2d(inner.relu(), self.kernels[at + 1], self.biases[at + 1], padding=1)
@@ -104,8 +106,8 @@ class BoardNetwork(Prior):
         epochs, batch_size = settings.get("epochs", 10), settings.get("batch_size", 256)
         check_sizes(epochs=epochs, batch_size=batch_size)
         learning_rate, share = settings.get("learning_rate", 1e-3), settings.get("validation", VALIDATION)
-        if not learning_rate > 0:
-            raise ValueError(f"learning_rate: a number above 0 is expected, not {learning_rate}")
+        if not 0 < learning_rate < inf:
+            raise ValueError(f"learning_rate: a finite number above 0 is expected, not {learning_rate}")
         units = len(plans) if plans.group is None else len(plans.group.unique())
         training, held_out = (plans, None) if share is None or units < 2 else plans.split(share, generator)
         self._begin(generator)

@@ -35,7 +35,7 @@ def hash_table(codes: Array, values: Array) -> tuple[Array, Array]:
 def frequent(parts: list[Array], min_count: int) -> Array:
     """The codes that occur at least `min_count` times in `parts` (integers `[M, F]` each), sorted, int32."""
     size = 2**16
-    codes, counts = np.full(size, -1, dtype=np.int64), np.zeros(size, dtype=np.uint8)
+    codes, counts = np.full(size, -1, dtype=np.int64), np.zeros(size, dtype=np.int32)
     used = 0
     for part in parts:
         for at in range(0, len(part), 4096):
@@ -62,14 +62,13 @@ def _count(codes: Array, counts: Array, part: Array) -> int:
             if codes[at] == -1:
                 codes[at] = part[i, j]
                 new += 1
-            if counts[at] < 255:
-                counts[at] += 1
+            counts[at] += 1
     return new
 
 
 @njit(cache=True, nogil=True)
 def _larger(codes: Array, counts: Array) -> tuple[Array, Array]:
-    more, kept = np.full(2 * len(codes), -1, dtype=np.int64), np.zeros(2 * len(codes), dtype=np.uint8)
+    more, kept = np.full(2 * len(codes), -1, dtype=np.int64), np.zeros(2 * len(codes), dtype=np.int32)
     for i in range(len(codes)):
         if codes[i] != -1:
             at = place(more, codes[i])

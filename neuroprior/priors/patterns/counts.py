@@ -1,5 +1,6 @@
 """Smoothed counts of patterns: their product, or back-off from the rarest pattern to the most common."""
 
+from math import inf
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -28,8 +29,8 @@ class PatternCounts(PatternPrior):
         smoothing: k, or how many counts the marginal probabilities weigh.
 
     Attributes:
-        counts: float32 `[V + 1, A]`, for back-off; the last row is 0.
-        marginal: float32 `[A]`.
+        weights: of a product, see `PatternPrior`; for back-off the counts, float32 `[V + 1, A]`; the last row is 0.
+        marginal: float32 `[A]`: how common each action is; what back-off begins with.
     """
 
     marginal: Tensor
@@ -46,8 +47,8 @@ class PatternCounts(PatternPrior):
         super().__init__(num_actions, num_patterns, use_last=combine == "product", min_count=min_count)
         if combine not in ("product", "backoff"):
             raise ValueError(f'combine: "product" or "backoff" is expected, not {combine!r}')
-        if not smoothing > 0:
-            raise ValueError(f"smoothing: above 0 is expected, not {smoothing}")
+        if not 0 < smoothing < inf:
+            raise ValueError(f"smoothing: a finite number above 0 is expected, not {smoothing}")
         self.combine, self.smoothing = combine, float(smoothing)
         self.register_buffer("marginal", torch.full((num_actions,), 1 / num_actions))
 

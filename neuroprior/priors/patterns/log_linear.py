@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_count, check_memory, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.priors.patterns.pattern_prior import PatternPrior, Steps, compiled_fit
 
@@ -17,7 +17,7 @@ ADAGRAD = 1.0
 class LogLinearPrior(PatternPrior):
     """The probability of an action is proportional to exp of a sum of weights, one of each active pattern.
 
-    It is a product of experts, one a pattern (Orseau, Hutter and Leis, *Levin tree search with context models*, IJCAI
+    It is a product of experts, one a pattern (Orseau, Hutter and Lelis, *Levin tree search with context models*, IJCAI
     2023, have such a policy). The log-loss is convex in the weights; they are learned by Adagrad, one step of a plan
     after the other. A fit that follows another continues from its weights.
 
@@ -51,7 +51,7 @@ class LogLinearPrior(PatternPrior):
                 in proportion to their d / pi before it. Learn by log-loss first.
 
         Raises:
-            ValueError: a setting is out of range, or numba is not installed.
+            ValueError: a setting is out of range, the weights grow beyond all bounds, or numba is not installed.
         """
         check_sizes(epochs=epochs)
         if not learning_rate > 0 or not l2 >= 0:
@@ -76,6 +76,12 @@ class LogLinearPrior(PatternPrior):
                 counts = _levin_weights(losses, plan)
             order = random.permutation(len(action))
             loops.epoch(order, rows, last, action, counts, *tables, squares, learning_rate, l2, True, losses)
+        if not all(np.isfinite(table).all() for table in tables):
+            raise ValueError(
+                f"learning_rate, l2: with {learning_rate} and {l2} weights become infinite; give lower ones"
+            )
+        if not self.use_last:
+            tables[1][:] = tables[1][-1]
         self._take(vocabulary, tables)
         return self
 
@@ -124,8 +130,8 @@ class PatternNetwork(LogLinearPrior):
     ) -> None:
         super().__init__(num_actions, num_patterns, use_last=use_last, min_count=min_count)
         check_sizes(size=size)
-        if depth < 0:
-            raise ValueError(f"depth: at least 0 is expected, not {depth}")
+        check_memory(4 * size * num_actions, size=size)
+        check_count("depth", depth, 4 * size * size)
         self.size, self.depth = size, depth
         self.register_buffer("embeddings", torch.zeros(1, size))
         self.register_buffer("layers", torch.zeros(depth, size, size))

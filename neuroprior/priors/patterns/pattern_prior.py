@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, check_sizes
+from neuroprior._checks import check_range, check_sizes, is_integer
 from neuroprior.plans import Plans, check_patterns
 from neuroprior.priors.prior import Prior
 
@@ -61,13 +61,14 @@ class PatternPrior(Prior):
     Args:
         num_actions: A.
         num_patterns: F.
-        use_last: the last action counts too.
+        use_last: the last action counts too; otherwise only how common each action is.
         min_count: a pattern is learned where it occurs so often in training.
 
     Attributes:
         patterns: int32 `[V]`: the vocabulary, sorted.
         weights: float32 `[V + 1, A]`: what each pattern adds to the logits; the last row, of unknown patterns, is 0.
-        after: float32 `[A + 1, A]`: what each last action adds, and, in the last row, the beginning of a plan.
+        after: float32 `[A + 1, A]`: what each last action adds, and, in the last row, the beginning of a plan; without
+            `use_last` all rows are alike.
 
     Raises:
         ValueError: an argument is out of range.
@@ -117,7 +118,12 @@ class PatternPrior(Prior):
         return torch.where(self.patterns[at] == patterns, at, size)
 
     def scores(self, patterns: Tensor) -> Tensor:
-        """What the active `patterns [M, F]` add to the logits, `[M, A]`."""
+        """What the active `patterns [M, F]` add to the logits, `[M, A]`; ValueError for other shapes, and fractions."""
+        if patterns.dim() != 2 or patterns.shape[1] != self.num_patterns or not is_integer(patterns):
+            raise ValueError(
+                f"context: {self.num_patterns} patterns (integers) of each state are expected, not"
+                f" {str(patterns.dtype).removeprefix('torch.')} of shape {list(patterns.shape)}"
+            )
         return torch.cat(
             [self._scores(self.rows(some)) for some in patterns.split(max(AT_ONCE // patterns.shape[1], 1))]
         )
@@ -126,7 +132,7 @@ class PatternPrior(Prior):
         return self.weights[rows].sum(1)
 
     def _logits(self, scores: Tensor, last: Tensor) -> Tensor:
-        return scores + self.after[last] if self.use_last else scores
+        return scores + self.after[last]
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         if context is None:
@@ -148,7 +154,7 @@ class PatternPrior(Prior):
         return self._logits(scores, last.reshape(-1)).view(num, length, self.num_actions)
 
     def set_tables(self, **tables: Any) -> None:
-        """Take over tables, by name, numpy arrays or tensors; `weights` get a last row of zeros."""
+        """Take over tables, by name, numpy arrays or tensors."""
         for name, values in tables.items():
             self.register_buffer(name, torch.as_tensor(values).to(self.device))
 
@@ -172,6 +178,7 @@ class PatternPrior(Prior):
             and self.after.shape == (actions + 1, actions)
             and bool((self.patterns.diff() > 0).all())
             and not bool(self.weights.isnan().any() | self.after.isnan().any())
+            and (self.use_last or bool((self.after == self.after[-1]).all()))
         )
 
 

@@ -1,7 +1,7 @@
 """What puzzles on a board have in common: a mover that goes up, down, left or right, and a goal."""
 
 from abc import abstractmethod
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -101,6 +101,16 @@ class PuzzleWorld(World):
         height, width = self.shape
         if not isinstance(state, Tensor) or state.dtype != torch.uint8 or tuple(state.shape[1:]) != self.shape:
             raise ValueError(f"state: uint8 of shape [B, {height}, {width}] is expected: boards")
+
+
+def board_tensor(name: str, boards: Any) -> Tensor:
+    """Boards as a tensor; ValueError for what is none."""
+    try:
+        return torch.as_tensor(boards)
+    except (RuntimeError, TypeError, ValueError):
+        raise ValueError(
+            f"{name}: a file or boards of one size are expected, not this {type(boards).__name__}"
+        ) from None
 
 
 def _transformed_actions(number: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 import lzma
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from neuroprior._checks import check_memory
 SYMBOLS = " #.$*@+"
 """The symbols of the codes 0 to 6; `-` and `_` are floor, too."""
 _ALL_SYMBOLS = SYMBOLS + "-_"
+MOST_TILES = 256
+"""Cells of a board of sliding tiles, at most: numbers are one byte."""
 Boards = npt.NDArray[np.uint8]
 
 
@@ -41,6 +44,8 @@ def read_sokoban(path_or_text: str | Path) -> Boards:
     within = False
     for number, line in enumerate(text.split("\n"), 1):
         row = line.rstrip()
+        if row[:1].isdigit() and "#" in row and not row.strip(_ALL_SYMBOLS + "0123456789|()"):
+            raise ValueError(f"{name}, line {number}: rows of repeated symbols, such as {row!r}, are not understood")
         is_row = bool(row) and row.lstrip()[0] in _ALL_SYMBOLS
         if is_row:
             if not within:
@@ -108,13 +113,17 @@ def read_tiles(path: str | Path, shape: tuple[int, int] | None = None) -> Boards
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file holds no puzzle, or a line is none; the message names file and line.
+        ValueError: the file holds no puzzle, or a line is none; the message names file and line. Or the shape is none.
     """
     name, text = _text_of(path)
     lines = [(number, line.split()) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     if not lines:
         raise ValueError(f"{name}: there is no puzzle in it")
+    if shape is not None:
+        shape = board_shape(shape)
     cells = len(lines[0][1]) if shape is None else shape[0] * shape[1]
+    if cells > MOST_TILES:
+        raise ValueError(f"{name}: boards of at most {MOST_TILES} cells are expected, not {cells}")
     side = math.isqrt(cells)
     if shape is None and side * side != cells:
         raise ValueError(f"{name}, line {lines[0][0]}: {cells} numbers are no square board; give shape=(height, width)")
@@ -126,9 +135,14 @@ def read_tiles(path: str | Path, shape: tuple[int, int] | None = None) -> Boards
         if len(board) != cells or -1 in board or len(set(board)) != cells:
             raise ValueError(f"{name}, line {number}: each of 0 to {cells - 1} once is expected, not {_short(words)}")
         boards.append(board)
-    if cells > 256:
-        raise ValueError(f"{name}: boards of at most 256 cells are expected, not {cells}")
     return np.array(boards, dtype=np.uint8).reshape(-1, height, width)
+
+
+def board_shape(shape: Sequence[int]) -> tuple[int, int]:
+    """Height and width; ValueError for what is none."""
+    if not isinstance(shape, Sequence) or len(shape) != 2 or not all(isinstance(n, int) and n > 0 for n in shape):
+        raise ValueError(f"shape: height and width, integers of at least 1, are expected, not {shape!r}")
+    return shape[0], shape[1]
 
 
 def _short(words: list[str]) -> str:
@@ -137,9 +151,9 @@ def _short(words: list[str]) -> str:
 
 
 def _text_of(path_or_text: str | Path) -> tuple[str, str]:
-    """What messages call it, and the text; a string with a line break is the text itself."""
-    if isinstance(path_or_text, str) and "\n" in path_or_text:
-        return "text", path_or_text
+    """What messages call it, and the text; a string with a line break, or without a name, is the text itself."""
+    if isinstance(path_or_text, str) and ("\n" in path_or_text or not path_or_text.strip()):
+        return "text", path_or_text.removeprefix("\ufeff")
     path = Path(path_or_text)
     content = path.read_bytes()
     if path.suffix == ".xz":

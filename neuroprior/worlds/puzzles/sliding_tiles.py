@@ -9,8 +9,8 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, is_integer
 from neuroprior._random import generator_on
-from neuroprior.worlds.puzzles.puzzle import Observation, PuzzleWorld, reflected
-from neuroprior.worlds.puzzles.reading import read_tiles
+from neuroprior.worlds.puzzles.puzzle import Observation, PuzzleWorld, board_tensor, reflected
+from neuroprior.worlds.puzzles.reading import MOST_TILES, board_shape, read_tiles
 from neuroprior.worlds.puzzles.windows import CODES, Window, Windows, windows_within
 
 
@@ -46,7 +46,10 @@ class SlidingTilesWorld(PuzzleWorld):
         if boards is not None:
             wrong = (~_solvable(boards, goal)).nonzero()
             if len(wrong):
-                raise ValueError(f"boards[{int(wrong[0])}]: the goal cannot be reached from this board")
+                raise ValueError(
+                    f"boards[{int(wrong[0])}]: the goal cannot be reached from this board (without goal= it is 0, 1, 2,"
+                    " ... row by row)"
+                )
 
     @property
     def device(self) -> torch.device:
@@ -106,9 +109,8 @@ class SlidingTilesWorld(PuzzleWorld):
 
     def kinds(self, state: Tensor) -> Tensor:
         """1 for the tile that must go furthest up and left, and so on, row by row; 0 lies outside of the board."""
-        return self.tile_kinds()[state.flatten(1).long(), torch.arange(state[0].numel(), device=state.device)].view_as(
-            state
-        )
+        flat = state.flatten(1).long()
+        return self.tile_kinds()[flat, torch.arange(flat.shape[1], device=state.device)].view_as(state)
 
     def tile_kinds(self) -> Tensor:
         """The kind of each tile in each cell, int64 `[tiles, cells]`."""
@@ -119,7 +121,7 @@ class SlidingTilesWorld(PuzzleWorld):
 
     def planes(self, state: Tensor) -> Tensor:
         """One plane for the blank and each tile."""
-        return torch.nn.functional.one_hot(state.long(), state[0].numel()).permute(0, 3, 1, 2).float()
+        return torch.nn.functional.one_hot(state.long(), self.goal.numel()).permute(0, 3, 1, 2).float()
 
     def distances(self) -> Tensor:
         """The rows and columns from each cell to each tile's place, int64 `[tiles, cells]`; 0 for the blank."""
@@ -144,9 +146,9 @@ class SlidingTilesWorld(PuzzleWorld):
         _check_permutations("state", state)
 
     def symmetries(self) -> int:
-        """Two where transposing the board and renaming the tiles leaves the goal as it is; else one."""
-        height, width = self.goal.shape
-        return 2 if height == width and bool((self.transformed(self.goal[None], 1)[0] == self.goal).all()) else 1
+        """Two for square boards whose blank belongs on the diagonal, which can be transposed; else one."""
+        (height, width), blank = self.goal.shape, int(self._places()[0])
+        return 2 if height == width and blank // width == blank % width else 1
 
     def transformed(self, state: Tensor, number: int) -> Tensor:
         if number == 0:
@@ -169,7 +171,8 @@ def tile_windows(height: int, width: int) -> tuple[Window, ...]:
     squares = windows_within(2, 2, 1)
     if len(squares) * _num_kinds(height, width) ** 4 >= CODES // 2:
         squares = ()
-    return *windows_within(1, 1, max(height, width) - 1), *pairs, *squares
+    cells = ((row, column, 1, 1) for row in range(1 - height, height) for column in range(1 - width, width))
+    return *cells, *pairs, *squares
 
 
 def _num_kinds(height: int, width: int) -> int:
@@ -202,12 +205,12 @@ def sliding_tiles(
             range.
     """
     check_count("scramble", scramble)
-    if shape is not None and (len(shape) != 2 or min(shape) < 1):
-        raise ValueError(f"shape: height and width, at least 1, are expected, not {shape}")
+    if shape is not None:
+        shape = board_shape(shape)
     given = None
     if boards is not None:
         is_file = isinstance(boards, str | Path)
-        given = torch.as_tensor(read_tiles(boards, shape) if is_file else boards)
+        given = board_tensor("boards", read_tiles(boards, shape) if is_file else boards)
         if shape is not None and given.dim() == 2 and given.shape[1] == shape[0] * shape[1]:
             given = given.view(-1, *shape)
         if given.dim() != 3 or 0 in given.shape or (shape is not None and given.shape[1:] != shape):
@@ -218,13 +221,13 @@ def sliding_tiles(
         if shape is None:
             raise ValueError("sliding_tiles: give boards, shape or goal")
         goal = torch.arange(shape[0] * shape[1]).view(shape)
-    goal = torch.as_tensor(goal)
+    goal = board_tensor("goal", goal)
     if goal.dim() != 2 or (shape is not None and goal.shape != shape):
         raise ValueError(
             f"goal: shape {'[H, W]' if shape is None else list(shape)} is expected, not {list(goal.shape)}"
         )
-    if not 2 <= goal.numel() <= 256:
-        raise ValueError(f"goal: a board of 2 to 256 cells is expected, not {goal.numel()}")
+    if not 2 <= goal.numel() <= MOST_TILES:
+        raise ValueError(f"goal: a board of 2 to {MOST_TILES} cells is expected, not {goal.numel()}")
     _check_permutations("goal", goal[None])
     if given is not None:
         _check_permutations("boards", given)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_range
 from neuroprior._hashing import row_hashes
-from neuroprior.worlds.puzzles.puzzle import Observation, PuzzleWorld, reflected
+from neuroprior.worlds.puzzles.puzzle import Observation, PuzzleWorld, board_tensor, reflected
 from neuroprior.worlds.puzzles.reading import count_problem, read_sokoban
 from neuroprior.worlds.puzzles.windows import Window, Windows, windows_with_mover, windows_within
 
@@ -148,9 +148,14 @@ class SokobanWorld(PuzzleWorld):
 
     def check_state(self, state: Tensor) -> None:
         super().check_state(state)
-        wrong = ((state >= PLAYER).flatten(1).sum(1) != 1).nonzero()
+        check_range("state", state, PLAYER_ON_GOAL + 1, "codes of cells")
+        of_player, of_box, of_goal = state >= PLAYER, state == BOX, (state == GOAL) | (state == PLAYER_ON_GOAL)
+        players, missing = of_player.flatten(1).sum(1), of_box.flatten(1).sum(1) - of_goal.flatten(1).sum(1)
+        wrong = ((players != 1) | (missing != 0)).nonzero()
         if len(wrong):
-            raise ValueError(f"state[{int(wrong[0])}]: a board with one player is expected")
+            raise ValueError(
+                f"state[{int(wrong[0])}]: a board with one player, and as many boxes as goals, is expected"
+            )
 
     def symmetries(self) -> int:
         """Eight for square boards, else four."""
@@ -178,8 +183,10 @@ def sokoban(
         boards = torch.from_numpy(read_sokoban(levels))
     elif isinstance(levels, list | tuple) and all(isinstance(level, str) for level in levels):
         boards = torch.from_numpy(read_sokoban("\n;\n".join(["", *levels])))
+        if len(boards) != len(levels):
+            raise ValueError(f"levels: one in each of {len(levels)} texts is expected, not {len(boards)} together")
     else:
-        boards = torch.as_tensor(levels)
+        boards = board_tensor("levels", levels)
     return SokobanWorld(boards, windows, observation)
 
 

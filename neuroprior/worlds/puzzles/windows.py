@@ -11,6 +11,9 @@ Window = tuple[int, int, int, int]
 CODES = 2**31
 """Patterns are numbered below this."""
 
+FURTHEST = 256
+"""Rows or columns that windows may reach from the mover, or be high or wide."""
+
 
 def windows_within(height: int, width: int, distance: int) -> tuple[Window, ...]:
     """All windows of a size whose cells are at most `distance` rows and columns from the mover."""
@@ -41,13 +44,22 @@ class Windows:
         offsets: int64 `[F]`.
 
     Raises:
-        ValueError: there are no windows, or they have 2**31 patterns or more together.
+        ValueError: there are no windows, one of them is none, or they have 2**31 patterns or more together.
     """
 
     def __init__(self, windows: Sequence[Window], base: int, outside: int) -> None:
         self.windows, self.base, self.outside = tuple(windows), base, outside
         if not self.windows:
             raise ValueError("windows: at least one is expected")
+        for k, window in enumerate(self.windows):
+            whole = (
+                isinstance(window, Sequence) and len(window) == 4 and all(isinstance(number, int) for number in window)
+            )
+            if not whole or min(window[2:]) < 1 or max(map(abs, window)) > FURTHEST:
+                raise ValueError(
+                    f"windows[{k}]: integers (row, column, height, width) are expected, height and width at least 1 and"
+                    f" none beyond {FURTHEST}, not {window!r}"
+                )
         sizes = [base ** (height * width) for _, _, height, width in self.windows]
         self.num_codes = sum(sizes)
         if self.num_codes >= CODES:

@@ -86,6 +86,20 @@ def test_tiles_with_two_seeds(tmp_path):
     assert {row["prior"] for row in found["pairs"]} == {"bootstrap", "mcts", "a-star"}
 
 
+def test_levels_of_other_sizes_and_of_known_walls(tmp_path):
+    train = level_file(tmp_path / "train.txt")
+    (tmp_path / "test.txt").write_text("#####\n#@$.#\n#####\n\n" + "\n".join(["#" * 12, "#@ $ .######", "#" * 12]))
+    # The walls of the second level are those of a training level, too.
+    for test, problems, own in ((str(tmp_path / "test.txt"), 2, 1), (train, 20, None)):
+        out = tmp_path / f"out-{problems}"
+        arguments = ["--train", train, "--test", test, "--budget", "300", "--sweeps", "1", "--processes", "1"]
+        assert main(["puzzles", *arguments, "--priors", "bootstrap", "board", "--out", str(out)]) == 0
+        found = json.loads((out / "results.json").read_text())
+        assert [row["problems"] for row in found["rows"]] == [problems] * 2
+        assert found["rows"][0]["solved"] == 1
+        assert (found["own_walls"][0]["problems"] if own else found.get("own_walls")) == own
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -1,5 +1,6 @@
 """The log-linear prior: closed forms, its optimum, and what it does with patterns that it does not know."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuroprior import Plans
-from neuroprior.priors import LogLinearPrior, load, save
+from neuroprior.priors import LogLinearPrior, PatternNetwork, load, save
 from neuroprior.priors.patterns import Steps
 
 
@@ -59,8 +60,31 @@ def test_patterns_that_are_rare_or_unknown_weigh_nothing() -> None:
     assert prior.patterns.tolist() == [5, 9]
     assert prior.weights.shape == (3, 2)
     assert not prior.weights[-1].any()
-    assert prior.start(2, torch.tensor([[7], [2**31 - 1]]))[0].equal(torch.zeros(2, 2))
+    assert prior.start(2, torch.tensor([[7], [2**31 - 1]]))[0].equal(prior.after[:2])
     assert LogLinearPrior(2, 1, min_count=1).fit(plans).patterns.tolist() == [5, 7, 9]
+
+
+@pytest.mark.parametrize("make", [LogLinearPrior, PatternNetwork])
+def test_without_last_actions_the_frequencies_of_actions_count(make: type[LogLinearPrior]) -> None:
+    plans = Plans(torch.tensor([[0, 0, 1, 2]] * 40), 3, context=random_plans(40).context)
+    prior = make(3, 2, use_last=False, min_count=10**6)  # no pattern is known
+    prior.fit(plans, generator=seeded(), epochs=200, l2=0.0)
+    assert plans.context is not None
+    for probs in prior(plans.actions, plans.context).softmax(-1).flatten(0, 1).unique(dim=0):
+        assert torch.allclose(probs, torch.tensor([0.5, 0.25, 0.25]), atol=2e-2)
+    # With patterns, too, the expected and the observed counts of actions are equal at the optimum.
+    prior = make(3, 2, use_last=False).fit(plans, generator=seeded(), epochs=200, l2=0.0)
+    means = prior(plans.actions, plans.context).softmax(-1).mean((0, 1))
+    assert torch.allclose(means, torch.tensor([0.5, 0.25, 0.25]), atol=1e-2)
+
+
+@pytest.mark.parametrize("min_count", [255, 256, 400, 401])
+def test_patterns_may_have_to_be_common(min_count: int) -> None:
+    context = torch.stack([torch.full((400, 1), 5), torch.arange(400)[:, None]])  # pattern 5 occurs 400 times
+    context[1, 5] = 6
+    plans = Plans(torch.arange(800).view(2, 400) % 3, 3, context=context)
+    prior = LogLinearPrior(3, 1, min_count=min_count).fit(plans, generator=seeded(), epochs=1)
+    assert prior.patterns.tolist() == ([5] if min_count <= 400 else [])
 
 
 def test_a_second_fit_goes_on_from_the_first() -> None:
@@ -131,6 +155,13 @@ def test_bad_input_is_refused() -> None:
     for settings in ({"loss": "square"}, {"epochs": 0}, {"l2": -1.0}, {"learning_rate": 0.0}, {"steps": 3}):
         with pytest.raises(ValueError, match=next(iter(settings))):
             prior.fit(plans, **settings)
+    for settings in ({"learning_rate": math.inf}, {"learning_rate": 1e30}, {"l2": math.inf}):
+        with pytest.raises(ValueError, match="become infinite"):
+            prior.fit(plans, **settings)
+    assert prior.log_prob(plans).isfinite().all()
+    for wrong in (torch.zeros(1, 2), torch.zeros(1, 3, dtype=torch.int32), torch.zeros(1, 1, 2, dtype=torch.int32)):
+        with pytest.raises(ValueError, match="context: 2 patterns"):
+            prior.start(1, wrong)
     steps = Steps(
         torch.zeros(2, 2, dtype=torch.int32), torch.tensor([0, 4]), torch.tensor([0, 1]), torch.tensor([0, 0])
     )

@@ -1,5 +1,6 @@
 """Counts of patterns: naive Bayes and back-off, computed by hand."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,24 @@ def test_back_off_goes_from_the_commonest_pattern_to_the_rarest() -> None:
     assert float(prior.start(1, torch.tensor([[1, 7]]))[0].softmax(-1)[0, 0]) == pytest.approx(first, abs=1e-6)
 
 
+def test_without_known_patterns_actions_are_as_common_as_they_were() -> None:
+    # Actions 0, 1, 0, 0, 1, 1, 0, 0, 0: with a third of an action each, 6 + 1/3, 3 + 1/3 and 1/3 of 10.
+    plans = Plans(torch.tensor([[0, 1, 0], [0, 1, 1], [0, 0, 0]]), 3, context=torch.arange(9).view(3, 3, 1))
+    marginal = torch.tensor([19.0, 10.0, 1.0]) / 30
+    backoff = PatternCounts(3, 1, combine="backoff").fit(plans)
+    assert plans.context is not None
+    for probs in backoff(plans.actions, plans.context).softmax(-1).flatten(0, 1):
+        assert torch.allclose(probs, marginal, atol=1e-6)
+    # Nine steps hold nothing out. First came 0 three times; after 0 came 1, 0, 1, 0; after 1 came 0 and 1.
+    product = PatternCounts(3, 1).fit(plans)
+    counts = torch.tensor([[2.0, 2.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    logits, state = product.start(1, torch.tensor([[99]]))
+    for last, due in ((3, logits), (0, None), (1, None), (2, None)):
+        got = product.step(torch.tensor([last]), state)[0] if due is None else due
+        want = (counts[last] + marginal) / (counts[last].sum() + 1)
+        assert torch.allclose(got.softmax(-1)[0], want, atol=1e-6)
+
+
 def copied_plans() -> Plans:
     """The action is the first pattern in 3 of 4 steps; the other nine repeat it, so that naive Bayes is too sure."""
     generator = torch.Generator().manual_seed(0)
@@ -73,7 +92,7 @@ def test_saved_and_loaded(combine: str, tmp_path: Path) -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    for settings in ({"combine": "sum"}, {"smoothing": 0.0}, {"min_count": 0}):
+    for settings in ({"combine": "sum"}, {"smoothing": 0.0}, {"smoothing": math.inf}, {"min_count": 0}):
         with pytest.raises(ValueError, match=next(iter(settings))):
             PatternCounts(2, 2, **settings)
     with pytest.raises(ValueError, match="epochs"):

@@ -62,5 +62,12 @@ def test_bad_input_is_refused() -> None:
         BoardNetwork(4, (1, 0, 4))
     with pytest.raises(ValueError, match="size 12"):
         BoardNetwork(4, (3, 2, 2)).fit(boards())
+    with pytest.raises(ValueError, match="memory"):
+        BoardNetwork(4, (1, 10**6, 10**6))
+    with pytest.raises(RuntimeError, match="shape"):  # and not two boards
+        BoardNetwork(4, (1, 4, 4)).start(1, torch.zeros(1, 32))
+    for sizes in ({"depth": -1}, {"depth": 1.5}, {"depth": True}, {"size": 10**11}):
+        with pytest.raises(ValueError, match=next(iter(sizes))):
+            PatternNetwork(2, 2, **sizes)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="learning_rate"):
         PatternNetwork(2, 2).fit(exclusive_or(), learning_rate=0.0)
