@@ -202,7 +202,8 @@ class LevinPlanner(BestFirstPlanner):
     root, share one queue: a node has the lowest that a root before it gives it, which is that of the last one. The cost
     falls at each new root, so that expansions are not bounded by the solution's d / pi. Of each root's search at most c
     nodes cost at most c; so a solution is found after at most r * c expansions, with r roots among the nodes expanded
-    until then and c the highest cost on the way to it. With a heuristic there is no bound.
+    until then and c the highest cost on the way to it. With a heuristic as well, the order is that of PHS* with d and
+    pi counted from the last root, and no bound is known.
 
     The prior's probabilities are not renormalised over legal actions.
 
@@ -273,7 +274,7 @@ class _Trees:
 
     def __init__(self, planner: BestFirstPlanner, world: World, stepper: Stepper, state: Tensor) -> None:
         self.planner, self.world, self.stepper, self.actions = planner, world, stepper, world.num_actions
-        self.lower_bound: Heuristic | None = getattr(world, "lower_bound") if planner.reroot else None  # noqa: B009
+        self.lower_bound: Heuristic | None = getattr(world, "lower_bound", None) if planner.reroot else None
         batch, device = len(state), state.device
         self.rows = torch.arange(batch, device=device)
         self.size = torch.zeros(batch, dtype=torch.long, device=device)
