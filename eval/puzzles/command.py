@@ -19,6 +19,7 @@ from eval.puzzles.contest import (
     BOOTSTRAP,
     LEARNED,
     PLANNERS,
+    REROOTED,
     SEARCHES,
     Job,
     Problems,
@@ -43,7 +44,7 @@ FILES = {
 }
 """Training and test problems by world."""
 
-PriorName = Literal[BOOTSTRAP, *LEARNED, *PLANNERS, *SEARCHES]  # type: ignore[valid-type]
+PriorName = Literal[BOOTSTRAP, REROOTED, *LEARNED, *PLANNERS, *SEARCHES]  # type: ignore[valid-type]
 
 
 def puzzles(
@@ -74,10 +75,11 @@ def puzzles(
         test: file of test problems; by default those of eval/data.
         num_test: so many of them, the first; all by default.
         budget: expansions for each test problem.
-        priors: bootstrap (the log-linear prior after all sweeps); fitted to its solutions: log-linear, network, product
-            and, for 50 problems and 2,000 expansions at most, as they are slow, backoff, markov, board; as slow, with
-            the bootstrapped prior: frontier, mcts (these planners, not Levin tree search); without any learning:
-            uniform, a-star, weighted-a-star (weight 5), greedy, breadth-first.
+        priors: bootstrap (the log-linear prior after all sweeps); rerooted (the same prior, searched with rerooting);
+            fitted to its solutions: log-linear, network, product and, for 50 problems and 2,000 expansions at most, as
+            they are slow, backoff, markov, board; as slow, with the bootstrapped prior: frontier, mcts (these planners,
+            not Levin tree search); without any learning: uniform, a-star, weighted-a-star (weight 5), greedy,
+            breadth-first.
         guided: search with the heuristic, too (PHS*); by default in tiles alone.
         sweeps: of solving and learning.
         seeds: repeats; each takes the training problems in another order.

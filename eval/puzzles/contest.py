@@ -39,6 +39,9 @@ from neuroprior.worlds.puzzles.sokoban import WALL
 BOOTSTRAP = "bootstrap"
 """The log-linear prior that found the solutions, from which all others learn."""
 
+REROOTED = "rerooted"
+"""The bootstrapped prior in a search with rerooting."""
+
 BOARD_CHANNELS, BOARD_DEPTH = 32, 2
 """Of the convolutional network."""
 
@@ -185,7 +188,7 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
         if job.prior in SLOW:
             problems, budget = problems[: SLOW_BUDGET[0]], min(budget, SLOW_BUDGET[1])
         heuristic = test.lower_bound if settings.guided else None
-        planner = LevinPlanner(prior, budget, heuristic=heuristic)
+        planner = LevinPlanner(prior, budget, heuristic=heuristic, reroot=job.prior == REROOTED)
         if job.prior in PLANNERS:
             value = None if heuristic is None else lambda state: -test.lower_bound(state).double()
             length = min(PLAN_LENGTH[settings.world], budget)
@@ -199,7 +202,7 @@ def contest(settings: Settings, folder: Path, job: Job) -> dict[str, Any]:
         raise RuntimeError(f"{job.name}: a plan does not do what the search says")
     bounded = isinstance(planner, LevinPlanner) and planner.heuristic is None
     if bounded and bool((found.expansions.double().log() > found.log_bound + 1e-9).any()):
-        raise RuntimeError(f"{job.name}: more expansions than d / pi")
+        raise RuntimeError(f"{job.name}: more expansions than the bound allows")
     moves = [
         "".join(LETTERS[action] for action in plan[:length]) if solved else None
         for plan, length, solved in zip(found.plan.tolist(), found.lengths.tolist(), found.solved.tolist(), strict=True)
@@ -234,7 +237,7 @@ def _search(planner: Planner, world: PuzzleWorld, state: torch.Tensor, generator
 def _prior(settings: Settings, folder: Path, job: Job, train: Problems) -> Prior:
     """The bootstrapped prior, or another that learns from its solutions."""
     solutions = read_solutions(folder)
-    if job.prior in (BOOTSTRAP, *PLANNERS):
+    if job.prior in (BOOTSTRAP, REROOTED, *PLANNERS):
         return load(folder / f"prior-{settings.sweeps}")
     prior = LEARNED[job.prior](train.world)
     state = _shuffled(train.boards, settings, job.seed)[torch.tensor(list(solutions))]

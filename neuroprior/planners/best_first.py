@@ -29,6 +29,12 @@ FIRST_NODES = 256
 BLOCK = 256
 """Edges in a block of the queue: the minimum of each block is kept, so that few numbers are read to find the least."""
 
+PATH = "edge", "depth", "since", "log_prob", "peak", "least", "gain"
+"""What is known of a path to a node before it is expanded."""
+
+TAKEN = "edge", "depth", "gain"
+"""What of it is written to the results."""
+
 EMPTY = -(2**63)
 """Marks a free place of a hash table."""
 
@@ -45,6 +51,7 @@ class Search(NamedTuple):
         expansions: int64 `[B]`: nodes that were expanded: those whose actions the prior was asked for.
         log_bound: float64 `[B]`: log(d / pi) of the solution, d its nodes (its actions and 1) and pi the probability of
             its actions; inf where there is none. With one node at a time, Levin tree search expands at most d / pi.
+            With rerooting: the logarithm of the bound that holds then, see `LevinPlanner`.
         model_steps: int64 `[B]`: single simulator steps.
     """
 
@@ -86,6 +93,9 @@ class BestFirstPlanner(Planner):
     order: tuple[int, float] = (0, 1.0)
     """For the compiled loop: 0 for d / pi, 1 for depth + weight * heuristic; and the weight."""
 
+    reroot = False
+    """Whether nodes nearer to the goal than all before them on their path are new roots, see `LevinPlanner`."""
+
     def __init__(
         self,
         prior: Steppable | None = None,
@@ -112,7 +122,7 @@ class BestFirstPlanner(Planner):
         """The cost of nodes, `[...]` float64, whose order is that of expansion.
 
         Args:
-            depth: actions from the start, at least 1.
+            depth: actions from the start, with rerooting from the last root; at least 1.
             log_prob: the log-probability of these actions.
             left: what the heuristic says is left; 0 without one.
         """
@@ -142,6 +152,9 @@ class BestFirstPlanner(Planner):
             raise ValueError("world: a deterministic one is expected: a search reaches each state by the same actions")
         if not world.has_goal:
             raise ValueError(f"world: one with goals is expected (World.solved), not {type(world).__name__}")
+        if self.reroot and not hasattr(world, "lower_bound"):
+            kind = type(world).__name__
+            raise ValueError(f"reroot: a world with lower_bound(state), the steps left, is expected, not {kind}")
         prior = UniformPrior(world.num_actions).to(state.device) if self.prior is None else self.prior
         check_in_world(prior, world, state)
         if isinstance(of := getattr(self.heuristic, "__self__", None), World) and of is not world:
@@ -168,7 +181,7 @@ class BestFirstPlanner(Planner):
 
     def _search_compiled(self, module: Any, world: PuzzleWorld, prior: Steppable, state: Tensor) -> Search:
         informed = self.heuristic is not None
-        found = module.search_all(world, prior, state, *self.order, informed, self.max_nodes)
+        found = module.search_all(world, prior, state, *self.order, informed, self.reroot, self.max_nodes)
         lengths = torch.tensor([len(plan) for plan in found.plans], dtype=torch.long)
         plans = [torch.from_numpy(plan) for plan in found.plans]
         padded = torch.nn.utils.rnn.pad_sequence(plans, batch_first=True) if plans else torch.zeros(0, 0)
@@ -192,7 +205,23 @@ class LevinPlanner(BestFirstPlanner):
     the start. With a heuristic h the order is that of PHS*, (d + h) / pi ** (1 + h / d) (Orseau and Lelis,
     *Policy-guided heuristic search with guarantees*, AAAI 2021).
 
-    The prior's probabilities are not renormalised over legal actions. Arguments: see `BestFirstPlanner`.
+    With `reroot` it is the root-LTS of Orseau, Hutter and Lelis (*Exponential speedups by rerooting Levin tree search*,
+    2024) with weights of 1: roots are the start and every node whose `world.lower_bound` is below those of all nodes
+    before it on its path, and each is the start of a Levin tree search of its own. Their costs d / pi, counted from the
+    root, share one queue: a node has the lowest that a root before it gives it, which is that of the last one. The cost
+    falls at each new root, so that expansions are not bounded by the solution's d / pi. Of each root's search at most c
+    nodes cost at most c; so a solution is found after at most r * c expansions, with r roots among the nodes expanded
+    until then and c the highest cost on the way to it. With a heuristic as well, the order is that of PHS* with d and
+    pi counted from the last root, and no bound is known.
+
+    The prior's probabilities are not renormalised over legal actions.
+
+    Args:
+        reroot: whether there are such roots. The world needs `lower_bound(state)`, as `SokobanWorld` has it.
+        prior, max_nodes, heuristic, nodes_at_once, temperature, compile: see `BestFirstPlanner`.
+
+    Raises:
+        ValueError: see `BestFirstPlanner`; and `search` raises it where `reroot` finds no `world.lower_bound`.
     """
 
     def __init__(
@@ -201,12 +230,14 @@ class LevinPlanner(BestFirstPlanner):
         max_nodes: int = 10_000,
         *,
         heuristic: Heuristic | None = None,
+        reroot: bool = False,
         nodes_at_once: int = 1,
         temperature: float = 1.0,
         compile: bool = True,
     ) -> None:
         how: dict[str, Any] = {"nodes_at_once": nodes_at_once, "temperature": temperature, "compile": compile}
         super().__init__(prior, max_nodes, heuristic=heuristic, **how)
+        self.reroot = reroot
 
     def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:
         nodes = depth.double() + 1
@@ -245,11 +276,14 @@ class _Trees:
     """The search trees of B problems, grown together: R of them still, `rows` numbers them among the B.
 
     A node is numbered in the order of expansion, and its edge by action a is node * A + a. Of each node are kept the
-    edge that led to it, its depth, the log-probability and the rewards of its path, its state, and the prior's.
+    edge that led to it, its depth and the rewards of its path, its state, and the prior's; since the last root on its
+    path, which without rerooting is the start, the actions (`since`) and their log-probability; and of all nodes on its
+    path the highest log(d / pi) from the root before them (`peak`) and the lowest `World.lower_bound` (`least`).
     """
 
     def __init__(self, planner: BestFirstPlanner, world: World, stepper: Stepper, state: Tensor) -> None:
         self.planner, self.world, self.stepper, self.actions = planner, world, stepper, world.num_actions
+        self.lower_bound: Heuristic | None = getattr(world, "lower_bound", None) if planner.reroot else None
         batch, device = len(state), state.device
         self.rows = torch.arange(batch, device=device)
         self.size = torch.zeros(batch, dtype=torch.long, device=device)
@@ -267,10 +301,11 @@ class _Trees:
         self.seen = torch.zeros(0, 0, dtype=torch.long)
         self.nodes = {
             "edge": torch.full((batch, self.capacity), -1, device=device),
-            "depth": torch.zeros(batch, self.capacity, dtype=torch.long, device=device),
-            "log_prob": torch.zeros(batch, self.capacity, dtype=torch.float64, device=device),
-            "gain": torch.zeros(batch, self.capacity, dtype=torch.float64, device=device),
-            "left": torch.zeros(batch, self.capacity, dtype=torch.float64, device=device),
+            **{name: torch.zeros(batch, self.capacity, dtype=torch.long, device=device) for name in ("depth", "since")},
+            **{
+                name: torch.zeros(batch, self.capacity, dtype=torch.float64, device=device)
+                for name in ("log_prob", "peak", "least", "gain", "left")
+            },
             "state": state.new_zeros(batch, self.capacity, *state.shape[1:]),
             "hidden": hidden.new_zeros(batch, self.capacity, *hidden.shape[1:]),
             "action_log_prob": torch.zeros(batch, self.capacity, self.actions, dtype=torch.float64, device=device),
@@ -278,7 +313,9 @@ class _Trees:
         self._make_room(batch)
         every = torch.arange(batch, device=device)
         self._insert(every, row_hashes(state))
-        self._add(every, torch.full_like(every, -1), empty, empty.double(), empty.double(), state, logits, hidden)
+        path = {name: self.nodes[name][:, 0].clone() for name in PATH}
+        path |= {"edge": torch.full_like(every, -1), "least": torch.full_like(path["peak"], inf)}
+        self._add(every, path, state, logits, hidden)
         self.size[self.result.solved] = 0
         self._drop(self.result.solved | (self.size >= planner.max_nodes) | (self.minima.amin(1) == inf))
 
@@ -299,22 +336,24 @@ class _Trees:
         node = self.nodes
         state, reward = self.world.step(node["state"][tree, parent], action)
         self.steps.index_add_(0, tree, torch.ones_like(tree))
-        depth = node["depth"][tree, parent] + 1
-        log_prob = node["log_prob"][tree, parent] + node["action_log_prob"][tree, parent, action]
-        gain = node["gain"][tree, parent] + reward.double()
+        path = {name: node[name][tree, parent] for name in PATH} | {"edge": edge}
+        path["depth"] += 1
+        path["since"] += 1
+        path["log_prob"] += node["action_log_prob"][tree, parent, action]
+        path["peak"] = path["peak"].maximum((path["since"].double() + 1).log() - path["log_prob"])
+        path["gain"] += reward.double()
         new = self._insert(tree, row_hashes(state))
         solved = new & self.world.solved(state)
-        over = self._finish(tree[solved], edge[solved], depth[solved], log_prob[solved], gain[solved], state[solved])
+        over = self._finish(tree[solved], {name: x[solved] for name, x in path.items()}, state[solved])
         # Of trees that reached their goal, and beyond the budget, nothing more is expanded.
         wanted = new & ~over[tree]
         rank = _rank(tree, wanted)
         wanted &= self.size[tree] + rank < self.planner.max_nodes
-        tree, edge, depth, log_prob, gain = (x[wanted] for x in (tree, edge, depth, log_prob, gain))
-        state, action, parent = state[wanted], action[wanted], parent[wanted]
+        tree, state, action, parent = (x[wanted] for x in (tree, state, action, parent))
         if len(tree):
             hidden = node["hidden"][tree, parent]
             logits, hidden = self.stepper.step_in(self.world, action, hidden, state)
-            self._add(tree, edge, depth, log_prob, gain, state, logits, hidden)
+            self._add(tree, {name: x[wanted] for name, x in path.items()}, state, logits, hidden)
         self._drop(over | (self.size >= self.planner.max_nodes) | (self.minima.amin(1) == inf))
 
     def _popped(self) -> tuple[Tensor, Tensor]:
@@ -332,11 +371,8 @@ class _Trees:
             self.minima[every, block] = blocks[every, block].amin(1)
         return torch.cat(trees), torch.cat(edges)
 
-    def _add(
-        self, tree: Tensor, edge: Tensor, depth: Tensor, log_prob: Tensor, gain: Tensor, state: Tensor,
-        logits: Tensor, hidden: Tensor,
-    ) -> None:  # fmt: skip
-        """Expand new nodes `[M]`: enter them, and their edges into the queue."""
+    def _add(self, tree: Tensor, path: dict[str, Tensor], state: Tensor, logits: Tensor, hidden: Tensor) -> None:
+        """Expand new nodes `[M]` with what is known of their `path`: enter them, and their edges into the queue."""
         at = self.size[tree] + _rank(tree, torch.ones_like(tree, dtype=torch.bool))
         self.size.index_add_(0, tree, torch.ones_like(tree))
         while bool((self.size > self.capacity).any()):
@@ -346,10 +382,17 @@ class _Trees:
             raise ValueError("prior: its logits are NaN")
         legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
         left, of_children = self._left(tree, state, legal)
-        named = {"edge": edge, "depth": depth, "log_prob": log_prob, "gain": gain, "left": left}
-        for name, values in (named | {"state": state, "hidden": hidden, "action_log_prob": own}).items():
+        if self.lower_bound is not None:
+            bound = value_of(self.lower_bound, state).double()
+            rooted = bound < path["least"]
+            path |= {name: path[name].masked_fill(rooted, 0) for name in ("since", "log_prob")}
+            path["least"] = path["least"].minimum(bound)
+            left = bound if self.planner.heuristic is None else left
+        named = {"left": left, "state": state, "hidden": hidden, "action_log_prob": own}
+        for name, values in (path | named).items():
             self.nodes[name][tree, at] = values
-        cost = self.planner.cost((depth + 1)[:, None].expand_as(own), log_prob[:, None] + own, of_children)
+        depth = (path["since"] + 1)[:, None].expand_as(own)
+        cost = self.planner.cost(depth, path["log_prob"][:, None] + own, of_children)
         edges = at[:, None] * self.actions + torch.arange(self.actions, device=at.device)
         self.queue[tree[:, None], edges] = cost.masked_fill(~legal | cost.isnan(), inf)
         block = edges.div(BLOCK, rounding_mode="floor")
@@ -418,17 +461,17 @@ class _Trees:
             more = values.new_zeros(trees, self.capacity - old, *values.shape[2:])
             self.nodes[name] = torch.cat([values, more], 1)
 
-    def _finish(
-        self, tree: Tensor, edge: Tensor, depth: Tensor, log_prob: Tensor, gain: Tensor, state: Tensor
-    ) -> Tensor:
+    def _finish(self, tree: Tensor, path: dict[str, Tensor], state: Tensor) -> Tensor:
         """Take the first solution of each tree; which trees have one, bool `[R]`."""
         over = torch.zeros(len(self.rows), dtype=torch.bool, device=tree.device)
         first = _rank(tree, torch.ones_like(tree, dtype=torch.bool)) == 0
-        tree, edge, depth, log_prob, gain, state = (x[first] for x in (tree, edge, depth, log_prob, gain, state))
+        tree, edge, depth, gain, state = (x[first] for x in (tree, *(path[name] for name in TAKEN), state))
         over[tree] = True
         row, found = self.rows[tree], self.result
         found.solved[row] = True
-        found.log_bound[row] = (depth.double() + 1).log() - log_prob
+        entered = torch.arange(self.capacity, device=tree.device) < self.size[tree][:, None]
+        roots = ((self.nodes["since"][tree] == 0) & entered).sum(1)
+        found.log_bound[row] = roots.double().log() + path["peak"][first]
         self._take(tree, edge, depth, gain, state)
         return over
 
@@ -459,8 +502,7 @@ class _Trees:
             gain = self.nodes["gain"][lost].masked_fill(beyond, -inf)
             left = self.nodes["left"][lost].masked_fill(gain < gain.amax(1, keepdim=True), inf)
             best = left.argmin(1)
-            of = {name: self.nodes[name][lost, best] for name in ("edge", "depth", "gain", "state")}
-            self._take(lost, *of.values())
+            self._take(lost, *(self.nodes[name][lost, best] for name in (*TAKEN, "state")))
         kept = (~over).nonzero()[:, 0]
         self.rows, self.size, self.steps = self.rows[kept], self.size[kept], self.steps[kept]
         self.queue, self.minima, self.seen = self.queue[kept], self.minima[kept], self.seen[kept]

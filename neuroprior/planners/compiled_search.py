@@ -290,6 +290,8 @@ def search(
     distances: Array,
     order: int,
     weight: float,
+    informed: bool,
+    reroot: bool,
     max_nodes: int,
     path: Array,
 ) -> tuple[int, int, float, int]:
@@ -300,18 +302,20 @@ def search(
         start: uint8 `[cells]`.
         mover: the place of the player or the blank.
         goal: uint8 `[cells]`: the solved board of a sliding puzzle; Sokoban needs none.
-        distances: float64 `[G, cells]`, see `_left`; without rows there is no heuristic.
+        distances: float64 `[G, cells]`, see `_left`; without a heuristic and rerooting it needs no rows.
         order: `LEVIN` or `ADDITIVE`.
         weight: of the heuristic where the order is additive; infinity: the heuristic alone.
+        informed: whether the order has the heuristic.
+        reroot: whether a node with a heuristic below those of all before it on its path is a new root.
         max_nodes: expansions at most.
         path: uint8 `[R]`: gets the actions, the first R of them.
 
     Returns:
         The expansions, the length of the solution or, where there is none, of the path to the node with the least
-        heuristic (the first such), the solution's log(d / pi) (infinite without one), and the steps that were taken.
+        heuristic (the first such), the solution's `Search.log_bound` (infinite without one), and the steps that were
+        taken.
     """
     num, high, actions = len(start), len(start) // board.width, ACTIONS
-    informed = len(distances) > 0
     best = np.zeros(2 ** len(distances) if board.puzzle == SOKOBAN and len(distances) <= MATCHED else 1)
     patterned = order == LEVIN and (len(tables.codes) > 2 or np.any(tables.after != 0))  # else all are alike
     across = board.width + 2 * board.radius
@@ -329,6 +333,7 @@ def search(
     )
     came, depths = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int32)
     log_probs, own = np.empty(room, dtype=np.float64), np.empty((room, actions), dtype=np.float64)
+    sinces, peaks, leasts = np.empty(room, dtype=np.int32), np.empty(room), np.empty(room)  # see `best_first._Trees`
     places = 1
     while places < 2 * room:
         places *= 2
@@ -346,6 +351,7 @@ def search(
     code ^= board.keys[kinds, mover]
     wrongs = np.empty(room, dtype=np.int32)
     edge, depth, log_prob, nodes, steps = -1, 0, 0.0, 0, 0
+    since, peak, lowest, roots = 0, 0.0, np.inf, 0
     nearest, least = 0, np.inf
     while True:
         if depth > 0 or nodes > 0:
@@ -368,6 +374,8 @@ def search(
                 for place in (before, mover):
                     wrong += int(cells[place] != goal[place]) - int(boards[parent, place] != goal[place])
             depth, log_prob = depths[parent] + 1, log_probs[parent] + own[parent, action]
+            since, lowest = sinces[parent] + 1, leasts[parent]
+            peak = max(peaks[parent], np.log(since + 1.0) - log_prob)
         at = (code * np.uint64(MIXER) >> np.uint64(20)) & mask
         known = False
         while seen[at] >= 0:
@@ -384,16 +392,20 @@ def search(
         if known:
             continue
         if wrong == 0:
-            return nodes, _path(came, edge, depth, path), np.log(depth + 1.0) - log_prob, steps
+            return nodes, _path(came, edge, depth, path), np.log(max(roots, 1)) + peak, steps
         node = nodes
         nodes += 1
         seen[at] = node
         boards[node], movers[node], hashes[node], wrongs[node] = cells, mover, code, wrong
-        came[node], depths[node], log_probs[node] = edge, depth, log_prob
-        if informed:
+        left = 0.0
+        if informed or reroot:
             left = _left(board, cells, distances, best)
             if left < least:
                 nearest, least = node, left
+        if reroot and left < lowest:
+            since, log_prob, lowest, roots = 0, 0.0, left, roots + 1
+        came[node], depths[node], log_probs[node] = edge, depth, log_prob
+        sinces[node], peaks[node], leasts[node] = since, peak, lowest
         if patterned:
             _patterns(board, cells, mover, padded, rows, codes)
             last = edge % actions if edge >= 0 else actions
@@ -410,7 +422,7 @@ def search(
                 steps += 1
                 left = _left(board, child, distances, best)
             if order == LEVIN:
-                d = depth + 2.0
+                d = since + 2.0
                 cost = np.log(d + left) - (1 + left / d) * (log_prob + own[node, action])
             elif weight == np.inf:
                 cost = left
@@ -492,7 +504,14 @@ class Found(NamedTuple):
 
 
 def search_all(
-    world: PuzzleWorld, prior: Any, state: Tensor, order: int, weight: float, informed: bool, max_nodes: int
+    world: PuzzleWorld,
+    prior: Any,
+    state: Tensor,
+    order: int,
+    weight: float,
+    informed: bool,
+    reroot: bool,
+    max_nodes: int,
 ) -> Found:
     """Search from each of `state [B, H, W]`; the cores share the problems."""
     board, tables = compiled_board(world), compiled_tables(prior)
@@ -510,11 +529,13 @@ def search_all(
 
     def one(number: int) -> None:
         path, far = np.zeros(LONGEST, np.uint8), uninformed
-        if informed:
+        if informed or reroot:
             far = goal_distances(cells[number], board.width) if distances is None else distances
         start = np.ascontiguousarray(cells[number]), int(movers[number])
         while True:
-            nodes, length, bound, taken = search(board, tables, *start, goal, far, order, weight, max_nodes, path)
+            nodes, length, bound, taken = search(
+                board, tables, *start, goal, far, order, weight, informed, reroot, max_nodes, path
+            )
             if length <= len(path):
                 break
             path = np.zeros(length, np.uint8)

@@ -3,6 +3,7 @@
 import heapq
 import math
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import pytest
@@ -33,6 +34,10 @@ class Goal(TabularWorld):
     def solved(self, state: Tensor) -> Tensor:
         return state == self.num_states - 1
 
+    def lower_bound(self, state: Tensor) -> Tensor:
+        """Not a bound at all; a search for new minima on a path does not know."""
+        return state * 5 % 13
+
 
 def random_table(seed: int, states: int = 200) -> Goal:
     """Three actions, of which the first is always legal."""
@@ -52,40 +57,51 @@ def levin(depth: int, log_prob: float, left: float) -> float:
 
 
 def plain(
-    world: World, prior: Prior, start: Tensor, budget: int, cost: Callable[..., float], heuristic: Any
+    world: Any, prior: Prior, start: Tensor, budget: int, cost: Callable[..., float], heuristic: Any, reroot: bool
 ) -> tuple[int, list[int] | None, float]:
-    """Expansions, the plan that reaches the goal (None: none does) and its log(d / pi)."""
+    """Expansions, the plan that reaches the goal (None: none does) and its bound.
+
+    Of each root on a path its nodes hold the actions since then and their log-probability: the lowest cost counts, with
+    a heuristic that from the last root. The bound is the highest d / pi on the way times the number of roots.
+    """
     if bool(world.solved(start[None])[0]):
         return 0, [], 0.0
-    seen, queue, nodes = {int(start)}, list[tuple[float, int]](), list[Any]()
+    seen, queue, nodes, roots = {int(start)}, list[tuple[float, int]](), list[Any](), 0
 
-    def expand(state: Tensor, logits: Tensor, hidden: Tensor, log_prob: float, path: list[int]) -> None:
+    def expand(
+        state: Tensor, logits: Tensor, hidden: Tensor, path: list[int], since: Any, least: float, c: float
+    ) -> None:
+        nonlocal roots
+        bound = float(world.lower_bound(state)) if reroot else 0.0
+        if bound < least:
+            since, least, roots = [*since, (0, 0.0)], bound, roots + 1
         own = torch.log_softmax(logits.double(), -1)[0].tolist()
+        after = [[(d + 1, log_prob + own[action]) for d, log_prob in since] for action in range(world.num_actions)]
         for action in range(world.num_actions):
             if bool(world.legal_actions(state)[0, action]):
                 reached = world.step(state, torch.tensor([action]))[0]
                 left = 0.0 if heuristic is None else float(heuristic(reached))
-                key = cost(len(path) + 1, log_prob + own[action], left)
+                key = min(cost(*one, left) for one in after[action][-1 if heuristic else 0 :])
                 heapq.heappush(queue, (key, len(nodes) * world.num_actions + action))
-        nodes.append((state, hidden, [log_prob + one for one in own], path))
+        nodes.append((state, hidden, path, after, least, c))
 
-    expand(start[None], *prior.start(1), 0.0, [])
+    expand(start[None], *prior.start(1), [], [], math.inf, 0.0)
     while queue and len(nodes) < budget:
         number, action = divmod(heapq.heappop(queue)[1], world.num_actions)
-        state, hidden, log_probs, path = nodes[number]
+        state, hidden, path, after, least, c = nodes[number]
         reached = world.step(state, torch.tensor([action]))[0]
         if int(reached) in seen:
             continue
         seen.add(int(reached))
-        path = [*path, action]
+        path, c = [*path, action], max(c, min(levin(*one, 0) for one in after[action]))
         if bool(world.solved(reached)[0]):
-            return len(nodes), path, math.log(len(path) + 1) - log_probs[action]
-        expand(reached, *prior.step(torch.tensor([action]), hidden), log_probs[action], path)
+            return len(nodes), path, math.log(roots) + c
+        expand(reached, *prior.step(torch.tensor([action]), hidden), path, after[action], least, c)
     return len(nodes), None, math.inf
 
 
 @pytest.mark.parametrize("heuristic", [None, far], ids=["blind", "informed"])
-@pytest.mark.parametrize("kind", ["levin", "additive"])
+@pytest.mark.parametrize("kind", ["levin", "rerooted", "additive"])
 def test_searches_are_those_of_a_heap(kind: str, heuristic: Any) -> None:
     prior: Prior = MarkovPrior(3, 2).fit(torch.randint(3, (30, 5), generator=torch.Generator().manual_seed(0)))
     if kind == "additive":
@@ -95,13 +111,13 @@ def test_searches_are_those_of_a_heap(kind: str, heuristic: Any) -> None:
         state = torch.randint(200, (12,), generator=torch.Generator().manual_seed(seed))
         state[0] = 199  # solved already
         for budget in (1, 30, 400):
-            if kind == "levin":
-                planner, cost = LevinPlanner(prior, budget, heuristic=heuristic), levin
-            else:
+            planner: BestFirstPlanner = LevinPlanner(prior, budget, heuristic=heuristic, reroot=kind == "rerooted")
+            cost: Callable[..., float] = levin
+            if kind == "additive":
                 planner, cost = AStarPlanner(heuristic, 2.0, budget), lambda depth, _, left: depth + 2 * left
             found = planner.search(world, state)
             for n, start in enumerate(state):
-                expansions, plan, bound = plain(world, prior, start, budget, cost, heuristic)
+                expansions, plan, bound = plain(world, prior, start, budget, cost, heuristic, planner.reroot)
                 assert int(found.expansions[n]) == expansions
                 assert bool(found.solved[n]) == (plan is not None)
                 assert float(found.log_bound[n]) == pytest.approx(bound)
@@ -126,7 +142,7 @@ def test_priors_whose_states_grow_search_as_others(name: str) -> None:
         check_found(world, state, found)
         assert bool((found.expansions <= at_once * found.log_bound.exp() + 1e-6).all())
         for n, start in enumerate(state if at_once == 1 else ()):
-            expansions, plan, bound = plain(world, prior, start, 120, levin, None)
+            expansions, plan, bound = plain(world, prior, start, 120, levin, None, False)
             assert int(found.expansions[n]) == expansions
             assert float(found.log_bound[n]) == pytest.approx(bound, rel=1e-5)
             if plan is not None:
@@ -153,12 +169,39 @@ def test_no_solution_takes_more_expansions_than_its_bound() -> None:
     for seed in range(5):
         world = random_table(seed)
         state = torch.randint(200, (40,), generator=generator)
-        for at_once in (1, 8):
-            found = LevinPlanner(prior, 300, nodes_at_once=at_once).search(world, state)
+        for at_once, reroot in ((1, False), (8, False), (1, True), (8, True)):
+            found = LevinPlanner(prior, 300, nodes_at_once=at_once, reroot=reroot).search(world, state)
             check_found(world, state, found)
             assert bool((found.expansions <= at_once * found.log_bound.exp() + 1e-6).all())
             solved += int(found.solved.sum())
-    assert solved > 100
+    assert solved > 200
+
+
+class Tree(Goal):
+    """A binary tree whose goal is the last leaf: of the start 2n steps away on paper, and no nearer beside its path."""
+
+    def __init__(self, height: int) -> None:
+        states = torch.arange(2 ** (height + 1) - 1)
+        inner = states < 2**height - 1
+        children = torch.where(inner[:, None], 2 * states[:, None] + torch.tensor([1, 2]), states[:, None])
+        super().__init__(children, torch.zeros(len(states)))
+        self.bound = torch.full_like(states, height)
+        levels = torch.arange(height + 1)
+        self.bound[2 ** (levels + 1) - 2] = height - levels
+
+    def lower_bound(self, state: Tensor) -> Tensor:
+        return self.bound[state]
+
+
+def test_rerooting_needs_as_many_expansions_as_there_are_siblings_on_the_way() -> None:
+    for height in (1, 4, 8):
+        world, start = Tree(height), torch.tensor([0])
+        blind = LevinPlanner(UniformPrior(2), 10_000).search(world, start)
+        assert blind.expansions.tolist() == [2 ** (height + 1) - 2]
+        found = LevinPlanner(UniformPrior(2), 10_000, reroot=True).search(world, start)
+        assert found.expansions.tolist() == [2 * height]
+        assert found.plan.tolist() == [[1] * height]
+        assert float(found.log_bound) == pytest.approx(math.log(height * 2 / 0.5))
 
 
 def test_a_star_finds_shortest_plans() -> None:
@@ -205,6 +248,8 @@ def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
         for prior in (UniformPrior(4), *(prior.fit(plans, generator=generator) for prior in learned))
     ]
     planners += [LevinPlanner(learned[0], 80, heuristic=world.lower_bound)]
+    planners += [LevinPlanner(prior, 80, reroot=True) for prior in (UniformPrior(4), learned[0])]
+    planners += [LevinPlanner(learned[0], 80, heuristic=world.lower_bound, reroot=True)]
     planners += [AStarPlanner(world.lower_bound, weight, 80) for weight in (1.0, 3.0, math.inf)]
     planners += [AStarPlanner(None, 1.0, 80)]
     solved = 0
@@ -223,8 +268,12 @@ def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
 def test_an_unsolved_problem_gets_the_plan_to_its_best_node() -> None:
     world = sokoban(["########\n#@ $  .#\n########"])
     state = world.boards
-    planner = LevinPlanner(UniformPrior(4), 4, heuristic=world.lower_bound)
-    for planner.compile in (True, False):
+    planners = (
+        LevinPlanner(UniformPrior(4), 4, heuristic=world.lower_bound),
+        LevinPlanner(UniformPrior(4), 5, reroot=True),
+    )
+    for planner, compiled in product(planners, (True, False)):
+        planner.compile = compiled
         found = planner.search(world, state)
         assert not found.solved.any()
         assert found.plan.tolist() == [[3, 3, 3]]  # the box is one step from the goal
@@ -251,6 +300,8 @@ def test_any_prior_searches_any_world_with_goals() -> None:
 def test_bad_input_is_refused() -> None:
     with pytest.raises(ValueError, match="with goals"):
         LevinPlanner(UniformPrior(4)).search(gridworld(3, 3), torch.tensor([0]))
+    with pytest.raises(ValueError, match="lower_bound"):
+        LevinPlanner(UniformPrior(9), reroot=True).search(cube(), torch.tensor([1]))
     with pytest.raises(ValueError, match="max_nodes"):
         LevinPlanner(UniformPrior(4), 0)
     with pytest.raises(ValueError, match="weight"):

@@ -27,7 +27,8 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
     train = level_file(tmp_path / "train.txt")
     out, test = tmp_path / "out", tmp_path / "test.txt"
     test.write_text("########\n#@ $ . #\n########\n########\n\n########\n#.$   @#\n########\n########\n")
-    priors = ("bootstrap", "log-linear", "markov", "backoff", "board", "frontier", "mcts", "uniform", "greedy")
+    learned = ("bootstrap", "rerooted", "log-linear", "markov", "backoff", "board", "frontier", "mcts")
+    priors = (*learned, "uniform", "greedy")
     arguments = [
         *("puzzles", "--train", train, "--num-train", "20", "--test", str(test), "--budget", "500", "--sweeps", "2"),
         *("--priors", *priors, "--processes", "1", "--out", str(out)),
@@ -41,7 +42,7 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
     assert all(row["seconds_per_problem"] > 0 and row["median_expansions"] >= 1 for row in rows.values())
     boards = sokoban(test).boards
     lines = [json.loads(line) for line in (out / "solutions.jsonl").read_text().splitlines()]
-    assert len(lines) == 9 * 2
+    assert len(lines) == 10 * 2
     world = sokoban(test)
     for line in lines:
         state = boards[line["problem"]][None]
