@@ -163,6 +163,7 @@ def test_actions_are_counted_by_plan():
         ["0", 2, 1, 6.0],
         ["1", 1, 1, 2.0],
     ]
+    assert frame["share"].tolist() == pytest.approx([1 / 2, 1 / 3, 1 / 6])  # of all actions
 
 
 def test_bits_are_shown_as_nats_and_perplexities_too(made):
