@@ -268,7 +268,7 @@ class _Sheet:
                 wrong = next(i for i, row in enumerate(rows) if len(row) != self.width)
                 like = "header" if self.has_header else "first row"
                 above = wrong == 1 and begins
-                hint = "; if its header is further down, give names that it has (--columns.action), or remove what is above"
+                hint = "; if its header is further down, give its names (--columns.action), or remove what is above"
                 raise ValueError(
                     f"{self.path}, line {lines[wrong]}: {len(rows[wrong])} cells, where the {like} has {self.width}"
                     f"{hint * above}"
