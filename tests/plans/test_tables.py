@@ -500,3 +500,13 @@ def test_times_of_day_of_starts_and_stops_that_are_rows(tmp_path):
     text = "action,kind,start\na,START,0:10:05\na,STOP,0:10:07.5\n"
     columns = {"action": "action", "event_type": "kind"}
     assert read(tmp_path, text, columns=columns).durations.tolist() == [[2.5]]
+
+
+def test_starts_and_stops_that_are_rows_may_overlap(tmp_path):
+    """Each STOP ends the last START of its own action, whatever else goes on, in any order of rows."""
+    rows = ["a,START,0", "b,START,1", "a,STOP,2", "b,STOP,4", "a,START,5", "a,STOP,5.5"]
+    columns = {"action": "action", "event_type": "kind"}
+    for order in (rows, rows[::-1]):
+        plans = read(tmp_path, "action,kind,start\n" + "\n".join(order) + "\n", columns=columns)
+        assert (listed(plans), plans.durations.tolist()) == ([["a", "b", "a"]], [[2, 3, 0.5]])
+        assert "1 actions begin before the one before them ended" in plans.notes
