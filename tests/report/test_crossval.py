@@ -169,6 +169,21 @@ def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
     assert one.taken.mean == pytest.approx(1 / 3)
 
 
+@pytest.mark.parametrize("at_once", [1, 14, 25])
+def test_plans_are_scored_in_parts_as_a_whole(at_once, monkeypatch):
+    """Bits and forecasts of all parts count, also where a part has no action that counts."""
+    plans = chain()
+    prior, mask = MarkovPrior(3, 1).fit(plans), counted(plans, 2)
+    unit = units(plans, mask)
+    whole = fits.score_arrays(prior, plans, mask, unit)
+    assert whole["calibration"][..., 2].sum() == 3 * int(mask.sum())
+    monkeypatch.setattr(MarkovPrior, "actions_at_once", at_once)
+    assert not mask.any(1).all()
+    parts = fits.score_arrays(prior, plans, mask, unit)
+    for what, values in whole.items():
+        assert parts[what].reshape(-1).tolist() == pytest.approx(values.reshape(-1).tolist(), abs=1e-6)
+
+
 def test_samples_in_contexts_that_follow_from_actions(tmp_path):
     """In a ring of four places; what is written beyond the ends of plans says nothing of where actions lead."""
     actions = torch.randint(3, (24, 7), generator=seeded(0))
