@@ -130,6 +130,22 @@ def test_first_modes_and_transitions_are_smoothed():
     torch.testing.assert_close(prior.transitions, each / each.sum(2, keepdim=True), atol=1e-6, rtol=0)
 
 
+def test_em_takes_all_its_iterations():
+    """Of 24 those of the restarts are the first 8; the prior after 8 goes on to that of 16 and of 24."""
+    modes = switching_source(30, 20)[1]
+    actions = torch.where(torch.rand(30, 20, generator=seeded(1)) < 0.7, modes, 2)
+
+    def fitted(iterations, more=0):
+        how = {"order": 0, "folds": 1, "restarts": 1, "tolerance": 0.0, "smoothing": 0.5}
+        prior = SwitchingPrior(3, 2, **how, max_iterations=iterations).fit(actions, generator=seeded(0))
+        prior.max_iterations = more
+        return prior.fit(actions, warm_start=True).transitions
+
+    whole = fitted(24)
+    torch.testing.assert_close(fitted(8, 16), whole, atol=1e-5, rtol=0)
+    assert (fitted(8, 8) - whole).abs().max() > 1e-3
+
+
 def test_em_never_lowers_the_likelihood():
     actions = switching_source(40, 25)[0]
     totals = []
