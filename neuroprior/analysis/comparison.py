@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from math import inf, log
+from math import inf, log, log2
 
 import torch
 from torch import Tensor
 
 from neuroprior.analysis.statistics import ENOUGH_UNITS, Difference, ratio_difference
 from neuroprior.plans import Plans
+from neuroprior.plans.columns import never_occur
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
 from neuroprior.priors.counts import TooLargeError, chains
@@ -94,6 +95,16 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
     given = plans if prior.takes_context else plans.without_context()
     with torch.no_grad():
         return -prior.action_log_probs(given).double().cpu() / log(2)
+
+
+def never_taken(plans: Plans) -> str:
+    """What to say beside the bits of the uniform prior where some actions never occur; "" where all do."""
+    occur = plans.actions[plans.mask()].unique().cpu().numpy()
+    never = never_occur(occur, plans.num_actions, plans.action_names)
+    if not never or not len(occur):
+        return ""
+    others = f"without them it needs {log2(len(occur)):.4f} bits"
+    return f"uniform counts all {plans.num_actions} actions, of which {never}; {others}"
 
 
 def unit_name(plans: Plans, mask: Tensor | None = None) -> str:

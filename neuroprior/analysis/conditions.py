@@ -186,7 +186,7 @@ def compare_conditions(
         plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in design.conditions.tolist()
     ]
     if design.untestable:
-        verdict = f"Not tested: {design.untestable}."
+        verdict = " ".join(f"{text}." for text in (f"Not tested: {design.untestable}", design.odd) if text)
         return ConditionComparison(design, names, [], None, {}, nan, 0, False, nan, False, verdict)
     kept = (design.block >= 0).to(plans.actions.device)
     plans, of_plan = plans[kept], design.block[design.block >= 0]
@@ -211,7 +211,7 @@ def compare_conditions(
     p_value = float(_shares_reaching(-ranked.log().sum(0))[0])
     smallest = design.smallest_p(drawn)
     conclusive = smallest < LEVEL and len(design.units) >= ENOUGH_UNITS
-    verdict = _verdict(design, names, tests, p_value, smallest, conclusive)
+    verdict = _verdict(design, names, tests, p_value, smallest, conclusive) + f" {design.odd}." * bool(design.odd)
     exact = design.possible <= drawn + 1
     return ConditionComparison(
         design, names, families, prediction, tests, p_value, labelings.shape[1], exact, smallest, conclusive, verdict

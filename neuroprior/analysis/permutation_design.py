@@ -38,6 +38,7 @@ class PermutationDesign:
         unit: int64 `[B]`, ascending: the rank of the unit of each block.
         label: int64 `[B]`: the rank of the condition of each block.
         untestable: why nothing can be tested; empty where it can.
+        odd: which units are under several conditions, where most are under one, and what to do; else empty.
     """
 
     kind: Kind
@@ -49,6 +50,7 @@ class PermutationDesign:
     unit: Tensor
     label: Tensor
     untestable: str
+    odd: str = ""
 
     @staticmethod
     def of(plans: Plans) -> "PermutationDesign":
@@ -76,14 +78,18 @@ class PermutationDesign:
         names = plans.condition_names
         named = [names[c] if names else f"condition {c}" for c in conditions.tolist()]
         reason = _reason(kind, item, under[kept], named)
-        if reason and kind == "within":
-            several = numbers[under.sum(1) > 1].tolist()
-            several = [
-                str(n) if plans.group_names is None or item == "plans" else plans.group_names[n] for n in several
-            ]
-            reason += f" (under several: {listed(several)}; the other {len(numbers) - len(several)} under one)"
+        single = under.sum(1) == 1
+        odd = ""
+        if kind == "within" and single.sum() > (~single).sum() and not _reason("between", item, under[single], named):
+            several = numbers[~single].tolist()
+            groups = item == "groups" and plans.group_names
+            odd = (
+                f"Under several conditions: {listed([groups[n] for n in several] if groups else several)}; the other"
+                f" {int(single.sum())} {item} are under one each. If that is a slip, mend the condition of their plans;"
+                f" if not, leave these {item} out, and the others are compared with one another"
+            )
         return PermutationDesign(
-            kind, item, conditions, numbers[kept], left, block, of_block[:, 0], of_block[:, 1], reason
+            kind, item, conditions, numbers[kept], left, block, of_block[:, 0], of_block[:, 1], reason, odd
         )
 
     @property

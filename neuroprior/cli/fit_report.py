@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from neuroprior._files import versions, write_json
-from neuroprior.analysis.comparison import Score, baselines, score, too_few, unit_name
+from neuroprior.analysis.comparison import Score, baselines, never_taken, score, too_few, unit_name
 from neuroprior.cli.fit_folds import TRAINED, cross_validated
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
 from neuroprior.priors import CombinedPrior, Prior, save
@@ -114,7 +114,9 @@ def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
         "difference": lambda row: "" if row.name == trained else plus_minus(row, "more_than_trained", "more_high", "+"),
     }
     best = f"{few}." if few else "*: best on the validation plans, which chose the settings."
-    caption = f"±: 95 % interval over {unit}. difference: from the last row.\n{best}"
+    caption = "\n".join(
+        filter(None, [f"±: 95 % interval over {unit}. difference: from the last row.", best, never_taken(data.plans)])
+    )
     title = f"Bits per action on {len(data.held_out):,} held-out plans ({actions:,} actions)"
     title += f", {data.folds} folds" if data.folds > 1 else ""
     return printed(title, table(frame, columns, caption, align="llrr"))

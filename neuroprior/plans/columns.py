@@ -239,13 +239,16 @@ def named(values: Any, names: Sequence[str] | None) -> Any:
 
 def never_notes(actions: Integers, num_actions: int) -> list[str]:
     """A note where some of the action numbers below the largest never occur: codes from 1, say, or with gaps."""
-    occur = np.unique(actions)
+    never = never_occur(np.unique(actions), num_actions)
+    return [f"actions are numbers from 0 to {num_actions - 1}, of which {never}"] if never else []
+
+
+def never_occur(occur: Integers, num_actions: int, names: Sequence[str] | None = None) -> str:
+    """Which of the actions are none of those that `occur`, and that they never occur; "" where all do."""
     number = num_actions - len(occur)
-    if not number:
-        return []
-    first = np.setdiff1d(np.arange(min(num_actions, len(occur) + SHOWN)), occur)  # at least `SHOWN`, or all
+    first = np.setdiff1d(np.arange(min(num_actions, len(occur) + SHOWN)), occur).tolist()  # at least `SHOWN`, or all
     verb = "occurs" if number == 1 else "occur"
-    return [f"actions are numbers from 0 to {num_actions - 1}, of which {listed(first, number)} never {verb}"]
+    return f"{listed(named(first, names), number)} never {verb}" if number else ""
 
 
 def listed(values: Sequence[Any] | NDArray[Any], number: int | None = None) -> str:

@@ -37,8 +37,11 @@ EVENT_TYPES = ("START", "STOP", "POINT")
 UNLABELLED = "missing"
 """The action of rows without a label, where these are to count as one."""
 
-CLOCK, DATE = r"\s*(\d+:)?\d+:\d+([.,]\d*)?\s*", r"\s*\d{4}[-/.]\d{1,2}[-/.]\d{1,2}([T ].*)?\s*"
+CLOCK, DATE = r"\s*(?:(\d+):)?(\d+):(\d+(?:[.,]\d*)?)\s*", r"\s*\d{4}[-/.]\d{1,2}[-/.]\d{1,2}([T ].*)?\s*"
 """Times that are no numbers: hours, minutes and seconds, or a date and perhaps a time of day."""
+
+NUMBERS, CLOCKS, DATES, ZONED_DATES = "numbers", "times of day", "dates", "dates with a time zone"
+"""Kinds of times."""
 
 ZONED = r".*[T ].*(Z|[+-]\d{2}:?\d{2})\s*"
 """A date and time with a time zone."""
@@ -105,7 +108,7 @@ class Table:
     ) -> None:
         self.decimal = decimal
         self.frame, self.place, self.of = frame, place, of
-        self.zoned: bool | None = None  # whether the dates that were read have a time zone
+        self.times = ""  # of which kind starts and stops are
         if not hasattr(frame, "columns") or not hasattr(frame, "iloc"):
             raise ValueError(f"{of}: a pandas frame is expected, not {type(frame).__name__}")
         if not isinstance(columns, Columns | Mapping | None):
@@ -180,36 +183,62 @@ class Table:
 
         column = self.frame.iloc[:, position]
         if pd.api.types.is_datetime64_any_dtype(column) or pd.api.types.is_timedelta64_dtype(column):
-            if pd.api.types.is_datetime64_any_dtype(column):
-                self._check_zone(what, column.dt.tz is not None)
+            dates = pd.api.types.is_datetime64_any_dtype(column)
+            self._check_kind(what, (ZONED_DATES if column.dt.tz is not None else DATES) if dates else CLOCKS)
             return _seconds(column)
         if self.decimal == ",":
             column = column.map(lambda value: COMMA.sub(r"\1.\2", value) if isinstance(value, str) else value)
         missing = column.isna() | column.map(lambda value: isinstance(value, str) and is_missing(value))
         values = pd.to_numeric(column.where(~missing), errors="coerce")
         if times and values[~missing].isna().any():
-            texts = column.where(~missing).astype(object)
-            for form, parse in ((CLOCK, pd.to_timedelta), (DATE, _dates)):
-                if texts[~missing].astype(str).str.fullmatch(form).all():
-                    if form == DATE:
-                        self._check_zone(what, bool(texts[~missing].astype(str).str.fullmatch(ZONED).any()))
-                    with contextlib.suppress(ValueError, TypeError):
-                        values = pd.Series(_seconds(parse(texts)))
+            texts = column.where(~missing).astype(object).astype(str)
+            if texts[~missing].str.fullmatch(CLOCK).all():
+                self._check_kind(what, CLOCKS)
+                values = self._clock(what, texts)
+            elif texts[~missing].str.fullmatch(DATE).all():
+                self._check_kind(what, ZONED_DATES if texts[~missing].str.fullmatch(ZONED).any() else DATES)
+                with contextlib.suppress(ValueError, TypeError):
+                    values = pd.Series(_seconds(_dates(texts.where(~missing))))
+        elif times and what != "duration" and not missing.all():
+            self._check_kind(what, NUMBERS)
         found: NDArray[np.float64] = values.to_numpy(np.float64, na_value=np.nan)
         wrong = np.flatnonzero(~np.isfinite(found) & ~missing.to_numpy())
         if wrong.size:
             text, kind = str(column.iloc[wrong[0]]), "a number or a time" if times else "a finite number"
             if times and re.fullmatch(f"{DATE}|{DAY}", text):
                 kind = "a date that can be read with the others; all as year-month-day are expected"
+            elif times and re.fullmatch(CLOCK, text):
+                kind = "a time that can be read with the others; all as h:m:s (below 60) or as numbers are expected"
             elif re.fullmatch(r"\s*-?\d+,\d+\s*", text):
                 kind += " (a decimal point is expected, no comma)"
             raise ValueError(f"{self.place(wrong[0])}: {what} {text!r} is not {kind}")
         return found
 
-    def _check_zone(self, what: str, zoned: bool) -> None:
-        if self.zoned not in (None, zoned):
-            raise ValueError(f"{self.of}: {what}: dates with a time zone in all columns, or in none, are expected")
-        self.zoned = zoned
+    def _check_kind(self, what: str, kind: str) -> None:
+        if what == "duration":  # it is taken from no other time
+            return
+        if self.times not in ("", kind):
+            raise ValueError(f"{self.of}: {what}: {kind} in one column, {self.times} in another; one kind is expected")
+        self.times = kind
+
+    def _clock(self, what: str, texts: Any) -> Any:
+        """Seconds of texts such as 1:02:03.5 and 2:03.5; NaN for what is none, or has 60 seconds.
+
+        Two numbers are minutes and seconds where one of the column has a fraction, or is beyond the hours of a day.
+
+        Raises:
+            ValueError: two numbers may be hours and minutes as well.
+        """
+        parts = texts.str.extract(CLOCK)
+        hours, minutes, seconds = (parts[i].str.replace(",", ".").astype(float) for i in range(3))
+        two = hours.isna() & minutes.notna()
+        if two.any() and not (parts[2][two].str.contains("[.,]") | (minutes[two] > 23)).any():
+            row = int(two.to_numpy().argmax())
+            raise ValueError(
+                f"{self.place(row)}: {what} {texts.iloc[row]!r} may be hours and minutes, or minutes and seconds;"
+                " times as h:m:s are expected"
+            )
+        return (3600 * hours.fillna(0) + 60 * minutes + seconds).where((seconds < 60) & (hours.isna() | (minutes < 60)))
 
     def unused(self) -> dict[int, str]:
         """The names of the columns that hold nothing, by their positions."""
@@ -414,7 +443,7 @@ def _paired(table: Table) -> tuple[Table, list[str]]:
     frame.isetitem(table.at["start"], time[rows])
     frame.isetitem(table.at["event_type"], stop[rows])
     paired = copy(table)
-    paired.frame = frame
+    paired.frame, paired.times = frame, ""
     paired.place = lambda i: table.place(int(rows[i]))
     paired.at = {"stop" if what == "event_type" else what: at for what, at in table.at.items()}
     open_ended = int(np.isnan(stop[rows]).sum())

@@ -19,9 +19,10 @@ from neuroprior.analysis import (
     transitions,
     two_sample_tests,
 )
-from neuroprior.analysis.comparison import too_few, unit_name
+from neuroprior.analysis.comparison import never_taken, too_few, unit_name
 from neuroprior.analysis.statistics import ENOUGH_UNITS
 from neuroprior.plans import Plans, has_patterns, is_per_step
+from neuroprior.plans.columns import never_occur
 from neuroprior.priors import learn_macros
 from neuroprior.report import figures
 from neuroprior.report.conditions import condition_section
@@ -73,6 +74,8 @@ def plans_tables(plans: Plans, frame: pd.DataFrame) -> list[Table]:
     if plans.durations is not None:
         counted |= {"median duration": "median_duration:.3g"}
     caption = f"The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
+    never = never_occur(plans.actions[plans.mask()].unique().cpu().numpy(), plans.num_actions, plans.action_names)
+    caption = f"{caption} {never[:1].upper()}{never[1:]}.".strip() if never else caption
     return [described, table(frame[:LISTED], counted, caption, "Actions")]
 
 
@@ -130,6 +133,8 @@ def score_section(found: Evaluation) -> Part:
         f"{'' if saved else 'On held-out actions. '}±: 95 % intervals over {found.unit}. more bits: the difference from"
         f" {found.reference[1]}, paired."
     )
+    never = never_taken(found.plans) if any(model.name == "uniform" for model in found.models) else ""
+    caption += f" {never[:1].upper()}{never[1:]}." if never else ""
     if learned:
         same = "; ".join(f"{number:,} of {len(found.plans):,} plans for {name}" for name, number in learned.items())
         caption += f" Training data: plans that are the same as plans which the prior has learned from ({same})."

@@ -448,6 +448,29 @@ def test_animals_that_are_not_under_every_condition_are_left_out():
     assert alone.tests == found.tests
 
 
+@pytest.mark.parametrize("slips", [[3], [3, 9]])
+def test_slips_in_conditions_are_named(slips):
+    """A session or two with the wrong condition make a paired design of twelve animals, of which few are left."""
+    conditions = [[0, 0]] * 6 + [[1, 1]] * 6
+    for animal in slips:
+        conditions[animal] = [0, 1]
+    plans = study(12, conditions)
+    found = compare_conditions(replace(plans, group_names=[f"m{n}" for n in range(12)]))
+    names = ", ".join(f"m{animal}" for animal in slips)
+    assert f"Under several conditions: {names}; the other {12 - len(slips)} groups are under one each." in found.verdict
+    assert "mend the condition of their plans" in found.verdict
+    assert f"conditions: {', '.join(map(str, slips))};" in compare_conditions(plans).verdict
+    # What is advised helps: the others can be compared.
+    others = compare_conditions(plans[~torch.isin(plans.group, torch.tensor(slips))], 99)
+    assert (others.design.kind, others.design.odd, others.conclusive) == ("between", "", True)
+
+
+@pytest.mark.parametrize("conditions", [within(8), [*within(8), [0], [1]], [[0, 1], [0], [1]], [[0, 1], *[[0]] * 5]])
+def test_paired_designs_are_no_slips(conditions):
+    """Nor are those of which too few animals are under one condition to be compared with one another."""
+    assert PermutationDesign.of(study(13, conditions)).odd == ""
+
+
 def test_conditions_are_named_by_their_numbers():
     plans = study(10, between(8))
     found = compare_conditions(plans)

@@ -90,7 +90,7 @@ def test_each_recipe(name, tmp_path, capsys):
     assert (tmp_path / "run" / "learning_curve.png").exists() == (name in ("gru", "transformer"))
 
 
-def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch):
+def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch, capsys):
     """The trained prior's row is what the saved prior takes for the plans that the split holds out.
 
     Baselines learn from the training plans and are chosen on the validation plans alone: here the worst is chosen.
@@ -100,7 +100,7 @@ def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch):
     def baselines(training, validation, *_):
         given.extend([training, validation])
         for name, prior, bits in (("markov-1", MarkovPrior(3, 1), 9.0), ("markov-0", MarkovPrior(3, 0), 1.0)):
-            yield Baseline(name, "as given", prior.fit(training), bits)
+            yield Baseline(name, "as given", prior.fit(training) if training.num_actions == 3 else None, bits)
 
     monkeypatch.setattr("neuroprior.cli.fit_report.baselines", baselines)
     write_plans(some_plans(), tmp_path / "plans.npz")
@@ -119,6 +119,11 @@ def test_the_table_is_of_the_held_out_plans(tmp_path, monkeypatch):
     assert all(learned_from(out, learned))
     assert all(learned_from(out, chosen_on))
     assert not all(learned_from(out, held_out))
+    assert "never" not in capsys.readouterr().out
+    write_plans(replace(some_plans(), num_actions=5), tmp_path / "more.npz")
+    assert main([*recipe("markov"), "--data.file", str(tmp_path / "more.npz"), "--out", str(tmp_path / "more")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "uniform counts all 5 actions, of which 3, 4 never occur; without them it needs 1.5850 bits" in printed
     again = MarkovPrior(3, 3).fit(learned)
     assert torch.equal(again.log_prob(held_out.actions), load(out).log_prob(held_out.actions))
 

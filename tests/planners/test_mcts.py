@@ -154,6 +154,19 @@ def test_the_tree_grows_as_puct_says(scores, exploration):
         assert decision.model_steps == len(world.log) == len(taken) + len(set(taken))
 
 
+@pytest.mark.parametrize("any_prefix", [False, True])
+def test_with_prefixes_a_plan_is_worth_its_best_one(any_prefix):
+    """Action 0 first gives 1 and then nothing, action 1 always .5: where plans may stop, most tries are of action 0."""
+    world = TabularWorld(torch.tensor([[1, 3], [2, 2], [2, 2], [3, 3]]), torch.tensor([[0.0, 1.0, 0.0, 0.5]]))
+    taken = []
+    step = world.step
+    world.step = lambda state, action, *draws: taken.extend(state.tolist()) or step(state, action, *draws)
+    decision = MCTSPlanner(UniformPrior(2), 8, 20, any_prefix=any_prefix).plan(world, torch.tensor([0]), seeded(0))
+    assert decision.score.tolist() == [1.0 if any_prefix else 0.5]
+    shares = {first: sum(state in below for state in taken) for first, below in ((0, (1, 2)), (1, (3,)))}
+    assert shares[1 - any_prefix] > 2 * shares[int(any_prefix)]
+
+
 def test_other_states_than_numbers_and_priors_that_see():
     world = cube(scramble=2)
     state = world.reset(10, seeded(0))

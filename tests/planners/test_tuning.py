@@ -127,6 +127,17 @@ def test_best_sampling_takes_prefixes_and_contexts(rewards):
     assert sum(whole.scores.values()) < sum(first.scores.values())
 
 
+@pytest.mark.parametrize("at_once", [1, 30, 2**22])
+def test_all_starts_count_however_they_are_divided(at_once, monkeypatch):
+    """Each start stays where it is, and has a reward of its own: the score of every setting is their mean."""
+    monkeypatch.setattr(SamplingPlanner, "steps_at_once", at_once)
+    rewards = torch.tensor([0.0, 1.0, 5.0, 3.0, 2.0])
+    world = TabularWorld(torch.arange(5)[:, None].expand(5, 2), rewards[None])
+    found = best_sampling(UniformPrior(2), world, torch.arange(5), 2, 5, generator=seeded(0))
+    assert len(found.scores) == 9
+    assert list(found.scores.values()) == pytest.approx([2.2] * 9)
+
+
 def test_choices_are_the_best_of_blocks():
     score = torch.tensor([[0.0, 3, 1, 2, 9, 4, 8]])
     assert choices(score, 4, 2, 0.0).tolist() == [[1, 3]]

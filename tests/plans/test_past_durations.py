@@ -26,6 +26,13 @@ def test_the_features_of_each_step():
     assert found[1, :2].tolist() == [[0, 1, 0, 1], [-4, 0, 0, 1]]  # 0 takes as long as the least that is told apart
 
 
+def test_the_end_takes_no_time():
+    """Whatever stands there as the duration of an end symbol is none of an action."""
+    actions, times = torch.tensor([[0, 1, 2], [1, 0, 2]]), torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    ended = Plans(actions, 3, end=2, durations=times)
+    assert PastDurations.of(ended) == PastDurations.of(Plans(actions[:, :2], 3, durations=times[:, :2]))
+
+
 @pytest.mark.parametrize("number", [1, 3])
 def test_no_duration_is_known_before_its_action_is_chosen(number):
     """The context of step t is the same whatever the actions from t on take."""

@@ -1,5 +1,7 @@
 """Tables of events: from a frame, and from files as laboratories export them."""
 
+import datetime
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -429,3 +431,82 @@ def test_a_line_that_names_the_separator_is_no_row(tmp_path, first):
     (tmp_path / "b.csv").write_text(f"{first}\naction_1;action_2\n1;0\n0\n")
     with pytest.raises(ValueError, match=r"b\.csv, line 4: 1 cells, where the header has 2"):
         read_plans(tmp_path / "b.csv")
+
+
+EVENTS = "session,behaviour,start\n1,walk,0\n1,rest,2\n"
+ABOVE = "the header is line {}; what is above it is not read"
+
+
+@pytest.mark.parametrize(
+    "above",
+    [
+        "# made by a program\n",
+        "# made by a program, version 2\n\n# arena: A\n",
+        "Observation id,x\nDate,2020-01-01\n\n",
+        "session notes,,\ndate,2020-01-01,\n,,\n",  # as a spreadsheet writes them
+        "walk\na,b,c\n",
+    ],
+)
+def test_what_is_above_the_header_is_not_read(tmp_path, above):
+    line = above.count("\n") + 1
+    columns = {"action": "behaviour", "plan": "session"}
+    plans = read(tmp_path, above + EVENTS, columns=columns)
+    assert listed(plans) == [["walk", "rest"]]
+    assert plans.durations[0, 0] == 2
+    assert list(plans.notes)[-1] == ABOVE.format(line)
+    named = read(tmp_path, above + EVENTS.replace("session,behaviour", "plan,action"))
+    assert (listed(named), named.notes[-1]) == ([["walk", "rest"]], ABOVE.format(line))
+    with refuses(f"line {line + 2}", "start 'x'"):
+        read(tmp_path, above + EVENTS.replace(",2", ",x"), columns=columns)
+    semicolons = above + EVENTS.replace(",", ";").replace("2", "2,5")
+    assert read(tmp_path, semicolons, columns=columns).durations[0, 0] == 2.5
+
+
+def test_a_header_that_begins_with_a_hash(tmp_path):
+    plans = read(tmp_path, "#,plan,action\n1,x,a\n2,x,b\n")
+    assert (listed(plans), plans.notes) == ([["a", "b"]], ("columns that are not used: #",))
+    wide = read(tmp_path, "# x\naction_1,action_2\na,b\n")
+    assert listed(wide) == [["a", "b"]]
+
+
+@pytest.mark.parametrize("columns", [{"action": "walk"}, {"action": "rest"}])
+def test_rows_are_no_headers(tmp_path, columns):
+    """A slip in the name of a column that is an action does not make a header of its row."""
+    with refuses("columns.action", "not there", "session, behaviour, start"):
+        read(tmp_path, EVENTS, columns=columns)
+
+
+@pytest.mark.parametrize(
+    ("starts", "seconds"),
+    [
+        (["10:05.5", "10:07"], 1.5),
+        (["0:10:05", "0:10:07"], 2),
+        (["00:10:05,5", "00:10:07"], 1.5),
+        (["59:58", "1:00:01"], 3),
+        (["59.5", "61"], 1.5),
+        (["0:05.5", "0:07"], 1.5),
+    ],
+)
+def test_times_of_day_are_minutes_and_seconds_where_that_is_sure(tmp_path, starts, seconds):
+    assert read(tmp_path, f"plan;action;start\n1;a;{starts[0]}\n1;b;{starts[1]}\n").durations[0, 0] == seconds
+
+
+def test_times_of_python_are_times_of_day():
+    times = [datetime.time(10, 0, 5), datetime.time(10, 0, 7, 500_000)]
+    assert Plans.from_dataframe(pd.DataFrame({"action": ["a", "b"], "start": times})).durations[0, 0] == 2.5
+
+
+def test_times_of_day_of_starts_and_stops_that_are_rows(tmp_path):
+    text = "action,kind,start\na,START,0:10:05\na,STOP,0:10:07.5\n"
+    columns = {"action": "action", "event_type": "kind"}
+    assert read(tmp_path, text, columns=columns).durations.tolist() == [[2.5]]
+
+
+def test_starts_and_stops_that_are_rows_may_overlap(tmp_path):
+    """Each STOP ends the last START of its own action, whatever else goes on, in any order of rows."""
+    rows = ["a,START,0", "b,START,1", "a,STOP,2", "b,STOP,4", "a,START,5", "a,STOP,5.5"]
+    columns = {"action": "action", "event_type": "kind"}
+    for order in (rows, rows[::-1]):
+        plans = read(tmp_path, "action,kind,start\n" + "\n".join(order) + "\n", columns=columns)
+        assert (listed(plans), plans.durations.tolist()) == ([["a", "b", "a"]], [[2, 3, 0.5]])
+        assert "1 actions begin before the one before them ended" in plans.notes

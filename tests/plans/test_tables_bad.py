@@ -64,11 +64,25 @@ def test_nothing_is_noted_of_plain_tables(tmp_path):
         ("plan,action\n1,a\n".encode("utf-16-le"), ["line 1", "UTF-16"]),
         ("<!DOCTYPE html><html><body>Not found</body></html>", ["a web page"]),
         ('action,duration\na,"1,5"\n', ["line 2", "'1,5'", "a decimal point"]),
+        ("action,start\na,10:05\nb,10:06\n", ["line 2", "'10:05'", "hours and minutes, or minutes and seconds"]),
+        ("action,start\na,1:10:05\nb,10:06\n", ["line 3", "'10:06'", "hours and minutes, or minutes and seconds"]),
+        ("action,start\na,59.5\nb,1:00.5\n", ["line 3", "'1:00.5'", "or as numbers"]),
+        ("action,start\na,1:00:75\n", ["line 2", "'1:00:75'", "below 60"]),
+        ("action,start\na,1:75:00\n", ["line 2", "'1:75:00'", "below 60"]),
+        ("action,start,stop\na,5,0:00:06\n", ["stop", "times of day", "numbers in another"]),
+        ("action,start,stop\na,2020-01-01 10:00:00,10:00:05\n", ["stop", "times of day", "dates in another"]),
+        ("notes\nx,y\na,b\n", ["line 2: 2 cells", "further down", "columns.action"]),
     ],
 )
 def test_what_is_refused(text, words, tmp_path):
     with refuses("a.csv", *words):
         read(tmp_path, text)
+
+
+@pytest.mark.parametrize("text", ["# made by x\n0\n1\n", "# made by x, v2\n0,1\n1,0\n", "#action\na\n"])
+def test_comments_are_no_actions(text, tmp_path):
+    with refuses("a.csv, line 1", "begins with #"):
+        read(tmp_path, text, columns=None)
 
 
 @pytest.mark.parametrize(

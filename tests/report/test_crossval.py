@@ -169,6 +169,21 @@ def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
     assert one.taken.mean == pytest.approx(1 / 3)
 
 
+@pytest.mark.parametrize("at_once", [1, 14, 25])
+def test_plans_are_scored_in_parts_as_a_whole(at_once, monkeypatch):
+    """Bits and forecasts of all parts count, also where a part has no action that counts."""
+    plans = chain()
+    prior, mask = MarkovPrior(3, 1).fit(plans), counted(plans, 2)
+    unit = units(plans, mask)
+    whole = fits.score_arrays(prior, plans, mask, unit)
+    assert whole["calibration"][..., 2].sum() == 3 * int(mask.sum())
+    monkeypatch.setattr(MarkovPrior, "actions_at_once", at_once)
+    assert not mask.any(1).all()
+    parts = fits.score_arrays(prior, plans, mask, unit)
+    for what, values in whole.items():
+        assert parts[what].reshape(-1).tolist() == pytest.approx(values.reshape(-1).tolist(), abs=1e-6)
+
+
 def test_samples_in_contexts_that_follow_from_actions(tmp_path):
     """In a ring of four places; what is written beyond the ends of plans says nothing of where actions lead."""
     actions = torch.randint(3, (24, 7), generator=seeded(0))
@@ -276,3 +291,28 @@ def test_a_damaged_result_is_named(tmp_path):
         run.path(job).write_bytes(content)
         with refuses("fold0-counts.npz", "damaged"):
             run.do([job], processes=1)
+
+
+def test_the_reference_is_the_best_model_wherever_it_stands(tmp_path):
+    """Of a chain of order 1 the best is not the last of the table; differences are from it."""
+    found = evaluated(chain(60, 12), tmp_path)
+    costs = [model.cost for model in found.models]
+    assert costs.index(min(costs)) not in (0, len(costs) - 1)
+    assert found.reference[0] is found.models[costs.index(min(costs))] is found.best
+    table = found.table()
+    assert table["more"].tolist() == pytest.approx([cost - min(costs) for cost in costs])
+    assert found.reference[1] == f"{table['model'][costs.index(min(costs))]} (actions)"
+
+
+def test_a_gain_is_over_one_action_less(tmp_path):
+    """At each lag: the bits with all nearer actions known less those with this one as well, on the same actions."""
+    plans, design = chain(60, 12), Design(2, max_steps=STEPS, reach=3)
+    todo = jobs(design, ["counts", "lags"], [ACTIONS])
+    results = cross_validation(tmp_path, plans, None, design).do(todo, processes=1)
+    arrays = results[[job.kind for job in todo].index("lags")]
+    bits, actions = (arrays[f"markov/{what}"].sum(1) for what in ("bits", "actions"))
+    gains = evaluate(plans, None, design, todo, results).gains
+    assert gains["lag"].tolist() == [1, 2, 3]
+    assert gains["bits"].tolist() == pytest.approx(((bits[:-1] - bits[1:]) / actions[1:]).tolist())
+    assert gains["units"].tolist() == [arrays["markov/bits"].shape[1]] * 3
+    assert ((gains["low"] < gains["bits"]) & (gains["bits"] < gains["high"])).all()

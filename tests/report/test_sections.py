@@ -163,6 +163,7 @@ def test_actions_are_counted_by_plan():
         ["0", 2, 1, 6.0],
         ["1", 1, 1, 2.0],
     ]
+    assert frame["share"].tolist() == pytest.approx([1 / 2, 1 / 3, 1 / 6])  # of all actions
 
 
 def test_bits_are_shown_as_nats_and_perplexities_too(made):
@@ -268,3 +269,18 @@ def test_parts_of_a_plan_are_not_plans():
     assert "over parts of the plan" in found.lead
     assert "1 plan is too few for a verdict" in found.lead
     assert "*" not in verdicts(found)
+
+
+@pytest.mark.parametrize("names", [None, ["run", "rest", "hide", "dig", "eat", "drink"]])
+def test_actions_that_never_occur_count_in_uniform_and_the_report_says_so(names):
+    """Bits of uniform are those of all names: the tables say which never occur, and what the others alone take."""
+    actions = torch.randint(2, (30, 8), generator=seeded(0)) * 2 + 1
+    plans = Plans(actions, 6, action_names=names)
+    made = report(plans, **QUICK, sections=["file", "scores"])
+    assert made.frames["plans"].set_index("model")["bits_per_action"]["uniform"] == pytest.approx(math.log2(6))
+    listed = "0, 2, 4, 5 never occur" if names is None else "Run, hide, eat, drink never occur"
+    first, scores = (next(s for s in made.sections if s.title == title) for title in ("Plans", "Held-out scores"))
+    assert listed in first.tables[1].caption
+    assert f"of which {listed[:1].lower()}{listed[1:]}; without them it needs 1.0000 bits" in scores.tables[0].caption
+    whole = report(replace(plans, actions=actions // 2, num_actions=2, action_names=None), **QUICK, sections=["scores"])
+    assert not any("never" in table.caption for section in whole.sections for table in section.tables)

@@ -4,8 +4,8 @@ import csv
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,7 +26,7 @@ from neuroprior.plans.columns import (
 )
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans, is_per_step
-from neuroprior.plans.tables import fields_of
+from neuroprior.plans.tables import Columns, fields_of
 
 ROWS_AT_ONCE = 2**10
 """Rows that are parsed together; a few times faster than blocks that exceed the processor's cache."""
@@ -37,6 +37,12 @@ SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*\s*', re.IGNORECASE)
 
 OUR_WORDS = re.compile(r"plan|action(_1)?|context_1")
 OUR_COLUMNS = re.compile(r"plan|group|condition|start|stop|duration|(action|context)(_\d+)?")
+PARTS = {"plan", "group"}
+"""Columns of which a header with `action` has one."""
+
+MOST_ABOVE = 100
+"""Lines among which the header is looked for."""
+
 OTHER_WORDS = re.compile(r"session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code")
 Row = list[str]
 T = TypeVar("T")
@@ -44,10 +50,9 @@ T = TypeVar("T")
 
 def read_csv(path: Path, num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
     """Plans of a CSV file: see `read_plans`."""
-    sheet = _Sheet(path, "columns" in table)
+    sheet = _Sheet(path, table.get("columns"))
     plans = _read(sheet, num_actions, action_names, **table)
-    note = f"line 1 says that {sheet.delimiter!r} parts the columns, and is no plan"
-    return replace(plans, notes=(*plans.notes, note)) if sheet.top > 1 else plans
+    return replace(plans, notes=(*plans.notes, sheet.note)) if sheet.note else plans
 
 
 def _read(sheet: "_Sheet", num_actions: int | None, action_names: Names | None, **table: Any) -> Plans:
@@ -112,7 +117,7 @@ def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
     blocks = list(sheet.blocks())
     lines = np.concatenate([lines for lines, _ in blocks])
     frame = pd.DataFrame([row for _, rows in blocks for row in rows], columns=sheet.header, dtype=object)
-    usual = "action" in sheet.columns and bool({"plan", "group"} & sheet.columns.keys())
+    usual = "action" in sheet.columns and bool(PARTS & sheet.columns.keys())
     if not table.keys() - {"num_actions", "action_names"} and not usual:
         raise ValueError(
             f"{sheet.path}, line {sheet.top}: both columns 'plan' and 'action', or 'action_1', are expected; or"
@@ -209,26 +214,35 @@ class _Sheet:
         header: the names of the columns as they are.
         width: the number of cells of every row.
         top: the number of the line with which the table begins.
+        note: what is above the table; empty for nothing.
+
+    Args:
+        path: the file.
+        given: the columns that the user names: the first line that has all of them is the header.
 
     Raises:
         ValueError: an empty file, one that is not UTF-8 or not CSV, or a header with a column twice.
     """
 
-    def __init__(self, path: Path, has_header: bool = False) -> None:
+    def __init__(self, path: Path, given: Columns | Mapping[str, Any] | None = None) -> None:
         self.path = path
         with open_text(path) as file:
-            line = file.readline()
-            said = SEPARATOR.fullmatch(line)
-            sample = next((each for each in chain([line], file) if each.strip()), "")
-        self.top = 2 if said else 1
-        self.delimiter = said[1] if said else _delimiter(sample)
+            lines = list(islice(file, MOST_ABOVE)) or [""]
+            sample = next((each for each in chain(lines, file) if each.strip()), "")
+        said, found = SEPARATOR.fullmatch(lines[0]), _find_header(lines, given)
+        self.top, self.note = 1, ""
+        if said:
+            self.top, self.note = 2, f"line 1 says that {said[1]!r} parts the columns, and is no plan"
+        elif found and any(line.strip() for line in lines[: found[0]]):
+            self.top, self.note = found[0] + 1, f"the header is line {found[0] + 1}; what is above it is not read"
+        self.delimiter = said[1] if said else found[1] if found else _delimiter(sample)
         first = next((row for _, rows in self._all() for row in rows), None)
         if first is None:
             raise ValueError(f"{path}: no rows; plans are expected")
         self.width = len(first)
         names = _words(first)
         self.header = [cell.strip() for cell in first]
-        self.has_header = has_header or any(OUR_WORDS.fullmatch(name) for name in names)
+        self.has_header = given is not None or any(OUR_WORDS.fullmatch(name) for name in names)
         if self.has_header:
             known = [name for name in names if OUR_COLUMNS.fullmatch(name)]
             twice = next((name for name in known if known.count(name) > 1), None)
@@ -240,20 +254,27 @@ class _Sheet:
                 " ...); say which column holds the actions (--columns.action), and which says to which plan a row"
                 " belongs (--columns.plan)"
             )
+        elif self.header[0].startswith("#"):
+            raise ValueError(
+                f"{path}, line {self.top}: begins with #; leave a comment out, and the # before names of columns"
+            )
         self.columns = {name: i for i, name in enumerate(names)} if self.has_header else {}
 
     def blocks(self) -> Iterator[tuple[Integers, list[Row]]]:
         """The rows below the header, all of `width` cells, in blocks, with the line on which each ends."""
-        skip = int(self.has_header)
+        skip, begins = int(self.has_header), True
         for lines, rows in self._all():
             if len({len(row) for row in rows} - {self.width}):
                 wrong = next(i for i, row in enumerate(rows) if len(row) != self.width)
                 like = "header" if self.has_header else "first row"
+                above = wrong == 1 and begins
+                hint = "; if its header is further down, give its names (--columns.action), or remove what is above"
                 raise ValueError(
                     f"{self.path}, line {lines[wrong]}: {len(rows[wrong])} cells, where the {like} has {self.width}"
+                    f"{hint * above}"
                 )
             yield lines[skip:], rows[skip:]
-            skip = 0
+            skip, begins = 0, False
 
     def _all(self) -> Iterator[tuple[Integers, list[Row]]]:
         """All rows but blank ones."""
@@ -307,14 +328,45 @@ def _words(row: Row) -> list[str]:
     return [cell.strip().lower() for cell in row]
 
 
-def _delimiter(line: str) -> str:
-    """The delimiter of a file by its first line: the one with which it is a header, else the most frequent one."""
-    rows: dict[str, Any] = {}
+def _parted(line: str) -> dict[str, Row]:
+    """The cells of a line for each delimiter."""
+    rows: dict[str, Row] = {}
     for delimiter in DELIMITERS:
         try:
             rows[delimiter] = next(csv.reader([line], delimiter=delimiter), [])
         except csv.Error:
             rows[delimiter] = []
+    return rows
+
+
+def _find_header(lines: list[str], given: Columns | Mapping[str, Any] | None) -> tuple[int, str] | None:
+    """The number from 0 of the line that names the columns, and its delimiter; None where no line is known to.
+
+    What is above it must begin with a comment or a shorter line, or have another width: else it is a row of the table.
+    """
+    columns = given if isinstance(given, Mapping | None) else asdict(given)
+    given_names = [one if isinstance(one, list | tuple) else [one] for one in (columns or {}).values()]
+    wanted = set(_words([str(name) for name in chain(*given_names) if name is not None]))
+    rows = [_parted(line) for line in lines]
+    for number, parted in enumerate(rows):
+        for delimiter, row in parted.items():
+            words = set(_words(row))
+            is_header = wanted <= words if wanted else "action_1" in words or (words > {"action"} and words & PARTS)
+            if is_header:
+                above = [other[delimiter] for other in rows[:number] if other[delimiter]]
+                unlike = not above or above[0][0].startswith("#") or _width(above[0]) < len(row)
+                return (number, delimiter) if unlike or any(len(other) != len(row) for other in above) else None
+    return None
+
+
+def _width(row: Row) -> int:
+    """The number of cells up to the last one that holds something."""
+    return max((i for i, cell in enumerate(row, 1) if cell.strip()), default=0)
+
+
+def _delimiter(line: str) -> str:
+    """The delimiter of a file by its first line: the one with which it is a header, else the most frequent one."""
+    rows = _parted(line)
     words = {d: sum(bool(OUR_WORDS.fullmatch(name)) for name in _words(row)) for d, row in rows.items()}
     return max(DELIMITERS, key=lambda d: (words[d], len(rows[d])))
 

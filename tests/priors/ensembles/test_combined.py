@@ -24,6 +24,7 @@ from neuroprior import (
     load,
     save,
 )
+from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, seeded
 
@@ -158,6 +159,22 @@ def test_experts_that_add_nothing_are_left_out():
     prior.learn_weights(some_plans(400, seed=5))
     assert list(prior.experts) == [quick]
     assert prior.tried == 6
+
+
+@pytest.mark.parametrize(
+    ("costs", "kept"), [([5, 5, 5], [0, 2]), ([9, 5, 5], [1, 2]), ([5, 5, 9], [0, 2]), ([0, 0, 0], [0, 2])]
+)
+def test_of_the_dearest_that_may_go_the_one_that_is_missed_least_goes(costs, kept):
+    """Losses by hand, in tolerances above the least: without the last expert too much is lost, whatever it costs."""
+
+    class ByHand(HeldOut):
+        def combined(self, kept: list[int]) -> tuple[torch.Tensor, float]:
+            losses = {(0, 1, 2): 0.0, (1, 2): 0.5, (0, 2): 0.1, (0, 1): 2.0}
+            return torch.tensor([float(k) for k in kept]), 1 + self.tolerance * losses.get(tuple(kept), 3.0)
+
+    held_out = ByHand(torch.zeros(1, 2, 3, 1), torch.zeros(1, 2, dtype=torch.long), torch.ones(1, 2).bool(), 3)
+    found, powers = held_out.choose(costs)
+    assert (found, powers.tolist()) == (kept, [float(k) for k in kept])
 
 
 def test_experts_of_different_plans_are_both_kept():

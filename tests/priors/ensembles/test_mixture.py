@@ -18,6 +18,7 @@ from neuroprior import (
     load,
     save,
 )
+from neuroprior.priors.ensembles.mixture import divided
 from neuroprior.priors.ensembles.packing import DIGITS, pack, unpack
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, seeded
@@ -179,3 +180,11 @@ def test_states_side_by_side():
         assert after.shape == before.shape
         assert after.equal(before)
     assert all(a.equal(b[[3, 1]]) for a, b in zip(unpack(packed[[3, 1]], 5), parts, strict=True))
+
+
+@pytest.mark.parametrize(("length", "held_out"), [(1, 100), (10, 100), (80, 62), (200, 25), (500, 20)])
+def test_the_share_held_out_is_a_tenth_of_few_plans_and_a_fiftieth_of_many(length, held_out):
+    """5,000 actions between these; of 1,000 plans of so many actions."""
+    plans = Plans(torch.zeros(1000, length, dtype=torch.uint8), 2)
+    learned, chosen_on = divided(plans, None, seeded(0))
+    assert (len(learned), len(chosen_on)) == (1000 - held_out, held_out)

@@ -104,6 +104,48 @@ def test_em_is_that_of_baum_and_welch():
         np.testing.assert_allclose(one.numpy(), other, atol=1e-6)
 
 
+def test_first_modes_and_transitions_are_smoothed():
+    """One iteration, by expected numbers over all paths: `smoothing` counts in all for the first mode and for each row.
+
+    The rows in a context are those of all contexts in advance, and these stay where they are in advance.
+    """
+    plans, smoothing, stay = some_plans(num=12, length=4, contexts=2), 3.0, 2.0
+    how = {"order": 0, "num_contexts": 2, "smoothing": smoothing, "stay": stay, "restarts": 1}
+    prior = SwitchingPrior(3, 3, **how, max_iterations=1).fit(plans, generator=seeded(0))
+    likelihood, smoothed, _ = enumerated(prior, plans)
+    rows, cells = prior.cells(plans.actions, plans.context)
+    moved = torch.zeros(2, 3, 3, dtype=torch.double)
+    for path in itertools.product(range(3), repeat=4):
+        joint = prior.first[path[0]] / likelihood
+        for t, mode in enumerate(path):
+            joint = joint * prior.log_probs[rows[:, t], mode, plans.actions[:, t].long()].double().exp()
+            joint = joint * (prior.transitions[cells[:, t], path[t - 1], mode] if t else 1)
+        for t in range(1, 4):
+            moved[:, path[t - 1], path[t]].index_add_(0, cells[:, t], joint)
+    first = smoothed[:, 0].sum(0) + smoothing / 3
+    everywhere = moved.sum(0) + stay * torch.eye(3)
+    each = moved + smoothing * everywhere / everywhere.sum(1, keepdim=True)
+    prior.fit(plans, warm_start=True)
+    torch.testing.assert_close(prior.first, first / first.sum(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(prior.transitions, each / each.sum(2, keepdim=True), atol=1e-6, rtol=0)
+
+
+def test_em_takes_all_its_iterations():
+    """Of 24 those of the restarts are the first 8; the prior after 8 goes on to that of 16 and of 24."""
+    modes = switching_source(30, 20)[1]
+    actions = torch.where(torch.rand(30, 20, generator=seeded(1)) < 0.7, modes, 2)
+
+    def fitted(iterations, more=0):
+        how = {"order": 0, "folds": 1, "restarts": 1, "tolerance": 0.0, "smoothing": 0.5}
+        prior = SwitchingPrior(3, 2, **how, max_iterations=iterations).fit(actions, generator=seeded(0))
+        prior.max_iterations = more
+        return prior.fit(actions, warm_start=True).transitions
+
+    whole = fitted(24)
+    torch.testing.assert_close(fitted(8, 16), whole, atol=1e-5, rtol=0)
+    assert (fitted(8, 8) - whole).abs().max() > 1e-3
+
+
 def test_em_never_lowers_the_likelihood():
     actions = switching_source(40, 25)[0]
     totals = []
