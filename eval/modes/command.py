@@ -98,10 +98,11 @@ def modes(
 
 
 def _likelihood_table(frame: pd.DataFrame) -> Table:
-    cells = [f"{row['nats']:.4f} ±{row['high'] - row['nats']:.4f} ({row['stable']})" for _, row in frame.iterrows()]
+    cells = [f"{row['nats']:.4f} ({row['stable']})" for _, row in frame.iterrows()]
+    widest = (frame["high"] - frame["nats"]).max()
     caption = (
-        "±: 95 % intervals over sequences. In brackets: modes that come back, whose posterior correlates by"
-        f" {STABLE} or more with that of a mode of the prior of each fold."
+        f"95 % intervals over sequences: at most ±{widest:.4f}; rows.csv has each. In brackets: modes that come back,"
+        f" whose posterior correlates by {STABLE} or more with that of a mode of the prior of each fold."
     )
     title = "Nats per held-out move, given the node, by number of modes"
     return runs.table_by(frame, {"order": "order"}, "modes", cells, caption, title)
@@ -121,6 +122,6 @@ def _mode_table(rows: pd.DataFrame, whole: pd.DataFrame) -> Table:
 
 
 def _since_table(since: pd.DataFrame) -> Table:
-    cells = [runs.plus_minus(row, "share", 100).replace(" ", "") for _, row in since.iterrows()]
+    cells = [runs.plus_minus(row, "share", 100, digits=0).replace(" ", "") for _, row in since.iterrows()]
     caption = "%, ±: 95 % intervals over sequences. Columns: from so many moves to those of the next."
     return runs.table_by(since, {"mode": "mode"}, "from", cells, caption, "Moves in each mode since the water")
