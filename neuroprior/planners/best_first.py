@@ -2,8 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import lru_cache
-from importlib import import_module
 from math import inf
 from typing import Any, NamedTuple
 
@@ -11,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_memory, check_sizes
+from neuroprior._compiled import compiled
 from neuroprior._hashing import row_hashes
 from neuroprior.planners.planner import Decision, Planner, value_of
 from neuroprior.plans import action_dtype
@@ -176,7 +175,7 @@ class BestFirstPlanner(Planner):
         informed = self.heuristic is not None and self.heuristic != getattr(world, "lower_bound", None)
         if not self.compile or informed or self.nodes_at_once > 1 or self.temperature != 1:
             return None
-        module = _load_compiled() if isinstance(world, PuzzleWorld) else None
+        module = compiled("neuroprior.planners.compiled_search") if isinstance(world, PuzzleWorld) else None
         return module if module is not None and module.can_search(world, prior) else None
 
     def _search_compiled(self, module: Any, world: PuzzleWorld, prior: Steppable, state: Tensor) -> Search:
@@ -586,12 +585,3 @@ def _followed(world: World, state: Tensor, plans: Tensor, lengths: Tensor) -> tu
         state[on], reward = world.step(state[on], plans[on, t].long())
         score[on] += reward.double()
     return state, score
-
-
-@lru_cache(maxsize=1)
-def _load_compiled() -> Any:
-    """The module with the compiled loop; None where numba is not installed, or does not work here."""
-    try:
-        return import_module("neuroprior.planners.compiled_search")
-    except Exception:  # a numba that does not fit numpy may fail in any way
-        return None

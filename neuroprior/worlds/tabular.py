@@ -1,14 +1,13 @@
 """Worlds that are tables: a transition table and any number of reward maps over it, all evaluated in one call."""
 
 from collections.abc import Sequence
-from functools import cache
-from importlib import import_module
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count, check_range, is_integer
+from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
 from neuroprior.worlds.outcomes import Outcomes
 from neuroprior.worlds.world import Rollout, World, check_plans, join_states
@@ -193,7 +192,7 @@ class TabularWorld(World):
         """The module with the compiled loop, where it can roll out `plans [B, P, L]` and is worth it; else None."""
         able = self.outcomes is None and self.reward.dtype in (torch.float32, torch.float64)
         able = able and plans.device.type == "cpu"
-        return _load_compiled() if able and plans.numel() >= self.compile_from else None
+        return compiled("neuroprior.worlds.compiled") if able and plans.numel() >= self.compile_from else None
 
     def _reward_index(self, offset: Tensor, taken: Tensor, outcome: Tensor, after: Tensor) -> Tensor:
         """The indices of the rewards of steps to the cells `after`; `offset` is the reward map * S."""
@@ -248,15 +247,6 @@ class TabularWorld(World):
                 f"state: int64 is expected, not {str(state.dtype).removeprefix('torch.')}; use state.long()"
             )
         check_range("state", state, self.num_maps * self.num_states, "states (reward maps x cells)")
-
-
-@cache
-def _load_compiled() -> Any:
-    """The module with the compiled loop; None where numba is not installed, or does not work here."""
-    try:
-        return import_module("neuroprior.worlds.compiled")
-    except Exception:  # a numba that does not fit numpy may fail in any way
-        return None
 
 
 def _check_shapes(next_state: Tensor, probability: Tensor | None, legal: Tensor | None) -> None:

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import TabularWorld, World, gridworld
-from neuroprior.worlds import Rollout, tabular
+from neuroprior._compiled import compiled
+from neuroprior.worlds import Rollout
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
 
 UP, RIGHT, DOWN, LEFT = range(4)
@@ -181,13 +182,13 @@ def test_a_numba_that_does_not_work_is_left_alone(monkeypatch, error):
 
     monkeypatch.setitem(sys.modules, "numba", Wrong("numba"))
     monkeypatch.delitem(sys.modules, "neuroprior.worlds.compiled", raising=False)
-    tabular._load_compiled.cache_clear()
+    compiled.cache_clear()
     world = random_world(1, "WS")
     world.compile_from = 0
     try:
         assert world.rollout(world.reset(2, seeded(0)), torch.zeros(2, 3, 4).long()).rewards.shape == (2, 3, 4)
     finally:
-        tabular._load_compiled.cache_clear()
+        compiled.cache_clear()
 
 
 def test_rollout_takes_stored_actions():

@@ -10,15 +10,20 @@ the identity; and `likelihood [N, L, K]` is that of each action in each mode, no
 sequence likelihoods are 1.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+
+from neuroprior._compiled import compiled
 
 ROWS = 1024
 """Sequences are cut until about so many chunks are walked through side by side."""
 
 TINY = 1e-300
+
+COMPILE_FROM = 2**16
+"""Elements of `steps` from which the compiled loop is taken: loading it pays for no fewer."""
 
 
 class Smoothed(NamedTuple):
@@ -49,12 +54,25 @@ def predict(initial: Tensor, steps: Tensor, likelihood: Tensor) -> tuple[Tensor,
 
 def smooth(initial: Tensor, steps: Tensor, likelihood: Tensor) -> Smoothed:
     """The modes given whole sequences; see the module for the arguments."""
+    if steps.numel() >= COMPILE_FROM and steps.device.type == "cpu" and steps.dtype == torch.double:
+        module = compiled("neuroprior.priors.switching.compiled_smoothing")
+        if module is not None:
+            return _smooth_compiled(module, initial, steps, likelihood)
     chunks, (num, length) = _cut(steps, likelihood), likelihood.shape[:2]
     _, after, log_likelihood = _forward(initial, chunks, num, length)
     later = _backward(chunks, num, length)
     moved = after[:, :-1, :, None] * steps[:, 1:] * (likelihood[:, 1:] * later[:, 1:])[:, :, None]
     moved = moved / moved.sum((-1, -2), keepdim=True).clamp(min=TINY)
     return Smoothed(log_likelihood, after, _normalised(after * later), moved)
+
+
+def _smooth_compiled(module: Any, initial: Tensor, steps: Tensor, likelihood: Tensor) -> Smoothed:
+    num, length, modes = likelihood.shape
+    after, smoothed = (likelihood.new_empty(likelihood.shape) for _ in range(2))
+    totals, moved = likelihood.new_empty(num, length), steps.new_empty(num, length - 1, modes, modes)
+    given = [values.contiguous().numpy() for values in (initial, steps, likelihood)]
+    module.smooth(*given, TINY, *(values.numpy() for values in (totals, after, smoothed, moved)))
+    return Smoothed(totals.log(), after, smoothed, moved)
 
 
 def most_probable_path(initial: Tensor, steps: Tensor, likelihood: Tensor) -> Tensor:
