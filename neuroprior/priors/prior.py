@@ -446,3 +446,9 @@ def _names(what: str, learned: dict[str, Any], most: int) -> tuple[str, ...] | N
     if not isinstance(names, list | tuple) or len(names) > most or not all(isinstance(name, str) for name in names):
         raise ValueError(f"{what}: at most {most} texts are expected")
     return tuple(names)
+
+
+def taken_of(forecasts: Tensor, actions: Tensor) -> Tensor:
+    """`[..., E]`: of log-probabilities `[..., E, A]`, those of `actions [...]`."""
+    index = actions.long()[..., None, None].expand(*forecasts.shape[:-1], 1)
+    return forecasts.gather(-1, index)[..., 0]

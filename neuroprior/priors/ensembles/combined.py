@@ -16,13 +16,12 @@ from neuroprior.priors.ensembles.mixture import (
     divided,
     learned_weights,
     mixed,
-    taken_of,
     weights_before,
 )
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.neural.neural import training_settings
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, taken_of
 from neuroprior.priors.uniform import UniformPrior
 
 LEAST = -30.0
@@ -66,7 +65,7 @@ class CombinedPrior(MixturePrior):
         experts: priors that `fit` then fits and combines; None: those that suit the plans.
         share: of the fixed share; set by `fit`.
         effort: which networks are trained where no experts are given: "fast", a GRU alone; "standard", a stacked prior
-            as well; "full", a second GRU and a transformer as well.
+            as well; "full", a transformer and a switching network as well.
         num_contexts, context_size: see `Prior`.
 
     Raises:

@@ -11,7 +11,7 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, taken_of
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates for the share; `fit` takes the best."""
@@ -164,12 +164,6 @@ class MixturePrior(Prior):
     def _mixed(self, weights: Tensor, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
         forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in found], 1)
         return mixed(weights, forecasts), pack([weights, forecasts, *(state for _, state in found)])
-
-
-def taken_of(forecasts: Tensor, actions: Tensor) -> Tensor:
-    """`[..., E]`: of log-probabilities `[..., E, A]`, those of `actions [...]`."""
-    index = actions.long()[..., None, None].expand(*forecasts.shape[:-1], 1)
-    return forecasts.gather(-1, index)[..., 0]
 
 
 def after(weights: Tensor, taken: Tensor, first: Tensor, share: float) -> Tensor:

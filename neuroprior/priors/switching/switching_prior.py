@@ -13,7 +13,7 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.ensembles.mixture import taken_of
+from neuroprior.priors.prior import taken_of
 from neuroprior.priors.switching.forward_backward import TINY, Smoothed, most_probable_path, predict, smooth
 from neuroprior.priors.switching.mode_chains import ModeChains
 from neuroprior.priors.switching.spectral_start import spectral_modes

@@ -24,6 +24,7 @@ from neuroprior import (
     load,
     save,
 )
+from neuroprior.priors import SwitchingNetwork
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, seeded
@@ -214,7 +215,7 @@ def test_weights_are_learned_on_held_out_plans_and_counts_from_all():
     [
         ("fast", {GRUPrior}),
         ("standard", {GRUPrior, StackedPrior}),
-        ("full", {GRUPrior, StackedPrior, TransformerPrior}),
+        ("full", {GRUPrior, StackedPrior, TransformerPrior, SwitchingNetwork}),
     ],
 )
 def test_effort_says_which_networks_are_trained(effort, kinds, monkeypatch):
@@ -224,7 +225,7 @@ def test_effort_says_which_networks_are_trained(effort, kinds, monkeypatch):
         fit = kind.fit
 
         def recorded(self, plans, **how):
-            trained.append(kind)
+            trained.append(type(self))
             return fit(self, plans, **how)
 
         monkeypatch.setattr(kind, "fit", recorded)
