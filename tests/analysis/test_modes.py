@@ -182,3 +182,31 @@ def test_as_many_folds_as_groups_where_these_are_few():
     for group, expected in ((torch.arange(9) // 3, 3), (torch.zeros(9, dtype=torch.long), 5)):
         choice = choose_modes(replace(plans, group=group), [2], generator=seeded(0), **how)
         assert len(choice.stability[2]) == expected
+
+
+def adjusted_rand_index(one, other):
+    """Of two clusterings of the same things (Hubert and Arabie 1985)."""
+    table = np.zeros((one.max() + 1, other.max() + 1))
+    np.add.at(table, (one, other), 1)
+
+    def pairs(counts):
+        return (counts * (counts - 1) / 2).sum()
+
+    both, first, second = pairs(table), pairs(table.sum(1)), pairs(table.sum(0))
+    expected = first * second / pairs(np.array([len(one)]))
+    return (both - expected) / ((first + second) / 2 - expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("modes", [2, 3])
+def test_nine_of_ten_sources_give_up_their_modes(modes):
+    found, alike = 0, []
+    for seed in range(10):
+        plans, truth = source(30, 80, seed=100 + seed, modes=modes, stay=0.97)
+        how = {"order": 0, "restarts": 2, "max_iterations": 30}
+        choice = choose_modes(plans, [1, 2, 3, 4], generator=seeded(seed), **how)
+        found += choice.chosen == modes
+        path = mode_plans(choice.priors[modes], plans).actions.numpy()
+        alike.append(adjusted_rand_index(truth.numpy().ravel(), path.ravel()))
+    assert found >= 9
+    assert min(alike) >= 0.9
