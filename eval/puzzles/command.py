@@ -54,7 +54,7 @@ def puzzles(
     test: str | None = None,
     num_test: PositiveInt | None = None,
     budget: PositiveInt = 50_000,
-    priors: Sequence[PriorName] = (BOOTSTRAP, "log-linear", "network", "product", "uniform", "greedy"),
+    priors: Sequence[PriorName] = (BOOTSTRAP, REROOTED, "log-linear", "network", "product", "uniform", "greedy"),
     guided: bool | None = None,
     sweeps: PositiveInt = 8,
     seeds: PositiveInt = 1,
