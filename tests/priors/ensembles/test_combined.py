@@ -24,6 +24,8 @@ from neuroprior import (
     load,
     save,
 )
+from neuroprior.priors.counts import chains
+from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, seeded
@@ -224,6 +226,24 @@ def test_weights_are_learned_on_held_out_plans_and_counts_from_all():
     assert [e.order for e in prior.experts if isinstance(e, MarkovPrior)] == [0]
     again = CombinedPrior(A, [MarkovPrior(A, 0)]).fit(plans, generator=seeded(0))
     assert again.experts[0].log_prob(plans).equal(MarkovPrior(A, 0).fit(plans).log_prob(plans))
+
+
+@pytest.mark.parametrize("num_contexts", [None, C])
+def test_chains_are_chosen_on_the_plans_that_are_held_out(num_contexts):
+    """In noise the longest chain is the likeliest only where it was learned: here twelve plans, in contexts or none."""
+    plans = Plans(
+        torch.randint(A, (60, 8), generator=seeded(0)), A, context=torch.randint(C, (60, 8), generator=seeded(1))
+    )
+    learned, held_out = plans[:12], plans[12:]
+
+    def bits(prior: Prior, some: Plans) -> float:
+        return -float(prior.log_prob(some if prior.takes_context else some.without_context()).sum())
+
+    found = best_chain(learned, held_out, num_contexts)
+    tried = [chain for order in ORDERS for chain in chains(learned, order, num_contexts)]
+    best = min(tried, key=lambda chain: bits(chain, held_out))
+    assert (found.order, found.backoff, found.smoothing) == (best.order, best.backoff, best.smoothing)
+    assert bits(found, held_out) < bits(min(tried, key=lambda chain: bits(chain, learned)), held_out) - 10
 
 
 @pytest.mark.parametrize(
