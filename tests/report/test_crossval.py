@@ -13,7 +13,7 @@ from neuroprior.plans.folds import folds, in_parts
 from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior
 from neuroprior.priors.counts import BACKOFFS_TRIED
 from neuroprior.report import fits
-from neuroprior.report.fits import ACTIONS, CONTEXT, KINDS, Design, Job, counted, split
+from neuroprior.report.fits import ACTIONS, CONTEXT, DURATIONS, KINDS, Design, Job, counted, split
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, jobs
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import refuses, seeded
@@ -167,6 +167,18 @@ def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
     (one,) = found.models[0].calibration.bins
     assert one.forecast == pytest.approx(1 / 3, abs=1e-6)
     assert one.taken.mean == pytest.approx(1 / 3)
+
+
+def test_durations_of_other_held_out_plans_do_not_matter():
+    """Nor are their logarithms standardised by them: by those of the training plans alone."""
+    times = torch.rand(32, 7, generator=seeded(3)) + 0.5
+    plans = chain(durations=times[:24])
+    design, job = Design(1, max_steps=1), Job(0, "gru", DURATIONS)
+    test = Plans(plans.actions[:8], 3, plans.lengths[:8], durations=times[24:])
+    other = replace(test, durations=times[24:] * torch.tensor([1.0] * 3 + [100.0] * 5)[:, None])
+    bits, again = (fits.fit_and_score(plans, some, design, job)["gru/bits"] for some in (test, other))
+    assert again[:3] == pytest.approx(bits[:3], abs=1e-6)
+    assert abs(again[3:] - bits[3:]).max() > 1e-4
 
 
 @pytest.mark.parametrize("at_once", [1, 14, 25])

@@ -196,6 +196,18 @@ def test_of_the_dearest_that_may_go_the_one_that_is_missed_least_goes(costs, kep
     assert (found, powers.tolist()) == (kept, [float(k) for k in kept])
 
 
+def test_what_is_lost_is_counted_from_the_least_loss_so_far():
+    """In tolerances: without the first expert the loss falls by 1; without the second as well it is as at first."""
+
+    class ByHand(HeldOut):
+        def combined(self, kept: list[int]) -> tuple[torch.Tensor, float]:
+            losses = {(0, 1, 2): 0.0, (1, 2): -1.0, (2,): 0.1, (1,): 5.0}
+            return torch.tensor([float(k) for k in kept]), 1 + self.tolerance * losses.get(tuple(kept), 3.0)
+
+    held_out = ByHand(torch.zeros(1, 2, 3, 1), torch.zeros(1, 2, dtype=torch.long), torch.ones(1, 2).bool(), 3)
+    assert held_out.choose([1, 1, 1])[0] == [1, 2]
+
+
 def test_experts_of_different_plans_are_both_kept():
     """The pool of two experts, of which each is right in half of the plans, is right in none."""
     one, two = independent([0.8, 0.1, 0.1]), independent([0.1, 0.8, 0.1])
