@@ -10,10 +10,10 @@ import torch
 from neuroprior.analysis.comparison import DEPTH, score_bits, units
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds, in_parts
-from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior
+from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior
 from neuroprior.priors.counts import BACKOFFS_TRIED
 from neuroprior.report import fits
-from neuroprior.report.fits import ACTIONS, CONTEXT, DURATIONS, KINDS, Design, Job, counted, split
+from neuroprior.report.fits import ACTIONS, COMBINED, CONTEXT, DURATIONS, KINDS, Design, Job, counted, split
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, jobs
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import refuses, seeded
@@ -167,6 +167,18 @@ def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
     (one,) = found.models[0].calibration.bins
     assert one.forecast == pytest.approx(1 / 3, abs=1e-6)
     assert one.taken.mean == pytest.approx(1 / 3)
+
+
+def test_the_combined_prior_learns_its_weights_on_plans_that_its_experts_did_not_see(monkeypatch):
+    """Actions are independent; a chain of order 6 knows by heart the plans that it counted, and no others."""
+
+    def experts(learned: Plans, *others: object) -> list[Prior]:
+        return [ContextTreePrior(3, 0).fit(learned), MarkovPrior(3, 6, 0.01, backoff="dirichlet").fit(learned)]
+
+    monkeypatch.setattr(fits, "fitted_experts", experts)
+    drawn = torch.multinomial(torch.tensor([0.7, 0.2, 0.1]), 480, True, generator=seeded(0)).view(60, 8)
+    found = fits.fit_and_score(Plans(drawn, 3), Plans(drawn[:5], 3), Design(1), Job(0, COMBINED, ACTIONS))
+    assert str(found["combined/how"]).split()[1:] == ["contexttree"]
 
 
 def test_durations_of_other_held_out_plans_do_not_matter():

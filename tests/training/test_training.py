@@ -124,6 +124,26 @@ def test_in_training_each_action_counts_the_same(equal: int, tmp_path: Path) -> 
     assert slope == pytest.approx(((log_probs.exp() - share) / math.log(2)).tolist(), abs=1e-5)
 
 
+def test_dropout_is_drawn_anew_in_each_step(tmp_path: Path) -> None:
+    class Dropped(Constant):
+        def forward(self, plans: torch.Tensor, context: torch.Tensor | None = None) -> torch.Tensor:
+            masks.append(torch.nn.functional.dropout(torch.ones(64), training=self.training).tolist())
+            return super().forward(plans, context)
+
+    plans, how, drawn = Plans(torch.zeros(4, 2).long(), 3), Settings(6, window=2, check_every=3), []
+    for number, seed in enumerate((0, 0, 1)):
+        masks: list[list[float]] = []
+        data, off = PlansModule(plans, plans, how, seed=0), {"enable_progress_bar": False, "logs": False}
+        trainer = make_trainer(str(tmp_path / str(number)), 6, 6, data.steps, "cpu", **off)
+        run_training(trainer, PriorModule(Dropped(), seed=seed), data)
+        whole = [1.0] * 64
+        assert [mask == whole for mask in masks] == [False, False, False, True] * 2
+        drawn.append([mask for mask in masks if mask != whole])
+    first, again, other = drawn
+    assert first == again
+    assert len({tuple(mask) for mask in first + other}) == 12
+
+
 def test_in_validation_each_action_counts_the_same(tmp_path: Path) -> None:
     """Windows near the end hold the actions of few plans, and weigh less."""
     lengths = torch.tensor([12, 9, 8, 5])

@@ -171,6 +171,15 @@ def test_what_is_lost_without_an_expert_is_counted_by_action(share, kept):
     assert [type(expert) for expert in prior.experts] == kept
 
 
+@pytest.mark.parametrize(("number", "kept"), [(1, [UniformPrior]), (20, [Dear])])
+def test_on_few_actions_more_may_be_lost(number, kept):
+    """The loss is .0008 nats an action higher without the dear expert: of 50 actions .04 in all, of 1,000 .8."""
+    half = (torch.arange(50) < 26).long()[torch.randperm(50, generator=seeded(0))]
+    prior = CombinedPrior(2, [UniformPrior(2), Dear(2, 0, 1e-9).fit(half[:, None])])
+    prior.learn_weights(Plans(half.repeat(number, 1), 2))
+    assert [type(expert) for expert in prior.experts] == kept
+
+
 def test_experts_that_add_nothing_are_left_out():
     plans = some_plans(400)
     quick, dear = MarkovPrior(A, 1).fit(plans), Dear(A, 1).fit(plans)
