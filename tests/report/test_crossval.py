@@ -221,6 +221,13 @@ def test_samples_in_contexts_that_follow_from_actions(tmp_path):
     assert all(model.generated is None for model in evaluated(other, tmp_path, inputs=(CONTEXT,)).models)
 
 
+def test_samples_in_a_context_that_is_only_seen_last():
+    """Where it leads is unknown; all actions may be taken in it. Twelve are equal by chance with 6e-6."""
+    plans = Plans(torch.randint(3, (24, 4), generator=seeded(0)), 3, context=torch.arange(4).repeat(24, 1))
+    found = fits.fit_and_score(plans, plans[:12], Design(1), Job(0, "counts", CONTEXT))
+    assert len(set(found["uniform/generated"][:, -1])) > 1
+
+
 @pytest.mark.parametrize("skip", [0, 2])
 def test_units_of_folds_are_those_of_the_whole(skip):
     """What is scored fold by fold has the interval of all plans together: a score of bits all 1 has no spread."""

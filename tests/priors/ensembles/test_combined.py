@@ -24,7 +24,7 @@ from neuroprior import (
     load,
     save,
 )
-from neuroprior.priors.counts import chains
+from neuroprior.priors.counts import BACKOFFS_TRIED, chains
 from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.testing import check_prior
@@ -293,6 +293,15 @@ def test_effort_says_which_networks_are_trained(effort, kinds, monkeypatch):
     assert isinstance(prior, CombinedPrior)
     assert prior.num_contexts == C
     assert set(trained) == kinds
+
+
+def test_every_chain_was_tried_though_the_best_alone_is_an_expert():
+    """And so the bound counts them: a chain and a context tree without the context, and one of each with it."""
+    prior = CombinedPrior(A, effort="fast", num_contexts=C)
+    prior.fit(some_plans(contexts=True), generator=seeded(0), **QUICK)
+    counting = len(ORDERS) * len(BACKOFFS_TRIED) + 1
+    assert prior.tried == 1 + 2 * counting + 1 + 2  # uniform, those that count, a GRU; the pool and the fixed share
+    assert prior.bound <= math.log(prior.tried) + 1e-5
 
 
 def test_the_same_seed_gives_the_same_prior(tmp_path):
