@@ -293,15 +293,10 @@ def test_effort_says_which_networks_are_trained(effort, kinds, monkeypatch):
     assert isinstance(prior, CombinedPrior)
     assert prior.num_contexts == C
     assert set(trained) == kinds
-
-
-def test_every_chain_was_tried_though_the_best_alone_is_an_expert():
-    """And so the bound counts them: a chain and a context tree without the context, and one of each with it."""
-    prior = CombinedPrior(A, effort="fast", num_contexts=C)
-    prior.fit(some_plans(contexts=True), generator=seeded(0), **QUICK)
+    # The bound counts every chain that was tried, though the best alone is an expert: without the context, and with it.
     counting = len(ORDERS) * len(BACKOFFS_TRIED) + 1
-    assert prior.tried == 1 + 2 * counting + 1 + 2  # uniform, those that count, a GRU; the pool and the fixed share
-    assert prior.bound <= math.log(prior.tried) + 1e-5
+    networks = {"fast": 1, "standard": 2, "full": 4}[effort]
+    assert prior.tried == 1 + 2 * counting + networks + 2  # uniform first; the pool and the fixed share last
 
 
 def test_the_same_seed_gives_the_same_prior(tmp_path):
