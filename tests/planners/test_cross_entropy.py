@@ -91,6 +91,20 @@ def test_elites_are_a_share_of_the_candidates_so_far():
     assert torch.equal(tried[1], tried[0].amin(1, keepdim=True).expand(-1, 2, -1))
 
 
+def test_all_candidates_are_tried_in_rounds_of_nearly_as_many(monkeypatch):
+    tried, rollout = [], TabularWorld.rollout
+
+    def count(self, state, plans, *args):
+        tried.append(plans.shape[1])
+        return rollout(self, state, plans, *args)
+
+    monkeypatch.setattr(TabularWorld, "rollout", count)
+    world = random_world(0)
+    decision = CrossEntropyPlanner(UniformPrior(3), 2, 11, rounds=4).plan(world, world.reset(3, seeded(0)), seeded(0))
+    assert tried == [2, 3, 3, 3]
+    assert decision.model_steps == 11 * 2
+
+
 def test_candidates_are_drawn_at_the_temperature():
     """In the only round there are no elites: chi-square against the prior at temperature 2."""
     prior, world = MarkovPrior(3, 0).fit(torch.tensor([[0] * 9, [1] * 9, [0] * 9, [2] * 9, [0] * 9])), random_world(0)

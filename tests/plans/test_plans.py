@@ -1,5 +1,7 @@
 """Plans: shapes, dtypes, lengths, contexts, splits, and what is refused."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -201,6 +203,17 @@ def test_names_must_name_every_number():
         Plans(ACTIONS, 3, group=torch.tensor([0, 1, 2, 2]), group_names=("a", "b"))
     with refuses("context_names"):
         Plans(ACTIONS, 3, context_names=("a",))
+
+
+@pytest.mark.parametrize("wrong", [-0.5, math.inf, -math.inf])
+def test_durations_are_times_where_there_are_actions(wrong):
+    """Those that are not known are NaN; whatever stands beyond the ends of plans is 0."""
+    durations, lengths = torch.tensor([[1.5, 0.0, wrong], [math.nan, 2.0, wrong]]), torch.tensor([2, 2])
+    actions = torch.zeros(2, 3, dtype=torch.long)
+    kept = Plans(actions, 1, lengths, durations=durations).durations
+    assert kept.nan_to_num(-1).tolist() == [[1.5, 0, 0], [-1, 2, 0]]
+    with refuses(f"durations[1, 2]: {wrong}; finite times"):
+        Plans(actions, 1, torch.tensor([2, 3]), durations=durations)
 
 
 def test_steps_of_plans() -> None:

@@ -83,6 +83,18 @@ def test_stars_and_limits_of_the_printed_tables():
     assert len(carried.rows) == min(LISTED, len(frames["condition_sequences"]))
 
 
+def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
+    """Short plans without an effect, so that not as many of one condition are taken for the other as the reverse."""
+    section, frames = section_of(study(0, between(9, 1), 12, 3, habit=0.2))
+    blocks = frames["condition_blocks"]
+    pairs = [*zip(blocks["condition"], blocks["classified"], strict=True)]
+    printed = section.tables[2]
+    names = ["drug 0", "drug 1"]
+    assert printed.headings == ["condition", *(f"predicted\n{name}" for name in names)]
+    assert printed.rows == [[own, *(str(pairs.count((own, other))) for other in names)] for own in names]
+    assert pairs.count(("drug 0", "drug 1")) != pairs.count(("drug 1", "drug 0"))
+
+
 def test_a_report_has_the_section(tmp_path):
     made = report(changed(between(12)), folds=2, out=tmp_path, sections=["file", "conditions"], **QUICK)
     assert made.lead.endswith(compare_conditions(changed(between(12)), generator=seeded(0)).verdict)

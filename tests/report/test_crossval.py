@@ -10,10 +10,10 @@ import torch
 from neuroprior.analysis.comparison import DEPTH, score_bits, units
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import folds, in_parts
-from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior
+from neuroprior.priors import ContextTreePrior, GRUPrior, MarkovPrior, Prior
 from neuroprior.priors.counts import BACKOFFS_TRIED
 from neuroprior.report import fits
-from neuroprior.report.fits import ACTIONS, CONTEXT, KINDS, Design, Job, counted, split
+from neuroprior.report.fits import ACTIONS, COMBINED, CONTEXT, DURATIONS, KINDS, Design, Job, counted, split
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, jobs
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.sources import refuses, seeded
@@ -169,6 +169,30 @@ def test_calibration_and_samples_are_of_the_held_out_plans(tmp_path):
     assert one.taken.mean == pytest.approx(1 / 3)
 
 
+def test_the_combined_prior_learns_its_weights_on_plans_that_its_experts_did_not_see(monkeypatch):
+    """Actions are independent; a chain of order 6 knows by heart the plans that it counted, and no others."""
+
+    def experts(learned: Plans, *others: object) -> list[Prior]:
+        return [ContextTreePrior(3, 0).fit(learned), MarkovPrior(3, 6, 0.01, backoff="dirichlet").fit(learned)]
+
+    monkeypatch.setattr(fits, "fitted_experts", experts)
+    drawn = torch.multinomial(torch.tensor([0.7, 0.2, 0.1]), 480, True, generator=seeded(0)).view(60, 8)
+    found = fits.fit_and_score(Plans(drawn, 3), Plans(drawn[:5], 3), Design(1), Job(0, COMBINED, ACTIONS))
+    assert str(found["combined/how"]).split()[1:] == ["contexttree"]
+
+
+def test_durations_of_other_held_out_plans_do_not_matter():
+    """Nor are their logarithms standardised by them: by those of the training plans alone."""
+    times = torch.rand(32, 7, generator=seeded(3)) + 0.5
+    plans = chain(durations=times[:24])
+    design, job = Design(1, max_steps=1), Job(0, "gru", DURATIONS)
+    test = Plans(plans.actions[:8], 3, plans.lengths[:8], durations=times[24:])
+    other = replace(test, durations=times[24:] * torch.tensor([1.0] * 3 + [100.0] * 5)[:, None])
+    bits, again = (fits.fit_and_score(plans, some, design, job)["gru/bits"] for some in (test, other))
+    assert again[:3] == pytest.approx(bits[:3], abs=1e-6)
+    assert abs(again[3:] - bits[3:]).max() > 1e-4
+
+
 @pytest.mark.parametrize("at_once", [1, 14, 25])
 def test_plans_are_scored_in_parts_as_a_whole(at_once, monkeypatch):
     """Bits and forecasts of all parts count, also where a part has no action that counts."""
@@ -195,6 +219,13 @@ def test_samples_in_contexts_that_follow_from_actions(tmp_path):
     # Where a context leads to two others by the same action, samples have none.
     other = replace(plans, context=context_of("index a step"))
     assert all(model.generated is None for model in evaluated(other, tmp_path, inputs=(CONTEXT,)).models)
+
+
+def test_samples_in_a_context_that_is_only_seen_last():
+    """Where it leads is unknown; all actions may be taken in it. Twelve are equal by chance with 6e-6."""
+    plans = Plans(torch.randint(3, (24, 4), generator=seeded(0)), 3, context=torch.arange(4).repeat(24, 1))
+    found = fits.fit_and_score(plans, plans[:12], Design(1), Job(0, "counts", CONTEXT))
+    assert len(set(found["uniform/generated"][:, -1])) > 1
 
 
 @pytest.mark.parametrize("skip", [0, 2])

@@ -109,6 +109,15 @@ def test_gains_of_laws_are_held_out():
     assert frame.loc["b", "units"] == 8
 
 
+def test_the_gains_of_laws_and_of_transitions_add_up():
+    """Before action 0 the mean is 1, before others 8: log(17 / 3) - (2 / 3) log 8 over one exponential law, in all."""
+    plans = timed(False)
+    means = torch.where(torch.cat([plans.actions[:, 1:], plans.actions[:, :1]], 1) == 0, 1.0, 8.0)
+    laws = tables(replace(plans, durations=plans.durations / 2 * means))["duration_laws"]
+    assert laws["gain"].sum() == pytest.approx(log(17 / 3) - 2 / 3 * log(8), abs=0.04)
+    assert (laws["gain"] > 0.06).all()
+
+
 def test_durations_that_predict_the_next_action():
     """Half of the actions are followed by action 0, the others by any: the bits are known."""
     gained = tables(timed(True))["next_by_duration"].iloc[0]

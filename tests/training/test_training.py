@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import lightning
 import pytest
 import torch
 
@@ -83,6 +84,64 @@ def test_the_curve_holds_the_learning_rate_and_the_bits_of_each_epoch(tmp_path: 
     # A step takes all plans, which are also those of the validation before it.
     before = [entry["validation_bits"] for entry in curve[:-1]]
     assert [entry["train_bits"] for entry in curve[1:]] == pytest.approx(before, rel=1e-5)
+
+
+class Constant(torch.nn.Module):
+    """A prior of one logit for each action, the same before all actions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.logits = torch.nn.Parameter(torch.tensor([1.0, 0.0, -1.0]))
+
+    def forward(self, plans: torch.Tensor, context: torch.Tensor | None = None) -> torch.Tensor:
+        return self.logits.expand(*plans.shape, 3)
+
+
+@pytest.mark.parametrize("equal", [1, 40])
+def test_in_training_each_action_counts_the_same(equal: int, tmp_path: Path) -> None:
+    """Its gradient, which is clipped where it is long, is that of the mean over actions; also where plans are merged.
+
+    In the plans there are 19 actions, of which 7, 8 and 4 are 0, 1 and 2.
+    """
+    actions = torch.tensor([[0, 0, 0, 1, 1, 1, 1, 2, 2], [0, 0, 2, 1, 1, 1, 0, 1, 0], [2, 0, 0, 0, 0, 0, 0, 0, 0]])
+    lengths = torch.tensor([9, 8, 2])
+    seen: list[tuple[float, list[float]]] = []
+
+    class Watch(lightning.Callback):
+        def on_after_backward(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+            assert isinstance(prior.logits.grad, torch.Tensor)
+            seen.append((float(trainer.callback_metrics["train_bits"]), prior.logits.grad.tolist()))
+
+    plans, prior = Plans(actions.repeat(equal, 1), 3, lengths.repeat(equal)), Constant()
+    data = PlansModule(plans, plans, Settings(1, window=9, check_every=1), seed=0)
+    module, off = PriorModule(prior), {"enable_progress_bar": False, "logs": False}
+    run_training(make_trainer(str(tmp_path), 1, 1, data.steps, "cpu", **off, callbacks=[Watch()]), module, data)
+    log_probs = torch.tensor([1.0, 0.0, -1.0]).log_softmax(0)
+    share = torch.tensor([7.0, 8.0, 4.0]) / 19
+    ((bits, slope),) = seen
+    assert (data.training.weight is not None) == (equal > 1)
+    assert bits == pytest.approx(-float(share @ log_probs) / math.log(2), rel=1e-5)
+    assert slope == pytest.approx(((log_probs.exp() - share) / math.log(2)).tolist(), abs=1e-5)
+
+
+def test_dropout_is_drawn_anew_in_each_step(tmp_path: Path) -> None:
+    class Dropped(Constant):
+        def forward(self, plans: torch.Tensor, context: torch.Tensor | None = None) -> torch.Tensor:
+            masks.append(torch.nn.functional.dropout(torch.ones(64), training=self.training).tolist())
+            return super().forward(plans, context)
+
+    plans, how, drawn = Plans(torch.zeros(4, 2).long(), 3), Settings(6, window=2, check_every=3), []
+    for number, seed in enumerate((0, 0, 1)):
+        masks: list[list[float]] = []
+        data, off = PlansModule(plans, plans, how, seed=0), {"enable_progress_bar": False, "logs": False}
+        trainer = make_trainer(str(tmp_path / str(number)), 6, 6, data.steps, "cpu", **off)
+        run_training(trainer, PriorModule(Dropped(), seed=seed), data)
+        whole = [1.0] * 64
+        assert [mask == whole for mask in masks] == [False, False, False, True] * 2
+        drawn.append([mask for mask in masks if mask != whole])
+    first, again, other = drawn
+    assert first == again
+    assert len({tuple(mask) for mask in first + other}) == 12
 
 
 def test_in_validation_each_action_counts_the_same(tmp_path: Path) -> None:

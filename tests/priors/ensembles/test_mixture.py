@@ -188,3 +188,10 @@ def test_the_share_held_out_is_a_tenth_of_few_plans_and_a_fiftieth_of_many(lengt
     plans = Plans(torch.zeros(1000, length, dtype=torch.uint8), 2)
     learned, chosen_on = divided(plans, None, seeded(0))
     assert (len(learned), len(chosen_on)) == (1000 - held_out, held_out)
+
+
+def test_plans_without_actions_are_not_held_out():
+    """Of 40 plans 10 have actions: of these, half are held out, and none is left for another 30."""
+    lengths = torch.where(torch.arange(40) % 4 == 0, 3, 0)
+    parts = divided(Plans(torch.randint(A, (40, 3), generator=seeded(0)), A, lengths), 0.5, seeded(0))
+    assert [part.mask().sum(1).tolist() for part in parts] == [[3] * 5] * 2
