@@ -346,8 +346,13 @@ class SwitchingPrior(HistoryPrior):
 
     def _inputs(self, plans: Plans, rows: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
         """The `steps` and the `likelihood` of inference in plans."""
-        likelihood = self._likelihood(self.log_probs[rows], plans.actions)
-        return self._steps(cells), likelihood.masked_fill(~plans.mask()[..., None], 1.0)
+        steps, likelihood = self._steps(cells), self._likelihood(self.log_probs[rows], plans.actions)
+        if plans.lengths is not None:
+            # Else the most probable path would be that into modes that last, beyond the plan's end.
+            beyond = ~plans.mask()
+            steps[beyond] = torch.eye(steps.shape[-1], dtype=steps.dtype, device=steps.device)
+            likelihood = likelihood.masked_fill(beyond[..., None], 1.0)
+        return steps, likelihood
 
     def tables_fit(self) -> bool:
         modes, whole = self.num_modes, self.log_probs

@@ -279,6 +279,22 @@ def test_actions_beyond_the_end_say_nothing():
     torch.testing.assert_close(one.posterior(plans).smoothed[:1, : int(lengths[0])], cut)
 
 
+@pytest.mark.parametrize("contexts", [None, 4])
+def test_the_most_probable_path_ends_with_the_plan(contexts):
+    # Beyond the end a path would have gained by being in a mode that lasts.
+    plans = some_plans(contexts=contexts)
+    prior = SwitchingPrior(3, 2, 1, contexts, smoothing=0.5).fit(plans, generator=seeded(0))
+    prior.transitions[:] = STICKY.flip(0, 1)
+    lengths = torch.arange(40) % 6 + 1
+    path = prior.posterior(replace(plans, lengths=lengths)).path
+    for length in range(1, 7):
+        own = lengths == length
+        context = None if contexts is None else plans.context[own, :length]
+        cut = replace(plans[own], actions=plans.actions[own, :length], context=context)
+        assert path[own, :length].equal(prior.posterior(cut).path)
+        assert path[own, :length].equal(enumerated(prior, cut)[2])
+
+
 def test_modes_are_numbered_by_how_often_they_occur():
     actions, modes = switching_source(60, 100, matrix=torch.tensor([[0.7, 0.3], [0.05, 0.95]]))
     prior = SwitchingPrior(3, 2).fit(actions, generator=seeded(4))
