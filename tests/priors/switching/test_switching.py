@@ -312,6 +312,30 @@ def test_counting_anew_keeps_the_modes():
     assert float((before - after).abs().mean()) < 0.02
 
 
+def test_going_on_from_nothing_begins():
+    # Modes that are all alike would remain so.
+    plans = Plans(switching_source(10, 30)[0], 3)
+    fitted = SwitchingPrior(3, 2).fit(plans, generator=seeded(0)).log_probs
+    assert SwitchingPrior(3, 2).fit(plans, generator=seeded(0), warm_start=True).log_probs.equal(fitted)
+    assert SwitchingPrior(3, 2).recount(plans).log_probs.equal(fitted)
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (4, 0)])
+def test_plans_without_actions(shape):
+    none = Plans(torch.zeros(shape, dtype=torch.long), 3)
+    prior = SwitchingPrior(3, 2).fit(none, generator=seeded(0))
+    assert [tuple(values.shape) for values in prior.posterior(none)] == [(*shape, 2), (*shape, 2), shape]
+    torch.testing.assert_close(prior.log_prob([[0, 1]]).exp(), torch.tensor([1 / 9]))
+
+
+def test_what_no_mode_can_do_says_nothing_about_the_modes():
+    actions = switching_source(10, 30)[0]
+    prior = SwitchingPrior(4, 2, smoothing=0).fit(Plans(actions, 4), generator=seeded(0))
+    held_out = torch.randint(4, (10, 20), generator=seeded(4))
+    for values in prior.posterior(Plans(held_out, 4))[:2]:
+        torch.testing.assert_close(values.sum(-1), torch.ones(10, 20, dtype=torch.double))
+
+
 @pytest.mark.parametrize(("phases", "contexts"), [(1, None), (2, 3)])
 def test_it_is_a_prior(phases, contexts):
     plans = some_plans(contexts=contexts)
@@ -351,6 +375,7 @@ def test_the_same_seed_gives_the_same_modes(tmp_path):
         ({"order": -1}, "order"),
         ({"order": 1.5}, "order"),
         ({"smoothing": float("nan")}, "smoothing"),
+        ({"smoothing": "8"}, "smoothing"),
         ({"sharing": 1.1}, "sharing"),
         ({"stay": -1}, "stay"),
         ({"switching": "never"}, "switching"),
