@@ -250,7 +250,8 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
 
     `mode`; `share` of the actions, by the smoothed posterior; `dwell`, mean actions from its beginning to its end in
     the most probable path (those that the end of a plan cuts off left out, where there are others); `visits` a plan;
-    `actions`, the three that it takes oftener than all modes together by most, with their shares in the mode; `enters`
+    `actions`, up to three that it takes oftener than all modes together, those by most first (of a single mode, the
+    commonest), with their shares in the mode; `enters`
     and `leaves`, the three contexts in which the path most often changes to it and from it, where contexts are indices.
 
     Raises:
@@ -263,7 +264,7 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     weights, actions = found.smoothed.cpu()[mask], plans.actions[mask].long()
     path = found.path.cpu()
     taken = torch.zeros(prior.num_modes, plans.num_actions, dtype=torch.double).index_add_(1, actions, weights.T)
-    overall = taken.sum(0) / taken.sum()
+    overall = taken.sum(0) / taken.sum() if prior.num_modes > 1 else taken.new_zeros(plans.num_actions)
     names = plans.action_names or tuple(map(str, range(plans.num_actions)))
     changed = (path[:, 1:] != path[:, :-1]) & mask[:, 1:]
     context = plans.context
@@ -279,7 +280,7 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
             "share": float(weights[:, k].mean()),
             "dwell": dwell,
             "visits": float((((path == k) & mask)[:, :1].sum() + (changed & (path[:, 1:] == k)).sum()) / len(plans)),
-            "actions": ", ".join(f"{names[a]} {own[a]:.2f}" for a in most),
+            "actions": ", ".join(f"{names[a]} {own[a]:.2f}" for a in most if own[a] > overall[a]),
         }
         if places is not None and context is not None:
             for what, of in (("enters", path[:, 1:]), ("leaves", path[:, :-1])):

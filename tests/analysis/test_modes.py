@@ -146,7 +146,11 @@ def test_the_table_says_what_each_mode_does():
     assert table["share"].tolist() == pytest.approx([0.55, 0.45], abs=0.01)
     assert table["dwell"].tolist() == pytest.approx([5.5, 4.0], abs=0.01)  # the last rest is cut off
     assert table["visits"].tolist() == [2, 2]
+    # Only what a mode does oftener than both together.
+    assert table["actions"].str.split(", ").map(len).tolist() == [1, 1]
     assert table["actions"].str.split(" ").str[0].tolist() == ["walk", "rest"]
+    one = SwitchingPrior(2, 1, 0).fit(plans, generator=seeded(1))
+    assert mode_table(one, plans.without_context())["actions"].tolist() == ["walk 0.55, rest 0.45"]
     assert table.loc["rest", "enters"] == "nest 1.00"
     assert table.loc["walk", "enters"] == "hill 1.00"
 

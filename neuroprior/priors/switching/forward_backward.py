@@ -7,7 +7,7 @@ distribution over modes.
 Throughout, of N sequences of L steps with K modes, `initial [K]` is the distribution of the first mode;
 `steps [N, L, K, K]` leads from the mode before each action (row) to the mode of the action (column), the first of them
 the identity; and `likelihood [N, L, K]` is that of each action in each mode, not 0 in all of them. Beyond the end of a
-sequence likelihoods are 1.
+sequence likelihoods are 1 and steps the identity.
 """
 
 from typing import Any, NamedTuple

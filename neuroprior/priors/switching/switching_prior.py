@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from copy import copy
 from math import inf
+from numbers import Real
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
@@ -26,6 +27,9 @@ SURE = 0.8
 
 SHORT_RUN = 8
 """Iterations after which the best of the restarts goes on alone (Biernacki, Celeux and Govaert 2003)."""
+
+IMPOSSIBLE = 1e-100
+"""Likelihood of an action in a mode that cannot take it, where modes are inferred."""
 
 ELEMENTS = 2**24
 """Sequences are inferred together until there are so many elements in a tensor."""
@@ -127,7 +131,7 @@ class SwitchingPrior(HistoryPrior):
         check_count("order", order, 0)
         check_count("max_iterations", max_iterations, 0)
         for name, value in (("smoothing", smoothing), ("stay", stay), ("tolerance", tolerance)):
-            if not 0 <= value < float("inf"):
+            if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= value < inf:
                 raise ValueError(f"{name}: a finite number of at least 0 is expected, not {value!r}")
         check_share("sharing", sharing)
         if switching not in ("context", "constant"):
@@ -195,7 +199,8 @@ class SwitchingPrior(HistoryPrior):
 
     def _likelihood(self, log_probs: Tensor, actions: Tensor) -> Tensor:
         """Of actions `[...]` in each mode and phase, `[..., K * D]`, from `log_probs [..., K, A]`."""
-        likelihood = taken_of(log_probs, actions).double().exp()
+        # An action that no mode can take says nothing about the modes; 1e-300 would be lost in products.
+        likelihood = taken_of(log_probs, actions).double().exp().clamp(min=IMPOSSIBLE)
         return likelihood if self.phases == 1 else likelihood.repeat_interleave(self.phases, -1)
 
     def _matrices(self) -> Tensor:
@@ -243,14 +248,17 @@ class SwitchingPrior(HistoryPrior):
         Args:
             plans: `Plans`, or integers `[N, L]` for plans without context.
             generator: draws the modes that EM starts from, and the folds.
-            settings: `warm_start=True`: EM goes on from what was learned before.
+            settings: `warm_start=True`: EM goes on from what was learned before, if anything was.
 
         Raises:
             ValueError: plans that this prior cannot learn from, an unknown setting, or too many histories.
         """
         self.check_settings(settings)
         plans, generator = self.training_plans(plans), generator_on(generator, self.device)
-        if settings.get("warm_start", False):
+        if plans.actions.numel() == 0:
+            self.learn(*self.count(plans))
+            return self
+        if settings.get("warm_start", False) and len(self.row_code):
             return self._go_on(plans, generator, self.max_iterations)
         learner = _Learner(self, plans, generator)
         starts = [learner.random_start(generator) for _ in range(self.restarts)]
@@ -268,7 +276,10 @@ class SwitchingPrior(HistoryPrior):
 
     def recount(self, plans: Plans) -> Self:
         """Learn from `plans` what the modes do, beginning with the modes that are known."""
-        return self._go_on(self.training_plans(plans), torch.Generator(self.device).manual_seed(0), SHORT_RUN)
+        generator, known = torch.Generator(self.device).manual_seed(0), bool(len(self.row_code))
+        if not known or plans.actions.numel() == 0:
+            return self.fit(plans, generator=generator)
+        return self._go_on(self.training_plans(plans), generator, SHORT_RUN)
 
     @torch.no_grad()
     def _go_on(self, plans: Plans, generator: torch.Generator, iterations: int) -> Self:
@@ -290,6 +301,9 @@ class SwitchingPrior(HistoryPrior):
         """
         plans = self._as_plans(plans)
         self._check_scored(plans)
+        if plans.actions.numel() == 0:
+            none = self.first.new_zeros(*plans.actions.shape, self.num_modes)
+            return ModePosterior(none, none, none[..., 0].long())
         found = []
         for _, steps, likelihood in self._in_parts(plans):
             path = most_probable_path(self.first, steps, likelihood).div(self.phases, rounding_mode="floor")
@@ -307,7 +321,7 @@ class SwitchingPrior(HistoryPrior):
         Raises:
             ValueError: there is no such mode.
         """
-        if not isinstance(mode, int) or not 0 <= mode < self.num_modes:
+        if isinstance(mode, bool) or not isinstance(mode, int) or not 0 <= mode < self.num_modes:
             raise ValueError(f"mode: an integer from 0 to {self.num_modes - 1} is expected, not {mode!r}")
         phases = self.first.view(self.num_modes, self.phases)[mode]
         first = torch.zeros_like(self.first).view(self.num_modes, self.phases)
@@ -346,8 +360,13 @@ class SwitchingPrior(HistoryPrior):
 
     def _inputs(self, plans: Plans, rows: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
         """The `steps` and the `likelihood` of inference in plans."""
-        likelihood = self._likelihood(self.log_probs[rows], plans.actions)
-        return self._steps(cells), likelihood.masked_fill(~plans.mask()[..., None], 1.0)
+        steps, likelihood = self._steps(cells), self._likelihood(self.log_probs[rows], plans.actions)
+        if plans.lengths is not None:
+            # Else the most probable path would be that into modes that last, beyond the plan's end.
+            beyond = ~plans.mask()
+            steps[beyond] = torch.eye(steps.shape[-1], dtype=steps.dtype, device=steps.device)
+            likelihood = likelihood.masked_fill(beyond[..., None], 1.0)
+        return steps, likelihood
 
     def tables_fit(self) -> bool:
         modes, whole = self.num_modes, self.log_probs

@@ -279,6 +279,22 @@ def test_actions_beyond_the_end_say_nothing():
     torch.testing.assert_close(one.posterior(plans).smoothed[:1, : int(lengths[0])], cut)
 
 
+@pytest.mark.parametrize("contexts", [None, 4])
+def test_the_most_probable_path_ends_with_the_plan(contexts):
+    # Beyond the end a path would have gained by being in a mode that lasts.
+    plans = some_plans(contexts=contexts)
+    prior = SwitchingPrior(3, 2, 1, contexts, smoothing=0.5).fit(plans, generator=seeded(0))
+    prior.transitions[:] = STICKY.flip(0, 1)
+    lengths = torch.arange(40) % 6 + 1
+    path = prior.posterior(replace(plans, lengths=lengths)).path
+    for length in range(1, 7):
+        own = lengths == length
+        context = None if contexts is None else plans.context[own, :length]
+        cut = replace(plans[own], actions=plans.actions[own, :length], context=context)
+        assert path[own, :length].equal(prior.posterior(cut).path)
+        assert path[own, :length].equal(enumerated(prior, cut)[2])
+
+
 def test_modes_are_numbered_by_how_often_they_occur():
     actions, modes = switching_source(60, 100, matrix=torch.tensor([[0.7, 0.3], [0.05, 0.95]]))
     prior = SwitchingPrior(3, 2).fit(actions, generator=seeded(4))
@@ -294,6 +310,30 @@ def test_counting_anew_keeps_the_modes():
     more = torch.cat([training, switching_source(60, 100, seed=9)[0]])
     after = prior.recount(Plans(more, 3)).posterior(training).smoothed
     assert float((before - after).abs().mean()) < 0.02
+
+
+def test_going_on_from_nothing_begins():
+    # Modes that are all alike would remain so.
+    plans = Plans(switching_source(10, 30)[0], 3)
+    fitted = SwitchingPrior(3, 2).fit(plans, generator=seeded(0)).log_probs
+    assert SwitchingPrior(3, 2).fit(plans, generator=seeded(0), warm_start=True).log_probs.equal(fitted)
+    assert SwitchingPrior(3, 2).recount(plans).log_probs.equal(fitted)
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (4, 0)])
+def test_plans_without_actions(shape):
+    none = Plans(torch.zeros(shape, dtype=torch.long), 3)
+    prior = SwitchingPrior(3, 2).fit(none, generator=seeded(0))
+    assert [tuple(values.shape) for values in prior.posterior(none)] == [(*shape, 2), (*shape, 2), shape]
+    torch.testing.assert_close(prior.log_prob([[0, 1]]).exp(), torch.tensor([1 / 9]))
+
+
+def test_what_no_mode_can_do_says_nothing_about_the_modes():
+    actions = switching_source(10, 30)[0]
+    prior = SwitchingPrior(4, 2, smoothing=0).fit(Plans(actions, 4), generator=seeded(0))
+    held_out = torch.randint(4, (10, 20), generator=seeded(4))
+    for values in prior.posterior(Plans(held_out, 4))[:2]:
+        torch.testing.assert_close(values.sum(-1), torch.ones(10, 20, dtype=torch.double))
 
 
 @pytest.mark.parametrize(("phases", "contexts"), [(1, None), (2, 3)])
@@ -335,6 +375,7 @@ def test_the_same_seed_gives_the_same_modes(tmp_path):
         ({"order": -1}, "order"),
         ({"order": 1.5}, "order"),
         ({"smoothing": float("nan")}, "smoothing"),
+        ({"smoothing": "8"}, "smoothing"),
         ({"sharing": 1.1}, "sharing"),
         ({"stay": -1}, "stay"),
         ({"switching": "never"}, "switching"),
