@@ -130,8 +130,9 @@ class SwitchingPrior(HistoryPrior):
         check_sizes(num_modes=num_modes, phases=phases, folds=folds, restarts=restarts)
         check_count("order", order, 0)
         check_count("max_iterations", max_iterations, 0)
-        for name, value in (("smoothing", smoothing), ("stay", stay), ("tolerance", tolerance)):
-            if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= value < inf:
+        numbers: dict[str, object] = {"smoothing": smoothing, "stay": stay, "tolerance": tolerance}
+        for name, value in numbers.items():
+            if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= float(value) < inf:
                 raise ValueError(f"{name}: a finite number of at least 0 is expected, not {value!r}")
         check_share("sharing", sharing)
         if switching not in ("context", "constant"):
