@@ -36,8 +36,10 @@ def mode_section(found: Evaluation) -> Part | None:
     numbers = found.settings.get("modes")
     if not numbers:
         return None
-    plans = in_parts(found.plans, BLOCKS) if found.settings.get("cut") else found.plans
-    choice = choose_modes(plans, numbers, skip=found.settings["skip"], generator=torch.Generator().manual_seed(0))
+    plans = divided = found.plans
+    if found.settings.get("cut"):
+        divided = in_parts(plans, min(BLOCKS, max(int(plans.mask().sum()) // 2, 1)))
+    choice = choose_modes(divided, numbers, skip=found.settings["skip"], generator=torch.Generator().manual_seed(0))
     prior, stable = choice.prior, choice.stable().tolist()
     tables, boxes, frames = [choice_table(choice)], list[FigureBox](), {"modes": choice.frame()}
     text = [

@@ -102,3 +102,17 @@ def test_the_report_says_where_there_is_no_sign_of_modes():
 def test_the_report_refuses_modes_that_cannot_be(given):
     with pytest.raises(ValueError, match="modes"):
         report(Plans(torch.zeros(4, 4, dtype=torch.long), 3), models=["counts"], **given)
+
+
+def test_the_modes_of_a_single_long_plan_are_described_over_its_course():
+    """Parts serve to choose among numbers of modes; occupancy is over the plan, which begins in one mode alone."""
+    mode = (torch.arange(800) // 20) % 2
+    mode[:160] = 0
+    wild = torch.rand(800, generator=seeded(1)) < 0.2
+    actions = torch.where(wild, torch.randint(3, (800,), generator=seeded(2)), mode)
+    made = report(Plans(actions[None], 3), modes=[2], **QUICK)
+    assert len(made.frames["mode_actions"]) == 800
+    assert made.frames["mode_actions"]["step"].max() == 799
+    occupancy = made.frames["mode_occupancy"]
+    first = occupancy[occupancy["part"] == 1].set_index("mode")["share"]
+    assert first.max() > 0.9
