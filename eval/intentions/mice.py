@@ -8,12 +8,11 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 from torch.nn.utils.rnn import pad_sequence
 
-from eval.worlds.labyrinth import DATA, arrives_within
+from eval.worlds.labyrinth import DATA, arrivals, arrives_within
 from neuroprior import MarkovPrior, Plans, read_plans
 from neuroprior.analysis import infer
 from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import labyrinth
-from neuroprior.worlds.labyrinth import WATER
 
 BLOCKS = 10
 """Blocks of consecutive sequences, each held out once."""
@@ -45,13 +44,6 @@ FEATURES = {
     "node, move, modes": (1, 3),
 }
 """What the chance of arriving is regressed on, by kind: columns of `features_of`."""
-
-
-def arrivals(plans: Plans) -> Tensor:
-    """`[N, L]` bool: the moves that arrive at the water."""
-    assert plans.context is not None
-    after = labyrinth().next_state[plans.context, plans.actions.long()]
-    return (after == WATER) & (plans.context != WATER)
 
 
 def stretches(plans: Plans, arrives: Tensor) -> tuple[Plans, Plans]:

@@ -1,7 +1,5 @@
 """`python -m eval modes`: how many hidden modes have mice in a labyrinth, which come back, and where they lead."""
 
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
@@ -89,10 +87,8 @@ def modes(
         caption = "The share of the moves in each mode by moves since the water. Bands: 95 % intervals over sequences."
         boxes.append(FigureBox(since_figure(since), caption, "Modes since the last drink.", "since_water"))
     section = Section("Hidden modes of the mice", tables=tables, figures=boxes)
-    given = sys.argv[1:] if sys.argv[1:2] == ["modes"] else ["modes"]
     shown = {"modes": list(modes), "orders": list(orders)} | asdict(settings)
-    command = "python -m eval " + shlex.join(given)
-    document = Document("Hidden modes of mice", lead, [section], frames, shown, command)
+    document = Document("Hidden modes of mice", lead, [section], frames, shown, runs.command_line("modes"))
     publish(document, Path(out))
     write_figures(Path(out), document.figures)
 

@@ -1,6 +1,7 @@
 """Hidden modes of mice in a labyrinth: priors fitted in folds, and what their modes do there."""
 
 from dataclasses import dataclass
+from math import log
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,9 +9,9 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from eval.worlds.labyrinth import DATA, arrives_within
+from eval.worlds.labyrinth import DATA, arrivals, arrives_within
 from neuroprior import Plans, read_plans
-from neuroprior.analysis.comparison import score_bits
+from neuroprior.analysis.comparison import action_bits, score_bits
 from neuroprior.analysis.modes import STABLE, agreements, mode_plans
 from neuroprior.plans import folds
 from neuroprior.priors import SwitchingPrior
@@ -57,9 +58,10 @@ def fit_and_infer(job: Job, settings: ModeSettings) -> dict[str, np.ndarray[Any,
     """ "nats": `[N, L]`, of each move of all sequences; "modes": `[N, L, K]`, their posterior given all of these."""
     plans = read_plans(DATA)
     prior = fitted(job, settings, plans)
-    logits = prior.forward(plans.actions, plans.context).log_softmax(-1)
-    nats = -logits.gather(-1, plans.actions.long()[..., None])[..., 0]
-    return {"nats": nats.numpy(), "modes": prior.posterior(plans).smoothed.to(torch.float16).numpy()}
+    return {
+        "nats": (log(2) * action_bits(prior, plans)).numpy(),
+        "modes": prior.posterior(plans).smoothed.to(torch.float16).numpy(),
+    }
 
 
 def likelihoods(results: dict[Job, dict[str, np.ndarray[Any, Any]]], plans: Plans, seed: int) -> pd.DataFrame:
@@ -72,11 +74,11 @@ def likelihoods(results: dict[Job, dict[str, np.ndarray[Any, Any]]], plans: Plan
     mask[:, :SKIP] = False
     rows = []
     for modes, order in dict.fromkeys((job.modes, job.order) for job in results):
-        nats, least = torch.zeros(plans.actions.shape), torch.ones(modes)
+        nats, least = torch.zeros(plans.actions.shape, dtype=torch.double), torch.ones(modes)
         whole = torch.from_numpy(results[Job(modes, order, FOLDS)]["modes"]).double()
         for fold, (_, held_out) in enumerate(parts):
             found = results[Job(modes, order, fold)]
-            nats[held_out] = torch.from_numpy(found["nats"])[held_out]
+            nats[held_out] = torch.from_numpy(found["nats"]).double()[held_out]
             own = agreements(whole, torch.from_numpy(found["modes"]).double(), plans.mask())
             least = torch.minimum(least, own)
         mean, low, high, _ = score_bits("", "", nats, plans, mask).bits_per_action()
@@ -115,7 +117,7 @@ def events(plans: Plans) -> Events:
     turns[:, 1:] = out[:, 1:] != out[:, :-1]
     known = torch.arange(plans.max_length) <= plans.max_length - WITHIN
     # At node 0 alone a move leads back to its node: home and back.
-    reached = ((after == WATER) & (plans.context != WATER), after == plans.context)
+    reached = (arrivals(plans), after == plans.context)
     padded = (torch.cat([one, one.new_zeros(len(one), WITHIN - 1)], 1) for one in reached)
     water, home = (arrives_within(one, WITHIN) for one in padded)
     return Events(water, home, turns, known.expand(out.shape))

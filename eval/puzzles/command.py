@@ -1,8 +1,6 @@
 """`python -m eval puzzles`: Sokoban and sliding tiles by policy-guided search."""
 
 import json
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
@@ -29,7 +27,7 @@ from eval.puzzles.contest import (
     contest,
     problems_of,
 )
-from eval.worlds.runs import check_distinct
+from eval.worlds.runs import check_distinct, command_line
 from neuroprior._files import write_whole
 from neuroprior._jobs import JobRun
 from neuroprior.analysis.statistics import paired_difference
@@ -139,8 +137,7 @@ def report(
         f" {best['budget']:,} expansions, with {best['mean_expansions']:,.0f} on average."
     )
     sections = [Section(one.title, tables=[one]) for one in tables]
-    given = sys.argv[1:] if sys.argv[1:2] == ["puzzles"] else ["puzzles"]
-    command = "python -m eval " + shlex.join(given)
+    command = command_line("puzzles")
     return Document("Puzzles", lead, sections, frames, asdict(settings), command, keys={"puzzles": "rows"})
 
 

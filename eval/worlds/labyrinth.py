@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from neuroprior import Plans, Prior, SamplingPlanner, TabularWorld
+from neuroprior.worlds import labyrinth
 from neuroprior.worlds.labyrinth import WATER
 
 DATA = Path(__file__).parents[1] / "data" / "labyrinth" / "plans.jsonl"
@@ -40,6 +41,13 @@ def cut_plans(plans: Plans, length: int) -> Plans:
 
     group = torch.arange(len(plans)).repeat_interleave(pieces)
     return replace(plans, actions=cut(plans.actions), context=cut(plans.context), group=group, plan_names=None)
+
+
+def arrivals(plans: Plans) -> Tensor:
+    """`[N, L]` bool: the moves that arrive at the water."""
+    assert plans.context is not None
+    after = labyrinth().next_state[plans.context, plans.actions.long()]
+    return (after == WATER) & (plans.context != WATER)
 
 
 def arrives_within(arrives: Tensor, number: int) -> Tensor:

@@ -87,12 +87,16 @@ def run_experiment(
     run = partial(work, settings=settings)
     jobs = JobRun(run, Path(out) / "runs", asked, name=attrgetter("name"), packages=MAKERS)
     results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title=name)
-    command = name.split()[0]
-    given = sys.argv[1:] if sys.argv[1:2] == [command] else [command]
     shown = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
-    document = report(results, shown, "python -m eval " + shlex.join(given))
+    document = report(results, shown, command_line(name.split()[0]))
     publish(document, Path(out))
     return document
+
+
+def command_line(command: str) -> str:
+    """What was typed to run an experiment, or its command alone where it was called from Python."""
+    given = sys.argv[1:] if sys.argv[1:2] == [command] else [command]
+    return "python -m eval " + shlex.join(given)
 
 
 def check_distinct(**options: Sequence[Any]) -> None:
