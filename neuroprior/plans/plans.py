@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any
 
 import torch
@@ -10,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from neuroprior._checks import check_range, check_sizes, is_integer
-from neuroprior._random import generator_on
 from neuroprior.plans.columns import check_distinct
+from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.tables import Columns, Missing, fields_of
 
 MOST_ACTIONS = 2**31
@@ -19,7 +18,7 @@ MOST_ACTIONS = 2**31
 
 
 @dataclass(frozen=True, eq=False)
-class Plans:
+class Plans(Sequences):
     """N executed plans of up to L actions.
 
     Attributes:
@@ -128,15 +127,6 @@ class Plans:
         elif first is not None and bool((first < torch.as_tensor(self.lengths)).any()):
             plan = int((first < torch.as_tensor(self.lengths)).nonzero()[0, 0])
             raise ValueError(f"actions[{plan}]: goes on after the end symbol {self.end}, at action {int(first[plan])}")
-
-    def __len__(self) -> int:
-        """The number of plans, N."""
-        return self.actions.shape[0]
-
-    @property
-    def max_length(self) -> int:
-        """The number of columns of `actions`, L."""
-        return self.actions.shape[1]
 
     def mask(self, end: bool = True) -> Tensor:
         """`[N, L]` bool: True where a plan has an action; with `end` False, one that is not the end symbol."""
@@ -288,39 +278,6 @@ class Plans:
     def without_context(self) -> "Plans":
         """The same plans without their context."""
         return self if self.context is None else replace(self, context=None, context_names=None)
-
-    def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple["Plans", "Plans"]:
-        """Split at random into plans for training and plans for validation; groups stay together.
-
-        One plan alone is cut in time: its last actions are held out.
-
-        Args:
-            validation: the share of plans (of groups, where there are any; of the actions of a single plan) held out,
-                between 0 and 1; at least one plan, group or action is kept on each side.
-            generator: draws the split.
-
-        Raises:
-            ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups, and not a
-                single plan of at least two actions.
-        """
-        given: object = validation
-        if not isinstance(given, Real) or not 0 < validation < 1:
-            said = given if isinstance(given, Real | str | None) else type(given).__name__
-            raise ValueError(f"validation: a share between 0 and 1 is expected, not {said}")
-        length = int(self.mask().sum()) if len(self) == 1 else 0
-        if length > 1:
-            cut = length - min(max(round(length * validation), 1), length - 1)
-            return self.steps(0, cut), self.steps(cut, length)
-        unit = torch.arange(len(self)) if self.group is None else self.group.unique(return_inverse=True)[1].cpu()
-        units = int(unit.max()) + 1 if len(unit) else 0
-        if units < 2:
-            raise ValueError(f"plans: {units} {'plans' if self.group is None else 'groups'} cannot be split in two")
-        held_out = min(max(round(units * validation), 1), units - 1)
-        order = torch.randperm(units, generator=generator_on(generator, "cpu"))
-        chosen = torch.zeros(units, dtype=torch.bool)
-        chosen[order[:held_out]] = True
-        index = chosen[unit].to(self.actions.device)
-        return self[~index], self[index]
 
     def steps(self, first: int = 0, stop: int | None = None) -> "Plans":
         """Actions `first` to `stop` - 1 of each plan, with what belongs to them; shorter plans have fewer, or none.

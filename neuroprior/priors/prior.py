@@ -1,21 +1,22 @@
 """The interface of a prior: a distribution over action sequences that is also a small state machine."""
 
 import inspect
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, ClassVar, Literal, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from neuroprior._checks import check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans import PastDurations, Plans, check_context, check_patterns, has_patterns, is_per_step
+from neuroprior.priors.saved import SavedModule
 from neuroprior.sampling import ancestral as sampling
 from neuroprior.sampling.draws import after_end
 
 
-class Prior(nn.Module, ABC):
+class Prior(SavedModule):
     """A distribution over sequences of A actions, numbered from 0.
 
     A subclass writes `start`, `step` and `fit`. Samplers and planners use `num_actions`, `start` and `step` alone.
@@ -45,15 +46,8 @@ class Prior(nn.Module, ABC):
         ValueError: an argument is out of range.
     """
 
-    known: ClassVar[dict[str, type["Prior"]]] = {}
-    """Every subclass by name; `load` finds a folder's class here."""
-
     actions_at_once: ClassVar[int] = 2**21
     """Actions that `log_prob` scores together; bounds the memory that it takes."""
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        Prior.known[cls.__name__] = cls
 
     def __init__(
         self,
@@ -85,10 +79,6 @@ class Prior(nn.Module, ABC):
     def takes_context(self) -> bool:
         """True for a prior whose predictions depend on a context."""
         return not (self.num_contexts is None and self.context_size is None and self.num_patterns is None)
-
-    def __repr__(self) -> str:
-        """The class with its constructor's arguments; priors made of priors show these in the same way."""
-        return _call(type(self), self.config)
 
     @property
     def device(self) -> torch.device:
@@ -375,6 +365,21 @@ class Prior(nn.Module, ABC):
                 )
 
 
+def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
+    """A prior that is given, or described as in the `config` of a prior made of priors: `prior` (its class), `config`.
+
+    Raises:
+        KeyError: the description lacks a key, or there is no such class.
+        ValueError: it describes another kind of module.
+    """
+    if isinstance(given, Prior):
+        return given
+    made = SavedModule.known[given["prior"]](**given["config"])
+    if not isinstance(made, Prior):
+        raise ValueError(f"{given['prior']}: not a prior over numbered actions")
+    return made
+
+
 def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[str, int]) -> Prior:
     """A prior from its class, or a function that makes it.
 
@@ -423,19 +428,6 @@ def as_actions(plans: Any) -> Tensor:
         return torch.as_tensor(plans)
     except (RuntimeError, TypeError, ValueError):
         raise ValueError(f"plans: Plans or a tensor is expected, not {type(plans).__name__}") from None
-
-
-def _call(kind: type[Prior], config: Mapping[str, Any]) -> str:
-    """A call of the constructor with these arguments, in the order of its parameters."""
-    order = list(inspect.signature(kind).parameters)
-    names = sorted(config, key=lambda name: order.index(name) if name in order else len(order))
-    return f"{kind.__name__}({', '.join(f'{name}={_argument(config[name])}' for name in names)})"
-
-
-def _argument(value: Any) -> str:
-    if isinstance(value, Mapping) and set(value) == {"prior", "config"}:
-        return _call(Prior.known[value["prior"]], value["config"])
-    return f"[{', '.join(map(_argument, value))}]" if isinstance(value, list) else repr(value)
 
 
 def _names(what: str, learned: dict[str, Any], most: int) -> tuple[str, ...] | None:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import torch
 from safetensors import SafetensorError
@@ -13,6 +13,7 @@ from safetensors.torch import save as write_tensors
 
 from neuroprior._files import read_json
 from neuroprior.priors.prior import Prior
+from neuroprior.priors.saved import SavedModule
 
 FILES = ("model.safetensors", "config.json")
 
@@ -23,13 +24,16 @@ SPARE = 2**26
 """Numbers that a prior may hold beyond those of its file before these are read."""
 
 
-def save(prior: Prior, folder: str | os.PathLike[str]) -> Path:
+Kind = TypeVar("Kind", bound=SavedModule)
+
+
+def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
     """Save a prior to a folder, made if need be: `model.safetensors` (weights or counts) and `config.json`.
 
     Both files are written under temporary names and renamed when they are whole.
 
     Args:
-        prior: any `Prior` whose `config` gives its constructor's arguments.
+        prior: any prior, of actions or of vectors, whose `config` gives its constructor's arguments.
         folder: where.
 
     Returns:
@@ -39,7 +43,7 @@ def save(prior: Prior, folder: str | os.PathLike[str]) -> Path:
         OSError: the folder cannot be written.
         ValueError: it is no prior.
     """
-    if not isinstance(prior, Prior):
+    if not isinstance(prior, SavedModule):
         raise ValueError(f"prior: a Prior is expected, not {type(prior).__name__}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -60,22 +64,34 @@ def save(prior: Prior, folder: str | os.PathLike[str]) -> Path:
     return folder
 
 
-def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> Prior:
+@overload
+def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> Prior: ...
+@overload
+def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: type[Kind]) -> Kind: ...
+def load(
+    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: type[SavedModule] = Prior
+) -> SavedModule:
     """The prior that `save` wrote to a folder.
 
     Args:
         folder: where.
         device: where the prior shall compute.
+        kind: the class that is expected: `neuroprior.priors.VectorPrior` for a prior over vectors.
 
     Raises:
         FileNotFoundError: the folder or one of its two files is not there.
-        ValueError: a file is damaged or not of this kind, the prior's class is not known (import it first), or there is
-            no such device.
+        ValueError: a file is damaged or not of this kind, the prior's class is not known (import it first), it is of
+            another kind, or there is no such device.
     """
     if not isinstance(folder, str | os.PathLike):
         raise ValueError(f"folder: the name of a folder is expected, not {type(folder).__name__}")
     folder = Path(folder)
     config = _read_config(folder / "config.json")
+    made = SavedModule.known[config["prior"]]
+    if not issubclass(made, kind):
+        raise ValueError(
+            f"{folder}: a {made.__name__} is not a {kind.__name__}; use load(folder, kind={_kind_of(made).__name__})"
+        )
     data = (folder / "model.safetensors").read_bytes()
     digest = hashlib.sha256(data).hexdigest()
     unfinished = folder / ".config.json.partial"
@@ -110,9 +126,14 @@ def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> 
         raise ValueError(f"device: {str(device)!r} cannot be used here ({str(error).splitlines()[0][:200]})") from error
 
 
-def _made(config: dict[str, Any]) -> Prior:
+def _kind_of(made: type[SavedModule]) -> type[SavedModule]:
+    """The interface that a class implements: the one below `SavedModule`."""
+    return made.__mro__[made.__mro__.index(SavedModule) - 1]
+
+
+def _made(config: dict[str, Any]) -> SavedModule:
     """The prior that a configuration describes, before its tensors are loaded."""
-    prior = Prior.known[config["prior"]](**config["config"])
+    prior = SavedModule.known[config["prior"]](**config["config"])
     prior.restore(config["learned"])
     return prior
 
@@ -137,7 +158,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     missing = [key for key in ("prior", "config", "learned", "sha256") if key not in config]
     if missing:
         raise ValueError(f"{path}: {missing[0]!r} is missing")
-    if not isinstance(config["prior"], str) or config["prior"] not in Prior.known:
+    if not isinstance(config["prior"], str) or config["prior"] not in SavedModule.known:
         raise ValueError(f"{path}: the prior {config['prior']!r} is not known; import the module that defines it first")
     for key in ("config", "learned"):
         if not isinstance(config[key], dict):

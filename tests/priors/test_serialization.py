@@ -10,7 +10,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, UniformPrior, load, save
+from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, load, save
+from neuroprior.priors.saved import SavedModule
 from tests.support.sources import refuses, says, seeded
 
 A = 3
@@ -281,7 +282,7 @@ def test_a_class_of_ones_own_is_found_by_name(tmp_path):
 
     save(OwnPrior(A), tmp_path)
     assert type(load(tmp_path)) is OwnPrior
-    del Prior.known["OwnPrior"]
+    del SavedModule.known["OwnPrior"]
     refused(tmp_path, "OwnPrior", "import")
 
 

@@ -12,7 +12,7 @@ from neuroprior.plans import Plans
 from neuroprior.priors.counts import MarkovPrior
 from neuroprior.priors.durations.duration_model import DurationModel
 from neuroprior.priors.durations.laws import LAW_NAMES, LawName
-from neuroprior.priors.prior import Prior, construct
+from neuroprior.priors.prior import Prior, as_prior, construct
 
 
 class SemiMarkovPrior(Prior):
@@ -47,9 +47,9 @@ class SemiMarkovPrior(Prior):
         laws: Sequence[LawName] = LAW_NAMES,
         transitions: bool = True,
     ) -> None:
-        if isinstance(actions, Mapping):
-            actions = Prior.known[actions["prior"]](**actions["config"])
-        elif not isinstance(actions, Prior):
+        if isinstance(actions, Mapping | Prior):
+            actions = as_prior(actions)
+        else:
             contexts = {"num_contexts": num_contexts, "context_size": context_size}
             actions = construct(actions, num_actions, {name: c for name, c in contexts.items() if c is not None})
         if actions.num_actions != num_actions:

@@ -21,7 +21,7 @@ from neuroprior.priors.ensembles.mixture import (
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.neural.neural import training_settings
-from neuroprior.priors.prior import Prior, taken_of
+from neuroprior.priors.prior import Prior, as_prior, taken_of
 from neuroprior.priors.uniform import UniformPrior
 
 LEAST = -30.0
@@ -117,7 +117,7 @@ class CombinedPrior(MixturePrior):
 
     def restore(self, learned: dict[str, Any]) -> None:
         if "kept" in learned:
-            kept = [Prior.known[e["prior"]](**e["config"]) for e in learned["kept"]]
+            kept = [as_prior(e) for e in learned["kept"]]
             self.experts = nn.ModuleList(kept).to(self.device)
         super().restore(learned)
         if not isinstance(learned["tried"], int) or learned["tried"] < 0:

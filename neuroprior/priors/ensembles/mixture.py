@@ -11,7 +11,7 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.prior import Prior, taken_of
+from neuroprior.priors.prior import Prior, as_prior, taken_of
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates for the share; `fit` takes the best."""
@@ -59,7 +59,7 @@ class MixturePrior(Prior):
             raise ValueError("experts: at least one is expected")
         if not 0 <= share <= 1:
             raise ValueError(f"share: a number between 0 and 1 is expected, not {share!r}")
-        made = [e if isinstance(e, Prior) else Prior.known[e["prior"]](**e["config"]) for e in experts]
+        made = [as_prior(e) for e in experts]
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")

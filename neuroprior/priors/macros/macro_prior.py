@@ -11,7 +11,7 @@ from neuroprior._hashing import row_hashes
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.macros.macros import CRITERIA, Criterion, Macro, macros_of
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, as_prior
 
 
 class MacroPrior(Prior):
@@ -51,7 +51,7 @@ class MacroPrior(Prior):
         check_sizes(num_actions=num_actions)
         if by not in CRITERIA:
             raise ValueError(f"by: one of {', '.join(map(repr, CRITERIA))} is expected, not {by!r}")
-        made = inner if isinstance(inner, Prior) else Prior.known[inner["prior"]](**inner["config"])
+        made = as_prior(inner)
         if made.num_actions <= num_actions:
             raise ValueError(
                 f"inner: a prior over more than {num_actions} actions is expected, one for each macro;"

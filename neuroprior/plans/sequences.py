@@ -1,0 +1,76 @@
+"""What plans of numbered actions and plans of vectors have in common: they are split into training and validation."""
+
+from abc import ABC, abstractmethod
+from numbers import Real
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from neuroprior._random import generator_on
+
+
+class Sequences(ABC):
+    """N executed plans of up to L actions of some kind.
+
+    Attributes:
+        actions: `[N, L, ...]`.
+        group: integers `[N]`: the plans of a group are not independent; None if each plan is independent.
+    """
+
+    actions: Tensor
+    group: Tensor | None
+
+    def __len__(self) -> int:
+        """The number of plans, N."""
+        return self.actions.shape[0]
+
+    @property
+    def max_length(self) -> int:
+        """The number of columns of `actions`, L."""
+        return self.actions.shape[1]
+
+    @abstractmethod
+    def mask(self) -> Tensor:
+        """`[N, L]` bool: True where a plan has an action."""
+
+    @abstractmethod
+    def __getitem__(self, index: Tensor | slice) -> Self:
+        """The plans at `index` (a slice, integers or a bool mask)."""
+
+    @abstractmethod
+    def steps(self, first: int = 0, stop: int | None = None) -> Self:
+        """Actions `first` to `stop` - 1 of each plan, with what belongs to them."""
+
+    def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple[Self, Self]:
+        """Split at random into plans for training and plans for validation; groups stay together.
+
+        One plan alone is cut in time: its last actions are held out.
+
+        Args:
+            validation: the share of plans (of groups, where there are any; of the actions of a single plan) held out,
+                between 0 and 1; at least one plan, group or action is kept on each side.
+            generator: draws the split.
+
+        Raises:
+            ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups, and not a
+                single plan of at least two actions.
+        """
+        given: object = validation
+        if not isinstance(given, Real) or not 0 < validation < 1:
+            said = given if isinstance(given, Real | str | None) else type(given).__name__
+            raise ValueError(f"validation: a share between 0 and 1 is expected, not {said}")
+        length = int(self.mask().sum()) if len(self) == 1 else 0
+        if length > 1:
+            cut = length - min(max(round(length * validation), 1), length - 1)
+            return self.steps(0, cut), self.steps(cut, length)
+        unit = torch.arange(len(self)) if self.group is None else self.group.unique(return_inverse=True)[1].cpu()
+        units = int(unit.max()) + 1 if len(unit) else 0
+        if units < 2:
+            raise ValueError(f"plans: {units} {'plans' if self.group is None else 'groups'} cannot be split in two")
+        held_out = min(max(round(units * validation), 1), units - 1)
+        order = torch.randperm(units, generator=generator_on(generator, "cpu"))
+        chosen = torch.zeros(units, dtype=torch.bool)
+        chosen[order[:held_out]] = True
+        index = chosen[unit].to(self.actions.device)
+        return self[~index], self[index]

@@ -1,0 +1,118 @@
+"""The interface of a world whose actions are vectors: a batched simulator in which a planner tries its plans."""
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from neuroprior.worlds.world import Rollout, join_states
+
+
+class ContinuousWorld(ABC):
+    """A batched simulator whose actions are vectors of D numbers between bounds.
+
+    A state is one tensor whose first dimension is the batch; what its other dimensions mean is up to the world.
+    A subclass sets the bounds and writes `reset` and `step`; the rest has defaults.
+
+    Attributes:
+        action_low, action_high: `[D]` float32, finite: the bounds of each dimension. Actions beyond them are refused.
+        action_names: names of the D dimensions (joints, muscles), where there are any.
+        stochastic: True where the outcome of an action is random.
+    """
+
+    action_low: Tensor
+    action_high: Tensor
+    action_names: tuple[str, ...] | None = None
+    stochastic: bool = False
+
+    @property
+    def action_size(self) -> int:
+        """The number of dimensions of an action, D."""
+        return len(self.action_low)
+
+    @abstractmethod
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        """Random states to plan from, `[batch_size, ...]`."""
+
+    @abstractmethod
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """One step.
+
+        Args:
+            state: `[N, ...]`.
+            action: floating point `[N, D]` between the bounds.
+            generator: draws what is random.
+
+        Returns:
+            The next state `[N, ...]` and the reward of the step, `[N]` floating point: 0 from terminated states on.
+        """
+
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        """Try P plans from each of B starts. Shapes, dtypes and bounds are checked once, here, not at every step.
+
+        Args:
+            state: `[B, ...]`.
+            plans: floating point `[B, P, L, D]` between the bounds.
+            generator: draws what is random.
+            keep_states: also return the state after each step.
+
+        Returns:
+            Final states `[B, P, ...]`, rewards `[B, P, L]`, and states `[B, P, L, ...]` or None.
+
+        Raises:
+            ValueError: a shape, dtype or value is wrong; the message says which.
+        """
+        self.check_state(state)
+        check_vectors("plans", plans, self.action_low, self.action_high)
+        if plans.dim() != 4 or len(plans) != len(state):
+            raise ValueError(
+                f"plans: shape [B, P, L, D] with B = {len(state)} starts is expected, not {list(plans.shape)}"
+            )
+        batch, num_plans, length, _ = plans.shape
+        now = state.repeat_interleave(num_plans, 0)
+        rewards, states = [torch.zeros(batch, num_plans, 0, device=state.device)], []
+        for t in range(length):
+            now, reward = self.step(now, plans[:, :, t].flatten(0, 1), generator)
+            rewards.append(reward.view(batch, num_plans, 1))
+            if keep_states:
+                states.append(now)
+        shape = (batch, num_plans, *state.shape[1:])
+        kept = join_states(states, state, shape) if keep_states else None
+        return Rollout(now.view(shape), torch.cat(rewards, -1), kept)
+
+    def observe(self, state: Tensor) -> Tensor:
+        """The observation in `state [N, ...]`: floating point features `[N, C]`. Default: the state itself."""
+        return state.flatten(1).float()
+
+    def terminated(self, state: Tensor) -> Tensor:
+        """Which of `state [N, ...]` are final: `[N]` bool. Default: none."""
+        return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
+
+    def check_state(self, state: Tensor) -> None:
+        """Raise ValueError where `state` cannot be a batch of this world's states. Default: it must have a batch."""
+        if not isinstance(state, Tensor) or state.dim() == 0:
+            raise ValueError("state: a tensor of shape [B, ...] is expected, not a single number or another type")
+
+
+def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None:
+    """Raise ValueError unless `vectors [..., D]` are floating point numbers between `low [D]` and `high [D]`.
+
+    A millionth of the range beyond the bounds is taken for rounding.
+    """
+    if not vectors.is_floating_point():
+        raise ValueError(
+            f"{name}: floating point numbers are expected, not {str(vectors.dtype).removeprefix('torch.')}"
+        )
+    if not vectors.dim() or vectors.shape[-1] != len(low):
+        raise ValueError(f"{name}: vectors of {len(low)} numbers are expected, not {list(vectors.shape)}")
+    slack = 1e-6 * (high - low)
+    inside = (vectors >= low - slack) & (vectors <= high + slack)
+    if not inside.all():
+        where = (~inside).nonzero()[0].tolist()
+        d = where[-1]
+        raise ValueError(
+            f"{name}{where}: {float(vectors[tuple(where)]):g} is not between the bounds of dimension {d},"
+            f" {float(low[d]):g} and {float(high[d]):g}"
+        )
