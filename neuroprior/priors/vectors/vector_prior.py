@@ -279,7 +279,8 @@ class VectorPrior(SavedModule):
         for _ in range(length - 1):
             forecast, state = self.step(vectors[-1], state)
             vectors.append(forecast.sample(generator))
-        return torch.stack(vectors, 1).unflatten(0, (len(past), num_plans))
+        plans: Tensor = torch.stack(vectors, 1)
+        return plans.view(len(past), num_plans, length, self.action_size)
 
     def log_prob(self, plans: VectorPlans) -> Tensor:
         """Nats `[N]` of plans, a censored density; see `Forecast`.
