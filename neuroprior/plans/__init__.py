@@ -20,6 +20,7 @@ from neuroprior.plans.plans import (
     is_per_step,
 )
 from neuroprior.plans.tables import Columns, Missing
+from neuroprior.plans.vector_plans import VectorPlans
 
 __all__ = [
     "BLOCKS",
@@ -28,6 +29,7 @@ __all__ = [
     "FEWEST_UNITS",
     "PastDurations",
     "Plans",
+    "VectorPlans",
     "action_dtype",
     "all_plans",
     "check_context",

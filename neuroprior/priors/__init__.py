@@ -12,14 +12,25 @@ from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
 from neuroprior.priors.switching import ModePosterior, SwitchingNetwork, SwitchingPrior
 from neuroprior.priors.uniform import UniformPrior
+from neuroprior.priors.vectors import (
+    AutoregressivePrior,
+    GaussianForecast,
+    NoisePrior,
+    StepSynergies,
+    StoredWindows,
+    VectorPrior,
+    WindowSynergies,
+)
 
 __all__ = [
+    "AutoregressivePrior",
     "BoardNetwork",
     "CombinedPrior",
     "ContextTreePrior",
     "DurationLaw",
     "DurationModel",
     "GRUPrior",
+    "GaussianForecast",
     "Leaf",
     "LogLinearPrior",
     "Macro",
@@ -27,16 +38,21 @@ __all__ = [
     "MarkovPrior",
     "MixturePrior",
     "ModePosterior",
+    "NoisePrior",
     "PatternCounts",
     "PatternNetwork",
     "PatternPrior",
     "Prior",
     "SemiMarkovPrior",
     "StackedPrior",
+    "StepSynergies",
+    "StoredWindows",
     "SwitchingNetwork",
     "SwitchingPrior",
     "TransformerPrior",
     "UniformPrior",
+    "VectorPrior",
+    "WindowSynergies",
     "decode",
     "fit",
     "learn_macros",

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, Literal, overload
 
 import torch
 from safetensors import SafetensorError
@@ -14,6 +14,7 @@ from safetensors.torch import save as write_tensors
 from neuroprior._files import read_json
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.saved import SavedModule
+from neuroprior.priors.vectors.vector_prior import VectorPrior
 
 FILES = ("model.safetensors", "config.json")
 
@@ -24,7 +25,7 @@ SPARE = 2**26
 """Numbers that a prior may hold beyond those of its file before these are read."""
 
 
-Kind = TypeVar("Kind", bound=SavedModule)
+KINDS: dict[str, type] = {"actions": Prior, "vectors": VectorPrior}
 
 
 def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
@@ -65,18 +66,25 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
 
 
 @overload
-def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> Prior: ...
-@overload
-def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: type[Kind]) -> Kind: ...
 def load(
-    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: type[SavedModule] = Prior
-) -> SavedModule:
+    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Literal["actions"] = "actions"
+) -> Prior: ...
+@overload
+def load(
+    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Literal["vectors"]
+) -> VectorPrior: ...
+def load(
+    folder: str | os.PathLike[str],
+    device: torch.device | str = "cpu",
+    *,
+    kind: Literal["actions", "vectors"] = "actions",
+) -> Prior | VectorPrior:
     """The prior that `save` wrote to a folder.
 
     Args:
         folder: where.
         device: where the prior shall compute.
-        kind: the class that is expected: `neuroprior.priors.VectorPrior` for a prior over vectors.
+        kind: what it is a prior over: numbered "actions", or "vectors".
 
     Raises:
         FileNotFoundError: the folder or one of its two files is not there.
@@ -87,11 +95,11 @@ def load(
         raise ValueError(f"folder: the name of a folder is expected, not {type(folder).__name__}")
     folder = Path(folder)
     config = _read_config(folder / "config.json")
-    made = SavedModule.known[config["prior"]]
-    if not issubclass(made, kind):
-        raise ValueError(
-            f"{folder}: a {made.__name__} is not a {kind.__name__}; use load(folder, kind={_kind_of(made).__name__})"
-        )
+    if kind not in KINDS:
+        raise ValueError(f'kind: "actions" or "vectors" is expected, not {kind!r}')
+    if not issubclass(SavedModule.known[config["prior"]], KINDS[kind]):
+        other = next(name for name in KINDS if name != kind)
+        raise ValueError(f'{folder}: {config["prior"]} is no prior over {kind}; use load(folder, kind="{other}")')
     data = (folder / "model.safetensors").read_bytes()
     digest = hashlib.sha256(data).hexdigest()
     unfinished = folder / ".config.json.partial"
@@ -121,14 +129,10 @@ def load(
     if broken := [name for name, value in tensors.items() if value.is_floating_point() and bool(value.isnan().any())]:
         raise ValueError(f"{folder / 'model.safetensors'}: {broken[0]} has numbers that are NaN")
     try:
+        assert isinstance(prior, Prior | VectorPrior)
         return prior.to(device).eval()
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device: {str(device)!r} cannot be used here ({str(error).splitlines()[0][:200]})") from error
-
-
-def _kind_of(made: type[SavedModule]) -> type[SavedModule]:
-    """The interface that a class implements: the one below `SavedModule`."""
-    return made.__mro__[made.__mro__.index(SavedModule) - 1]
 
 
 def _made(config: dict[str, Any]) -> SavedModule:

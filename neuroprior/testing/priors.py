@@ -8,12 +8,14 @@ from torch import Tensor
 
 from neuroprior.plans import Plans, all_plans, is_per_step
 from neuroprior.priors import Prior, load, save
+from neuroprior.priors.vectors import VectorPrior
 from neuroprior.sampling.ancestral import sample
 from neuroprior.testing.chi_square import chi_square
 from neuroprior.testing.rules import FALSE_ALARM, require
+from neuroprior.testing.vector_priors import check_vector_prior
 
 
-def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
+def check_prior(prior: Prior | VectorPrior, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `prior` does what a prior must.
 
     With each kind of context that it takes: stepping equals `forward`, also past its window and after states were
@@ -22,15 +24,21 @@ def check_prior(prior: Prior, length: int | None = None, num_plans: int = 20_000
     same plans and torch's global generator is left alone; saving and loading, and moving to a GPU where there is one,
     change nothing.
 
+    A prior over vectors is checked in the same way: stepping against `action_log_probs`, and, with one or two
+    dimensions, that its densities integrate to one, the masses at the bounds included, and that samples fit them.
+
     Args:
-        prior: the prior to check, trained or not.
-        length: of the plans; None: the longest (at most 5) with at most 1,024 plans.
-        num_plans: samples of a chi-square test.
+        prior: the prior to check, trained or not; over numbered actions or over vectors.
+        length: of the plans; None: the longest (at most 5) with at most 1,024 plans; 5 for vectors.
+        num_plans: samples of a chi-square test, at most.
         seed: draws plans and contexts.
 
     Raises:
         AssertionError: the prior breaks a rule.
     """
+    if isinstance(prior, VectorPrior):
+        check_vector_prior(prior, length or 5, num_plans, seed)
+        return
     actions = prior.num_actions
     if length is None:
         length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)

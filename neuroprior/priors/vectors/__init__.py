@@ -1,5 +1,18 @@
 """Priors over vectors in time: distributions over sequences of numbers between bounds, for continuous actions."""
 
+from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
+from neuroprior.priors.vectors.noise import NoisePrior
+from neuroprior.priors.vectors.stored_windows import StoredWindows
+from neuroprior.priors.vectors.synergies import StepSynergies, WindowSynergies
 from neuroprior.priors.vectors.vector_prior import Forecast, GaussianForecast, VectorPrior
 
-__all__ = ["Forecast", "GaussianForecast", "VectorPrior"]
+__all__ = [
+    "AutoregressivePrior",
+    "Forecast",
+    "GaussianForecast",
+    "NoisePrior",
+    "StepSynergies",
+    "StoredWindows",
+    "VectorPrior",
+    "WindowSynergies",
+]

@@ -171,6 +171,20 @@ class VectorPrior(SavedModule):
         return len(self.action_low)
 
     @property
+    def middle(self) -> Tensor:
+        """`[D]`, the middle of the range."""
+        return (self.action_low + self.action_high) / 2
+
+    @property
+    def half_range(self) -> Tensor:
+        """`[D]`, half the range: the unit of standard deviations."""
+        return (self.action_high - self.action_low) / 2
+
+    def scaled(self, vectors: Tensor) -> Tensor:
+        """`vectors [..., D]` in units of half the range, from its middle."""
+        return (vectors - self.middle) / self.half_range
+
+    @property
     def device(self) -> torch.device:
         """Where the prior computes."""
         return self.action_low.device
@@ -266,6 +280,8 @@ class VectorPrior(SavedModule):
         check_sizes(num_plans=num_plans, length=length)
         batch = 1 if context is None else len(context)
         past = torch.zeros(batch, 0, self.action_size, device=self.device) if past is None else past
+        if past.dim() != 3 or past.shape[2] != self.action_size or not bool(past.isfinite().all()):
+            raise ValueError(f"past: finite vectors [B, T, {self.action_size}] are expected, not {list(past.shape)}")
         self.check_context(context, len(past))
         return self.continuations(num_plans, length, past, context, generator_on(generator, self.device))
 

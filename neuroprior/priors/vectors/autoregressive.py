@@ -1,0 +1,60 @@
+"""Vector autoregressions: the Markov chains of continuous actions."""
+
+from typing import Any
+
+import torch
+
+from neuroprior._checks import check_count
+from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.priors.vectors.linear_gaussian import (
+    LinearGaussianPrior,
+    best_of,
+    held_out_split,
+    mean_nats,
+    moments_or_white,
+)
+
+RIDGES = (1e-5, 1e-3, 1e-1)
+"""Added to the variances of the past, as shares of the mean variance; held-out likelihood chooses."""
+
+
+class AutoregressivePrior(LinearGaussianPrior):
+    """A vector autoregression of order p, by ridge regression over all plans: the Markov chain of this setting.
+
+    Args:
+        action_low, action_high: D numbers each: the bounds.
+        order: p, vectors that predictions depend on; None: the one of `orders` that predicts held-out plans best. The
+            ridge is always chosen so.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    orders = (1, 2, 3, 4, 6, 8, 12, 16)
+    """Those that `fit` tries."""
+
+    def __init__(self, action_low: Any, action_high: Any, order: int | None = None) -> None:
+        super().__init__(action_low, action_high)
+        if order is not None:
+            check_count("order", order)
+        self.order = order
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return super().config | {"order": self.order}
+
+    def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
+        orders = self.orders if self.order is None else (self.order,)
+        learning, held_out = held_out_split(plans, generator)
+        scores: dict[tuple[int, float], float] = {}
+        for order in orders:
+            windows = self.scaled(learning.windows(order + 1))
+            if scores and len(windows) <= (order + 1) * self.action_size:
+                break
+            moments = moments_or_white(windows, self.scaled(learning.actions)[learning.mask()], order)
+            for ridge in RIDGES:
+                self.set_window(*moments, ridge)
+                scores[order, ridge] = mean_nats(self, held_out)
+        order, ridge = best_of(scores)
+        windows = self.scaled(plans.windows(order + 1))
+        self.set_window(*moments_or_white(windows, self.scaled(plans.actions)[plans.mask()], order), ridge)

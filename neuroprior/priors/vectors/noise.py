@@ -1,0 +1,83 @@
+"""Noise as a prior over vectors: white, or coloured as planners draw it."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_count
+from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.priors.vectors.linear_gaussian import LEAST_STD, LinearGaussianPrior, best_of, mean_nats
+
+
+class NoisePrior(LinearGaussianPrior):
+    """Coloured noise: each dimension is an independent Gaussian process with power 1 / f ** exponent.
+
+    With exponent 0 this is white noise, with 2 about a random walk; planners such as iCEM draw their candidates so
+    (Pinneri et al., 2020). Given vectors before, the noise goes on from them. The process is periodic in 2 (`memory` +
+    1) steps, and its slowest part has that period.
+
+    Args:
+        action_low, action_high: D numbers each: the bounds.
+        exponent: of the spectrum, from 0; None: the one with the highest likelihood in `fit`.
+        scale: standard deviation, in units of half the range; None: each dimension's own in `fit` (1 before that).
+        memory: vectors that predictions depend on.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    exponents = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+    """Those that `fit` tries."""
+
+    def __init__(
+        self,
+        action_low: Any,
+        action_high: Any,
+        exponent: float | None = 0.0,
+        scale: float | None = None,
+        memory: int = 30,
+    ) -> None:
+        super().__init__(action_low, action_high)
+        check_count("memory", memory)
+        for name, value in (("exponent", exponent), ("scale", scale)):
+            if value is not None and not 0 <= value < float("inf"):
+                raise ValueError(f"{name}: a number of at least 0 is expected, not {value!r}")
+        self._given = {"exponent": exponent, "scale": scale, "memory": memory}
+        self.exponent = exponent or 0.0
+        self._colour(self.exponent, torch.zeros(self.action_size), torch.full((self.action_size,), scale or 1.0))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return super().config | self._given
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return super().learned | {"exponent": self.exponent}
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
+        self.exponent = float(learned["exponent"])
+
+    def _colour(self, exponent: float, mean: Tensor, scale: Tensor) -> None:
+        memory = int(self._given["memory"] or 0) if exponent else 0
+        lags = torch.arange(memory + 1, dtype=torch.double)
+        frequency = torch.arange(1, memory + 2, dtype=torch.double) / (2 * (memory + 1))
+        power = frequency**-exponent
+        shape = (power[:, None] * torch.cos(2 * torch.pi * frequency[:, None] * lags)).sum(0) / power.sum()
+        toeplitz = shape[(lags[:, None] - lags).abs().long()] if exponent else torch.ones(1, 1, dtype=torch.double)
+        variance = torch.diag(scale.double().square())
+        self.set_window(mean.double().repeat(memory + 1), torch.kron(toeplitz.contiguous(), variance))
+
+    def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
+        values = self.scaled(plans.actions)[plans.mask()]
+        mean, std = values.mean(0), values.std(0, correction=0).clamp(min=LEAST_STD)
+        if self._given["scale"] is not None:
+            mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])
+        if self._given["exponent"] is None:
+            scores = {}
+            for exponent in self.exponents:
+                self._colour(exponent, mean, std)
+                scores[exponent] = mean_nats(self, plans)
+            self.exponent = best_of(scores)
+        self._colour(self.exponent, mean, std)

@@ -1,0 +1,188 @@
+"""Stored windows: plans go on as they went on before, after the past that was nearest."""
+
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_count, check_memory, check_sizes
+from neuroprior._random import generator_on
+from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.priors.vectors.linear_gaussian import best_of, held_out_split, mean_nats
+from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
+
+BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
+"""That `fit` tries, of the match of the past."""
+
+NOISES = (0.02, 0.05, 0.1, 0.2, 0.4)
+"""That `fit` tries, around the stored vectors."""
+
+MOST_CHOSEN_ON = 2_000
+"""Stored windows that bandwidths are chosen with, at most; all are kept."""
+
+
+class StoredWindows(VectorPrior):
+    """A nearest-neighbour prior: segments of executed plans are followed, with noise.
+
+    A segment of `horizon` vectors is one of the stored ones, the more probable the nearer the vectors before it are to
+    the present past: with probability proportional to exp(-d / (2 bandwidth ** 2)), d the sum of squared differences
+    over the last `match` vectors. It is followed with independent Gaussian noise, and then the next one is chosen. As
+    which segment is being followed is not known, a vector's density is that of a mixture, weighted by what was seen of
+    the segment so far. All distances are in units of half the range.
+
+    `read` begins a new segment after the past. `state` is `[N, 2 + match * D + M]`: vectors known, place in the
+    segment, the last vectors, and the log-weights of M stored segments.
+
+    Args:
+        action_low, action_high: D numbers each: the bounds.
+        match: vectors of the past that are compared.
+        horizon: vectors of a segment.
+        bandwidth: of the match; None: the one that predicts held-out plans best.
+        noise: standard deviation around the stored vectors; None: chosen in the same way.
+        max_windows: segments that are stored at most; of more, as many evenly spaced ones.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    segments: Tensor
+
+    def __init__(
+        self,
+        action_low: Any,
+        action_high: Any,
+        match: int = 4,
+        horizon: int = 20,
+        bandwidth: float | None = None,
+        noise: float | None = None,
+        max_windows: int = 10_000,
+    ) -> None:
+        super().__init__(action_low, action_high)
+        check_sizes(horizon=horizon, max_windows=max_windows)
+        check_count("match", match)
+        for name, value in (("bandwidth", bandwidth), ("noise", noise)):
+            if value is not None and not 0 < value < float("inf"):
+                raise ValueError(f"{name}: a number above 0 is expected, not {value!r}")
+        self.match, self.horizon, self.max_windows = match, horizon, max_windows
+        self._given = {"bandwidth": bandwidth, "noise": noise}
+        self.bandwidth, self.noise = bandwidth or 0.2, noise or 0.1
+        self.memory = match
+        # Before anything is learned, one segment in the middle of the range.
+        self.register_buffer("segments", torch.zeros(1, match + horizon, self.action_size))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        own = {"match": self.match, "horizon": self.horizon, "max_windows": self.max_windows}
+        return super().config | own | self._given
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        found = {"bandwidth": self.bandwidth, "noise": self.noise, "num_segments": len(self.segments)}
+        return super().learned | found
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
+        number = learned["num_segments"]
+        check_sizes(num_segments=number)
+        shape = (number, self.match + self.horizon, self.action_size)
+        check_memory(4 * shape[0] * shape[1] * shape[2], num_segments=number)
+        self.bandwidth, self.noise = float(learned["bandwidth"]), float(learned["noise"])
+        self.register_buffer("segments", torch.zeros(shape, device=self.device))
+
+    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+        self.check_settings(settings)
+        plans = self.training_plans(plans)
+        if None in self._given.values():
+            learning, held_out = held_out_split(plans, generator_on(generator, "cpu"))
+            self._store(learning, min(self.max_windows, MOST_CHOSEN_ON))
+            bandwidths = (self._given["bandwidth"],) if self._given["bandwidth"] else BANDWIDTHS
+            noises = (self._given["noise"],) if self._given["noise"] else NOISES
+            scores = {}
+            for self.bandwidth in bandwidths:
+                for self.noise in noises:
+                    scores[self.bandwidth, self.noise] = mean_nats(self, held_out)
+            self.bandwidth, self.noise = best_of(scores)
+        self._store(plans, self.max_windows)
+        return self
+
+    def _store(self, plans: VectorPlans, most: int) -> None:
+        size = self.match + self.horizon
+        windows = plans.windows(size)
+        if not len(windows):
+            raise ValueError(
+                f"plans: none has {size} vectors, match and horizon together; the longest has"
+                f" {int(plans.mask().sum(1).max())}"
+            )
+        if len(windows) > most:
+            windows = windows[torch.linspace(0, len(windows) - 1, most).round().long()]
+        self.register_buffer("segments", self.scaled(windows).to(self.device))
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        empty = torch.zeros(batch_size, 2 + self.match * self.action_size, device=self.device)
+        return self._begin(empty)
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        size = self.match * self.action_size
+        known, place = int(state[0, 0]) if len(state) else 0, int(state[0, 1]) if len(state) else 0
+        value = self.scaled(action)
+        past = torch.cat([state[:, 2 : 2 + size], value], 1)[:, self.action_size :]
+        head = torch.tensor([min(known + 1, self.match), place + 1], device=self.device).expand(len(state), 2)
+        if place + 1 == self.horizon:
+            return self._begin(torch.cat([head, past], 1))
+        ones = torch.ones(self.action_size, device=self.device)
+        due = self.segments[:, self.match + place]
+        value = torch.where(value.abs() > 1 - 1e-6, value.sign(), value)
+        nats = censored_log_prob(value[:, None], due, self.noise * ones, -ones, ones).sum(-1)
+        weights = (state[:, 2 + size :] + nats).log_softmax(-1)
+        return self._forecast(torch.cat([head, past, weights], 1), place + 1)
+
+    def read(self, past: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        known = min(past.shape[1], self.match)
+        last = self.scaled(past[:, past.shape[1] - known :])
+        padded = torch.nn.functional.pad(last, (0, 0, self.match - known, 0)).flatten(1)
+        head = torch.tensor([known, 0], device=self.device).expand(len(past), 2)
+        return self._begin(torch.cat([head, padded], 1))
+
+    def _begin(self, state: Tensor) -> tuple[GaussianForecast, Tensor]:
+        """A new segment, after the past in `state [N, 2 + match * D]`."""
+        known = int(state[0, 0]) if len(state) else 0
+        head = torch.tensor([known, 0], device=self.device).expand(len(state), 2)
+        return self._forecast(torch.cat([head, state[:, 2:], self._matches(state[:, 2:], known)], 1), 0)
+
+    def _matches(self, past: Tensor, known: int) -> Tensor:
+        """The log-weights `[N, M]` of segments after `past [N, match * D]`, of which the last `known` vectors count."""
+        size = self.action_size
+        own = past[:, (self.match - known) * size :]
+        stored = self.segments[:, self.match - known : self.match].flatten(1)
+        distances = own.square().sum(-1)[:, None] + stored.square().sum(-1) - 2 * own @ stored.T
+        return (-distances / (2 * self.bandwidth**2)).log_softmax(-1)
+
+    def _forecast(self, state: Tensor, place: int) -> tuple[GaussianForecast, Tensor]:
+        mean = (self.middle + self.half_range * self.segments[:, self.match + place]).expand(len(state), -1, -1)
+        weights = state[:, 2 + self.match * self.action_size :]
+        return GaussianForecast(mean, self.noise * self.half_range, self.action_low, self.action_high, weights), state
+
+    def continuations(
+        self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
+    ) -> Tensor:
+        """Whole segments at once: which is followed is drawn at its beginning, and not known afterwards."""
+        _, state = self.read(past)
+        size, batch = self.match * self.action_size, len(past)
+        known = min(past.shape[1], self.match)
+        last, weights = state[:, 2 : 2 + size], state[:, 2 + size :]
+        parts: list[Tensor] = []
+        for at in range(0, length, self.horizon):
+            times = num_plans if not parts else 1
+            chosen = torch.multinomial(weights.exp(), times, replacement=True, generator=generator).flatten()
+            steps = min(self.horizon, length - at)
+            mean = self.segments[chosen, self.match : self.match + steps]
+            noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+            parts.append((mean + self.noise * noise).clamp(-1, 1))
+            if at + steps < length:
+                last = last.repeat_interleave(times, 0)
+                last = torch.cat([last, parts[-1].flatten(1)], 1)[:, steps * self.action_size :]
+                known = min(known + steps, self.match)
+                weights = self._matches(last, known)
+        scaled = torch.cat(parts, 1)
+        plans = (self.middle + self.half_range * scaled).clamp(self.action_low, self.action_high)
+        return plans.view(batch, num_plans, length, self.action_size)

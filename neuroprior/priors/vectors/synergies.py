@@ -1,0 +1,168 @@
+"""Synergies: actions lie near a plane of few dimensions, of windows over time or of single vectors."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuroprior._checks import check_count, check_sizes
+from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.priors.vectors.linear_gaussian import (
+    LinearGaussianPrior,
+    best_of,
+    held_out_split,
+    mean_nats,
+    moments_or_white,
+    window_moments,
+)
+
+RIDGE = 1e-5
+"""Added to the variances of the past, as a share of their mean."""
+
+
+class WindowSynergies(LinearGaussianPrior):
+    """Synergies over time: windows of W vectors lie near a plane of few dimensions, with Gaussian coordinates.
+
+    The principal components of all windows (probabilistic PCA: Tipping and Bishop, 1999) are patterns over time and
+    dimensions together, near motor synergies (time-varying ones: d'Avella et al., 2003). The next vector is predicted
+    from the vectors before it in the window, in closed form.
+
+    Args:
+        action_low, action_high: D numbers each: the bounds.
+        num_components: patterns; None: as many as predict held-out plans best.
+        window: W, vectors in a window, at least 2.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(self, action_low: Any, action_high: Any, num_components: int | None = None, window: int = 20) -> None:
+        super().__init__(action_low, action_high)
+        check_sizes(window=window - 1 if isinstance(window, int) else window)
+        if num_components is not None:
+            check_sizes(num_components=num_components)
+        self.num_components, self.window = num_components, window
+        self.explained: tuple[float, ...] = ()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return super().config | {"num_components": self.num_components, "window": self.window}
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return super().learned | {"explained": list(self.explained)}
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
+        self.explained = tuple(float(share) for share in learned["explained"])
+
+    def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
+        window = min(self.window, int(plans.mask().sum(1).max()))
+        most = window * self.action_size
+        tried = [self.num_components or 0]
+        if self.num_components is None:
+            learning, held_out = held_out_split(plans, generator)
+            tried = [k for k in COMPONENTS if k < most] or [most]
+            scores = {}
+            mean, covariance = self._window_moments(learning, window)
+            for number in tried:
+                self.set_window(mean, principal(covariance, number))
+                scores[number] = mean_nats(self, held_out)
+            tried = [best_of(scores)]
+        mean, covariance = self._window_moments(plans, window)
+        self.set_window(mean, principal(covariance, min(tried[0], most)))
+        self.explained = explained_shares(covariance)
+
+    def _window_moments(self, plans: VectorPlans, window: int) -> tuple[Tensor, Tensor]:
+        return moments_or_white(
+            self.scaled(plans.windows(window)), self.scaled(plans.actions)[plans.mask()], window - 1
+        )
+
+
+COMPONENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+"""Numbers of components that are tried."""
+
+
+class StepSynergies(LinearGaussianPrior):
+    """Synergies per step: each vector lies near a plane of few dimensions, whose coordinates are an autoregression.
+
+    The principal components of single vectors are patterns over dimensions at one time (time-invariant synergies); the
+    contrast to `WindowSynergies`.
+
+    Args:
+        action_low, action_high: D numbers each: the bounds.
+        num_components: patterns, at most D; None: as many as predict held-out plans best.
+        order: of the autoregression of the coordinates; 0: independent in time.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(self, action_low: Any, action_high: Any, num_components: int | None = None, order: int = 1) -> None:
+        super().__init__(action_low, action_high)
+        check_count("order", order)
+        if num_components is not None:
+            check_sizes(num_components=num_components)
+            if num_components > self.action_size:
+                raise ValueError(f"num_components: at most {self.action_size}, one a dimension, not {num_components}")
+        self.num_components, self.order = num_components, order
+        self.explained: tuple[float, ...] = ()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return super().config | {"num_components": self.num_components, "order": self.order}
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return super().learned | {"explained": list(self.explained)}
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
+        self.explained = tuple(float(share) for share in learned["explained"])
+
+    def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
+        number = self.num_components
+        if number is None:
+            learning, held_out = held_out_split(plans, generator)
+            scores = {}
+            for each in range(1, self.action_size + 1):
+                self._project(learning, each)
+                scores[each] = mean_nats(self, held_out)
+            number = best_of(scores)
+        self._project(plans, number)
+
+    def _project(self, plans: VectorPlans, number: int) -> None:
+        values = self.scaled(plans.actions)[plans.mask()]
+        covariance = window_moments(values[:, None])[1]
+        vectors = torch.linalg.eigh(covariance)[1][:, -number:]
+        self.explained = explained_shares(covariance)
+        window, size = self.order + 1, self.action_size
+        whole, joint = moments_or_white(self.scaled(plans.windows(window)), values, self.order)
+        # The coordinates keep their covariance over time; what is beside the plane is white, and the same in all
+        # directions.
+        plane = torch.kron(torch.eye(window, dtype=torch.double), vectors @ vectors.T)
+        beside = covariance.trace() - (vectors.T @ covariance @ vectors).trace()
+        white = torch.eye(size, dtype=torch.double) - vectors @ vectors.T
+        level = beside / max(size - number, 1)
+        noise = torch.kron(torch.eye(window, dtype=torch.double), level * white)
+        self.set_window(whole, plane @ joint @ plane + noise, RIDGE)
+
+
+def principal(covariance: Tensor, number: int) -> Tensor:
+    """`covariance [n, n]` with all but its `number` largest principal components made equal (probabilistic PCA)."""
+    values, vectors = torch.linalg.eigh(covariance)
+    values = values.clamp(min=0)
+    number = min(number, len(values))
+    rest = values[: len(values) - number]
+    kept = values.clone()
+    if len(rest):
+        kept[: len(rest)] = rest.mean()
+    rebuilt: Tensor = (vectors * kept) @ vectors.T
+    return rebuilt
+
+
+def explained_shares(covariance: Tensor) -> tuple[float, ...]:
+    """The share of the variance that the first 1, 2, ... principal components explain."""
+    values = torch.linalg.eigvalsh(covariance).flip(0).clamp(min=0)
+    total = values.sum()
+    return tuple((values.cumsum(0) / total).tolist()) if total > 0 else (1.0,) * len(values)

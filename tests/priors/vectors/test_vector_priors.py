@@ -1,0 +1,278 @@
+"""Priors over vectors: the conformance suite, closed forms, and sources whose parameters are known."""
+
+from math import erf, log, pi, sqrt
+
+import pytest
+import torch
+
+from neuroprior.plans import VectorPlans
+from neuroprior.priors import (
+    AutoregressivePrior,
+    GaussianForecast,
+    MarkovPrior,
+    NoisePrior,
+    StepSynergies,
+    StoredWindows,
+    VectorPrior,
+    WindowSynergies,
+    load,
+    save,
+)
+from neuroprior.testing import check_prior
+
+LOW, HIGH = [-1.0, -2.0], [1.0, 3.0]
+KINDS = {
+    "white": lambda low, high: NoisePrior(low, high),
+    "coloured": lambda low, high: NoisePrior(low, high, None, memory=6),
+    "autoregressive": lambda low, high: AutoregressivePrior(low, high),
+    "window synergies": lambda low, high: WindowSynergies(low, high, window=6),
+    "step synergies": lambda low, high: StepSynergies(low, high, order=2),
+    "stored windows": lambda low, high: StoredWindows(low, high, match=2, horizon=4, max_windows=10),
+}
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def source(num: int = 12, length: int = 40, low=LOW, high=HIGH, seed: int = 0) -> VectorPlans:
+    """A damped rotation driven by noise, part of which lies at the bounds."""
+    low, high = torch.tensor(low), torch.tensor(high)
+    turn = 0.95 * torch.tensor([[0.9, -0.43], [0.43, 0.9]])[: len(low), : len(low)]
+    noise = 0.3 * torch.randn(num, length, len(low), generator=seeded(seed))
+    now, rows = torch.zeros(num, len(low)), []
+    for t in range(length):
+        now = (now @ turn.T + noise[:, t]).clamp(-1, 1)
+        rows.append(now)
+    share = (torch.stack(rows, 1) + 1) / 2
+    return VectorPlans(low + share * (high - low), low, high)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fitted", [False, True])
+@pytest.mark.parametrize("size", [1, 2])
+def test_conformance(kind, fitted, size):
+    prior = KINDS[kind](LOW[:size], HIGH[:size])
+    if fitted:
+        prior.fit(source(low=LOW[:size], high=HIGH[:size]), generator=seeded())
+    check_prior(prior, num_plans=2000)
+
+
+def test_a_forecast_is_a_density_between_the_bounds_and_a_mass_at_each():
+    def cdf(x):
+        return 0.5 * (1 + erf(x / sqrt(2)))
+
+    forecast = GaussianForecast(
+        torch.full((3, 1, 1), 0.5), torch.tensor([2.0]), torch.tensor([-1.0]), torch.tensor([3.0])
+    )
+    nats = forecast.log_prob(torch.tensor([[-1.0], [1.5], [3.0]])).double()
+    inside = -0.5 * 0.25 - log(2) - 0.5 * log(2 * pi)
+    expected = torch.tensor([log(cdf(-0.75)), inside, log(1 - cdf(1.25))]).double()
+    assert nats.allclose(expected, atol=1e-6)
+
+
+def test_dimensions_depend_on_those_before_them_as_they_are():
+    """Where the first of two dimensions is clipped, the second follows what was executed."""
+    coupling = torch.tensor([[0.0, 0.0], [0.7, 0.0]])
+    low, high = -torch.ones(2), torch.ones(2)
+    forecast = GaussianForecast(torch.full((1, 1, 2), 0.2), torch.tensor([0.5, 0.1]), low, high, None, coupling)
+    value = torch.tensor([[1.0, 0.9]])
+    alone = GaussianForecast(torch.tensor([[[0.2]]]), torch.tensor([0.5]), low[:1], high[:1])
+    given = GaussianForecast(torch.tensor([[[0.2 + 0.7 * 0.8]]]), torch.tensor([0.1]), low[:1], high[:1])
+    expected = alone.log_prob(value[:, :1]) + given.log_prob(value[:, 1:])
+    assert forecast.log_prob(value).allclose(expected, atol=1e-6)
+    samples = forecast.repeat_interleave(20_000).sample(seeded())
+    clipped = samples[samples[:, 0] == 1]
+    assert len(clipped) > 500
+    assert abs(float(clipped[:, 1].mean()) - 0.76) < 5 * 0.1 / sqrt(len(clipped))
+
+
+def test_weights_of_a_mixture():
+    mean = torch.tensor([[[-0.5], [0.5]]])
+    weights = torch.tensor([[0.2, 0.8]]).log()
+    bounds = torch.tensor([-1.0]), torch.tensor([1.0])
+    forecast = GaussianForecast(mean, torch.tensor([0.01]), *bounds, weights)
+    equal = GaussianForecast(mean, torch.tensor([0.01]), *bounds)
+    at = torch.tensor([[-0.5]])
+    assert float(forecast.log_prob(at) - equal.log_prob(at)) == pytest.approx(log(0.2 / 0.5), abs=1e-4)
+    share = (forecast.repeat_interleave(4000).sample(seeded()) > 0).float().mean()
+    assert abs(float(share) - 0.8) < 5 * sqrt(0.16 / 4000)
+
+
+def autoregression(coefficients, num=40, length=100, std=0.05):
+    """A one-dimensional autoregression, too small to meet its bounds."""
+    order, values = len(coefficients), torch.zeros(num, length + len(coefficients))
+    noise = std * torch.randn(values.shape, generator=seeded(3))
+    for t in range(order, values.shape[1]):
+        past = values[:, t - order : t].flip(1)
+        values[:, t] = past @ torch.tensor(coefficients) + noise[:, t]
+    return VectorPlans(values[:, order + 20 :, None], [-1.0], [1.0])
+
+
+def test_an_autoregression_is_found_with_its_order_and_entropy():
+    plans = autoregression([1.3, -0.6])
+    prior = AutoregressivePrior([-1.0], [1.0]).fit(plans[:30], generator=seeded())
+    held_out = plans[30:]
+    nats = prior.action_log_probs(held_out)[:, 5:].mean()
+    truth = -0.5 * (1 + log(2 * pi)) - log(0.05)
+    assert abs(float(nats) - truth) < 0.05
+    first = AutoregressivePrior([-1.0], [1.0], 1).fit(plans[:30], generator=seeded())
+    assert first.memory == 1
+    assert prior.memory >= 2
+    assert float(first.action_log_probs(held_out)[:, 5:].mean()) < float(nats) - 0.1
+    forecast, _ = prior.read(torch.tensor([[[0.3], [0.1]]]))
+    assert float(forecast.mean) == pytest.approx(1.3 * 0.1 - 0.6 * 0.3, abs=0.03)
+
+
+def test_noise_has_the_spectrum_that_it_is_given():
+    """Of 1 / f noise the autocorrelations follow from its spectrum."""
+    prior = NoisePrior([-50.0], [50.0], 1.0, scale=0.02, memory=15)
+    samples = prior.sample(20_000, 16, generator=seeded())[0, :, :, 0].double()
+    frequency = torch.arange(1, 17).double() / 32
+    power = 1 / frequency
+    for lag in (1, 3, 15):
+        expected = float((power * torch.cos(2 * pi * frequency * lag)).sum() / power.sum())
+        found = float((samples[:, 0] * samples[:, lag]).mean() / samples[:, 0].square().mean())
+        assert abs(found - expected) < 5 / sqrt(20_000)
+    assert float(samples.std()) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
+def test_the_exponent_of_noise_is_found(exponent):
+    truth = NoisePrior([-1.0], [1.0], exponent, scale=0.1, memory=20)
+    plans = VectorPlans(truth.sample(100, 40, generator=seeded(1))[0], [-1.0], [1.0])
+    assert NoisePrior([-1.0], [1.0], None, memory=20).fit(plans).exponent == exponent
+
+
+def test_synergies_explain_what_they_explain():
+    """Three dimensions driven by one signal: one synergy a step; a sine: two components of a window."""
+    phase = 6.28 * torch.rand(50, 1, generator=seeded()) + 0.5 * torch.arange(60)
+    pattern = torch.tensor([0.5, -0.3, 0.4])
+    values = torch.sin(phase)[..., None] * pattern + 0.01 * torch.randn(50, 60, 3, generator=seeded(1))
+    plans = VectorPlans(values, -torch.ones(3), torch.ones(3))
+    low, high = plans.action_low, plans.action_high
+    steps = StepSynergies(low, high, order=3).fit(plans, generator=seeded())
+    assert steps.explained[0] > 0.99
+    assert len(steps.explained) == 3
+    windows = WindowSynergies(low, high, 2, window=10).fit(plans)
+    assert windows.explained[0] < 0.9
+    assert windows.explained[1] > 0.99
+    single = WindowSynergies(low, high, 1, window=10).fit(plans)
+    chosen = WindowSynergies(low, high, window=10).fit(plans, generator=seeded())
+    nats = [float(each.action_log_probs(plans).mean()) for each in (single, windows, chosen)]
+    assert nats[0] < nats[1] - 0.5
+    assert nats[2] > nats[1] - 0.01
+
+
+def test_window_synergies_with_all_components_are_the_autoregression():
+    """Without a ridge, and with every component kept, both are the same regression on the same windows."""
+    plans = source(30, 60)
+    low, high = plans.action_low, plans.action_high
+    windows = WindowSynergies(low, high, 8, window=4).fit(plans)
+    chain = AutoregressivePrior(low, high, 3).fit(plans, generator=seeded())
+    assert windows.action_log_probs(plans)[:, 3:].allclose(chain.action_log_probs(plans)[:, 3:], atol=0.02)
+
+
+def test_a_stored_window_is_found_by_its_past():
+    ramps = torch.linspace(-0.9, 0.9, 30)
+    plans = VectorPlans(torch.stack([ramps, -ramps])[..., None], [-1.0], [1.0])
+    prior = StoredWindows([-1.0], [1.0], match=3, horizon=5, bandwidth=0.02, noise=0.005).fit(plans)
+    for way, values in ((1, ramps), (-1, -ramps)):
+        past = values[None, 10:13, None]
+        sampled = prior.sample(20, 5, past=past, generator=seeded())[0, :, :, 0]
+        assert (sampled - values[13:18]).abs().max() < 0.15, way
+        assert (sampled[:, -1] - sampled[:, 0]).sign().eq(way).all()
+    # What was seen of the segment tells which of the two it is, where the past did not.
+    flat = torch.zeros(1, 3, 1)
+    forecast, state = prior.read(flat)
+    forecast, state = prior.step(torch.tensor([[float(ramps[18])]]), state)
+    assert float(forecast.sample(seeded())) == pytest.approx(float(ramps[19]), abs=0.1)
+
+
+def test_priors_predict_held_out_plans_better_the_more_they_know():
+    plans, held_out = source(30, 60), source(10, 60, seed=9)
+    low, high = plans.action_low, plans.action_high
+    nats = {
+        name: float(KINDS[name](low, high).fit(plans, generator=seeded()).action_log_probs(held_out).mean())
+        for name in KINDS
+    }
+    assert nats["white"] < nats["coloured"] < nats["autoregressive"]
+    assert nats["white"] < nats["stored windows"] < nats["autoregressive"]
+
+
+def test_unequal_lengths_and_groups():
+    """Beyond a plan's end nothing counts, in learning as in scoring."""
+    plans = source(10, 30)
+    lengths = torch.tensor([30, 20, 10, 5, 1, 0, 30, 25, 15, 30])
+    cut = VectorPlans(plans.actions, plans.action_low, plans.action_high, lengths, group=torch.arange(10) // 2)
+    wild = cut.actions.clone()
+    wild[~cut.mask()] = 0.3
+    other = VectorPlans(wild, plans.action_low, plans.action_high, lengths, group=cut.group)
+    for name, make in KINDS.items():
+        one = make(LOW, HIGH).fit(cut, generator=seeded())
+        two = make(LOW, HIGH).fit(other, generator=seeded())
+        scores = one.action_log_probs(cut)
+        assert scores.equal(two.action_log_probs(other)), name
+        assert not scores[~cut.mask()].any()
+
+
+def test_constant_plans_and_a_single_vector_can_be_learned():
+    for actions in (torch.full((5, 30, 2), 0.5), torch.full((5, 30, 2), 1.0), torch.zeros(1, 25, 2)):
+        plans = VectorPlans(actions, -torch.ones(2), torch.ones(2))
+        for name, make in KINDS.items():
+            prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded())
+            assert prior.log_prob(plans).isfinite().all(), name
+            assert (prior.sample(9, 3, generator=seeded()) - actions[0, 0]).abs().mean() < 0.2, name
+    single = VectorPlans(torch.zeros(1, 1, 2), -torch.ones(2), torch.ones(2))
+    for name in KINDS:
+        if name != "stored windows":
+            assert KINDS[name](-torch.ones(2), torch.ones(2)).fit(single).log_prob(single).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: NoisePrior([1.0], [0.0]), "low below high"),
+        (lambda: NoisePrior([-1.0, -1.0], [1.0]), "D numbers each"),
+        (lambda: NoisePrior([], []), "D numbers each"),
+        (lambda: NoisePrior([float("nan")], [1.0]), "finite"),
+        (lambda: NoisePrior([-1.0], [1.0], -1.0), "exponent"),
+        (lambda: NoisePrior([-1.0], [1.0], 1.0, scale=float("nan")), "scale"),
+        (lambda: AutoregressivePrior([-1.0], [1.0], -1), "order"),
+        (lambda: AutoregressivePrior([-1.0], [1.0], 1.5), "order"),
+        (lambda: WindowSynergies([-1.0], [1.0], 0), "num_components"),
+        (lambda: WindowSynergies([-1.0], [1.0], window=1), "window"),
+        (lambda: StepSynergies([-1.0], [1.0], 2), "at most 1"),
+        (lambda: StoredWindows([-1.0], [1.0], horizon=0), "horizon"),
+        (lambda: StoredWindows([-1.0], [1.0], bandwidth=0.0), "bandwidth"),
+        (lambda: StoredWindows(LOW, HIGH, match=3, horizon=5).fit(source(3, 7)), "the longest has 7"),
+        (lambda: AutoregressivePrior(LOW, HIGH).fit(source(3, 7), ridge=1), "ridge: not a setting"),
+        (lambda: AutoregressivePrior([-1, -1], [1, 1]).fit(source(3, 7)), "action_low"),
+        (lambda: AutoregressivePrior(LOW, HIGH).fit(torch.zeros(3, 4, 2)), "VectorPlans"),
+        (lambda: AutoregressivePrior(LOW, HIGH).fit(source(3, 7).steps(7)), "none has a vector"),
+        (lambda: NoisePrior(LOW, HIGH).sample(0, 3), "num_plans"),
+        (lambda: NoisePrior(LOW, HIGH).sample(2, 3, torch.zeros(1, 2)), "takes none"),
+        (lambda: NoisePrior(LOW, HIGH).sample(2, 3, past=torch.zeros(1, 2, 3)), "past"),
+        (lambda: NoisePrior(LOW, HIGH).sample(2, 3, past=torch.full((1, 2, 2), float("nan"))), "past"),
+        (lambda: NoisePrior(LOW, HIGH).sample(2, 3, generator=7), "generator"),
+    ],
+)
+def test_bad_input(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_folders_say_what_they_hold(tmp_path):
+    save(AutoregressivePrior(LOW, HIGH).fit(source(), generator=seeded()), tmp_path / "vectors")
+    save(MarkovPrior(3), tmp_path / "actions")
+    assert isinstance(load(tmp_path / "vectors", kind="vectors"), VectorPrior)
+    with pytest.raises(ValueError, match='no prior over actions; use load\\(folder, kind="vectors"\\)'):
+        load(tmp_path / "vectors")
+    with pytest.raises(ValueError, match="no prior over vectors"):
+        load(tmp_path / "actions", kind="vectors")
+    with pytest.raises(ValueError, match="kind"):
+        load(tmp_path / "actions", kind="other")
+    text = (tmp_path / "vectors" / "config.json").read_text()
+    (tmp_path / "vectors" / "config.json").write_text(text.replace('"memory": ', '"memory": 1000000000'))
+    with pytest.raises(ValueError, match=r"config\.json|does not fit"):
+        load(tmp_path / "vectors", kind="vectors")
