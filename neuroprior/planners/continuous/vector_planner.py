@@ -1,27 +1,30 @@
 """The interface of a planner of vectors, and what it carries from one decision to the next."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from math import ceil
+from typing import NamedTuple, TypedDict
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_share, check_sizes
-from neuroprior.planners.planner import check_objective
+from neuroprior._random import generator_on
+from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.priors.vectors import VectorPrior
 from neuroprior.worlds.continuous import ContinuousWorld
 
 
 class Memory(NamedTuple):
-    """What a planner knows of the decisions before, for B runs; `control` carries it on.
+    """What a planner knows of the decisions before, for B runs; `control` moves it on.
 
     Attributes:
         past: `[B, T, D]`: the vectors that were executed, T >= 0, the last one last.
         observations: `[B, T, C]`: what was observed before each of them.
-        mean: `[B, L, D]`: the plan from which the next decision starts (the last one, moved on by what was executed);
-            None: there is none yet.
-        elites: `[B, E, L, D]`: kept candidates, moved on in the same way; None where a planner keeps none.
+        mean: `[B, M, D]`: the plan around which the next decision searches, without what was executed of it, M <= L;
+            the planner fills up the rest. None: there is none yet.
+        elites: `[B, E, M, D]`: kept candidates, shortened in the same way; None where a planner keeps none.
     """
 
     past: Tensor
@@ -29,13 +32,38 @@ class Memory(NamedTuple):
     mean: Tensor | None = None
     elites: Tensor | None = None
 
+    def moved_on(self, actions: Tensor, observations: Tensor, keep: int | None = None) -> "Memory":
+        """After `actions [B, T, D]` were executed, with `observations [B, T, C]` before each.
+
+        Args:
+            actions, observations: what happened since.
+            keep: how many of the last vectors are remembered; None: all.
+        """
+        steps = actions.shape[1]
+        past, seen = (
+            torch.cat([before, after], 1)[:, max(before.shape[1] + steps - keep, 0) if keep is not None else 0 :]
+            for before, after in ((self.past, actions), (self.observations, observations))
+        )
+        mean = None if self.mean is None else self.mean[:, steps:]
+        return Memory(past, seen, mean, None if self.elites is None else self.elites[:, :, steps:])
+
+    def rows(self, index: Tensor) -> "Memory":
+        """That of the runs at `index` (integers, or a bool mask)."""
+        return Memory(
+            self.past[index],
+            self.observations[index],
+            None if self.mean is None else self.mean[index],
+            None if self.elites is None else self.elites[index],
+        )
+
 
 class VectorDecision(NamedTuple):
     """What a planner decided for B starts.
 
     Attributes:
         plan: `[B, L, D]`: the plan to execute the beginning of.
-        score: `[B]`: the score of the best candidate that was simulated.
+        score: `[B]`: the score of the best candidate that was simulated: that of the plan, unless the planner says that
+            its plan is an average.
         model_steps: single simulator steps taken for each start.
         memory: for the next decision, not moved on yet: `past` as given; `mean` and `elites` of this decision.
     """
@@ -46,15 +74,27 @@ class VectorDecision(NamedTuple):
     memory: Memory
 
 
+class Proposal(TypedDict, total=False):
+    """What all planners of vectors take, as keyword arguments; see `VectorPlanner`."""
+
+    prior: VectorPrior | None
+    prior_share: float | None
+    discount: float
+    value: Callable[[Tensor], Tensor] | None
+
+
 class VectorPlanner(ABC):
     """Chooses, for each start, a sequence of vectors with a high return: the discounted sum of its rewards.
+
+    A subclass writes `plan`. In a stochastic world each candidate is simulated once.
 
     Args:
         length: L, vectors in a plan.
         num_plans: P, candidates that a decision simulates, over all its iterations.
         prior: proposes candidates; None: all are the planner's own.
-        prior_share: the share of candidates that the prior proposes, from 0 to 1; at 0 the plain algorithm, number for
-            number.
+        prior_share: the share, from 0 to 1, of the candidates that are drawn which the prior proposes, rounded to a
+            whole number; between 0 and 1 at least one candidate is the prior's and one the planner's own, if two are
+            drawn. At 0 the plain algorithm, number for number. None: one half with a prior.
         discount: of the reward of each further step, above 0 and at most 1.
         value: its value of the final state, times `discount ** L`, is added to a plan's score.
 
@@ -83,6 +123,11 @@ class VectorPlanner(ABC):
         self.length, self.num_plans, self.discount, self.value = length, num_plans, discount, value
         self.prior, self.prior_share = prior, share
 
+    @property
+    def keep(self) -> int | None:
+        """How many of the last executed vectors the planner reads; None: all."""
+        return self.prior.memory if self.prior is not None and self.prior_share else 0
+
     @abstractmethod
     def plan(
         self,
@@ -100,5 +145,91 @@ class VectorPlanner(ABC):
             memory: of the decisions before; None: runs begin.
 
         Raises:
-            ValueError: these are no states of the world, or the prior has other bounds than the world.
+            ValueError: these are no states of the world, the prior has other bounds than the world, the memory is of
+                other runs, or a reward is NaN.
         """
+
+    def begin(
+        self, world: ContinuousWorld, state: Tensor, generator: torch.Generator | None, memory: Memory | None
+    ) -> tuple[torch.Generator, Memory]:
+        """Check the arguments of `plan`; the generator to draw with, and the memory, empty where runs begin."""
+        world.check_state(state)
+        size = world.action_size
+        if self.prior is not None:
+            for name in ("action_low", "action_high"):
+                own, there = getattr(self.prior, name), getattr(world, name).to(self.prior.device)
+                if not own.equal(there) and (own.shape != there.shape or not own.allclose(there)):
+                    raise ValueError(f"prior: its {name} is {own.tolist()}, the world's {there.tolist()}")
+        if memory is None:
+            observed = world.observe(state)
+            past = torch.zeros(len(state), 0, size, device=state.device)
+            memory = Memory(past, observed.new_zeros(len(state), 0, *observed.shape[1:]))
+        for name, values in (("past", memory.past), ("mean", memory.mean)):
+            if values is not None and (len(values) != len(state) or values.shape[-1] != size):
+                raise ValueError(
+                    f"memory: {name} of shape [{len(state)}, ..., {size}] is expected, not {list(values.shape)}"
+                )
+        return generator_on(generator, state.device), memory
+
+    def prior_counts(self, drawn: Sequence[int]) -> list[int]:
+        """How many of the candidates `drawn` in each iteration the prior proposes; the share holds for their sum."""
+        total = sum(drawn)
+        wanted = round(self.prior_share * total)
+        if 0 < self.prior_share < 1 and total > 1:
+            wanted = min(max(wanted, 1), total - 1)
+        so_far = [0] + [ceil(wanted * sum(drawn[: i + 1]) / max(total, 1)) for i in range(len(drawn))]
+        return [after - before for before, after in pairwise(so_far)]
+
+    def proposals(
+        self, number: int, world: ContinuousWorld, state: Tensor, memory: Memory, generator: torch.Generator
+    ) -> Tensor:
+        """So many candidates from the prior for each start: `[B, number, L, D]`."""
+        if self.prior is None or not number:
+            return torch.zeros(len(state), 0, self.length, world.action_size, device=state.device)
+        context = None
+        if self.prior.takes_context:
+            context = torch.cat([memory.observations, world.observe(state)[:, None]], 1)
+        drawn = self.prior.sample(number, self.length, context, past=memory.past, generator=generator)
+        return drawn.to(state.device)
+
+    def scores(self, world: ContinuousWorld, state: Tensor, plans: Tensor, generator: torch.Generator) -> Tensor:
+        """The scores `[B, P]` of the candidates `plans [B, P, L, D]`, each simulated once.
+
+        Raises:
+            ValueError: a score is NaN.
+        """
+        final_state, rewards, _ = world.rollout(state, plans, generator)
+        if self.discount != 1:
+            rewards = rewards * self.discount ** torch.arange(self.length, device=rewards.device, dtype=rewards.dtype)
+        score = rewards.sum(-1)
+        if self.value is not None:
+            value = value_of(self.value, final_state.flatten(0, 1)).view_as(score)
+            score = score + self.discount**self.length * value.to(score.dtype)
+        if score.isnan().any():
+            raise ValueError("score: NaN; a reward of the world, or its value, is not a number")
+        return score
+
+
+def middle_and_half(world: ContinuousWorld, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The middle of the range of each dimension, and half its width: `[D]` each."""
+    low, high = world.action_low.to(device), world.action_high.to(device)
+    return (low + high) / 2, (high - low) / 2
+
+
+def filled(mean: Tensor | None, batch_size: int, length: int, middle: Tensor, repeat: bool) -> Tensor:
+    """The plan `[B, L, D]` to search around, of what is left of the last one.
+
+    Args:
+        mean: `[B, M, D]`, of which at most L vectors are taken; None: nothing is left.
+        batch_size: B.
+        length: L.
+        middle: `[D]`: what a plan begins with everywhere.
+        repeat: fill up with the last vector that is left; else with `middle`.
+    """
+    if mean is None or not mean.shape[1]:
+        return middle.expand(batch_size, length, -1)
+    missing = length - mean.shape[1]
+    if missing <= 0:
+        return mean[:, :length]
+    last = mean[:, -1:] if repeat else middle.expand(batch_size, 1, -1)
+    return torch.cat([mean, last.expand(-1, missing, -1)], 1)
