@@ -1,6 +1,8 @@
 """The interface of a world whose actions are vectors: a batched simulator in which a planner tries its plans."""
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -18,12 +20,15 @@ class ContinuousWorld(ABC):
         action_low, action_high: `[D]` float32, finite: the bounds of each dimension. Actions beyond them are refused.
         action_names: names of the D dimensions (joints, muscles), where there are any.
         stochastic: True where the outcome of an action is random.
+        state_shape: the dimensions of a state behind the batch, where the world says so: `check_state` holds states to
+            it, and to finite floating point numbers.
     """
 
     action_low: Tensor
     action_high: Tensor
     action_names: tuple[str, ...] | None = None
     stochastic: bool = False
+    state_shape: tuple[int, ...] | None = None
 
     @property
     def action_size(self) -> int:
@@ -65,11 +70,7 @@ class ContinuousWorld(ABC):
             ValueError: a shape, dtype or value is wrong; the message says which.
         """
         self.check_state(state)
-        check_vectors("plans", plans, self.action_low, self.action_high)
-        if plans.dim() != 4 or len(plans) != len(state):
-            raise ValueError(
-                f"plans: shape [B, P, L, D] with B = {len(state)} starts is expected, not {list(plans.shape)}"
-            )
+        self.check_plans(plans, len(state))
         batch, num_plans, length, _ = plans.shape
         now = state.repeat_interleave(num_plans, 0)
         rewards, states = [torch.zeros(batch, num_plans, 0, device=state.device)], []
@@ -91,9 +92,26 @@ class ContinuousWorld(ABC):
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def check_state(self, state: Tensor) -> None:
-        """Raise ValueError where `state` cannot be a batch of this world's states. Default: it must have a batch."""
+        """Raise ValueError where `state` cannot be a batch of this world's states: see `state_shape`."""
         if not isinstance(state, Tensor) or state.dim() == 0:
             raise ValueError("state: a tensor of shape [B, ...] is expected, not a single number or another type")
+        if self.state_shape is None:
+            return
+        if not state.is_floating_point() or tuple(state.shape[1:]) != self.state_shape:
+            shape = ", ".join(map(str, ("B", *self.state_shape)))
+            raise ValueError(
+                f"state: floating point numbers [{shape}] are expected, not {state.dtype} {list(state.shape)}"
+            )
+        if not state.isfinite().all():
+            where = (~state.isfinite()).nonzero()[0].tolist()
+            raise ValueError(f"state{where}: {float(state[tuple(where)])} is not a finite number")
+
+    def check_plans(self, plans: Tensor, batch_size: int) -> None:
+        """Raise ValueError unless `plans` are vectors `[batch_size, P, L, D]` between the bounds."""
+        if not isinstance(plans, Tensor) or plans.dim() != 4 or len(plans) != batch_size:
+            given = list(plans.shape) if isinstance(plans, Tensor) else type(plans).__name__
+            raise ValueError(f"plans: shape [B, P, L, D] with B = {batch_size} starts is expected, not {given}")
+        check_vectors("plans", plans, self.action_low, self.action_high)
 
 
 def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None:
@@ -116,3 +134,22 @@ def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None
             f"{name}{where}: {float(vectors[tuple(where)]):g} is not between the bounds of dimension {d},"
             f" {float(low[d]):g} and {float(high[d]):g}"
         )
+
+
+def check_positive(zero: bool = False, **numbers: object) -> None:
+    """Raise ValueError, naming the argument, unless all are finite numbers above 0, or 0 where `zero`."""
+    for name, number in numbers.items():
+        real = isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
+        if not real or not (number > 0 or (zero and number == 0)):  # type: ignore[operator]
+            raise ValueError(f"{name}: a finite number {'of at least' if zero else 'above'} 0 is expected, not {number!r}")
+
+
+def finite_vector(name: str, values: Sequence[float] | Tensor | object, size: int) -> Tensor:
+    """`values` as float32 `[size]`; ValueError, naming the argument, unless they are `size` finite numbers."""
+    try:
+        vector = torch.as_tensor(values, dtype=torch.float32)
+    except (RuntimeError, TypeError, ValueError):
+        vector = torch.empty(0)
+    if vector.shape != (size,) or not vector.isfinite().all():
+        raise ValueError(f"{name}: {size} finite numbers are expected, not {values!r}")
+    return vector
