@@ -15,10 +15,14 @@ class Sequences(ABC):
 
     Attributes:
         actions: `[N, L, ...]`.
+        lengths: integers `[N]`, the number of actions of each plan; None where all have L.
+        context: what actions depend on, one per plan or per step; None for no context.
         group: integers `[N]`: the plans of a group are not independent; None if each plan is independent.
     """
 
     actions: Tensor
+    lengths: Tensor | None
+    context: Tensor | None
     group: Tensor | None
 
     def __len__(self) -> int:

@@ -1,6 +1,7 @@
 """Batches of plans for training; long plans window by window; in an order that depends on the seed alone."""
 
 from collections.abc import Iterator
+from math import nan
 from typing import NamedTuple
 
 import lightning
@@ -9,6 +10,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans.sequences import Sequences
 from neuroprior.training.settings import Settings
 
 MOST_DISTINCT = 1024
@@ -25,10 +27,11 @@ class Batch(NamedTuple):
     """A window of some plans.
 
     Attributes:
-        actions: `[N, T]`.
+        actions: `[N, T]`; vectors `[N, T, D]`.
         weight: `[N, T]`, of each action in the loss; 0 beyond a plan's end.
         context: `[N]`, `[N, C]`, `[N, T]`, `[N, T, C]` or None.
-        previous: `[N]`, the action before the window, `num_actions` for none; None where all are whole plans.
+        previous: `[N]` or `[N, D]`, the action before the window, `num_actions` or NaN for none; None where all are
+            whole plans.
         continues: whether the rows continue those of the batch before, so that the hidden state is carried over.
     """
 
@@ -80,7 +83,7 @@ class PlansModule(lightning.LightningDataModule):
         ValueError: no validation plan has an action.
     """
 
-    def __init__(self, training: Plans, validation: Plans, settings: Settings, seed: int) -> None:
+    def __init__(self, training: Sequences, validation: Sequences, settings: Settings, seed: int) -> None:
         super().__init__()
         batch_size = settings.batches_of(training.max_length)
         self.training = Windows(training, settings.window, batch_size, LEAST_WINDOWS)
@@ -107,9 +110,9 @@ class Windows(Dataset[Batch]):
     `group_size` pieces are read side by side, window after window; `groups` such groups hold all pieces.
     """
 
-    def __init__(self, plans: Plans, window: int, batch_size: int, least_windows: int = 1) -> None:
-        merged = _merge(plans)
-        self.plans = plans if merged is None else merged[0]
+    def __init__(self, plans: Sequences, window: int, batch_size: int, least_windows: int = 1) -> None:
+        merged = _merge(plans) if isinstance(plans, Plans) else None
+        self.plans: Sequences = plans if merged is None else merged[0]
         self.weight = None if merged is None else merged[1]
         self.window = max(1, min(window, self.plans.max_length))
         lengths = self.plans.mask().sum(1).cpu()
@@ -148,8 +151,10 @@ class Windows(Dataset[Batch]):
             context = context[plan[:, None], place] if is_per_step(context) else context[plan]
         previous = None
         if self.window < plans.max_length:
-            last = plans.actions[plan, (first - 1).clamp(0, plans.max_length - 1)].long()
-            previous = torch.where(first > 0, last, plans.num_actions)
+            last = plans.actions[plan, (first - 1).clamp(0, plans.max_length - 1)]
+            none = torch.tensor(plans.num_actions if isinstance(plans, Plans) else nan, device=device)
+            follows = (first > 0).view(-1, *[1] * (last.dim() - 1))
+            previous = torch.where(follows, last.to(none.dtype), none)
         return Batch(plans.actions[plan[:, None], place], weight, context, previous, continues)
 
 
@@ -191,7 +196,7 @@ class Walk(Sampler[Step]):
             yield Step(mine if len(mine) else pieces[:1], number, number > 0 and step > start, len(mine) > 0)
 
 
-def _some(plans: Plans, seed: int) -> Plans:
+def _some(plans: Sequences, seed: int) -> Sequences:
     """Plans drawn at random, with about `MOST_VALIDATION` actions in all; all of them where they have fewer."""
     lengths = plans.mask().sum(1).cpu()
     taken = lengths.nonzero()[:, 0]

@@ -15,7 +15,7 @@ class PriorModule(lightning.LightningModule):
 
     Args:
         prior: any module with `forward(plans, context) -> logits [N, L, A]`; for plans longer than a window it needs
-            `forward_from` too, see `NeuralPrior`.
+            `forward_from` too, see `NeuralPrior`. For vectors, one with `log_probs_from`, see `VectorNetwork`.
         learning_rate: of AdamW, after the first tenth of the steps; it falls to 0 with half a cosine.
         weight_decay: of AdamW.
         seed: of dropout.
@@ -118,15 +118,22 @@ def bits(prior: nn.Module, batch: Batch, hidden: Tensor | None = None) -> tuple[
         The weighted sum of bits, the sum of the weights, and the hidden state for the next batch (None for whole
         plans).
     """
+    taken, hidden = _log_probs(prior, batch, hidden if batch.continues else None)
+    hidden = None if hidden is None or batch.previous is None else hidden.detach()
+    return -(taken * batch.weight).sum() / log(2), batch.weight.sum(), hidden
+
+
+def _log_probs(prior: Any, batch: Batch, hidden: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Nats `[N, T]` of a batch's actions, and the hidden state after them."""
+    if batch.actions.is_floating_point():
+        taken, hidden = prior.log_probs_from(batch.actions, batch.context, batch.previous, hidden)
+        return taken, hidden
     if batch.previous is None:
         logits = prior(batch.actions, batch.context)
     else:
-        forward_from: Any = prior.forward_from
-        logits, hidden = forward_from(batch.actions, batch.context, batch.previous, hidden if batch.continues else None)
-        hidden = None if hidden is None else hidden.detach()
+        logits, hidden = prior.forward_from(batch.actions, batch.context, batch.previous, hidden)
     log_probs = torch.log_softmax(logits.float(), -1)
-    taken = log_probs.gather(-1, batch.actions.long()[..., None])[..., 0]
-    return -(taken * batch.weight).sum() / log(2), batch.weight.sum(), hidden
+    return log_probs.gather(-1, batch.actions.long()[..., None])[..., 0], hidden
 
 
 def _rate(done: float) -> float:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from math import ceil
 
-from neuroprior.plans import Plans
+from neuroprior.plans.sequences import Sequences
 
 FEWEST_STEPS, MOST_STEPS = 10, 100
 """The least and the most steps between two validations, where these are not given."""
@@ -34,8 +34,8 @@ class Settings:
         learning_rate: of AdamW, after the first tenth of the steps.
         weight_decay: of AdamW.
         gradient_clip: the largest norm of a gradient.
-        validation: share of plans (of groups, where there are any) held out for early stopping; or other `Plans` for
-            it, and all plans are learned from.
+        validation: share of plans (of groups, where there are any) held out for early stopping; or other plans
+            for it, and all plans are learned from.
         check_every: steps between two validations (on the held-out plans); None: two passes through the plans, but at
             least `FEWEST_STEPS` and at most `MOST_STEPS`, so that small data sets are not overfitted before the first.
         patience: steps without a lower validation loss after which training stops. None: `PATIENCE` of all steps.
@@ -51,7 +51,7 @@ class Settings:
     learning_rate: float = 5e-3
     weight_decay: float = 0.01
     gradient_clip: float = 1.0
-    validation: float | Plans = 0.1
+    validation: float | Sequences = 0.1
     check_every: int | None = None
     patience: int | None = None
     progress: bool = True

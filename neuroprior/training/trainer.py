@@ -21,6 +21,7 @@ from torch import nn
 from neuroprior._files import write_whole
 from neuroprior._threads import one_thread
 from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans.sequences import Sequences
 from neuroprior.training.batches import PlansModule
 from neuroprior.training.module import PriorModule
 from neuroprior.training.settings import FEWEST, PATIENCE, Settings
@@ -32,30 +33,34 @@ CHECKPOINTS = "checkpoints"
 """Folder of `best.ckpt` and `last.ckpt`, in the folder of a training."""
 
 
-def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> float:
+def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> float:
     """Train `prior` in place, keeping the weights with the lowest loss on held-out plans.
 
     Args:
         prior: any module with `forward(plans, context) -> logits [N, L, A]`; one without `forward_from` (see
-            `NeuralPrior`) is trained on whole plans, however long.
+            `NeuralPrior`) is trained on whole plans, however long. For plans of vectors, one with `log_probs_from` (see
+            `VectorNetwork`).
         plans: at least two plans (two groups, where there are any), each with an action; or a single long one, whose
             end is then held out.
         settings: how.
         seed: draws the held-out plans and the order of training; the same seed gives the same weights on a CPU.
 
     Returns:
-        Bits per action on the held-out plans.
+        Bits per action on the held-out plans; of vectors the log-density, in bits.
 
     Raises:
         ValueError: too few plans or groups, validation plans with other actions or contexts, or the training diverged.
     """
     device = next(prior.parameters()).device
-    if isinstance(settings.validation, Plans):
+    training: Sequences
+    validation: Sequences
+    if isinstance(settings.validation, Sequences):
         training, validation = plans, settings.validation
         _check_alike(training, validation)
     else:
         training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
-    window = settings.window if hasattr(prior, "forward_from") else plans.max_length
+    in_windows = hasattr(prior, "forward_from") or hasattr(prior, "log_probs_from")
+    window = settings.window if in_windows else plans.max_length
     data = PlansModule(training, validation, replace(settings, window=window), seed)
     cuda = device.type == "cuda"
     with quiet(), tempfile.TemporaryDirectory() as folder, torch.random.fork_rng([device] if cuda else []):
@@ -77,12 +82,14 @@ def train(prior: nn.Module, plans: Plans, settings: Settings, seed: int) -> floa
     return best
 
 
-def _check_alike(training: Plans, validation: Plans) -> None:
+def _check_alike(training: Sequences, validation: Sequences) -> None:
     """Raise ValueError unless the actions and contexts of both are the same ones."""
-    if validation.num_actions != training.num_actions:
+    if type(training) is not type(validation):
+        raise ValueError(f"validation: {type(training).__name__} are expected, not {type(validation).__name__}")
+    if isinstance(training, Plans) and isinstance(validation, Plans) and validation.num_actions != training.num_actions:
         raise ValueError(f"validation: {training.num_actions} actions are expected, not {validation.num_actions}")
     for what in ("action_names", "context_names"):
-        expected, given = getattr(training, what), getattr(validation, what)
+        expected, given = getattr(training, what, None), getattr(validation, what, None)
         if expected is not None and given is not None and list(expected) != list(given):
             raise ValueError(f"validation: its {what} are not those of the plans that are learned from, in their order")
     if is_per_step(training.context) != is_per_step(validation.context):

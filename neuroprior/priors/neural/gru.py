@@ -77,7 +77,7 @@ class GRUPrior(NeuralPrior):
         return plain and inputs.device.type == "cpu" and inputs.shape[1] == 1
 
     def _one_step(self, inputs: Tensor, layers: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The output of `nn.GRU`, which is made for long sequences, for a single input, in half the time.
+        """The output of `nn.GRU` for a single input; see `gru_step`.
 
         Args:
             inputs: `[N, 1, D]`.
@@ -87,26 +87,41 @@ class GRUPrior(NeuralPrior):
         Returns:
             The output `[N, 1, hidden_size]`, the new `layers` and the new `recent`.
         """
-        size, below, after = self.hidden_size, None, []
         # Input gates that depend on an action alone are looked up, where there are more plans than actions.
         if self.takes_context or self.lags > 1 or len(inputs) <= self.num_actions:
             vectors, recent = self.embedding(inputs, recent)
-            below = vectors[:, 0]
-        for layer, before in enumerate(layers):
-            w_in, w_hidden, b_in, b_hidden = self.gru.all_weights[layer]
-            bias = torch.cat([b_in[: 2 * size] + b_hidden[: 2 * size], b_in[2 * size :]])
-            if below is None:
-                table = functional.linear(self.embedding.action.weight, w_in, bias)
-                gates = table.index_select(0, inputs[:, 0, 0].int())
-            else:
-                gates = functional.linear(below, w_in, bias)
-            share, new = gates[:, : 2 * size], gates[:, 2 * size :]
-            share.addmm_(before, w_hidden[: 2 * size].T).sigmoid_()
-            new.addcmul_(share[:, :size], functional.linear(before, w_hidden[2 * size :], b_hidden[2 * size :])).tanh_()
-            below = torch.lerp(new, before, share[:, size:])
-            after.append(below)
-        assert below is not None
-        return below[:, None], after[0][None] if len(after) == 1 else torch.stack(after), recent
+            out, layers = gru_step(self.gru, vectors[:, 0], layers)
+        else:
+            action = inputs[:, 0, 0].int()
+            out, layers = gru_step(self.gru, self.embedding.action.weight, layers, rows=action)
+        return out[:, None], layers, recent
 
     def hidden_size_of(self, state_size: int) -> int:
         return self.num_layers * self.hidden_size + self.lags - 1
+
+
+def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The output of `nn.GRU`, which is made for long sequences, for a single input, in half the time; no gradients.
+
+    Args:
+        gru: the network, with weights of one width.
+        below: `[N, width]`, the inputs; with `rows`, the distinct ones.
+        layers: `[layers, N, width]`, the hidden states.
+        rows: integers `[N]`: which of the distinct inputs each row reads; None: `below` has a row for each.
+
+    Returns:
+        The output `[N, width]`, and the new `layers`.
+    """
+    size, after = gru.hidden_size, []
+    for layer, before in enumerate(layers):
+        w_in, w_hidden, b_in, b_hidden = gru.all_weights[layer]
+        bias = torch.cat([b_in[: 2 * size] + b_hidden[: 2 * size], b_in[2 * size :]])
+        gates = functional.linear(below, w_in, bias)
+        if layer == 0 and rows is not None:
+            gates = gates.index_select(0, rows)
+        share, new = gates[:, : 2 * size], gates[:, 2 * size :]
+        share.addmm_(before, w_hidden[: 2 * size].T).sigmoid_()
+        new.addcmul_(share[:, :size], functional.linear(before, w_hidden[2 * size :], b_hidden[2 * size :])).tanh_()
+        below = torch.lerp(new, before, share[:, size:])
+        after.append(below)
+    return below, after[0][None] if len(after) == 1 else torch.stack(after)

@@ -80,7 +80,7 @@ class TransformerPrior(NeuralPrior):
     def build(self) -> None:
         self.embedding = Embedding(self.num_actions, self.width, self.lags, self.num_contexts, self.context_size)
         self.drop = nn.Dropout(self.dropout)
-        self.blocks = nn.ModuleList(_Block(self.width, self.num_heads, self.dropout) for _ in range(self.num_layers))
+        self.blocks = nn.ModuleList(Block(self.width, self.num_heads, self.dropout) for _ in range(self.num_layers))
         self.norm = nn.LayerNorm(self.width)
         self.head = nn.Linear(self.width, self.num_actions)
 
@@ -137,7 +137,7 @@ class TransformerPrior(NeuralPrior):
         after[:, :recent] = line
         places = after[:, recent:cached].unflatten(1, ((cached - recent) // self.cache_size, self.num_layers, -1))
         for layer, block in enumerate(self.blocks):
-            assert isinstance(block, _Block)
+            assert isinstance(block, Block)
             x = block.step(x, places[:, :, layer])
         after[:, cached : cached + kept] = before
         after[:, cached + kept :] = new
@@ -181,7 +181,7 @@ class TransformerPrior(NeuralPrior):
         return (state_size - self.lags + 1) // (self.cache_size + self.input_size) * self.cache_size + self.lags - 1
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
     """Attention and a two-layer network, each after a layer norm and added to its input."""
 
     def __init__(self, width: int, num_heads: int, dropout: float) -> None:

@@ -1,6 +1,7 @@
 """Priors over vectors in time: distributions over sequences of numbers between bounds, for continuous actions."""
 
 from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
+from neuroprior.priors.vectors.networks import VectorGRU, VectorTransformer
 from neuroprior.priors.vectors.noise import NoisePrior
 from neuroprior.priors.vectors.stored_windows import StoredWindows
 from neuroprior.priors.vectors.synergies import StepSynergies, WindowSynergies
@@ -13,6 +14,8 @@ __all__ = [
     "NoisePrior",
     "StepSynergies",
     "StoredWindows",
+    "VectorGRU",
     "VectorPrior",
+    "VectorTransformer",
     "WindowSynergies",
 ]

@@ -1,0 +1,392 @@
+"""Neural priors over vectors: a GRU and a transformer that predict the next vector as a mixture of Gaussians."""
+
+from abc import abstractmethod
+from dataclasses import replace
+from math import log
+from typing import Any, Self
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from neuroprior._checks import check_memory, check_sizes
+from neuroprior._random import draw_seed, generator_on
+from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.priors.neural.gru import gru_step
+from neuroprior.priors.neural.neural import training_settings
+from neuroprior.priors.neural.transformer import Block
+from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
+
+LEAST_STD = 1e-3
+"""The least standard deviation of a component, as a share of the range between the bounds."""
+
+FIRST_STD = 0.15
+"""Standard deviation of each component before training, as a share of the range."""
+
+FIRST_SPREAD = 0.1
+"""Standard deviation of the components' means before training, as a share of the range, so that they come to differ."""
+
+DEFAULTS = {"window": 64, "learning_rate": 3e-3, "max_steps": 1500}
+"""Settings of a training, where they are not given."""
+
+
+class VectorNetwork(VectorPrior):
+    """A network that predicts the next vector as a mixture of K censored Gaussians (Bishop 1994).
+
+    At each step the network reads the last `lags` vectors, scaled by the bounds to -1..1, and the features of the state
+    where it takes them, standardised by the mean and standard deviation in the first plans that it learned from. The
+    means of all components have a common part that is linear in these inputs (a vector autoregression); the rest of
+    the means, the weights, the standard deviations and the couplings are the network's.
+
+    Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
+    state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
+    `memory` vectors before its end: the training window, which bounds the time that a decision takes.
+
+    `state` is `[N, H + E]`: the H numbers that the network carries along, and the E of its next input.
+
+    A subclass writes `build` and `encode`.
+
+    Args:
+        action_low, action_high, context_size: see `VectorPrior`.
+        width: of the network's vectors.
+        num_layers: number of layers.
+        num_components: K.
+        lags: last vectors that each input shows directly.
+        coupled: within a component, each dimension depends on those before it; otherwise they are independent.
+        dropout: share of the network's activations that is set to 0 at random in training.
+        seed: draws the initial weights; torch's global generator is left alone.
+
+    Attributes:
+        memory: vectors read at once in training; None before `fit`.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    _mean: Tensor
+    _std: Tensor
+    _half: Tensor
+    _centre: Tensor
+    _place: Tensor
+
+    def __init__(
+        self,
+        action_low: Any,
+        action_high: Any,
+        context_size: int | None,
+        width: int,
+        num_layers: int,
+        num_components: int,
+        lags: int,
+        coupled: bool,
+        dropout: float,
+        seed: int,
+    ) -> None:
+        super().__init__(action_low, action_high, context_size)
+        check_sizes(width=width, num_layers=num_layers, num_components=num_components, lags=lags)
+        check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
+        if not 0 <= dropout < 1:
+            raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
+        self.width, self.num_layers, self.num_components, self.lags = width, num_layers, num_components, lags
+        self.coupled, self.dropout = coupled, dropout
+        size, features = self.action_size, context_size or 0
+        self.entry_size = size + 1
+        self.input_size = lags * self.entry_size + features
+        self.num_couplings = size * (size - 1) // 2 if coupled else 0
+        check_memory(4 * width * self.input_size, width=width, lags=lags)
+        self.register_buffer("_mean", torch.zeros(features))
+        self.register_buffer("_std", torch.ones(features))
+        self.register_buffer("_half", (self.action_high - self.action_low) / 2, persistent=False)
+        self.register_buffer("_centre", (self.action_high + self.action_low) / 2, persistent=False)
+        places = torch.tril_indices(size, size, -1)
+        self.register_buffer("_place", places[0] * size + places[1], persistent=False)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.inputs = nn.Linear(self.input_size, width)
+            self.linear = nn.Linear(self.input_size, size, bias=False)
+            self.drop = nn.Dropout(dropout)
+            self.build()
+            self.head = nn.Linear(width, num_components * (1 + 2 * size + self.num_couplings))
+            nn.init.zeros_(self.linear.weight)
+            with torch.no_grad():
+                self.head.weight.mul_(0.3)
+                _, means, stds, _ = self._parts(self.head.bias)
+                means.normal_(0, 2 * FIRST_SPREAD)
+                stds.fill_(log(2 * FIRST_STD))
+        self.to(self.device).eval()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        names = ("width", "num_layers", "num_components", "lags", "coupled", "dropout")
+        return super().config | {name: getattr(self, name) for name in names}
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return {"memory": self.memory}
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        memory = learned["memory"]
+        if memory is not None:
+            check_sizes(memory=memory)
+        self.memory = memory
+
+    @abstractmethod
+    def build(self) -> None:
+        """Make the layers."""
+
+    @abstractmethod
+    def encode(self, vectors: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Read a sequence.
+
+        Args:
+            vectors: `[N, T, width]`.
+            hidden: `[N, H]`, after the vectors before these; None: there are none.
+
+        Returns:
+            What the forecasts are made of, `[N, T, width]`, and `hidden` `[N, H']` after the last vector.
+        """
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        none = torch.zeros(batch_size, 1, self.lags * self.entry_size, device=self.device)
+        features = self._features(context)
+        return self._after(none if features is None else torch.cat([none, features[:, None]], -1), None)
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        size, last = self.lags * self.entry_size, state.shape[1] - self.input_size
+        kept, features = state[:, last + self.entry_size : last + size], self._features(context)
+        if features is None:
+            features = state[:, last + size :]
+        return self._after(torch.cat([kept, self._entries(action), features], 1)[:, None], state[:, :last])
+
+    def read(self, past: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        whole = self.memory is None or past.shape[1] <= self.memory
+        entries = self._entries(past if whole else past[:, past.shape[1] - (self.memory or 0) :])
+        if whole:
+            entries = functional.pad(entries, (0, 0, 1, 0))
+        if context is not None and context.dim() == 3:
+            context = context[:, context.shape[1] - entries.shape[1] :]
+        return self._after(self._lagged(entries, None, context), None)
+
+    def _after(self, inputs: Tensor, hidden: Tensor | None) -> tuple[GaussianForecast, Tensor]:
+        """The distribution after the last of `inputs [N, T, E]`, and the state."""
+        out, hidden = self.encode(self.drop(self.inputs(inputs)), hidden)
+        last = inputs[:, -1]
+        return self._forecast(out[:, -1], last), torch.cat([hidden, last], 1)
+
+    def log_probs_from(
+        self, actions: Tensor, context: Tensor | None, previous: Tensor | None, state: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Nats `[N, T]` of vectors that continue a sequence, and the state after it; training calls this.
+
+        Args:
+            actions: `[N, T, D]`, T > 0.
+            context: None, `[N, C]` or `[N, T, C]`.
+            previous: `[N, D]`, the vector before the first, NaN for none; None: there is none.
+            state: as the last call returned it; None: nothing was read before.
+        """
+        first = torch.zeros_like(actions[:, :1, :1]).expand(-1, -1, self.entry_size)
+        if previous is not None:
+            first = self._entries(previous)[:, None]
+        entries = torch.cat([first, self._entries(actions[:, :-1])], 1)
+        inputs = self._lagged(entries, state, context)
+        out, hidden = self.encode(
+            self.drop(self.inputs(inputs)), None if state is None else state[:, : state.shape[1] - self.input_size]
+        )
+        nats = self._forecast(out.flatten(0, 1), inputs.flatten(0, 1)).log_prob(actions.flatten(0, 1))
+        return nats.view(actions.shape[:2]), torch.cat([hidden, inputs[:, -1]], 1)
+
+    def action_log_probs(self, plans: VectorPlans) -> Tensor:
+        self.check_plans(plans)
+        actions, context = plans.actions, plans.context
+        if not plans.max_length or not len(plans):
+            return torch.zeros(actions.shape[:2], device=self.device)
+        parts, at_once, state = [], self.memory or plans.max_length, None
+        for first in range(0, plans.max_length, at_once):
+            now = slice(first, first + at_once)
+            part = context[:, now] if context is not None and context.dim() == 3 else context
+            nats, state = self.log_probs_from(actions[:, now], part, actions[:, first - 1] if first else None, state)
+            parts.append(nats)
+        return torch.cat(parts, 1).masked_fill(~plans.mask(), 0)
+
+    def _features(self, context: Tensor | None) -> Tensor | None:
+        """Standardised features."""
+        return None if context is None else (context - self._mean) / self._std
+
+    def _entries(self, actions: Tensor) -> Tensor:
+        """`[..., D + 1]`: vectors scaled to -1..1, and a 1; only zeros for a vector of NaN, which stands for none."""
+        scaled = (actions - self._centre) / self._half
+        entries = functional.pad(scaled, (0, 1), value=1.0)
+        return torch.where(actions[..., :1].isnan(), 0, entries)
+
+    def _lagged(self, entries: Tensor, state: Tensor | None, context: Tensor | None) -> Tensor:
+        """The inputs `[N, T, E]`: the last `lags` of `entries [N, T, D + 1]` and the features before each vector."""
+        size, before = self.lags * self.entry_size, entries.new_zeros(len(entries), self.lags - 1, self.entry_size)
+        if state is not None:
+            last = state.shape[1] - self.input_size
+            before = (
+                state[:, last + self.entry_size : last + size].unflatten(1, (-1, self.entry_size))
+                if self.lags > 1
+                else before
+            )
+        inputs = torch.cat([before, entries], 1).unfold(1, self.lags, 1).transpose(2, 3).flatten(2)
+        features = self._features(context)
+        if features is None:
+            return inputs
+        if features.dim() == 2:
+            features = features[:, None].expand(-1, inputs.shape[1], -1)
+        return torch.cat([inputs, features], -1)
+
+    def _parts(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Log-weights `[..., K]`, means, log-stds `[..., K, D]` and couplings of the head's output (or bias)."""
+        size, num = self.action_size, self.num_components
+        weights = numbers[..., :num]
+        means = numbers[..., num : num * (1 + size)].unflatten(-1, (num, size))
+        stds = numbers[..., num * (1 + size) : num * (1 + 2 * size)].unflatten(-1, (num, size))
+        return weights, means, stds, numbers[..., num * (1 + 2 * size) :]
+
+    def _forecast(self, out: Tensor, inputs: Tensor) -> GaussianForecast:
+        """The mixture for rows of the network's output `[M, width]` and input `[M, E]`."""
+        weights, means, stds, couplings = self._parts(self.head(self.drop(out)))
+        half = self._half
+        mean = self._centre + half * (means + self.linear(inputs)[:, None])
+        std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
+        coupling = None
+        if self.num_couplings:
+            size, num = self.action_size, self.num_components
+            coupling = couplings.new_zeros(len(out), num, size * size)
+            coupling = coupling.index_copy(2, self._place, couplings.unflatten(-1, (num, self.num_couplings)))
+            coupling = coupling.unflatten(-1, (size, size)) * (half[:, None] / half)
+        return GaussianForecast(mean, std, self.action_low, self.action_high, weights, coupling)
+
+    @property
+    def fit_settings(self) -> tuple[str, ...]:
+        return training_settings()
+
+    def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
+        """Train with Lightning until the likelihood of held-out plans no longer rises; returns self.
+
+        A prior that has learned before is trained further from its present weights.
+
+        Args:
+            plans: see `VectorPrior.fit`; at least two (two groups), or one of at least two vectors, cut in time.
+            generator: draws the held-out plans, the order of training and dropout.
+            settings: fields of `neuroprior.training.Settings`; what is not given is `DEFAULTS`, or as there.
+
+        Raises:
+            ValueError: plans that this prior cannot learn from, too few of them, a setting that is unknown or out of
+                range, or a training that diverged.
+        """
+        self.check_settings(settings)
+        from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
+
+        how = Settings(**(DEFAULTS | settings))
+        if isinstance(how.validation, VectorPlans):
+            how = replace(how, validation=self.training_plans(how.validation))
+        plans = self.training_plans(plans)
+        if self.memory is None and plans.context is not None:
+            features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
+            spread = features.std(0, correction=0)
+            self._mean.copy_(features.mean(0))
+            self._std.copy_(torch.where(spread > 1e-6 * (1 + features.abs().amax(0)), spread, 1))
+        self.memory = min(how.window, int(plans.mask().sum(1).max()))
+        train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
+        return self
+
+
+class VectorGRU(VectorNetwork):
+    """A gated recurrent network (Cho et al. 2014) over vectors.
+
+    Args:
+        action_low, action_high, context_size: see `VectorPrior`.
+        width, num_layers, num_components, lags, coupled, dropout, seed: see `VectorNetwork`.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        action_low: Any,
+        action_high: Any,
+        context_size: int | None = None,
+        width: int = 64,
+        num_layers: int = 1,
+        num_components: int = 5,
+        lags: int = 4,
+        coupled: bool = True,
+        dropout: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(
+            action_low, action_high, context_size, width, num_layers, num_components, lags, coupled, dropout, seed
+        )
+
+    def build(self) -> None:
+        self.gru = nn.GRU(self.width, self.width, self.num_layers, batch_first=True)
+
+    def encode(self, vectors: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
+        if hidden is None:
+            hidden = vectors.new_zeros(len(vectors), self.num_layers * self.width)
+        layers = hidden.unflatten(1, (self.num_layers, self.width)).transpose(0, 1)
+        if vectors.shape[1] == 1 and not (self.training or torch.is_grad_enabled()):
+            out, layers = gru_step(self.gru, vectors[:, 0], layers)
+            out = out[:, None]
+        else:
+            out, layers = self.gru(vectors, layers.contiguous())
+        return out, layers.transpose(0, 1).flatten(1)
+
+
+class VectorTransformer(VectorNetwork):
+    """A transformer with rotary positions over vectors; each layer attends at most `memory` inputs back.
+
+    `state` holds the keys and values of the last `memory` inputs, `2 * num_layers * width` numbers each.
+
+    Args:
+        action_low, action_high, context_size: see `VectorPrior`.
+        width: a multiple of 2 * `num_heads`.
+        num_heads: attention heads.
+        num_layers, num_components, lags, coupled, dropout, seed: see `VectorNetwork`.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        action_low: Any,
+        action_high: Any,
+        context_size: int | None = None,
+        width: int = 64,
+        num_layers: int = 2,
+        num_heads: int = 4,
+        num_components: int = 5,
+        lags: int = 4,
+        coupled: bool = True,
+        dropout: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        check_sizes(num_heads=num_heads, width=width)
+        if width % (2 * num_heads):
+            raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
+        self.num_heads = num_heads
+        super().__init__(
+            action_low, action_high, context_size, width, num_layers, num_components, lags, coupled, dropout, seed
+        )
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return super().config | {"num_heads": self.num_heads}
+
+    def build(self) -> None:
+        self.blocks = nn.ModuleList(Block(self.width, self.num_heads, self.dropout) for _ in range(self.num_layers))
+        self.norm = nn.LayerNorm(self.width)
+
+    def encode(self, vectors: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
+        past = None
+        if hidden is not None:
+            past = hidden.view(len(hidden), -1, self.num_layers, 2 * self.width)
+        caches = []
+        for layer, block in enumerate(self.blocks):
+            vectors, cache = block(vectors, None if past is None else past[:, :, layer], self.memory)
+            caches.append(cache)
+        return self.norm(vectors), torch.stack(caches, 2).flatten(1)
