@@ -16,6 +16,9 @@ COMMANDS = {
     "live": Command("eval.live.command:live", "priors that learn online while the world changes"),
     "quality": Command("eval.quality.command:quality", "how near priors come to sources of known entropy"),
     "puzzles": Command("eval.puzzles.command:puzzles", "Sokoban and sliding tiles solved by policy-guided search"),
+    "control": Command(
+        "eval.control.command:control_experiment", "priors that propose continuous actions to iCEM, MPPI and shooting"
+    ),
     "options": Command("eval.options.command:options", "modes that persist as options of a planner that samples"),
     "intentions": Command(
         "eval.intentions.command:intentions", "what an observed agent is after, by priors toward known goals"

@@ -2,6 +2,15 @@
 
 from neuroprior.planners.best_first import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
 from neuroprior.planners.bootstrap import Sweep, bootstrap
+from neuroprior.planners.continuous import (
+    Control,
+    ICEMPlanner,
+    MPPIPlanner,
+    ShootingPlanner,
+    VectorDecision,
+    VectorPlanner,
+    control,
+)
 from neuroprior.planners.cross_entropy import CrossEntropyPlanner
 from neuroprior.planners.distinct import DistinctPlanner
 from neuroprior.planners.exact import expected_score, oracle
@@ -21,6 +30,7 @@ from neuroprior.planners.tuning import Tuned, best_sampling, sampling_for, searc
 __all__ = [
     "AStarPlanner",
     "BestFirstPlanner",
+    "Control",
     "CrossEntropyPlanner",
     "Decision",
     "DistinctPlanner",
@@ -30,18 +40,24 @@ __all__ = [
     "FrontierPlanner",
     "HorizonPlanner",
     "HorizonRound",
+    "ICEMPlanner",
     "LevinPlanner",
     "MCTSPlanner",
+    "MPPIPlanner",
     "OptionPlanner",
     "Planner",
     "PriorPlanner",
     "SamplingPlanner",
     "Search",
+    "ShootingPlanner",
     "Sweep",
     "bootstrap",
     "Tuned",
+    "VectorDecision",
+    "VectorPlanner",
     "best_sampling",
     "collect",
+    "control",
     "execute",
     "expected_score",
     "extend_horizon",

@@ -18,7 +18,9 @@ from neuroprior.priors.vectors import (
     NoisePrior,
     StepSynergies,
     StoredWindows,
+    VectorGRU,
     VectorPrior,
+    VectorTransformer,
     WindowSynergies,
 )
 
@@ -51,7 +53,9 @@ __all__ = [
     "SwitchingPrior",
     "TransformerPrior",
     "UniformPrior",
+    "VectorGRU",
     "VectorPrior",
+    "VectorTransformer",
     "WindowSynergies",
     "decode",
     "fit",

@@ -1,5 +1,6 @@
 """Worlds: batched simulators in which planners try plans; grids, mazes, puzzles, foraging, Gymnasium environments."""
 
+from neuroprior.worlds.continuous import ContinuousWorld, DoubleIntegrator, PlanarArm
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.foraging import ForagingWorld, patches
@@ -23,6 +24,9 @@ from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
 __all__ = [
+    "ContinuousWorld",
+    "DoubleIntegrator",
+    "PlanarArm",
     "EpisodicWorld",
     "ForagingWorld",
     "GridWorld",

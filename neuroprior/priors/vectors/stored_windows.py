@@ -17,8 +17,8 @@ BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
 NOISES = (0.02, 0.05, 0.1, 0.2, 0.4)
 """That `fit` tries, around the stored vectors."""
 
-MOST_CHOSEN_ON = 2_000
-"""Stored windows that bandwidths are chosen with, at most; all are kept."""
+MOST_CHOSEN_WITH, MOST_CHOSEN_ON = 1_000, 500
+"""Stored windows with which bandwidths are chosen, and vectors on which, at most; in the end all are stored."""
 
 
 class StoredWindows(VectorPrior):
@@ -94,7 +94,8 @@ class StoredWindows(VectorPrior):
         plans = self.training_plans(plans)
         if None in self._given.values():
             learning, held_out = held_out_split(plans, generator_on(generator, "cpu"))
-            self._store(learning, min(self.max_windows, MOST_CHOSEN_ON))
+            self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH))
+            held_out = held_out[: max(MOST_CHOSEN_ON // held_out.max_length, 1)].steps(0, MOST_CHOSEN_ON)
             bandwidths = (self._given["bandwidth"],) if self._given["bandwidth"] else BANDWIDTHS
             noises = (self._given["noise"],) if self._given["noise"] else NOISES
             scores = {}

@@ -1,5 +1,6 @@
 """Synergies: actions lie near a plane of few dimensions, of windows over time or of single vectors."""
 
+from itertools import product
 from typing import Any
 
 import torch
@@ -25,7 +26,8 @@ class WindowSynergies(LinearGaussianPrior):
 
     The principal components of all windows (probabilistic PCA: Tipping and Bishop, 1999) are patterns over time and
     dimensions together, near motor synergies (time-varying ones: d'Avella et al., 2003). The next vector is predicted
-    from the vectors before it in the window, in closed form.
+    from the vectors before it in the window, in closed form. The covariance is shrunk towards that of white noise, by
+    the share that predicts held-out plans best.
 
     Args:
         action_low, action_high: D numbers each: the bounds.
@@ -59,28 +61,32 @@ class WindowSynergies(LinearGaussianPrior):
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         window = min(self.window, int(plans.mask().sum(1).max()))
         most = window * self.action_size
-        tried = [self.num_components or 0]
-        if self.num_components is None:
-            learning, held_out = held_out_split(plans, generator)
-            tried = [k for k in COMPONENTS if k < most] or [most]
-            scores = {}
-            mean, covariance = self._window_moments(learning, window)
-            for number in tried:
-                self.set_window(mean, principal(covariance, number))
-                scores[number] = mean_nats(self, held_out)
-            tried = [best_of(scores)]
-        mean, covariance = self._window_moments(plans, window)
-        self.set_window(mean, principal(covariance, min(tried[0], most)))
+        learning, held_out = held_out_split(plans, generator)
+        numbers = [k for k in COMPONENTS if k < most] or [most]
+        numbers = numbers if self.num_components is None else [min(self.num_components, most)]
+        mean, covariance, white = self._window_moments(learning, window)
+        scores = {}
+        for number, share in product(numbers, SHRINKAGES):
+            self.set_window(mean, torch.lerp(principal(covariance, number), white, share))
+            scores[number, share] = mean_nats(self, held_out)
+        number, share = best_of(scores)
+        mean, covariance, white = self._window_moments(plans, window)
+        self.set_window(mean, torch.lerp(principal(covariance, number), white, share))
         self.explained = explained_shares(covariance)
 
-    def _window_moments(self, plans: VectorPlans, window: int) -> tuple[Tensor, Tensor]:
-        return moments_or_white(
-            self.scaled(plans.windows(window)), self.scaled(plans.actions)[plans.mask()], window - 1
-        )
+    def _window_moments(self, plans: VectorPlans, window: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean and covariance of windows, and the covariance that white noise of equal variances would have."""
+        values = self.scaled(plans.actions)[plans.mask()]
+        mean, covariance = moments_or_white(self.scaled(plans.windows(window)), values, window - 1)
+        variances = values.double().var(0, correction=0)
+        return mean, covariance, torch.diag(variances.repeat(window))
 
 
 COMPONENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of components that are tried."""
+
+SHRINKAGES = (1e-4, 1e-2, 1e-1, 0.3)
+"""Shares of white noise in the covariance of windows that are tried: the fewer plans, the more helps."""
 
 
 class StepSynergies(LinearGaussianPrior):

@@ -110,6 +110,8 @@ def censored_log_prob(value: Tensor, mean: Tensor, std: Tensor, low: Tensor, hig
     """
     below, above = value <= low, value >= high
     inside = -0.5 * ((value - mean) / std).square() - std.log() - 0.5 * log(2 * pi)
+    if not (below | above).any():
+        return inside
     # Where a value is at no bound its tail is not used; a finite argument there keeps gradients finite.
     tail = torch.where(below, (low - mean) / std, torch.where(above, (mean - high) / std, 0.0))
     tails: Tensor = torch.special.log_ndtr(tail)

@@ -1,5 +1,7 @@
 """Worlds whose actions are vectors: a mass, an arm among obstacles, MuJoCo."""
 
 from neuroprior.worlds.continuous.continuous_world import ContinuousWorld, check_vectors
+from neuroprior.worlds.continuous.double_integrator import DoubleIntegrator
+from neuroprior.worlds.continuous.planar_arm import PlanarArm
 
-__all__ = ["ContinuousWorld", "check_vectors"]
+__all__ = ["ContinuousWorld", "DoubleIntegrator", "PlanarArm", "check_vectors"]

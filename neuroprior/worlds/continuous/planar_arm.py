@@ -24,8 +24,8 @@ class PlanarArm(ContinuousWorld):
 
     Obstacles do not block the arm, they cost: the reward of a step is minus the distance of the hand to the goal, minus
     `control_cost` times the mean square of the torques as shares of their bounds, minus `obstacle_cost` times how deep
-    each link is inside each obstacle (m, summed), at the end of the step. With the default obstacles the way straight to
-    the goal is barred: the arm must fold, pass, and stretch again.
+    each link is inside each obstacle (m, summed), at the end of the step. With the default obstacles the way straight
+    to the goal is barred: the arm must fold, pass, and stretch again.
 
     Args:
         num_links: n.
@@ -71,7 +71,7 @@ class PlanarArm(ContinuousWorld):
         self.action_high = max_torque * strength
         self.action_low = -self.action_high
         self.state_shape = (2 * num_links,)
-        # In absolute angles the kinetic energy is half the sum of coupling[i, j] cos(angle i - angle j) speed i speed j.
+        # In absolute angles the kinetic energy is half the sum of coupling[i, j] cos(angle i - angle j) speed i speed j
         link = torch.arange(num_links)
         beyond = num_links - 1 - torch.maximum(link[:, None], link)
         rods = masses / num_links**3
@@ -113,7 +113,8 @@ class PlanarArm(ContinuousWorld):
         offset = circles[:, :2] - ends[:, :-1, None]  # [N, n, M, 2]
         nearest = (offset * along).sum(-1, keepdim=True).clamp(0, length) * along
         depth = (circles[:, 2] - (offset - nearest).norm(dim=-1)).clamp(min=0)
-        return reward - self.obstacle_cost * depth.sum((1, 2))
+        rewards: Tensor = reward - self.obstacle_cost * depth.sum((1, 2))
+        return rewards
 
     def joints(self, state: Tensor) -> Tensor:
         """Where the joints and the hand are: `[N, n + 1, 2]`, from the base to the hand, in m."""

@@ -1,0 +1,1 @@
+"""Planners of vectors with learned proposals, in simulators with continuous actions."""
