@@ -141,7 +141,9 @@ def check_positive(zero: bool = False, **numbers: object) -> None:
     for name, number in numbers.items():
         real = isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
         if not real or not (number > 0 or (zero and number == 0)):  # type: ignore[operator]
-            raise ValueError(f"{name}: a finite number {'of at least' if zero else 'above'} 0 is expected, not {number!r}")
+            raise ValueError(
+                f"{name}: a finite number {'of at least' if zero else 'above'} 0 is expected, not {number!r}"
+            )
 
 
 def finite_vector(name: str, values: Sequence[float] | Tensor | object, size: int) -> Tensor:
