@@ -27,7 +27,7 @@ from neuroprior.analysis.statistics import (
 from neuroprior.report.document import Column, Document, publish, table
 from neuroprior.report.page import Table
 
-MAKERS = ("gymnasium", "minigrid")
+MAKERS = ("gymnasium", "minigrid", "mujoco")
 """Packages of which another version may make other worlds."""
 
 FORMER_NAMES = {"context": "sees"}

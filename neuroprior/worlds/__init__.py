@@ -1,6 +1,6 @@
 """Worlds: batched simulators in which planners try plans; grids, mazes, puzzles, foraging, Gymnasium environments."""
 
-from neuroprior.worlds.continuous import ContinuousWorld, DoubleIntegrator, PlanarArm
+from neuroprior.worlds.continuous import ContinuousWorld, DoubleIntegrator, PlanarArm, from_mujoco
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.foraging import ForagingWorld, patches
@@ -44,6 +44,7 @@ __all__ = [
     "format_sokoban",
     "four_rooms",
     "from_gymnasium",
+    "from_mujoco",
     "goal_direction",
     "gridworld",
     "labyrinth",
