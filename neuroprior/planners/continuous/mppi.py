@@ -57,7 +57,7 @@ class MPPIPlanner(VectorPlanner):
         num_plans: int,
         *,
         std: float = 0.5,
-        temperature: float = 0.3,
+        temperature: float = 0.1,
         normalise: bool = True,
         control_cost: bool = False,
         iterations: int = 1,
