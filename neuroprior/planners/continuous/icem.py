@@ -137,8 +137,9 @@ class ICEMPlanner(VectorPlanner):
             better = elite_score[:, 0] > best_score if i else torch.ones_like(row[:, 0], dtype=torch.bool)
             best = torch.where(better[:, None, None], elites[:, 0], best)
             best_score = torch.where(better, elite_score[:, 0], best_score)
-            mean = torch.lerp(elites.mean(1), mean, self.momentum)
-            std = torch.lerp(elites.std(1, correction=0), std, self.momentum)
+            centre = elites.mean(1)
+            spread = (elites - centre[:, None]).square().mean(1).sqrt()
+            mean, std = torch.lerp(centre, mean, self.momentum), torch.lerp(spread, std, self.momentum)
         kept = memory._replace(mean=mean, elites=elites[:, : self.num_kept])
         return VectorDecision(best, best_score, self.num_plans * self.length, kept)
 

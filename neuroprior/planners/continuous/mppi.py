@@ -49,13 +49,15 @@ class MPPIPlanner(VectorPlanner):
         ValueError: an argument is out of range, or a control cost, which is that of white noise, with another.
     """
 
+    averages = True
+
     def __init__(
         self,
         length: int,
         num_plans: int,
         *,
         std: float = 0.5,
-        temperature: float = 0.3,
+        temperature: float = 0.1,
         normalise: bool = True,
         control_cost: bool = False,
         iterations: int = 1,
@@ -109,7 +111,7 @@ class MPPIPlanner(VectorPlanner):
             raise ValueError("score: finite numbers are expected, of which MPPI makes weights; a score is infinite")
         less = score - score.amax(1, keepdim=True)
         if self.normalise:
-            spread = score.std(1, correction=0, keepdim=True)
+            spread = (score - score.mean(1, keepdim=True)).square().mean(1, keepdim=True).sqrt()
             # Equally good candidates have equal weights.
             less = less / torch.where(spread > 0, spread, 1)
         return less / self.temperature

@@ -98,9 +98,14 @@ class VectorPlanner(ABC):
         discount: of the reward of each further step, above 0 and at most 1.
         value: its value of the final state, times `discount ** L`, is added to a plan's score.
 
+    Attributes:
+        averages: True where the plan of a decision is an average of candidates, not the best of them.
+
     Raises:
         ValueError: an argument is out of range, or a share without a prior.
     """
+
+    averages: bool = False
 
     def __init__(
         self,

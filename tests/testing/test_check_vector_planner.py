@@ -1,0 +1,92 @@
+"""Every planner of vectors passes `check_planner`, and planners that break a rule do not."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from neuroprior.planners.continuous import ICEMPlanner, MPPIPlanner, ShootingPlanner
+from neuroprior.testing import check_planner
+from tests.support.sources import refuses
+
+PLANNERS = {
+    "shooting": ShootingPlanner,
+    "coloured": partial(ShootingPlanner, noise_beta=2.0, warm_start=False),
+    "icem": ICEMPlanner,
+    "first": partial(ICEMPlanner, prior_iterations=1, keep_elites=0.0, iterations=2),
+    "mppi": MPPIPlanner,
+    "plain": partial(MPPIPlanner, normalise=False, control_cost=True, iterations=3),
+    "value": partial(ICEMPlanner, discount=0.8, value=lambda state: state[:, 0]),
+}
+
+
+@pytest.mark.parametrize("make", PLANNERS.values(), ids=PLANNERS)
+def test_planners_of_vectors_conform(make):
+    check_planner(make, vectors=True)
+
+
+def spoilt(spoil):
+    class Spoilt(ShootingPlanner):
+        def plan(self, world, state, generator=None, memory=None):
+            return spoil(super().plan(world, state, generator, memory), world)
+
+    return Spoilt
+
+
+class Careless(ShootingPlanner):
+    """Reads the global generator."""
+
+    def plan(self, world, state, generator=None, memory=None):
+        torch.rand(1)
+        return super().plan(world, state, generator, memory)
+
+
+class Unchecked(ShootingPlanner):
+    """Never looks at the prior's bounds."""
+
+    def begin(self, world, state, generator, memory):
+        prior, self.prior = self.prior, None
+        try:
+            return super().begin(world, state, generator, memory)
+        finally:
+            self.prior = prior
+
+
+class Together(ShootingPlanner):
+    """Decides for all starts as for the first."""
+
+    def plan(self, world, state, generator=None, memory=None):
+        decision = super().plan(world, state, generator, memory)
+        if not len(state):
+            return decision
+        plan = decision.plan[:1].expand_as(decision.plan)
+        score = self.scores(world, state, plan[:, None], generator)[:, 0]
+        return decision._replace(plan=plan, score=score)
+
+
+class Eager(ShootingPlanner):
+    """Draws from the prior whatever its share."""
+
+    def proposals(self, number, world, state, memory, generator):
+        self.prior.sample(1, self.length, past=memory.past, generator=generator)
+        spread = float(self.prior.std)
+        torch.rand(int(10 * spread), generator=generator)
+        return super().proposals(number, world, state, memory, generator)
+
+
+@pytest.mark.parametrize(
+    ("make", "word"),
+    [
+        (spoilt(lambda decision, world: decision._replace(score=decision.score + 1)), "score"),
+        (spoilt(lambda decision, world: decision._replace(plan=decision.plan + 5)), "bounds"),
+        (spoilt(lambda decision, world: decision._replace(plan=decision.plan[:, :, :1])), "shapes"),
+        (spoilt(lambda decision, world: decision._replace(model_steps=decision.model_steps + 1)), "model_steps"),
+        (Careless, "global generator"),
+        (Unchecked, "bounds"),
+        (Together, "model_steps"),
+        (Eager, "prior_share"),
+    ],
+)
+def test_planners_that_break_a_rule_are_found(make, word):
+    with refuses(word, error=AssertionError):
+        check_planner(make, vectors=True)
