@@ -25,8 +25,8 @@ PLANNERS: dict[str, type[ICEMPlanner] | type[MPPIPlanner] | type[ShootingPlanner
 NOISES = tuple(product((0.3, 0.6, 1.0), (0.0, 1.0, 2.5)))
 """Standard deviations and spectral exponents of the planner's own noise that validation tries."""
 
-SHARES = (0.25, 0.5, 0.75)
-"""Shares of the prior's candidates that validation tries."""
+SHARES = ((0.25, 0), (0.5, 0), (0.5, 1), (0.8, 1))
+"""Shares of the prior's candidates that validation tries, and in how many of iCEM's iterations; 0: in all."""
 
 VALIDATION = 10_000
 """Added to the numbers of seeds for validation."""
@@ -57,11 +57,13 @@ class Choice(NamedTuple):
     Attributes:
         std, exponent: of the planner's own noise.
         share: of the prior's candidates; 0 for the plain planner.
+        iterations: of iCEM in which the prior proposes; 0: all.
     """
 
     std: float
     exponent: float
     share: float = 0.0
+    iterations: int = 0
 
 
 def planner_of(name: str, horizon: int, budget: int, choice: Choice, prior: VectorPrior | None) -> VectorPlanner:
@@ -124,14 +126,16 @@ def tuning_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
             shares[name][prior_name] = [
                 _return_of(
                     controlled(
-                        planner_of(name, task.horizon, budget, best[name]._replace(share=share), prior),
+                        planner_of(
+                            name, task.horizon, budget, best[name]._replace(share=share, iterations=number), prior
+                        ),
                         world,
                         settings,
                         seed,
                         1,
                     )
                 )
-                for share in SHARES
+                for share, number in SHARES
             ]
     return run._asdict() | {"plain": plain, "shares": shares}
 
@@ -146,7 +150,8 @@ def chosen(results: Sequence[dict[str, Any]], settings: ControlSettings) -> dict
         for prior in settings.priors if name in settings.planners else ():
             if prior != NONE:
                 means = torch.tensor([one["shares"][name][prior] for one in results]).mean(0).tolist()
-                found[name][prior] = plain._replace(share=SHARES[_highest(means)])
+                share, number = SHARES[_highest(means)]
+                found[name][prior] = plain._replace(share=share, iterations=number)
     return found
 
 

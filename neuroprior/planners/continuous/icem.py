@@ -40,9 +40,9 @@ class ICEMPlanner(VectorPlanner):
     iteration has candidates, and at least two. With 97 candidates the defaults are the reference's 40, 32 and 25 with
     ten elites.
 
-    A prior's candidates are those of any iteration, mixed with the planner's own: the elites are chosen from, and the
-    distribution is refitted to, all of them. At `prior_share=1` the prior draws all, and only shifted elites and the
-    mean of the elites are tried besides.
+    A prior's candidates are among those of the first iteration (`prior_iterations`), mixed with the planner's own: the
+    elites are chosen from, and the distribution is refitted to, all of them; later iterations search around the best.
+    At `prior_share=1` the prior draws all of them but shifted elites.
 
     Args:
         length, num_plans: see `VectorPlanner`.
@@ -78,7 +78,7 @@ class ICEMPlanner(VectorPlanner):
         momentum: float = 0.1,
         std: float = 0.5,
         noise_beta: float = 3.0,
-        prior_iterations: int | None = None,
+        prior_iterations: int | None = 1,
         **proposal: Unpack[Proposal],
     ) -> None:
         super().__init__(length, num_plans, **proposal)

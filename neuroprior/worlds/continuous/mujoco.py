@@ -18,8 +18,8 @@ class MujocoWorld(ContinuousWorld):
     """A task of Gymnasium, stepped and rolled out in batches in C; `from_mujoco` makes them.
 
     A state is `[N, S]` float64: MuJoCo's full physics state, that is the time (s), positions `qpos` and velocities
-    `qvel`. Rewards are float64. Each start begins without a solver warm start, so that no row depends on another; within
-    a rollout the solver starts from the step before, as in `env.step`. States equal those of `env.step` to rounding.
+    `qvel`. Rewards are float64. Each start begins without a solver warm start, so that no row depends on another;
+    within a rollout the solver starts from the step before, as in `env.step`, whose states these equal to rounding.
 
     Attributes:
         model: the `mujoco.MjModel`.
