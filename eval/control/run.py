@@ -68,8 +68,11 @@ class Choice(NamedTuple):
 
 def planner_of(name: str, horizon: int, budget: int, choice: Choice, prior: VectorPrior | None) -> VectorPlanner:
     """A planner by name, with what was chosen for it."""
-    share = choice.share if prior is not None else 0.0
-    return PLANNERS[name](horizon, budget, std=choice.std, noise_beta=choice.exponent, prior=prior, prior_share=share)
+    how: dict[str, Any] = {"std": choice.std, "noise_beta": choice.exponent, "prior": prior}
+    how["prior_share"] = choice.share if prior is not None else 0.0
+    if name == "icem":
+        how["prior_iterations"] = choice.iterations or None
+    return PLANNERS[name](horizon, budget, **how)
 
 
 def generator_of(settings: ControlSettings, seed: int, *place: object) -> torch.Generator:
@@ -164,7 +167,7 @@ def control_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
     """
     task = TASKS[run.world]
     own = {
-        planner: {prior: Choice(*numbers) for prior, numbers in some.items()}
+        planner: {prior: Choice(*numbers[:3], int(numbers[3])) for prior, numbers in some.items()}
         for planner, some in settings.choices[run.world].items()
     }
     plans = training_plans(task, settings, run.seed, own["icem"][NONE]).plans

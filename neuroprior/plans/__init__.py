@@ -9,6 +9,7 @@ from neuroprior.plans.io import (
     write_minari,
     write_plans,
 )
+from neuroprior.plans.io.vectors import read_vector_plans, vector_plans_from_trajectories, write_vector_plans
 from neuroprior.plans.past_durations import PastDurations
 from neuroprior.plans.plans import (
     Plans,
@@ -42,7 +43,10 @@ __all__ = [
     "is_per_step",
     "read_minari",
     "read_plans",
+    "read_vector_plans",
     "to_trajectories",
+    "vector_plans_from_trajectories",
     "write_minari",
     "write_plans",
+    "write_vector_plans",
 ]

@@ -9,9 +9,10 @@ from neuroprior._checks import is_integer
 from neuroprior.testing.chi_square import alike
 from neuroprior.testing.rules import FALSE_ALARM, raises, require, same
 from neuroprior.worlds import TabularWorld, World
+from neuroprior.worlds.continuous import ContinuousWorld
 
 
-def check_world(world: World, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
+def check_world(world: World | ContinuousWorld, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `world` does what a world must.
 
     `reset`, `step`, `observe`, `legal_actions`, `terminated` and `solved` return what the interface says; `step` does
@@ -19,6 +20,9 @@ def check_world(world: World, num_states: int = 50, length: int = 6, seed: int =
     `rollout` equals stepping and raises ValueError for plans of a wrong shape, dtype or range. A stochastic world
     says so, and its rollouts have the distribution of its steps (chi-square tests, with a false-alarm probability of
     1e-6 together); those of a table use common random numbers for all plans of a start.
+
+    Of a `ContinuousWorld` also: its bounds are finite and in order; `rollout` refuses vectors beyond them, NaN in
+    plans and NaN in states; terminated states stay, and give a reward of 0.
 
     Args:
         world: the world to check.
@@ -34,14 +38,17 @@ def check_world(world: World, num_states: int = 50, length: int = 6, seed: int =
     again = world.reset(num_states, torch.Generator().manual_seed(seed))
     require(len(state) == num_states, f"reset({num_states}) gave {len(state)} states")
     require(state.equal(again), "reset: the same seed gave other states")
-    actions = world.num_actions
-    plans = torch.randint(actions, (num_states, 3, length), generator=generator).to(state.device)
+    if isinstance(world, ContinuousWorld):
+        plans, wrong_plans = _vectors(world, state, length, generator)
+    else:
+        plans, wrong_plans = _numbers(world, state, length, generator)
     _check_step(world, state, plans[:, 0, 0], seed)
     _check_queries(world, state)
     by_steps, rewards, random = _step_through(world, state, plans, seed)
     rollout = world.rollout(state, plans, torch.Generator().manual_seed(seed))
     require(
-        rollout.rewards.shape == plans.shape, f"rollout: rewards {list(rollout.rewards.shape)}, not {list(plans.shape)}"
+        rollout.rewards.shape == plans.shape[:3],
+        f"rollout: rewards {list(rollout.rewards.shape)}, not {list(plans.shape[:3])}",
     )
     shape = (num_states, 3, *state.shape[1:])
     require(rollout.final_state.shape == shape, f"rollout: final_state {list(rollout.final_state.shape)}, not {shape}")
@@ -53,31 +60,68 @@ def check_world(world: World, num_states: int = 50, length: int = 6, seed: int =
         _check_distribution(world, state, plans[:, 0], seed)
     none = world.rollout(state, plans[:, :, :0])
     require(none.final_state[:, 0].equal(state), "rollout of plans of length 0 must end where it starts")
-    for wrong, what in (
-        (plans[:, 0], "plans of shape [B, L]"),
-        (plans[1:], "plans for too few starts"),
-        (plans.float(), "plans of floating point numbers"),
-        (plans + actions, "actions past the last"),
-        (plans - actions, "negative actions"),
-    ):
+    wrong_plans["plans without their dimension P"] = plans[:, 0]
+    wrong_plans["plans for too few starts"] = plans[1:]
+    for what, wrong in wrong_plans.items():
         require(raises(partial(world.rollout, state, wrong)), f"rollout must raise ValueError for {what}")
 
 
-def _check_step(world: World, state: Tensor, action: Tensor, seed: int) -> None:
+def _numbers(world: World, state: Tensor, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+    """Random plans of numbers `[N, 3, L]`, and wrong ones."""
+    actions = world.num_actions
+    plans = torch.randint(actions, (len(state), 3, length), generator=generator).to(state.device)
+    return plans, {
+        "plans of floating point numbers": plans.float(),
+        "actions past the last": plans + actions,
+        "negative actions": plans - actions,
+    }
+
+
+def _vectors(
+    world: ContinuousWorld, state: Tensor, length: int, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Random plans of vectors `[N, 3, L, D]`, and wrong ones; what holds for worlds of vectors only is checked."""
+    low, high = world.action_low, world.action_high
+    for name, bound in (("action_low", low), ("action_high", high)):
+        fits = bound.dim() == 1 and len(bound) == world.action_size and bound.dtype == torch.float32
+        require(fits and bool(bound.isfinite().all()), f"{name} must be finite float32 numbers, one a dimension")
+    require(bool((low < high).all()), "action_low must be below action_high in each dimension")
+    plans = low + (high - low) * torch.rand(len(state), 3, length, len(low), generator=generator).to(state.device)
+    if state.is_floating_point():
+        wrong = torch.full_like(state, torch.nan)
+        require(raises(partial(world.rollout, wrong, plans)), "rollout must raise ValueError for states of NaN")
+    ends = world.rollout(state, plans, torch.Generator().manual_seed(0), keep_states=True).states
+    require(ends is not None, "rollout: no states, though keep_states is True")
+    ends = torch.cat([state, ends.flatten(0, 2)]) if ends is not None else state
+    ends = ends[world.terminated(ends)]
+    if len(ends):
+        after, reward = world.step(ends, low.expand(len(ends), -1), generator)
+        require(after.equal(ends), "step: terminated states must stay as they are")
+        require(not reward.any(), "step: the reward from terminated states must be 0")
+    return plans, {
+        "plans of integers": plans.long(),
+        "vectors above action_high": plans + (high - low),
+        "vectors below action_low": plans - (high - low),
+        "vectors of NaN": torch.full_like(plans, torch.nan),
+        "vectors of too few dimensions": plans[..., 1:],
+    }
+
+
+def _check_step(world: World | ContinuousWorld, state: Tensor, action: Tensor, seed: int) -> None:
     """`step`: shapes, dtypes, seeds, and no change to what it was given."""
     kept = state.clone()
     after, reward = world.step(state, action, torch.Generator().manual_seed(seed))
     require(state.equal(kept), "step changed the state that it was given")
     require(after.shape == state.shape, f"step: state {list(after.shape)}, not {list(state.shape)}")
     require(after.dtype == state.dtype, f"step: state of {after.dtype}, not {state.dtype}")
-    require(reward.shape == action.shape, f"step: reward {list(reward.shape)}, not {list(action.shape)}")
+    require(reward.shape == action.shape[:1], f"step: reward {list(reward.shape)}, not {list(action.shape[:1])}")
     require(reward.is_floating_point(), f"step: reward of {reward.dtype}, not floating point")
     require(not reward.isnan().any(), "step: NaN in the reward")
     again, _ = world.step(state, action, torch.Generator().manual_seed(seed))
     require(after.equal(again), "step: the same seed gave other states")
 
 
-def _check_queries(world: World, state: Tensor) -> None:
+def _check_queries(world: World | ContinuousWorld, state: Tensor) -> None:
     """`observe`, `terminated` and `legal_actions`."""
     observed = world.observe(state)
     fits = (is_integer(observed) and observed.dim() in (1, 2)) or (observed.is_floating_point() and observed.dim() == 2)
@@ -86,11 +130,14 @@ def _check_queries(world: World, state: Tensor) -> None:
         "observe must give indices [N] or [N, F] or floating point features [N, C],"
         f" not {observed.dtype} {list(observed.shape)}",
     )
+    ended = world.terminated(state)
+    require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
+    if isinstance(world, ContinuousWorld):
+        require(observed.is_floating_point(), f"observe must give floating point features, not {observed.dtype}")
+        return
     solved = world.solved(state)
     require(solved.dtype == torch.bool and solved.shape == state.shape[:1], f"solved must be bool [{len(state)}]")
     require(world.has_goal or not solved.any(), "solved: a goal is reached, but has_goal is False")
-    ended = world.terminated(state)
-    require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
     legal = world.legal_actions(state)
     shape = [len(state), world.num_actions]
     require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal_actions must be bool {shape}")
@@ -99,9 +146,11 @@ def _check_queries(world: World, state: Tensor) -> None:
         require(bool(legal.all()), "all_legal is True, but legal_actions leaves some out")
 
 
-def _step_through(world: World, state: Tensor, plans: Tensor, seed: int) -> tuple[Tensor, Tensor, bool]:
+def _step_through(
+    world: World | ContinuousWorld, state: Tensor, plans: Tensor, seed: int
+) -> tuple[Tensor, Tensor, bool]:
     """Final states `[B, P]` and rewards `[B, P, L]` of single steps, and whether their outcomes are random."""
-    batch, num_plans, length = plans.shape
+    batch, num_plans, length = plans.shape[:3]
     finals, rewards = [], []
     random = False
     for p in range(num_plans):
@@ -120,8 +169,10 @@ def _step_through(world: World, state: Tensor, plans: Tensor, seed: int) -> tupl
     return torch.stack(finals, 1), torch.stack(rewards, 1), random
 
 
-def _check_distribution(world: World, state: Tensor, plans: Tensor, seed: int, times: int = 200) -> None:
-    """Rollouts in a stochastic world against steps, `times` from each start `[N, ...]` by its plan `[N, L]`."""
+def _check_distribution(
+    world: World | ContinuousWorld, state: Tensor, plans: Tensor, seed: int, times: int = 200
+) -> None:
+    """Rollouts in a stochastic world against steps, `times` from each start `[N, ...]` by its plan."""
     generator = torch.Generator().manual_seed(seed)
     group = torch.arange(len(state)).repeat_interleave(times)
     now, plans = state.repeat_interleave(times, 0), plans.repeat_interleave(times, 0)

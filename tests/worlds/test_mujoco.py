@@ -185,7 +185,8 @@ def test_pictures_are_drawn_or_the_reason_is_told():
     try:
         frames = world.render(world.reset(2, seeded()), 64, 48)
     except ValueError as error:
-        assert "MUJOCO_GL" in str(error)
+        if "MUJOCO_GL" not in str(error):
+            raise
     else:
         assert frames.shape == (2, 48, 64, 3)
         assert frames.dtype == torch.uint8

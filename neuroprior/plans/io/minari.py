@@ -34,18 +34,14 @@ def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
         ImportError: Minari is not installed.
         ValueError: actions that are not discrete, observations of a Dict, Tuple or Text space, or a damaged dataset.
     """
-    minari = _module("minari")
+    dataset = local_dataset(dataset_id)
     spaces = _module("gymnasium.spaces")
-    try:
-        dataset = minari.load_dataset(dataset_id)
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{dataset_id}: not among the local Minari datasets; `minari download {dataset_id}` gets a public one"
-        ) from None
-    with _one_line(dataset_id):
+    with one_line(dataset_id):
         space, observed = dataset.action_space, dataset.observation_space
         if not isinstance(space, spaces.Discrete):
-            raise ValueError(f"actions of the space {_shown(space)}; discrete actions are expected")
+            raise ValueError(
+                f"actions of the space {_shown(space)}; discrete actions are expected; of a Box see read_vector_plans"
+            )
         known = (spaces.Discrete, spaces.Box, spaces.MultiDiscrete, spaces.MultiBinary)
         if observations and not isinstance(observed, known):
             raise ValueError(f"observations of the space {_shown(observed)}; leave them out with observations=False")
@@ -61,6 +57,22 @@ def read_minari(dataset_id: str, *, observations: bool = True) -> Plans:
         groups = [about.get("group") for about in dataset.storage.get_episode_metadata(dataset.episode_indices)]
         ours = json.loads(dataset.storage.metadata.get(OURS, "{}"))
         return _restored(plans, groups, ours, observations)
+
+
+def local_dataset(dataset_id: str) -> Any:
+    """The local Minari dataset of this name.
+
+    Raises:
+        FileNotFoundError: there is none; the message says how to get it.
+        ImportError: Minari is not installed.
+    """
+    minari = _module("minari")
+    try:
+        return minari.load_dataset(dataset_id)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"{dataset_id}: not among the local Minari datasets; `minari download {dataset_id}` gets a public one"
+        ) from None
 
 
 def write_minari(plans: Plans, dataset_id: str) -> None:
@@ -96,7 +108,7 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
         )
         for episode, length in zip(to_trajectories(shown), lengths, strict=True)
     ]
-    with _one_line(dataset_id), warnings.catch_warnings(), _whole(dataset_id):
+    with one_line(dataset_id), warnings.catch_warnings(), _whole(dataset_id):
         warnings.simplefilter("ignore", UserWarning)  # of missing authors, code and environment
         dataset = minari.create_dataset_from_buffers(
             dataset_id,
@@ -152,7 +164,7 @@ def _restored(plans: Plans, groups: list[Any], ours: dict[str, Any], observation
 
 
 @contextmanager
-def _one_line(dataset_id: str) -> Iterator[None]:
+def one_line(dataset_id: str) -> Iterator[None]:
     """Turn what Minari, h5py and pyarrow raise over a dataset into one line."""
     try:
         yield

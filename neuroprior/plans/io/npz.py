@@ -1,6 +1,7 @@
 """Plans in NumPy's `.npz`: the arrays of `Plans` by their names; nothing is pickled."""
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,14 +21,16 @@ NAMES = ("action_names", "context_names", "group_names", "condition_names", "pla
 
 def read_npz(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:
     """Plans of a `.npz` file: see `read_plans`."""
-    arrays = _arrays(path)
+    arrays = arrays_of(path, (*NUMBERS, *NAMES, "num_actions", "end"))
     for key in NUMBERS:
         if key in arrays and arrays[key].dtype.kind not in "iuf":
             raise ValueError(f"{path}: {key}: an array of numbers is expected, not of {arrays[key].dtype}")
     if "actions" not in arrays:
         raise ValueError(f"{path}: no array 'actions'; it has {', '.join(sorted(arrays)) or 'none'}")
-    numbers: dict[str, Any] = {key: torch.from_numpy(_native(arrays[key])) for key in NUMBERS if key in arrays}
-    names: dict[str, Any] = {key: _names(path, key, arrays[key]) for key in NAMES if key in arrays}
+    if arrays["actions"].ndim == 3:
+        raise ValueError(f"{path}: actions {list(arrays['actions'].shape)} are vectors; read_vector_plans reads them")
+    numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in NUMBERS if key in arrays}
+    names: dict[str, Any] = {key: names_of(path, key, arrays[key]) for key in NAMES if key in arrays}
     end = _whole(path, "end", arrays)
     known = num_actions or _whole(path, "num_actions", arrays)
     if known is None and "action_names" in names:
@@ -49,7 +52,7 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
 def write_npz(plans: Plans, path: Path) -> None:
     """Write a `.npz` file, not compressed."""
     tensors = {key: getattr(plans, key) for key in NUMBERS}
-    arrays = {key: _array(value) for key, value in tensors.items() if value is not None}
+    arrays = {key: as_array(value) for key, value in tensors.items() if value is not None}
     for key in NAMES:
         if getattr(plans, key) is not None:
             arrays[key] = np.array(getattr(plans, key), str)
@@ -60,7 +63,8 @@ def write_npz(plans: Plans, path: Path) -> None:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+def arrays_of(path: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Those arrays of a `.npz` file that have one of these names."""
     check_file(path)
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a .npz file (a zip archive of arrays), or cut off; np.savez writes one")
@@ -68,7 +72,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             found = {}
-            for key in [key for key in file.files if key in (*NUMBERS, *NAMES, "num_actions", "end")]:
+            for key in [key for key in file.files if key in keys]:
                 found[key] = np.asarray(file[key])
             return found
     except Exception as error:  # numpy, zipfile and zlib raise a dozen unrelated kinds over damaged bytes
@@ -78,7 +82,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise ValueError(f"{path}: {key or 'the archive'}: {reason}") from error
 
 
-def _native(array: NDArray[Any]) -> NDArray[Any]:
+def native(array: NDArray[Any]) -> NDArray[Any]:
     """The same numbers in an order of bytes and a type that torch knows."""
     if array.dtype.kind == "f" and array.dtype.itemsize > 8:
         return array.astype(np.float64)
@@ -88,7 +92,7 @@ def _native(array: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("="))).reshape(array.shape)
 
 
-def _names(path: Path, key: str, array: NDArray[Any]) -> Names:
+def names_of(path: Path, key: str, array: NDArray[Any]) -> Names:
     if array.ndim != 1 or array.dtype.kind != "U":
         raise ValueError(f"{path}: {key}: one row of texts is expected, not {array.dtype} of shape {list(array.shape)}")
     return tuple(str(name) for name in array)
@@ -113,6 +117,6 @@ def _largest(numbers: dict[str, torch.Tensor]) -> int:
     return int(actions.long().max())
 
 
-def _array(values: torch.Tensor) -> NDArray[Any]:
+def as_array(values: torch.Tensor) -> NDArray[Any]:
     values = values.detach().cpu()
     return (values.float() if values.dtype == torch.bfloat16 else values).numpy()

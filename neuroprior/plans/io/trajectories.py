@@ -37,14 +37,14 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     observed: list[NDArray[Any] | None] = []
     for number, trajectory in enumerate(trajectories):
         place = f"trajectory {number}"
-        taken, made = _parts(trajectory, place)
+        taken, made = parts_of(trajectory, place)
         actions.append(_actions(taken, num_actions, place))
         if observations is not None:
-            observed.append(None if made is None else _observations(made, len(actions[-1]), place))
+            observed.append(None if made is None else observations_of(made, len(actions[-1]), place))
     if not actions:
         raise ValueError("trajectories: none are given")
     lengths = np.array([len(part) for part in actions])
-    context = _joined(observed)
+    context = joined(observed)
     return assembled("trajectories", lengths, np.concatenate(actions), num_actions, context=context, per_step=True)
 
 
@@ -59,7 +59,7 @@ def to_trajectories(plans: Plans) -> list[dict[str, NDArray[Any]]]:
     return found
 
 
-def _parts(trajectory: Any, place: str) -> tuple[Any, Any]:
+def parts_of(trajectory: Any, place: str) -> tuple[Any, Any]:
     """Actions and observations (or None) of a trajectory."""
     if isinstance(trajectory, Mapping):
         if "actions" not in trajectory:
@@ -80,13 +80,13 @@ def _parts(trajectory: Any, place: str) -> tuple[Any, Any]:
 
 
 def _actions(values: Any, num_actions: int, place: str) -> Integers:
-    actions = _array(values, f"{place}: actions")
+    actions = array_of(values, f"{place}: actions")
     if not actions.size and actions.ndim == 1:
         return np.zeros(0, np.int64)
     if actions.dtype.kind not in "iu" or actions.ndim != 1:
         raise ValueError(
             f"{place}: actions are {actions.dtype} of shape {list(actions.shape)}; one integer per step is expected"
-            " (discrete actions)"
+            " (discrete actions); of vectors see vector_plans_from_trajectories"
         )
     wrong = np.flatnonzero((actions < 0) | (actions >= num_actions))
     if wrong.size:
@@ -97,13 +97,13 @@ def _actions(values: Any, num_actions: int, place: str) -> Integers:
     return actions.astype(np.int64)
 
 
-def _observations(values: Any, length: int, place: str) -> NDArray[Any]:
+def observations_of(values: Any, length: int, place: str) -> NDArray[Any]:
     """Indices `[T]` or features `[T, C]`."""
     if isinstance(values, Mapping | tuple) or (isinstance(values, list) and values and isinstance(values[0], Mapping)):
         raise ValueError(
             f"{place}: observations are of a Dict or Tuple space; flatten them first (gymnasium.spaces.flatten)"
         )
-    observed = _array(values, f"{place}: observations")
+    observed = array_of(values, f"{place}: observations")
     if observed.ndim == 0 or len(observed) not in (length, length + 1):
         shown = list(observed.shape)[:1] or "one"
         raise ValueError(f"{place}: {shown} observations for {length} actions; {length} or {length + 1} are expected")
@@ -122,7 +122,7 @@ def _observations(values: Any, length: int, place: str) -> NDArray[Any]:
     return features
 
 
-def _joined(observed: list[NDArray[Any] | None]) -> NDArray[Any] | None:
+def joined(observed: list[NDArray[Any] | None]) -> NDArray[Any] | None:
     """All observations end to end: `[S]` or `[S, C]`, or None where there are none."""
     parts = [(i, part) for i, part in enumerate(observed) if part is not None]
     if not parts:
@@ -146,7 +146,7 @@ def _kind(part: NDArray[Any]) -> str:
     return "integers" if part.ndim == 1 else f"{part.shape[1]} features"
 
 
-def _array(values: Any, place: str) -> NDArray[Any]:
+def array_of(values: Any, place: str) -> NDArray[Any]:
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:

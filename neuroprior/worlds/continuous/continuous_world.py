@@ -21,7 +21,7 @@ class ContinuousWorld(ABC):
         action_names: names of the D dimensions (joints, muscles), where there are any.
         stochastic: True where the outcome of an action is random.
         state_shape: the dimensions of a state behind the batch, where the world says so: `check_state` holds states to
-            it, and to finite floating point numbers.
+            it, and to floating point numbers.
     """
 
     action_low: Tensor
@@ -92,12 +92,12 @@ class ContinuousWorld(ABC):
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def check_state(self, state: Tensor) -> None:
-        """Raise ValueError where `state` cannot be a batch of this world's states: see `state_shape`."""
+        """Raise ValueError where `state` cannot be a batch of this world's states, or is not finite."""
         if not isinstance(state, Tensor) or state.dim() == 0:
             raise ValueError("state: a tensor of shape [B, ...] is expected, not a single number or another type")
-        if self.state_shape is None:
-            return
-        if not state.is_floating_point() or tuple(state.shape[1:]) != self.state_shape:
+        if self.state_shape is not None and not (
+            state.is_floating_point() and tuple(state.shape[1:]) == self.state_shape
+        ):
             shape = ", ".join(map(str, ("B", *self.state_shape)))
             raise ValueError(
                 f"state: floating point numbers [{shape}] are expected, not {state.dtype} {list(state.shape)}"

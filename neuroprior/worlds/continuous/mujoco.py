@@ -19,7 +19,8 @@ class MujocoWorld(ContinuousWorld):
 
     A state is `[N, S]` float64: MuJoCo's full physics state, that is the time (s), positions `qpos` and velocities
     `qvel`. Rewards are float64. Each start begins without a solver warm start, so that no row depends on another;
-    within a rollout the solver starts from the step before, as in `env.step`, whose states these equal to rounding.
+    within a rollout the solver starts from the step before, as in `env.step`. States equal those of `env.step` to
+    rounding.
 
     Attributes:
         model: the `mujoco.MjModel`.
@@ -73,12 +74,12 @@ class MujocoWorld(ContinuousWorld):
         start = state.repeat_interleave(shape[1], 0)
         if not shape.numel():
             return Rollout(
-                start.view(*shape[:2], -1),
+                start.view(shape[0], shape[1], -1),
                 start.new_zeros(shape).double(),
-                start.new_zeros(*shape, *self.state_shape) if keep_states else None,
+                start.new_zeros((*shape, start.shape[1])) if keep_states else None,
             )
         states, rewards = self._run(start, plans.flatten(0, 1))
-        kept = states.reshape(*shape, -1)
+        kept = states.unflatten(0, shape[:2])
         return Rollout(kept[:, :, -1], rewards.view(shape), kept if keep_states else None)
 
     def _run(self, start: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:

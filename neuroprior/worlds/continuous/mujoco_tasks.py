@@ -1,4 +1,4 @@
-"""The MuJoCo tasks of Gymnasium: their rewards, observations, ends and starts, as in their `env.step` and `env.reset`."""
+"""The MuJoCo tasks of Gymnasium: their rewards, observations, ends and starts."""
 
 import math
 from collections.abc import Sequence
@@ -148,7 +148,7 @@ class _Reacher(MujocoWorld):
         return torch.stack([0.1 * first.cos() + 0.11 * both.cos() - x, 0.1 * first.sin() + 0.11 * both.sin() - y], -1)
 
     def _rewards(self, before: Tensor, after: Tensor, action: Tensor, sensors: Tensor) -> Tensor:
-        return -self._to_hand(after).norm(dim=-1) - action.square().sum(-1)
+        return -self._to_hand(after).square().sum(-1).sqrt() - action.square().sum(-1)
 
 
 class _Pusher(MujocoWorld):
@@ -180,8 +180,9 @@ class _Pusher(MujocoWorld):
 
     def _rewards(self, before: Tensor, after: Tensor, action: Tensor, sensors: Tensor) -> Tensor:
         hand, thing, goal = sensors.unflatten(-1, (3, 3)).unbind(-2)
-        near, far = (thing - hand).norm(dim=-1), (thing - goal).norm(dim=-1)
-        return -0.5 * near - far - 0.1 * action.square().sum(-1)
+        near, far = (thing - hand).square().sum(-1).sqrt(), (thing - goal).square().sum(-1).sqrt()
+        reward: Tensor = -0.5 * near - far - 0.1 * action.square().sum(-1)
+        return reward
 
 
 REACHERS = {"Reacher-v5": _Reacher, "Pusher-v5": _Pusher}

@@ -24,8 +24,8 @@ class PlanarArm(ContinuousWorld):
 
     Obstacles do not block the arm, they cost: the reward of a step is minus the distance of the hand to the goal, minus
     `control_cost` times the mean square of the torques as shares of their bounds, minus `obstacle_cost` times how deep
-    each link is inside each obstacle (m, summed), at the end of the step. With the default obstacles the way straight
-    to the goal is barred: the arm must fold, pass, and stretch again.
+    each link is inside each obstacle (m, summed), at the end of the step. With the default obstacle the stretched arm
+    cannot swing to the goal: it must fold, pass, and stretch again.
 
     Args:
         num_links: n.
@@ -48,7 +48,7 @@ class PlanarArm(ContinuousWorld):
         *,
         masses: float = 1.0,
         goal: Sequence[float] | Tensor = (0.0, 0.9),
-        obstacles: Sequence[Sequence[float]] | Tensor = ((0.66, 0.66, 0.2),),
+        obstacles: Sequence[Sequence[float]] | Tensor = ((0.6, 0.5, 0.25),),
         step_seconds: float = 0.05,
         num_substeps: int = 2,
         max_torque: float = 2.0,
@@ -71,7 +71,7 @@ class PlanarArm(ContinuousWorld):
         self.action_high = max_torque * strength
         self.action_low = -self.action_high
         self.state_shape = (2 * num_links,)
-        # In absolute angles the kinetic energy is half the sum of coupling[i, j] cos(angle i - angle j) speed i speed j
+        # In absolute angles the kinetic energy is half the sum of coupling[i, j] cos(angle_i - angle_j) v_i v_j.
         link = torch.arange(num_links)
         beyond = num_links - 1 - torch.maximum(link[:, None], link)
         rods = masses / num_links**3
@@ -105,16 +105,15 @@ class PlanarArm(ContinuousWorld):
     def _reward(self, angle: Tensor, action: Tensor) -> Tensor:
         """Of absolute angles `[N, n]` at the end of a step, and its torques: `[N]`."""
         ends = self._ends(angle)
-        reward = -(ends[:, -1] - self.goal.to(ends)).norm(dim=-1)
+        reward = -(ends[:, -1] - self.goal.to(ends)).square().sum(-1).sqrt()
         reward = reward - self.control_cost * (action / self.action_high.to(action)).square().mean(-1)
         circles = self.obstacles.to(ends)
         length = 1 / self.action_size
         along = (ends[:, 1:] - ends[:, :-1])[:, :, None] / length
         offset = circles[:, :2] - ends[:, :-1, None]  # [N, n, M, 2]
         nearest = (offset * along).sum(-1, keepdim=True).clamp(0, length) * along
-        depth = (circles[:, 2] - (offset - nearest).norm(dim=-1)).clamp(min=0)
-        rewards: Tensor = reward - self.obstacle_cost * depth.sum((1, 2))
-        return rewards
+        depth = (circles[:, 2] - (offset - nearest).square().sum(-1).sqrt()).clamp(min=0)
+        return reward - self.obstacle_cost * depth.sum((1, 2))
 
     def joints(self, state: Tensor) -> Tensor:
         """Where the joints and the hand are: `[N, n + 1, 2]`, from the base to the hand, in m."""
