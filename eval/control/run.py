@@ -167,7 +167,7 @@ def control_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
     """
     task = TASKS[run.world]
     own = {
-        planner: {prior: Choice(*numbers[:3], int(numbers[3])) for prior, numbers in some.items()}
+        planner: {prior: Choice._make(numbers) for prior, numbers in some.items()}
         for planner, some in settings.choices[run.world].items()
     }
     plans = training_plans(task, settings, run.seed, own["icem"][NONE]).plans
