@@ -36,7 +36,7 @@ class VectorNetwork(VectorPrior):
     At each step the network reads the last `lags` vectors, scaled by the bounds to -1..1, and the features of the state
     where it takes them, standardised by the mean and standard deviation in the first plans that it learned from. The
     means of all components have a common part that is linear in these inputs (a vector autoregression); the rest of
-    the means, the weights, the standard deviations and the couplings are the network's.
+    the means, the weights and the standard deviations are the network's.
 
     Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
     state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
@@ -52,7 +52,8 @@ class VectorNetwork(VectorPrior):
         num_layers: number of layers.
         num_components: K.
         lags: last vectors that each input shows directly.
-        coupled: within a component, each dimension depends on those before it; otherwise they are independent.
+        coupled: within a component, each dimension depends on those before it, in the same way at all times; otherwise
+            they are independent. Couplings that the network predicts are overfitted by some thousand vectors.
         dropout: share of the network's activations that is set to 0 at random in training.
         seed: draws the initial weights; torch's global generator is left alone.
 
@@ -67,7 +68,6 @@ class VectorNetwork(VectorPrior):
     _std: Tensor
     _half: Tensor
     _centre: Tensor
-    _place: Tensor
 
     def __init__(
         self,
@@ -92,25 +92,23 @@ class VectorNetwork(VectorPrior):
         size, features = self.action_size, context_size or 0
         self.entry_size = size + 1
         self.input_size = lags * self.entry_size + features
-        self.num_couplings = size * (size - 1) // 2 if coupled else 0
         check_memory(4 * width * self.input_size, width=width, lags=lags)
         self.register_buffer("_mean", torch.zeros(features))
         self.register_buffer("_std", torch.ones(features))
         self.register_buffer("_half", (self.action_high - self.action_low) / 2, persistent=False)
         self.register_buffer("_centre", (self.action_high + self.action_low) / 2, persistent=False)
-        places = torch.tril_indices(size, size, -1)
-        self.register_buffer("_place", places[0] * size + places[1], persistent=False)
+        self.coupling = nn.Parameter(torch.zeros(size, size)) if coupled else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.inputs = nn.Linear(self.input_size, width)
             self.linear = nn.Linear(self.input_size, size, bias=False)
             self.drop = nn.Dropout(dropout)
             self.build()
-            self.head = nn.Linear(width, num_components * (1 + 2 * size + self.num_couplings))
+            self.head = nn.Linear(width, num_components * (1 + 2 * size))
             nn.init.zeros_(self.linear.weight)
             with torch.no_grad():
                 self.head.weight.mul_(0.3)
-                _, means, stds, _ = self._parts(self.head.bias)
+                _, means, stds = self._parts(self.head.bias)
                 means.normal_(0, 2 * FIRST_SPREAD)
                 stds.fill_(log(2 * FIRST_STD))
         self.to(self.device).eval()
@@ -236,26 +234,20 @@ class VectorNetwork(VectorPrior):
             features = features[:, None].expand(-1, inputs.shape[1], -1)
         return torch.cat([inputs, features], -1)
 
-    def _parts(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Log-weights `[..., K]`, means, log-stds `[..., K, D]` and couplings of the head's output (or bias)."""
+    def _parts(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights `[..., K]`, means and log-stds `[..., K, D]` of the head's output (or bias)."""
         size, num = self.action_size, self.num_components
         weights = numbers[..., :num]
         means = numbers[..., num : num * (1 + size)].unflatten(-1, (num, size))
-        stds = numbers[..., num * (1 + size) : num * (1 + 2 * size)].unflatten(-1, (num, size))
-        return weights, means, stds, numbers[..., num * (1 + 2 * size) :]
+        return weights, means, numbers[..., num * (1 + size) :].unflatten(-1, (num, size))
 
     def _forecast(self, out: Tensor, inputs: Tensor) -> GaussianForecast:
         """The mixture for rows of the network's output `[M, width]` and input `[M, E]`."""
-        weights, means, stds, couplings = self._parts(self.head(self.drop(out)))
+        weights, means, stds = self._parts(self.head(self.drop(out)))
         half = self._half
         mean = self._centre + half * (means + self.linear(inputs)[:, None])
         std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
-        coupling = None
-        if self.num_couplings:
-            size, num = self.action_size, self.num_components
-            coupling = couplings.new_zeros(len(out), num, size * size)
-            coupling = coupling.index_copy(2, self._place, couplings.unflatten(-1, (num, self.num_couplings)))
-            coupling = coupling.unflatten(-1, (size, size)) * (half[:, None] / half)
+        coupling = None if self.coupling is None else self.coupling.tril(-1) * (half[:, None] / half)
         return GaussianForecast(mean, std, self.action_low, self.action_high, weights, coupling)
 
     @property
@@ -312,7 +304,7 @@ class VectorGRU(VectorNetwork):
         width: int = 64,
         num_layers: int = 1,
         num_components: int = 5,
-        lags: int = 4,
+        lags: int = 1,
         coupled: bool = True,
         dropout: float = 0.1,
         seed: int = 0,
@@ -360,7 +352,7 @@ class VectorTransformer(VectorNetwork):
         num_layers: int = 2,
         num_heads: int = 4,
         num_components: int = 5,
-        lags: int = 4,
+        lags: int = 1,
         coupled: bool = True,
         dropout: float = 0.1,
         seed: int = 0,
