@@ -26,8 +26,12 @@ FIRST_STD = 0.15
 FIRST_SPREAD = 0.1
 """Standard deviation of the components' means before training, as a share of the range, so that they come to differ."""
 
-DEFAULTS = {"window": 64, "learning_rate": 3e-3, "max_steps": 1500}
+DEFAULTS = {"window": 64, "learning_rate": 3e-3}
 """Settings of a training, where they are not given."""
+
+FEWEST, MOST, VECTORS_A_STEP = 300, 4000, 40
+"""Steps of a training, where these are not given: one for so many vectors, within these bounds. More steps overfit some
+thousand vectors before the learning rate has fallen."""
 
 
 class VectorNetwork(VectorPrior):
@@ -262,7 +266,8 @@ class VectorNetwork(VectorPrior):
         Args:
             plans: see `VectorPrior.fit`; at least two (two groups), or one of at least two vectors, cut in time.
             generator: draws the held-out plans, the order of training and dropout.
-            settings: fields of `neuroprior.training.Settings`; what is not given is `DEFAULTS`, or as there.
+            settings: fields of `neuroprior.training.Settings`; what is not given is as in `DEFAULTS`, or as there. None of
+                `max_steps`: one for `VECTORS_A_STEP` vectors, from `FEWEST` to `MOST`.
 
         Raises:
             ValueError: plans that this prior cannot learn from, too few of them, a setting that is unknown or out of
@@ -275,6 +280,8 @@ class VectorNetwork(VectorPrior):
         if isinstance(how.validation, VectorPlans):
             how = replace(how, validation=self.training_plans(how.validation))
         plans = self.training_plans(plans)
+        if how.max_steps is None:
+            how = replace(how, max_steps=min(max(int(plans.mask().sum()) // VECTORS_A_STEP, FEWEST), MOST))
         if self.memory is None and plans.context is not None:
             features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
             spread = features.std(0, correction=0)
@@ -305,7 +312,7 @@ class VectorGRU(VectorNetwork):
         num_layers: int = 1,
         num_components: int = 5,
         lags: int = 1,
-        coupled: bool = True,
+        coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
     ) -> None:
@@ -353,7 +360,7 @@ class VectorTransformer(VectorNetwork):
         num_heads: int = 4,
         num_components: int = 5,
         lags: int = 1,
-        coupled: bool = True,
+        coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
     ) -> None:

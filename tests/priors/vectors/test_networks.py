@@ -100,7 +100,7 @@ def test_the_density_with_its_masses_at_the_bounds_integrates_to_one_and_samples
 def test_states_are_reordered_by_their_rows(kind):
     data = plans(context_size=2)
     prior = kind(LOW, HIGH, 2, width=16)
-    forecast, state = prior.read(data.actions[:, :3], data.context[:, :4])
+    _, state = prior.read(data.actions[:, :3], data.context[:, :4])
     order = torch.tensor([4, 0, 0, 2])
     ahead, _ = prior.step(data.actions[order, 3], state[order])
     all_ahead, _ = prior.step(data.actions[:, 3], state)
@@ -113,7 +113,8 @@ def test_a_saved_prior_is_the_same_prior(kind, tmp_path: Path):
     with torch.enable_grad():
         prior = kind(LOW, HIGH, 2, width=16, num_components=2, lags=2, coupled=False).fit(data, generator=rng(), **HOW)
     again = load(save(prior, tmp_path), kind=VectorPrior)
-    assert repr(again) == repr(prior) and again.memory == prior.memory
+    assert repr(again) == repr(prior)
+    assert again.memory == prior.memory
     assert again.log_prob(data).equal(prior.log_prob(data))
 
 
@@ -128,7 +129,8 @@ def test_constant_vectors_and_features_leave_all_numbers_finite(kind, value):
     prior = kind([-1, -1], [1, 1], 1, width=8)
     prior.fit(data, generator=rng(), progress=False, max_steps=60, learning_rate=0.03)
     assert all(bool(weight.isfinite().all()) for weight in prior.state_dict().values())
-    assert prior.log_prob(data).isfinite().all() and prior.log_prob(data).mean() > -1
+    assert prior.log_prob(data).isfinite().all()
+    assert prior.log_prob(data).mean() > -1
     assert prior.sample(3, 5, torch.ones(1, 1), generator=rng()).isfinite().all()
 
 
