@@ -266,8 +266,8 @@ class VectorNetwork(VectorPrior):
         Args:
             plans: see `VectorPrior.fit`; at least two (two groups), or one of at least two vectors, cut in time.
             generator: draws the held-out plans, the order of training and dropout.
-            settings: fields of `neuroprior.training.Settings`; what is not given is as in `DEFAULTS`, or as there. None of
-                `max_steps`: one for `VECTORS_A_STEP` vectors, from `FEWEST` to `MOST`.
+            settings: fields of `neuroprior.training.Settings`; what is not given is as in `DEFAULTS`, or as there.
+                `max_steps` None is one step for `VECTORS_A_STEP` vectors, from `FEWEST` to `MOST`.
 
         Raises:
             ValueError: plans that this prior cannot learn from, too few of them, a setting that is unknown or out of
