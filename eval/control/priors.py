@@ -10,6 +10,7 @@ import torch
 from neuroprior.plans import VectorPlans
 from neuroprior.priors import (
     AutoregressivePrior,
+    DiscretisedPrior,
     NoisePrior,
     StepSynergies,
     StoredWindows,
@@ -31,6 +32,7 @@ SIMPLE: dict[str, Callable[..., VectorPrior]] = {
     "synergies": WindowSynergies,
     "step-synergies": StepSynergies,
     "stored": StoredWindows,
+    "discretised": DiscretisedPrior,
 }
 """Priors that are fitted in closed form, or store what they saw."""
 

@@ -14,6 +14,7 @@ from neuroprior.priors.switching import ModePosterior, SwitchingNetwork, Switchi
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.priors.vectors import (
     AutoregressivePrior,
+    DiscretisedPrior,
     GaussianForecast,
     NoisePrior,
     StepSynergies,
@@ -29,6 +30,7 @@ __all__ = [
     "BoardNetwork",
     "CombinedPrior",
     "ContextTreePrior",
+    "DiscretisedPrior",
     "DurationLaw",
     "DurationModel",
     "GRUPrior",

@@ -1,6 +1,7 @@
 """Priors over vectors in time: distributions over sequences of numbers between bounds, for continuous actions."""
 
 from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
+from neuroprior.priors.vectors.discretised import DiscretisedPrior
 from neuroprior.priors.vectors.networks import VectorGRU, VectorTransformer
 from neuroprior.priors.vectors.noise import NoisePrior
 from neuroprior.priors.vectors.stored_windows import StoredWindows
@@ -9,6 +10,7 @@ from neuroprior.priors.vectors.vector_prior import Forecast, GaussianForecast, V
 
 __all__ = [
     "AutoregressivePrior",
+    "DiscretisedPrior",
     "Forecast",
     "GaussianForecast",
     "NoisePrior",

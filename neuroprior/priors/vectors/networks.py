@@ -26,8 +26,12 @@ FIRST_STD = 0.15
 FIRST_SPREAD = 0.1
 """Standard deviation of the components' means before training, as a share of the range, so that they come to differ."""
 
-DEFAULTS = {"window": 64, "learning_rate": 3e-3, "max_steps": 1500}
+DEFAULTS = {"window": 64, "learning_rate": 3e-3}
 """Settings of a training, where they are not given."""
+
+FEWEST, MOST, VECTORS_A_STEP = 300, 4000, 40
+"""Steps of a training, where these are not given: one for so many vectors, within these bounds. More steps overfit some
+thousand vectors before the learning rate has fallen."""
 
 
 class VectorNetwork(VectorPrior):
@@ -36,7 +40,7 @@ class VectorNetwork(VectorPrior):
     At each step the network reads the last `lags` vectors, scaled by the bounds to -1..1, and the features of the state
     where it takes them, standardised by the mean and standard deviation in the first plans that it learned from. The
     means of all components have a common part that is linear in these inputs (a vector autoregression); the rest of
-    the means, the weights, the standard deviations and the couplings are the network's.
+    the means, the weights and the standard deviations are the network's.
 
     Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
     state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
@@ -52,7 +56,8 @@ class VectorNetwork(VectorPrior):
         num_layers: number of layers.
         num_components: K.
         lags: last vectors that each input shows directly.
-        coupled: within a component, each dimension depends on those before it; otherwise they are independent.
+        coupled: within a component, each dimension depends on those before it, in the same way at all times; otherwise
+            they are independent. Couplings that the network predicts are overfitted by some thousand vectors.
         dropout: share of the network's activations that is set to 0 at random in training.
         seed: draws the initial weights; torch's global generator is left alone.
 
@@ -67,7 +72,6 @@ class VectorNetwork(VectorPrior):
     _std: Tensor
     _half: Tensor
     _centre: Tensor
-    _place: Tensor
 
     def __init__(
         self,
@@ -92,25 +96,23 @@ class VectorNetwork(VectorPrior):
         size, features = self.action_size, context_size or 0
         self.entry_size = size + 1
         self.input_size = lags * self.entry_size + features
-        self.num_couplings = size * (size - 1) // 2 if coupled else 0
         check_memory(4 * width * self.input_size, width=width, lags=lags)
         self.register_buffer("_mean", torch.zeros(features))
         self.register_buffer("_std", torch.ones(features))
         self.register_buffer("_half", (self.action_high - self.action_low) / 2, persistent=False)
         self.register_buffer("_centre", (self.action_high + self.action_low) / 2, persistent=False)
-        places = torch.tril_indices(size, size, -1)
-        self.register_buffer("_place", places[0] * size + places[1], persistent=False)
+        self.coupling = nn.Parameter(torch.zeros(size, size)) if coupled else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.inputs = nn.Linear(self.input_size, width)
             self.linear = nn.Linear(self.input_size, size, bias=False)
             self.drop = nn.Dropout(dropout)
             self.build()
-            self.head = nn.Linear(width, num_components * (1 + 2 * size + self.num_couplings))
+            self.head = nn.Linear(width, num_components * (1 + 2 * size))
             nn.init.zeros_(self.linear.weight)
             with torch.no_grad():
                 self.head.weight.mul_(0.3)
-                _, means, stds, _ = self._parts(self.head.bias)
+                _, means, stds = self._parts(self.head.bias)
                 means.normal_(0, 2 * FIRST_SPREAD)
                 stds.fill_(log(2 * FIRST_STD))
         self.to(self.device).eval()
@@ -236,26 +238,20 @@ class VectorNetwork(VectorPrior):
             features = features[:, None].expand(-1, inputs.shape[1], -1)
         return torch.cat([inputs, features], -1)
 
-    def _parts(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Log-weights `[..., K]`, means, log-stds `[..., K, D]` and couplings of the head's output (or bias)."""
+    def _parts(self, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights `[..., K]`, means and log-stds `[..., K, D]` of the head's output (or bias)."""
         size, num = self.action_size, self.num_components
         weights = numbers[..., :num]
         means = numbers[..., num : num * (1 + size)].unflatten(-1, (num, size))
-        stds = numbers[..., num * (1 + size) : num * (1 + 2 * size)].unflatten(-1, (num, size))
-        return weights, means, stds, numbers[..., num * (1 + 2 * size) :]
+        return weights, means, numbers[..., num * (1 + size) :].unflatten(-1, (num, size))
 
     def _forecast(self, out: Tensor, inputs: Tensor) -> GaussianForecast:
         """The mixture for rows of the network's output `[M, width]` and input `[M, E]`."""
-        weights, means, stds, couplings = self._parts(self.head(self.drop(out)))
+        weights, means, stds = self._parts(self.head(self.drop(out)))
         half = self._half
         mean = self._centre + half * (means + self.linear(inputs)[:, None])
         std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
-        coupling = None
-        if self.num_couplings:
-            size, num = self.action_size, self.num_components
-            coupling = couplings.new_zeros(len(out), num, size * size)
-            coupling = coupling.index_copy(2, self._place, couplings.unflatten(-1, (num, self.num_couplings)))
-            coupling = coupling.unflatten(-1, (size, size)) * (half[:, None] / half)
+        coupling = None if self.coupling is None else self.coupling.tril(-1) * (half[:, None] / half)
         return GaussianForecast(mean, std, self.action_low, self.action_high, weights, coupling)
 
     @property
@@ -270,7 +266,8 @@ class VectorNetwork(VectorPrior):
         Args:
             plans: see `VectorPrior.fit`; at least two (two groups), or one of at least two vectors, cut in time.
             generator: draws the held-out plans, the order of training and dropout.
-            settings: fields of `neuroprior.training.Settings`; what is not given is `DEFAULTS`, or as there.
+            settings: fields of `neuroprior.training.Settings`; what is not given is as in `DEFAULTS`, or as there.
+                `max_steps` None is one step for `VECTORS_A_STEP` vectors, from `FEWEST` to `MOST`.
 
         Raises:
             ValueError: plans that this prior cannot learn from, too few of them, a setting that is unknown or out of
@@ -283,6 +280,8 @@ class VectorNetwork(VectorPrior):
         if isinstance(how.validation, VectorPlans):
             how = replace(how, validation=self.training_plans(how.validation))
         plans = self.training_plans(plans)
+        if how.max_steps is None:
+            how = replace(how, max_steps=min(max(int(plans.mask().sum()) // VECTORS_A_STEP, FEWEST), MOST))
         if self.memory is None and plans.context is not None:
             features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
             spread = features.std(0, correction=0)
@@ -312,8 +311,8 @@ class VectorGRU(VectorNetwork):
         width: int = 64,
         num_layers: int = 1,
         num_components: int = 5,
-        lags: int = 4,
-        coupled: bool = True,
+        lags: int = 1,
+        coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
     ) -> None:
@@ -360,8 +359,8 @@ class VectorTransformer(VectorNetwork):
         num_layers: int = 2,
         num_heads: int = 4,
         num_components: int = 5,
-        lags: int = 4,
-        coupled: bool = True,
+        lags: int = 1,
+        coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
     ) -> None:

@@ -1,0 +1,184 @@
+"""Neural priors over vectors: one density however it is computed, and it is the one that generated the data."""
+
+from math import e, log, pi
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.priors import load, save
+from neuroprior.priors.vectors import VectorGRU, VectorPrior, VectorTransformer
+from neuroprior.testing.chi_square import chi_square
+
+KINDS = [VectorGRU, VectorTransformer]
+LOW, HIGH = torch.tensor([-1.0, 0.5]), torch.tensor([2.0, 3.0])
+HOW = {"progress": False, "max_steps": 2, "check_every": 1, "window": 4}
+
+
+def rng(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def plans(num: int = 6, length: int = 9, context_size: int | None = None, per_step: bool = True) -> VectorPlans:
+    """Uniform vectors, a third of them clipped, in plans of unlike lengths."""
+    actions = (torch.rand(num, length, 2, generator=rng(1)) * 1.5 - 0.25) * (HIGH - LOW) + LOW
+    lengths = torch.arange(num) % 3 + length - 2
+    shape = (num, length) if per_step else (num,)
+    context = None if context_size is None else 5 + torch.randn(*shape, context_size, generator=rng(2))
+    return VectorPlans(actions.clamp(LOW, HIGH), LOW, HIGH, lengths=lengths, context=context)
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest) -> type[VectorGRU] | type[VectorTransformer]:
+    return request.param
+
+
+@pytest.mark.parametrize(("context_size", "per_step"), [(None, True), (3, True), (3, False)])
+@pytest.mark.parametrize("lags", [1, 3])
+@torch.no_grad()
+def test_scoring_whole_plans_equals_stepping_and_reading_beyond_the_training_window(kind, context_size, per_step, lags):
+    data = plans(length=13, context_size=context_size, per_step=per_step)
+    with torch.enable_grad():
+        prior = kind(LOW, HIGH, context_size, width=16, lags=lags).fit(data, generator=rng(), **HOW)
+    assert prior.memory == 4
+    whole = prior.action_log_probs(data)
+    assert whole.allclose(VectorPrior.action_log_probs(prior, data), atol=1e-4)
+    for t in range(5):  # where the past is no longer than `memory`, reading is stepping
+        context = data.context
+        if context is not None and context.dim() == 3:
+            context = context[:, : t + 1]
+        forecast, _ = prior.read(data.actions[:, :t], context)
+        assert forecast.log_prob(data.actions[:, t]).allclose(whole[:, t], atol=1e-4)
+
+
+@torch.no_grad()
+def test_a_long_past_is_read_from_its_last_vectors(kind):
+    with torch.enable_grad():
+        prior = kind(LOW, HIGH, width=16).fit(plans(), generator=rng(), **HOW)
+    past = plans(length=13, num=5).actions[:, :11]
+    other = torch.cat([past[:, :7].flip(1), past[:, 7:]], 1)
+    value = LOW.expand(5, 2) + 0.3
+    assert prior.read(past)[0].log_prob(value).equal(prior.read(other)[0].log_prob(value))
+    assert not prior.read(past)[0].log_prob(value).allclose(prior.read(past.flip(1))[0].log_prob(value))
+
+
+@pytest.mark.parametrize("coupled", [True, False])
+@torch.no_grad()
+def test_the_density_with_its_masses_at_the_bounds_integrates_to_one_and_samples_fit_it(kind, coupled):
+    prior = kind(LOW, HIGH, width=16, num_components=3, coupled=coupled, seed=3)
+    if coupled:
+        prior.coupling.fill_(0.7)
+    prior.head.weight.mul_(4)
+    prior.head.bias[9:] = 0  # wide components: there is some mass at every bound
+    forecast, state = prior.start(1)
+    forecast, state = prior.step(torch.tensor([[2.0, 1.0]]), state)
+    cells = 200
+    axes, widths = [], []
+    for low, high in zip(LOW.tolist(), HIGH.tolist(), strict=True):
+        width = (high - low) / cells
+        axes.append(torch.cat([torch.tensor([low]), low + width * (torch.arange(cells) + 0.5), torch.tensor([high])]))
+        widths.append(torch.cat([torch.ones(1), torch.full((cells,), width), torch.ones(1)]))
+    grid = torch.cartesian_prod(*axes)
+    mass = forecast.repeat_interleave(len(grid)).log_prob(grid).exp().view(cells + 2, -1)
+    mass = mass * widths[0][:, None] * widths[1]
+    assert mass.sum() == pytest.approx(1, abs=1e-3)
+    assert min(mass[0].sum(), mass[-1].sum(), mass[:, 0].sum(), mass[:, -1].sum()) > 1e-4
+
+    draws = forecast.repeat_interleave(100_000).sample(rng(5))
+    assert bool(((draws >= LOW) & (draws <= HIGH)).all())
+    cell = ((draws - LOW) / (HIGH - LOW) * 8).long().clamp(max=7) + 1
+    cell = torch.where(draws == LOW, 0, torch.where(draws == HIGH, 9, cell))
+    counts = (cell[:, 0] * 10 + cell[:, 1]).bincount(minlength=100)
+    coarse = torch.tensor([0, *(1 + i // 25 for i in range(cells)), 9])
+    expected = torch.zeros(100).index_add(0, (coarse[:, None] * 10 + coarse).flatten(), mass.flatten() / mass.sum())
+    assert chi_square(counts, expected * len(draws)) > 1e-6
+
+
+@torch.no_grad()
+def test_states_are_reordered_by_their_rows(kind):
+    data = plans(context_size=2)
+    prior = kind(LOW, HIGH, 2, width=16)
+    _, state = prior.read(data.actions[:, :3], data.context[:, :4])
+    order = torch.tensor([4, 0, 0, 2])
+    ahead, _ = prior.step(data.actions[order, 3], state[order])
+    all_ahead, _ = prior.step(data.actions[:, 3], state)
+    assert ahead.log_prob(data.actions[order, 4]).allclose(all_ahead.log_prob(data.actions[:, 4])[order], atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_saved_prior_is_the_same_prior(kind, tmp_path: Path):
+    data = plans(context_size=2)
+    with torch.enable_grad():
+        prior = kind(LOW, HIGH, 2, width=16, num_components=2, lags=2, coupled=False).fit(data, generator=rng(), **HOW)
+    again = load(save(prior, tmp_path), kind=VectorPrior)
+    assert repr(again) == repr(prior)
+    assert again.memory == prior.memory
+    assert again.log_prob(data).equal(prior.log_prob(data))
+
+
+def test_the_same_seed_gives_the_same_weights(kind):
+    first, second = (kind(LOW, HIGH, width=8).fit(plans(), generator=rng(7), **HOW) for _ in range(2))
+    assert all(a.equal(b) for a, b in zip(first.state_dict().values(), second.state_dict().values(), strict=True))
+
+
+@pytest.mark.parametrize("value", [0.3, -1.0])
+def test_constant_vectors_and_features_leave_all_numbers_finite(kind, value):
+    data = VectorPlans(torch.full((4, 6, 2), value), -torch.ones(2), torch.ones(2), context=torch.ones(4, 6, 1))
+    prior = kind([-1, -1], [1, 1], 1, width=8)
+    prior.fit(data, generator=rng(), progress=False, max_steps=60, learning_rate=0.03)
+    assert all(bool(weight.isfinite().all()) for weight in prior.state_dict().values())
+    assert prior.log_prob(data).isfinite().all()
+    assert prior.log_prob(data).mean() > -1
+    assert prior.sample(3, 5, torch.ones(1, 1), generator=rng()).isfinite().all()
+
+
+def test_unfit_arguments_and_plans_are_refused(kind):
+    for wrong in ({"width": 0}, {"num_components": 0}, {"lags": 0}, {"dropout": 1.0}, {"num_layers": 0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            kind(LOW, HIGH, **wrong)
+    prior = kind(LOW, HIGH, width=8)
+    with pytest.raises(ValueError, match="steps: not a setting"):
+        prior.fit(plans(), steps=3)
+    with pytest.raises(ValueError, match="action_low"):
+        prior.fit(VectorPlans(torch.zeros(2, 3, 2), -torch.ones(2), torch.ones(2)))
+    with pytest.raises(ValueError, match="features"):
+        kind(LOW, HIGH, 2, width=8).fit(plans())
+
+
+def autoregression(num: int, length: int, seed: int) -> VectorPlans:
+    """x[t] = 1.5 x[t-1] - .8 x[t-2] + .1 noise, in bounds that it does not reach."""
+    noise = 0.1 * torch.randn(num, length + 50, 1, generator=rng(seed))
+    line: list[Tensor] = [torch.zeros(num, 1), torch.zeros(num, 1)]
+    for t in range(length + 50):
+        line.append(1.5 * line[-1] - 0.8 * line[-2] + noise[:, t])
+    return VectorPlans(torch.stack(line[52:], 1), torch.tensor([-4.0]), torch.tensor([4.0]))
+
+
+@pytest.mark.slow
+def test_an_autoregression_is_learned_to_its_entropy(kind):
+    prior = kind([-4], [4], width=16, num_components=1, dropout=0.0)
+    prior.fit(autoregression(60, 60, 1), generator=rng(), progress=False, max_steps=400)
+    test = autoregression(100, 60, 2)
+    with torch.no_grad():
+        nats = float(prior.action_log_probs(test)[:, 4:].mean())
+    truth = -0.5 * log(2 * pi * e * 0.1**2)
+    assert truth - 0.05 < nats < truth + 0.04  # .013 is the standard error of the mean over the test's noise
+
+
+@pytest.mark.parametrize("kind", [VectorGRU, pytest.param(VectorTransformer, marks=pytest.mark.slow)])
+def test_two_modes_are_learned_and_features_are_used(kind):
+    feature = torch.rand(400, 10, 1, generator=rng(1)) * 2 - 1
+    side = torch.rand(400, 10, 1, generator=rng(2)).round() - 0.5
+    actions = 0.4 * feature + side + 0.05 * torch.randn(400, 10, 1, generator=rng(3))
+    data = VectorPlans(actions, torch.tensor([-2.0]), torch.tensor([2.0]), context=20 + 9 * feature)
+    both = [kind([-2], [2], 1, width=16, num_components=num, dropout=0.0) for num in (2, 1)]
+    nats = []
+    for prior in both:
+        prior.fit(data[:300], generator=rng(), progress=False, max_steps=250, learning_rate=0.01)
+        with torch.no_grad():
+            nats.append(float(prior.action_log_probs(data[300:]).mean()))
+    truth = -0.5 * log(2 * pi * e * 0.05**2) - log(2)
+    assert truth - 0.1 < nats[0] < truth + 0.1
+    assert nats[1] < -0.5 * log(2 * pi * e * 0.5**2) + 0.1  # one Gaussian has the spread of both modes
