@@ -38,7 +38,7 @@ def test_scoring_stepping_saving_and_reordering_agree(tokens: str, tmp_path: Pat
         prior = fitted(tokens)
     whole = prior.action_log_probs(data)
     assert whole.allclose(VectorPrior.action_log_probs(prior, data), atol=1e-4)
-    again = load(save(prior, tmp_path), kind=VectorPrior)
+    again = load(save(prior, tmp_path), kind="vectors")
     assert repr(again) == repr(prior)
     assert again.action_log_probs(data).equal(whole)
     order = torch.tensor([4, 0, 0, 2])

@@ -112,7 +112,7 @@ def test_a_saved_prior_is_the_same_prior(kind, tmp_path: Path):
     data = plans(context_size=2)
     with torch.enable_grad():
         prior = kind(LOW, HIGH, 2, width=16, num_components=2, lags=2, coupled=False).fit(data, generator=rng(), **HOW)
-    again = load(save(prior, tmp_path), kind=VectorPrior)
+    again = load(save(prior, tmp_path), kind="vectors")
     assert repr(again) == repr(prior)
     assert again.memory == prior.memory
     assert again.log_prob(data).equal(prior.log_prob(data))
