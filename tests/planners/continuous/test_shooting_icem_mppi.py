@@ -42,7 +42,8 @@ def test_the_share_is_that_of_all_candidates_that_are_drawn(make, share, number)
     """The prior's candidates are all alike here, and at a vector that noise never meets."""
     world = Seen()
     prior = drift(world, std=1e-9)
-    planner = make(5, 41 if make is ICEMPlanner else 40, prior=prior, prior_share=share)
+    everywhere = {"prior_iterations": None} if make is ICEMPlanner else {}
+    planner = make(5, 41 if make is ICEMPlanner else 40, prior=prior, prior_share=share, **everywhere)
     planner.plan(world, world.reset(3, seeded(0)), seeded(1))
     tried = torch.cat(world.tried, 1)
     middle = (world.action_low + world.action_high) / 2
