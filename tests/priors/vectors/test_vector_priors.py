@@ -1,5 +1,6 @@
 """Priors over vectors: the conformance suite, closed forms, and sources whose parameters are known."""
 
+from dataclasses import replace
 from math import erf, log, pi, sqrt
 
 import pytest
@@ -8,12 +9,15 @@ import torch
 from neuroprior.plans import VectorPlans
 from neuroprior.priors import (
     AutoregressivePrior,
+    DiscretisedPrior,
     GaussianForecast,
     MarkovPrior,
     NoisePrior,
     StepSynergies,
     StoredWindows,
+    VectorGRU,
     VectorPrior,
+    VectorTransformer,
     WindowSynergies,
     load,
     save,
@@ -56,6 +60,24 @@ def test_conformance(kind, fitted, size):
     if fitted:
         prior.fit(source(low=LOW[:size], high=HIGH[:size]), generator=seeded())
     check_prior(prior, num_plans=2000)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: VectorGRU(LOW[:1], HIGH[:1], 3, width=8),
+        lambda: VectorTransformer(LOW, HIGH, width=8, num_layers=1, num_heads=2),
+        lambda: DiscretisedPrior(LOW, HIGH, num_bins=5),
+    ],
+    ids=["gru", "transformer", "discretised"],
+)
+def test_conformance_of_networks_and_tokens(make):
+    prior = make()
+    plans = source(low=prior.action_low.tolist(), high=prior.action_high.tolist())
+    if prior.takes_context:
+        plans = replace(plans, context=torch.randn(*plans.actions.shape[:2], 3, generator=seeded()))
+    few = {"max_steps": 40, "progress": False} if prior.fit_settings else {}
+    check_prior(prior.fit(plans, generator=seeded(), **few), num_plans=600)
 
 
 def test_a_forecast_is_a_density_between_the_bounds_and_a_mass_at_each():
