@@ -7,12 +7,23 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import torch
 from jsonargparse.typing import PositiveInt
 
-from eval.control.priors import NONE, check_prior_name
+from eval.control.animation import animate
+from eval.control.priors import NONE, check_prior_name, fitted
 from eval.control.report import control_document
-from eval.control.run import ControlSettings, PlannerName, chosen, control_run, tuning_run
-from eval.control.tasks import TaskName, check_there
+from eval.control.run import (
+    Choice,
+    ControlSettings,
+    PlannerName,
+    chosen,
+    control_run,
+    planner_of,
+    training_plans,
+    tuning_run,
+)
+from eval.control.tasks import TASKS, TaskName, check_there
 from eval.worlds import runs
 from neuroprior._jobs import JobRun
 from neuroprior.report.document import write_figures
@@ -36,6 +47,7 @@ def control_experiment(
     processes: PositiveInt | None = None,
     dask: str | None = None,
     out: str = "runs/control",
+    animation: TaskName | None = None,
 ) -> None:
     """Do learned priors help planners of continuous actions?
 
@@ -60,6 +72,7 @@ def control_experiment(
         processes: how many runs, a task and a seed each, are done at a time; all cores by default.
         dask: address of a Dask scheduler, tcp://host:port, whose workers do the runs.
         out: folder for the report and for finished runs.
+        animation: draw a run in this task, with stored windows and the most candidates, as TASK.gif in the folder.
     """
     runs.check_distinct(tasks=tasks, priors=priors, planners=planners, budgets=budgets)
     for name in priors:
@@ -84,6 +97,24 @@ def control_experiment(
     how = tasks, seeds, out, processes, dask
     document = runs.run_experiment("control", control_run, control_document, settings, *how)
     write_figures(Path(out), document.figures)
+    if animation is not None:
+        _animated(animation, settings, Path(out))
+
+
+def _animated(task: str, settings: ControlSettings, out: Path) -> None:
+    """A moving picture of iCEM in the world before it changed; a line that says why, where there can be none."""
+    one = TASKS[task]
+    choice = Choice._make(settings.choices[task]["icem"][NONE]) if task in settings.choices else Choice(0.6, 1.0)
+    path = out / f"{task}.gif"
+    try:
+        prior = fitted("stored", training_plans(one, settings, 0, choice).plans, one.horizon, torch.Generator())
+        planner = planner_of(
+            "icem", one.horizon, max(settings.budgets), choice._replace(share=0.5, iterations=1), prior
+        )
+        animate(task, "same", planner, settings.steps, path, torch.Generator().manual_seed(settings.seed))
+        print(f"animation: {path}")
+    except ValueError as error:
+        print(f"no animation: {error}")
 
 
 def _tuned(

@@ -75,7 +75,11 @@ def control_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
     if len(saved):
         sections.insert(0, Section("Candidates saved", tables=[saving_table(saved)]))
     sections.append(Section("Likelihoods", tables=[likelihood_table(nats)] if len(nats) else []))
-    frames = {"rows": rows, "paired": gaps, "savings": saved, "likelihoods": nats}
+    alone = runs.frame_of(results, "alone")
+    if len(alone):
+        alone = runs.seed_means(alone.assign(task=alone["world"]), ["task", "condition", "prior"], "return")
+        sections.append(Section("Behaviour cloning", tables=[alone_table(alone)]))
+    frames = {"rows": rows, "paired": gaps, "savings": saved, "likelihoods": nats, "alone": alone}
     lead = " ".join(leads) or "Differences need at least two seeds."
     return Document("Priors that propose continuous actions", lead, sections, frames, settings, command)
 
@@ -206,6 +210,17 @@ def likelihood_table(nats: pd.DataFrame) -> Table:
         + " 80 %, 95 %: components that explain so much of the variance (of windows, or of single vectors), mean."
     )
     return table(nats, columns, caption, align="llrrrr")
+
+
+def alone_table(alone: pd.DataFrame) -> Table:
+    """Returns of a network that is executed without a planner."""
+    columns: dict[str, Column] = {
+        "task": "task",
+        "condition": "condition",
+        "return": lambda row: runs.plus_minus(row, "return", 1),
+    }
+    caption = f"The network's first draw is executed at each step, without simulations. {runs.over_seeds(alone)}"
+    return table(alone, columns, caption, align="llr")
 
 
 @drawn

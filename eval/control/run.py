@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
-from eval.control.priors import NONE, fitted, sees_state
+from eval.control.priors import CLONING, NONE, fitted, sees_state
 from eval.control.tasks import CONDITIONS, TASKS, ControlTask
 from eval.worlds.runs import Run
 from neuroprior.planners import Control, ICEMPlanner, MPPIPlanner, ShootingPlanner, VectorPlanner, control
@@ -163,7 +163,8 @@ def control_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
 
     Returns:
         `entries`, one of each condition, planner, prior and budget: `return`, the sum of rewards, and `seconds`, of a
-        decision; `likelihoods`, one of each prior: held-out `nats` a vector, `fit_seconds`, and what synergies explain.
+        decision; `alone`, the returns of behaviour cloning; `likelihoods`, one of each prior: held-out `nats` a vector,
+        `fit_seconds`, and how many components explain 80 and 95 % of the variance.
     """
     task = TASKS[run.world]
     own = {
@@ -190,7 +191,21 @@ def control_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
         )
         priors[name] = prior
     entries = list(_entries(run, settings, task, own, priors))
-    return run._asdict() | {"about": task.about, "entries": entries, "likelihoods": likelihoods}
+    alone = [] if CLONING not in priors else list(_alone(run, settings, task, priors[CLONING]))
+    found = {"entries": entries, "likelihoods": likelihoods, "alone": alone}
+    return run._asdict() | {"about": task.about} | found
+
+
+def _alone(
+    run: Run, settings: ControlSettings, task: ControlTask, prior: VectorPrior | None
+) -> Iterator[dict[str, Any]]:
+    """Behaviour cloning: the prior's first draw is executed at each step."""
+    for condition in CONDITIONS:
+        world = task.make(condition)
+        done = controlled(
+            ShootingPlanner(1, 1, prior=prior, prior_share=1.0, warm_start=False), world, settings, run.seed, 1, "alone"
+        )
+        yield {"condition": condition, "prior": CLONING, "return": _return_of(done)}
 
 
 def _entries(
