@@ -163,16 +163,16 @@ def test_no_other_share_is_likelier(seed):
 
 def test_weights_of_whole_plans_do_not_depend_on_what_is_beyond_their_ends():
     """Where each plan is one expert's: what pads the plans is the other's."""
-    experts, plans = alternating(8)
-    lengths, found = torch.arange(24) % 4 + 1, []
+    experts, plans = alternating(8, 16)
+    lengths, found = torch.arange(24) % 4 + 13, []
     for padding in range(A):
         beyond = torch.arange(40) >= lengths[:, None]
-        actions = torch.nn.functional.pad(plans.actions, (0, 35)).masked_fill(beyond, padding)
+        actions = torch.nn.functional.pad(plans.actions, (0, 24)).masked_fill(beyond, padding)
         mixture = MixturePrior(A, experts)
         mixture.learn_weights(Plans(actions, A, lengths))
         found.append((mixture.share, mixture.first.tolist()))
-    for share, first in found[1:]:
-        assert share == found[0][0]
+    for share, first in found:
+        assert share == 0
         assert first == pytest.approx(found[0][1], abs=1e-5)
 
 
@@ -228,7 +228,7 @@ def test_in_training_outputs_of_a_stacked_prior_are_dropped_too():
         prior.mixer.head.weight.fill_(1.0)
         prior.mixer.head.weight[0] = 0
         inputs = torch.zeros(1, 20, 1 + prior.mixer.num_experts * A)
-        logits = prior.mixer.train().encode(inputs)[0][0, :, 1]
-        assert logits.unique().numel() > 3
-        still = prior.mixer.eval().encode(inputs)[0][0, :, 1]
-        assert float(logits.mean()) == pytest.approx(float(still.mean()), rel=0.5)
+        for training in (True, False):
+            prior.mixer.train(training)
+            first, second = (prior.mixer.encode(inputs)[0] for _ in range(2))
+            assert first.equal(second) != training
