@@ -64,11 +64,12 @@ def smoothed(part, plans) -> np.ndarray:
     return out
 
 
-def test_modes_are_chosen_on_the_actions_that_count(part, plans):
+def test_modes_are_chosen_on_the_actions_that_count(part, plans, smoothed):
     choice = choose_modes(plans, [1, 2], skip=SKIP, generator=seeded(0))
     assert choice.chosen == 2
     pd.testing.assert_frame_equal(part.frames["modes"], choice.frame())
     pd.testing.assert_frame_equal(part.frames["mode_table"].drop(columns="stable"), mode_table(choice.prior, plans))
+    assert part.frames["mode_table"]["share"].tolist() == pytest.approx(np.nanmean(smoothed, (0, 1)).tolist())
     assert part.frames["mode_table"]["stable"].tolist() == ["yes" if one else "no" for one in choice.stable()]
 
 
