@@ -233,3 +233,21 @@ def test_refuses_stochastic_worlds():
     world = stochastic_world(0)
     with refuses("deterministic"):
         MCTSPlanner(UniformPrior(world.num_actions), 2, 2).plan(world, torch.zeros(1, dtype=torch.long))
+
+
+@pytest.mark.parametrize(("length", "num_plans"), [(3, 8), (5, 6)])
+def test_all_of_the_budget_is_spent(length, num_plans):
+    """Only steps of the world count, not those that the tree knows: of 4 ** length plans hardly any are known."""
+
+    class Counted(TabularWorld):
+        steps = 0
+
+        def step(self, state, action, generator=None):
+            self.steps += len(state)
+            return super().step(state, action, generator)
+
+    cells = torch.arange(4**length * 2)
+    world = Counted((cells[:, None] * 4 + torch.arange(1, 5)) % len(cells), torch.zeros(1, len(cells)))
+    decision = MCTSPlanner(UniformPrior(4), length, num_plans).plan(world, torch.zeros(1, dtype=torch.long), seeded(0))
+    assert decision.model_steps == world.steps
+    assert (num_plans - 1) * length < world.steps <= num_plans * length
