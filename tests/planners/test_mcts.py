@@ -247,7 +247,11 @@ def test_all_of_the_budget_is_spent(length, num_plans):
             return super().step(state, action, generator)
 
     cells = torch.arange(4**length * 2)
-    world = Counted((cells[:, None] * 4 + torch.arange(1, 5)) % len(cells), torch.zeros(1, len(cells)))
-    decision = MCTSPlanner(UniformPrior(4), length, num_plans).plan(world, torch.zeros(1, dtype=torch.long), seeded(0))
-    assert decision.model_steps == world.steps
-    assert (num_plans - 1) * length < world.steps <= num_plans * length
+    world = Counted(
+        (cells[:, None] * 4 + torch.arange(1, 5)) % len(cells), torch.rand(1, len(cells), generator=seeded(0))
+    )
+    planner = MCTSPlanner(UniformPrior(4), length, num_plans, exploration=0.3, objective="return")
+    decision = planner.plan(world, torch.arange(40), seeded(0))
+    # What is left in the end is less than a plan of as many actions.
+    assert 40 * (num_plans - 1) * length < world.steps <= 40 * decision.model_steps
+    assert decision.model_steps <= num_plans * length

@@ -253,8 +253,10 @@ def test_nothing_to_try():
 
 def test_what_is_beyond_the_ends_of_plans_counts_nothing():
     """What pads them would be far likelier at a higher temperature, or under uniform plans."""
-    own = torch.tensor([[0, 0], [0, 0], [0, 1]])
-    padded = torch.nn.functional.pad(own, (0, 6), value=1)
-    found = sampling_for(sure_of(0), Plans(padded, 2, torch.tensor([2, 2, 2])), 1)
-    assert found == sampling_for(sure_of(0), Plans(own, 2), 1)
-    assert found != sampling_for(sure_of(0), Plans(padded, 2), 1)
+    for sure in (0, 1):
+        own = torch.tensor([[sure, sure], [sure, sure], [sure, 1 - sure]])
+        padded = torch.nn.functional.pad(own, (0, 6), value=1 - sure)
+        for shares in ((0.0,), (0.0, 0.3)):
+            found = sampling_for(sure_of(sure), Plans(padded, 2, torch.tensor([2, 2, 2])), 1, uniform_shares=shares)
+            assert found == sampling_for(sure_of(sure), Plans(own, 2), 1, uniform_shares=shares)
+            assert found != sampling_for(sure_of(sure), Plans(padded, 2), 1, uniform_shares=shares)
