@@ -110,7 +110,7 @@ def test_information_by_lag_is_that_of_counts_and_of_networks_where_there_are_an
 @pytest.mark.parametrize("skip", [0, 3])
 def test_saved_priors_are_scored_on_the_actions_that_count_and_known_plans_are_marked(skip, tmp_path):
     """Two priors: the one has learned from four of the twelve plans, the other from none of them."""
-    plans, others = chain(length=24), chain(9, 24, seed=8)
+    plans, others = (Plans(torch.randint(3, (num, 24), generator=seeded(num)), 3) for num in (12, 9))
     for name, some in (("one", torch.cat([plans.actions[:4], others.actions])), ("two", others.actions)):
         save(MarkovPrior(3, 1).fit(some), tmp_path / name)
         keep_learned(tmp_path / name, Plans(some, 3))
