@@ -57,13 +57,13 @@ def test_test_plans_are_scored_and_nothing_is_held_out_of_the_others(num):
 
 
 def test_contexts_of_plans_and_of_test_plans_are_numbered_together():
-    """With gaps between them; the test plans have one that those to learn from have not."""
+    """With gaps between them; the test plans have one, between the others, that those to learn from have not."""
     learned = chain(context=torch.arange(12) % 2 * 7 + 3)
-    other = chain(8, seed=5, context=torch.arange(8) % 2 * 50 + 3)
+    other = chain(8, seed=5, context=torch.arange(8) % 2 * 2 + 3)
     made = report(learned, test=other, **SCORES)
     same = report(
-        replace(learned, context=torch.arange(12) % 2),
-        test=replace(other, context=torch.arange(8) % 2 * 2),
+        replace(learned, context=torch.arange(12) % 2 * 2),
+        test=replace(other, context=torch.arange(8) % 2),
         **SCORES,
     )
     for model in ("markov-0", "markov-1"):
