@@ -62,8 +62,8 @@ def test_contexts_of_plans_and_of_test_plans_are_numbered_together():
     other = chain(8, seed=5, context=torch.arange(8) % 2 * 2 + 3)
     made = report(learned, test=other, **SCORES)
     same = report(
-        replace(learned, context=torch.arange(12) % 2 * 2),
-        test=replace(other, context=torch.arange(8) % 2),
+        replace(learned, context=torch.arange(12) % 2 * 2, context_names=("a", "b", "c")),
+        test=replace(other, context=torch.arange(8) % 2, context_names=("a", "b", "c")),
         **SCORES,
     )
     for model in ("markov-0", "markov-1"):
