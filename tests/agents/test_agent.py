@@ -109,6 +109,51 @@ def test_it_learns_from_what_it_did():
     assert torch.equal(one.prior.log_prob(every_plan(4, 3)), due.log_prob(every_plan(4, 3)))
 
 
+class Pupil(MarkovPrior):
+    """Keeps the plans and settings of each fit."""
+
+    fit_settings = ("strength",)
+
+    def __init__(self, *given):
+        super().__init__(*given)
+        self.fits = []
+
+    def fit(self, plans, *, generator=None, **settings):
+        self.fits.append((plans, generator, settings))
+        return super().fit(plans)
+
+
+def test_what_a_fit_is_given():
+    """The agent's generator and settings, and what is left of all plans so far: about 0.5, 0.75 and 0.875 as many."""
+    prior = Pupil(4, 1)
+    one = agent(prior, number=400, learn_every=6, retention=0.5, training={"strength": 3})
+    one.run(18)
+    kept = [0.5, 0.75, 0.875]
+    assert len(prior.fits) == 3
+    for (plans, generator, settings), share in zip(prior.fits, kept, strict=True):
+        assert generator is one.generator
+        assert settings == {"strength": 3}
+        # Six standard errors of a binomial share at most.
+        assert abs(len(plans) - 400 * share) < 6 * (400 * share) ** 0.5
+    assert len(prior.fits[0][0]) < 300
+
+
+def test_all_is_kept_with_a_retention_of_1():
+    prior = Pupil(4, 1)
+    agent(prior, number=5, learn_every=6, retention=1.0).run(18)
+    assert [len(plans) for plans, _, _ in prior.fits] == [5, 10, 15]
+
+
+def test_steps_of_a_model_are_those_since_the_pause_too(tmp_path):
+    """What was executed before it and is not stored yet has its steps."""
+    whole = agent(learn_every=12)
+    whole.run(4)
+    saved = [done.model_steps for done in whole.recent]
+    again = restore_agent(agent(learn_every=12), save_agent(whole, tmp_path / "agent"))
+    assert [done.model_steps for done in again.recent] == saved
+    assert min(saved) > 0
+
+
 def test_it_learns_only_so_often(monkeypatch):
     """After 12, 24 and 36 steps, from all that was executed so far."""
     one, sizes = agent(retention=1.0), []

@@ -130,6 +130,18 @@ def test_forecast(within):
     assert float(error.max()) < 1 / (2 * sqrt(number))
 
 
+def test_a_forecast_is_by_the_last_posterior_of_each_agent():
+    """That after all of its observed actions, also where those of others go on."""
+    plans = Plans(ACTIONS, 2, lengths=torch.tensor([2, 4]))
+    observed = infer(PRIORS, plans, weights=[0.1, 0.1, 0.8])
+    given = RING, torch.tensor([0, 2])
+    how = {"targets": torch.arange(4), "length": 2, "num_plans": 50}
+    last = torch.stack([observed.log_probs[0, 2], observed.log_probs[1, 4]]).exp()
+    found, same = (forecast(PRIORS, *given, p, generator=seeded(0), **how) for p in (observed, last))
+    assert found.equal(same)
+    assert not found.equal(forecast(PRIORS, *given, observed.log_probs[:, 0].exp(), generator=seeded(0), **how))
+
+
 def test_what_is_impossible():
     """An intention without weight never gets any; one has to have some."""
     sure = infer(PRIORS, ACTIONS, weights=[0.0, 1.0, 0.0], switch=0.5).log_probs.exp()

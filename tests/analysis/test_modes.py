@@ -78,6 +78,13 @@ def test_bits_are_of_held_out_groups_and_begin_after_those_left_out():
         assert float(score.bits[number]) == pytest.approx(float(bits), rel=1e-5)
 
 
+def test_all_actions_count_where_nothing_else_is_asked():
+    plans, _ = source(6, 9, seed=4)
+    plans = replace(plans, lengths=torch.tensor([9, 9, 1, 4, 9, 2]))
+    choice = choose_modes(plans, [1], order=0, generator=seeded(0))
+    assert choice.scores[1].actions.tolist() == plans.lengths.tolist()
+
+
 def test_modes_are_matched_whatever_their_order():
     plans, _ = source(10, 40, seed=1, modes=3)
     smoothed = SwitchingPrior(4, 3, 0).fit(plans, generator=seeded(0)).posterior(plans).smoothed

@@ -363,3 +363,56 @@ def test_last_actions_count_where_no_pattern_is_known() -> None:
     planner.compile = False
     assert compiled.expansions.equal(planner.search(world, world.boards).expansions)
     assert not compiled.expansions.equal(LevinPlanner(UniformPrior(4), 100).search(world, world.boards).expansions)
+
+
+class Heated:
+    """A prior whose logits are divided by a temperature."""
+
+    def __init__(self, prior: Prior, temperature: float) -> None:
+        self.prior, self.temperature = prior, temperature
+        self.num_actions, self.context_per, self.device = prior.num_actions, prior.context_per, prior.device
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = self.prior.start(batch_size, context)
+        return logits / self.temperature, state
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        logits, state = self.prior.step(action, state, context)
+        return logits / self.temperature, state
+
+    def check_context_of(self, context: Tensor | None, num_plans: int = 0, length: int = 0) -> None:
+        self.prior.check_context_of(context, num_plans, length)
+
+
+@pytest.mark.parametrize("temperature", [0.3, 3.0])
+@pytest.mark.parametrize("kind", ["table", "puzzle"])
+def test_the_temperature_divides_the_logits(kind: str, temperature: float) -> None:
+    """In tables, and in puzzles with a prior of patterns, which the compiled loop could search with."""
+    if kind == "table":
+        world: Any = random_table(0)
+        state = torch.arange(20)
+        prior: Any = MarkovPrior(3, 2).fit(torch.randint(3, (30, 5), generator=torch.Generator().manual_seed(0)))
+        same = LevinPlanner(Heated(prior, temperature), 200).search(world, state)
+    else:
+        world = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=12).reset(6, torch.Generator().manual_seed(1)))
+        state = world.boards
+        prior = LogLinearPrior(4, len(world.windows.windows))
+        prior.fit(puzzle_plans(world, state), generator=torch.Generator().manual_seed(0))
+        same = LevinPlanner(prior, 200, temperature=temperature, compile=False).search(world, state)
+    warm = LevinPlanner(prior, 200, temperature=temperature).search(world, state)
+    cold = LevinPlanner(prior, 200).search(world, state)
+    assert warm.expansions.equal(same.expansions)
+    assert warm.plan.equal(same.plan)
+    assert not warm.expansions.equal(cold.expansions)
+
+
+def test_of_nodes_with_equal_rewards_the_one_nearest_to_the_goal_is_best() -> None:
+    """And one with a higher sum of rewards is better, however far: the goal is not reached within the budget."""
+    table = torch.tensor([[1, 2], [3, 3], [4, 4], [3, 3], [4, 4], [5, 5]])
+
+    left = torch.tensor([9.0, 1.0, 5.0, 4.0, 3.0, 0.0])
+    for reward, end in (([0.0, 0, 0, 0, 0, 0], 1), ([0.0, 1, 1, 0, 0, 0], 1), ([0.0, 0, 2, 0, 0, 0], 4)):
+        world = Goal(table, torch.tensor([reward]))
+        found = AStarPlanner(lambda state: left[state].double(), 1.0, 50).search(world, torch.tensor([0]))
+        assert not found.solved.any()
+        assert found.final_state.tolist() == [end]

@@ -194,3 +194,23 @@ def test_bad_input_is_refused() -> None:
         list(bootstrap(world, prior_for(world), world.boards[:0]))
     with pytest.raises(ValueError, match="lower_bound"):
         list(bootstrap(cube(), MarkovPrior(9, 1), torch.tensor([5]), guided=True))
+
+
+def test_solutions_are_learned_from_themselves_before_any_symmetry_of_theirs() -> None:
+    world = tiles(12)
+    plans = [torch.randint(4, (5 + k % 3,), generator=seeded(k), dtype=torch.uint8) for k in range(12)]
+    state, same = with_symmetries(world, world.boards, plans, 1, seeded(3))
+    assert state.equal(world.boards)
+    assert [plan.tolist() for plan in same] == [plan.tolist() for plan in plans]
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_a_sweep_searches_with_the_heuristic_where_it_is_guided(guided: bool) -> None:
+    """And with the prior as it is, within the budget: as many expansions as of that search."""
+    world, state = tiles(20), tiles(20).boards
+    heuristic = world.lower_bound if guided else None
+    found = LevinPlanner(prior_for(world), 300, heuristic=heuristic).search(world, state)
+    (sweep,) = bootstrap(world, prior_for(world), state, max_nodes=300, sweeps=1, guided=guided, epochs=1)
+    assert sweep.mean_expansions == pytest.approx(float(found.expansions.double().mean()))
+    assert sweep.solved == pytest.approx(float(found.solved.double().mean()))
+    assert (sweep.problems, sweep.max_nodes, sweep.solutions) == (20, 300, int(found.solved.sum()))

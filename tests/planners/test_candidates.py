@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neuroprior import FrontierPlanner, MarkovPrior, MCTSPlanner, TabularWorld
-from neuroprior.planners import DistinctPlanner, HorizonPlanner
+from neuroprior.planners import CrossEntropyPlanner, DistinctPlanner, HorizonPlanner, SamplingPlanner
 from tests.support.sources import FALSE_ALARM, p_value, seeded
 
 SHARES = torch.tensor([0.6, 0.4])
@@ -64,3 +64,37 @@ def test_distinct_plans_share_the_steps_of_their_beginnings(num_plans, length, s
     world = Recorded()
     decision = DistinctPlanner(chain(), length, num_plans).plan(world, torch.zeros(7, dtype=torch.long), seeded(0))
     assert decision.model_steps == world.steps / 7 == steps
+
+
+@pytest.mark.parametrize("temperature", [0.25, 1.0, 4.0])
+@pytest.mark.parametrize("kind", [SamplingPlanner, DistinctPlanner, FrontierPlanner, CrossEntropyPlanner])
+def test_candidates_are_drawn_at_the_planners_temperature(kind, temperature):
+    """Of two actions, and of the plans of two that begin with them."""
+    sharp = SHARES ** (1 / temperature) / (SHARES ** (1 / temperature)).sum()
+    for length in (1, 2):
+        assert p_value(tried(kind(chain(), length, 1, temperature=temperature), 3000), sharp) > FALSE_ALARM
+
+
+def test_of_plans_into_one_state_the_likelier_goes_on_where_only_the_last_reward_counts():
+    """Both actions of cell 0 lead to cell 1: the rarer one pays, which is lost on the way to the last step."""
+
+    class Paying(TabularWorld):
+        def step(self, state, action, generator=None):
+            after, _ = super().step(state, action, generator)
+            return after, torch.where(state == 0, 5.0 * action, action.float())
+
+    world, start = Paying(torch.tensor([[1, 1], [2, 2], [2, 2]]), torch.zeros(1, 3)), torch.zeros(20, dtype=torch.long)
+    for objective, first in (("terminal", 0), ("return", 1)):
+        planner = FrontierPlanner(chain(), 2, 2, noise=False, objective=objective)
+        decision = planner.plan(world, start, seeded(0))
+        assert decision.plan.tolist() == [[first, 1]] * 20
+
+
+@pytest.mark.parametrize(("share", "number", "uniform"), [(0.3, 9, 3), (0.1, 4, 0), (0.1, 6, 1), (0.9, 4, 4)])
+def test_the_share_of_uniform_plans_is_rounded_to_the_nearest_number(share, number, uniform):
+    """A prior that never takes action 1 of cell 0, but for those."""
+    sure = MarkovPrior(2, 0, 1e-9, backoff="dirichlet").fit(torch.zeros(9, 1, dtype=torch.long))
+    found = tried(SamplingPlanner(sure, 1, number, uniform_share=share), 2000)
+    assert len(found) == 2000 * number
+    expected = 1000 * uniform
+    assert abs(int(found.sum()) - expected) <= 5 * (expected / 2) ** 0.5

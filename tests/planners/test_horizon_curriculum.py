@@ -249,3 +249,22 @@ def test_bad_input():
         collect(ExhaustivePlanner(2), world, state=torch.zeros(0, dtype=torch.long), min_score=0.0)
     with refuses("num_plans"):
         list(extend_horizon(MarkovPrior(2, 1), plans, world, (4,), num_starts=5, num_plans=0))
+
+
+def test_settings_are_tried_as_they_are_planned_with(monkeypatch):
+    """What tells temperatures apart has the goal, the candidates and the rollouts of the rounds themselves."""
+    from neuroprior.planners import horizon_curriculum
+
+    seen, real = [], horizon_curriculum.best_sampling
+
+    def recorded(prior, world, state, length, num_plans, **how):
+        seen.append((len(state), length, num_plans, how))
+        return real(prior, world, state, length, num_plans, **how)
+
+    monkeypatch.setattr(horizon_curriculum, "best_sampling", recorded)
+    world, generator = FromTheMiddle(), seeded(0)
+    plans = collect(ExhaustivePlanner(2), world, 20, generator=generator)
+    goal = {"objective": "return", "discount": 0.9, "any_prefix": True}
+    how = {"temperatures": (1.0, 2.0), "uniform_shares": (0.0, 0.5), "num_rollouts": 3, "generator": generator}
+    list(extend_horizon(MarkovPrior(2, 1), plans, world, (4, 6), num_starts=30, num_plans=8, **how, **goal))
+    assert seen == [(30, length, 8, how | goal) for length in (4, 6)]

@@ -233,3 +233,25 @@ def test_refuses_stochastic_worlds():
     world = stochastic_world(0)
     with refuses("deterministic"):
         MCTSPlanner(UniformPrior(world.num_actions), 2, 2).plan(world, torch.zeros(1, dtype=torch.long))
+
+
+@pytest.mark.parametrize(("length", "num_plans"), [(3, 8), (5, 6)])
+def test_all_of_the_budget_is_spent(length, num_plans):
+    """Only steps of the world count, not those that the tree knows: of 4 ** length plans hardly any are known."""
+
+    class Counted(TabularWorld):
+        steps = 0
+
+        def step(self, state, action, generator=None):
+            self.steps += len(state)
+            return super().step(state, action, generator)
+
+    cells = torch.arange(4**length * 2)
+    world = Counted(
+        (cells[:, None] * 4 + torch.arange(1, 5)) % len(cells), torch.rand(1, len(cells), generator=seeded(0))
+    )
+    planner = MCTSPlanner(UniformPrior(4), length, num_plans, exploration=0.3, objective="return")
+    decision = planner.plan(world, torch.arange(40), seeded(0))
+    # What is left in the end is less than a plan of as many actions.
+    assert 40 * (num_plans - 1) * length < world.steps <= 40 * decision.model_steps
+    assert decision.model_steps <= num_plans * length

@@ -249,3 +249,14 @@ def test_nothing_to_try():
         search_weights(torch.tensor([0.1]), 4)
     with refuses("at most 0"):
         search_weights(torch.tensor([float("nan")]), 4)
+
+
+def test_what_is_beyond_the_ends_of_plans_counts_nothing():
+    """What pads them would be far likelier at a higher temperature, or under uniform plans."""
+    for sure in (0, 1):
+        own = torch.tensor([[sure, sure], [sure, sure], [sure, 1 - sure]])
+        padded = torch.nn.functional.pad(own, (0, 6), value=1 - sure)
+        for shares in ((0.0,), (0.0, 0.3)):
+            found = sampling_for(sure_of(sure), Plans(padded, 2, torch.tensor([2, 2, 2])), 1, uniform_shares=shares)
+            assert found == sampling_for(sure_of(sure), Plans(own, 2), 1, uniform_shares=shares)
+            assert found != sampling_for(sure_of(sure), Plans(padded, 2), 1, uniform_shares=shares)

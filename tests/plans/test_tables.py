@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neuroprior import Plans
-from neuroprior.plans import read_plans
+from neuroprior.plans import read_plans, write_plans
 from tests.support.sources import refuses
 
 LAB = """animal,session,behaviour,t,seconds,drug,observer,arena
@@ -510,3 +510,50 @@ def test_starts_and_stops_that_are_rows_may_overlap(tmp_path):
         plans = read(tmp_path, "action,kind,start\n" + "\n".join(order) + "\n", columns=columns)
         assert (listed(plans), plans.durations.tolist()) == ([["a", "b", "a"]], [[2, 3, 0.5]])
         assert "1 actions begin before the one before them ended" in plans.notes
+
+
+def of_times(starts, stops=None, **more):
+    frame = pd.DataFrame({"action": list("abab")[: len(starts)], "plan": 1, "start": starts} | more)
+    return Plans.from_dataframe(frame if stops is None else frame.assign(stop=stops))
+
+
+def test_a_stop_that_is_missing_among_times_of_day_is_not_known():
+    plans = of_times(["1:00:00", "1:00:10", "1:01:00"], ["1:00:05", None, "1:02:30.5"])
+    assert plans.durations[0, [0, 2]].tolist() == [5.0, 90.5]
+    assert plans.durations[0, 1].isnan()
+
+
+def test_two_numbers_beyond_the_hours_of_a_day_are_minutes_and_seconds():
+    assert of_times(["24:10", "24:30", "24:31"]).durations[0, :2].tolist() == [20.0, 1.0]
+    with pytest.raises(ValueError, match="hours and minutes, or minutes and seconds"):
+        of_times(["23:10", "23:30", "23:31"])
+
+
+def test_times_that_go_back_a_little_are_only_put_in_order():
+    little, much = of_times(["10:00:05", "10:00:01"]), of_times(["23:59:05", "0:00:01"])
+    assert [any("go back" in note for note in plans.notes) for plans in (little, much)] == [False, True]
+    assert all(any("order of their start" in note for note in plans.notes) for plans in (little, much))
+
+
+def test_a_column_of_starts_and_stops_is_told_from_one_of_other_words():
+    for words, noted in ((["START", "stop", "POINT", "START"], True), (["start", "stop", "pause", "start"], False)):
+        notes = of_times([1.0, 2.0, 3.0, 4.0], kind=words).notes
+        assert any("holds START and STOP" in note for note in notes) == noted
+        assert any("not used: kind" in note for note in notes)
+
+
+def test_what_parts_the_columns_is_what_makes_known_names_of_the_header(tmp_path):
+    """Here semicolons, though there are more commas."""
+    (tmp_path / "plans.csv").write_text("plan;action;a note, long, and, with, commas\n1;0;x\n1;1;y\n2;1;z\n")
+    plans = read_plans(tmp_path / "plans.csv")
+    assert plans.mask().sum(1).tolist() == [2, 1]
+
+
+def test_parts_of_a_plan_that_no_group_holds_together_are_written_as_plans(tmp_path):
+    """Else they would be read as one plan with a gap, whose parts form a group."""
+    plans = Plans(torch.tensor([[0, 1], [1, 1], [1, 0]]), 2, plan_names=("a", "a", "b"))
+    write_plans(plans, tmp_path / "plans.csv", layout="step")
+    again = read_plans(tmp_path / "plans.csv")
+    assert again.actions.tolist() == plans.actions.tolist()
+    assert again.group is None
+    assert again.plan_names is None

@@ -178,3 +178,23 @@ def test_the_figure_shows_the_features_that_differ_most():
     assert "durations" in set(features["family"])
     with refuses("means"):
         condition_figure(*(frame[:0] for frame in figure_tables(2, 3)))
+
+
+@pytest.mark.parametrize("conditions", [between(12), within(8)], ids=["between", "within"])
+def test_features_that_differ_most_come_first(conditions):
+    """Significant ones by family, then all by their p-values, and among equals by how unlike they are."""
+    features = section_of(changed(conditions, 40))[1]["conditions"]
+    families = ["transitions", "durations", "actions", "sequences"]
+    rank = [families.index(row.family) if row.significant else len(families) for row in features.itertuples()]
+    keys = [*zip(rank, features["corrected"], features["p_value"], -features["statistic"], strict=True)]
+    assert keys == sorted(keys)
+    assert len({key[:3] for key in keys}) < len(keys)
+
+
+def test_units_that_cannot_be_compared_are_counted():
+    """Of eight animals under both conditions one has lost the sessions under the second."""
+    plans = changed(within(8))
+    lost = (plans.group == 3) & (plans.condition == 1)
+    text = " ".join(section_of(plans[~lost])[0].text)
+    assert "1 groups that are not under every condition were left out" in text
+    assert "left out" not in " ".join(section_of(plans)[0].text)

@@ -1,10 +1,15 @@
 """The files of a document of results."""
 
 import json
+from io import StringIO
 
 import pandas as pd
+import pytest
+from rich.console import Console
 
-from neuroprior.report.document import Document, write_document
+from neuroprior.report.document import Document, show, write_document
+from neuroprior.report.page import Section, Table
+from neuroprior.report.part import p_text
 
 
 def test_files_hold_renamed_columns_under_both_names(tmp_path):
@@ -18,3 +23,32 @@ def test_files_hold_renamed_columns_under_both_names(tmp_path):
     ]
     assert pd.read_csv(tmp_path / "rows.csv")["sees"].tolist() == ["none", "initial"]
     assert list(frame) == ["context", "bits"]
+
+
+def test_a_table_that_is_empty_now_leaves_no_file_of_an_earlier_run(tmp_path):
+    full = pd.DataFrame({"bits": [1.5]})
+    write_document(Document("", "", [], {"one": full, "two": full}), tmp_path)
+    write_document(Document("", "", [], {"one": full, "two": full[:0]}), tmp_path)
+    assert {path.name for path in tmp_path.glob("*.csv")} == {"one.csv"}
+    assert json.loads((tmp_path / "results.json").read_text())["two"] == []
+
+
+def test_tables_are_printed_under_their_own_titles_else_that_of_their_section():
+    shown = [Table(["a wide heading"], [["1"]], title="Own title")]
+    shown += [Table(["a wide heading"], [["2"]], caption="A caption")]
+    stream = StringIO()
+    show(Document("", "The lead.", [Section("Its section", tables=shown)]), Console(file=stream, width=80))
+    said = [line.strip() for line in stream.getvalue().splitlines() if line.strip()]
+    assert [line for line in said if line in ("Own title", "Its section", "A caption", "The lead.")] == [
+        "Own title",
+        "Its section",
+        "A caption",
+        "The lead.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "<1e-300"), (1e-12, "1e-12"), (0.0043, "0.004"), (0.26, "0.3"), (1.0, "1")]
+)
+def test_p_values_have_a_digit(value, text):
+    assert p_text(value) == text

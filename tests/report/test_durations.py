@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neuroprior.analysis.comparison import score_bits
-from neuroprior.plans import Plans, write_plans
+from neuroprior.plans import BLOCKS, Plans, write_plans
 from neuroprior.priors import UniformPrior
 from neuroprior.report import Document, dwell_figure, report
 from neuroprior.report.durations import chain_bits
@@ -240,3 +240,30 @@ def test_rounded_durations_have_no_empty_bins():
     frames = (plans.durations * 5).ceil() / 5
     dwell = tables(replace(plans, durations=frames))["dwell"]
     assert (dwell["density"].groupby(dwell["action"]).apply(lambda own: (own[:8] > 0).all())).all()
+
+
+def test_the_parts_of_a_single_plan_are_its_units():
+    frames = tables(replace(timed(False, 1, 600), group=None))
+    for name in ("duration_laws", "next_by_duration"):
+        assert frames[name]["units"].tolist() == [BLOCKS] * len(frames[name])
+
+
+def test_gains_are_those_of_durations_above_0():
+    """Where a third take no time, gains are as if these were not known."""
+    plans = timed(False)
+    times = plans.durations.clone()
+    times[plans.actions == 1] = times[plans.actions == 1].sqrt()
+    found = [tables(replace(plans, durations=times.masked_fill(times < 0.7, none))) for none in (0.0, nan)]
+    for name in ("durations", "duration_laws"):
+        zero, unknown = (frames[name] for frames in found)
+        assert zero["gain"].tolist() == pytest.approx(unknown["gain"].tolist(), abs=1e-9)
+    assert found[0]["durations"]["gain"].abs().max() > 0.05
+
+
+def test_how_many_actions_have_laws_of_transitions():
+    """Those of which the next action says how long they take: one of three."""
+    plans = timed(False)
+    follows = torch.cat([plans.actions[:, 1:], plans.actions[:, :1]], 1) == 0
+    slow = torch.where(follows & (plans.actions == 2), 9.0, 1.0)
+    laws = tables(replace(plans, durations=plans.durations * slow))["duration_laws"]
+    assert laws["what"].tolist() == ["the law of each action", "and of each transition (in 1 of 3 actions)"]

@@ -2,14 +2,19 @@
 
 import pandas as pd
 import pytest
+import torch
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 
+from neuroprior import Plans
 from neuroprior.report import condition_figure
-from neuroprior.report.drawing import lines
+from neuroprior.report.drawing import KINDS, MARKOV, SPARE, colors, lines
 from neuroprior.report.figures import (
+    STRIPS,
     calibration_figure,
     drift_figure,
     dwell_figure,
+    ethogram_figure,
     lag_figure,
     motif_figure,
     order_figure,
@@ -146,3 +151,54 @@ def test_orders_that_are_left_out():
 def test_tables_without_a_column_are_refused(make, frames, words):
     with pytest.raises(ValueError, match=words):
         make(*(pd.DataFrame([dict.fromkeys(columns.split(), 1)]) for columns in frames))
+
+
+def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
+    places = [("place", f"part {n}", bits, bits - 0.1, bits + 0.1) for n, bits in enumerate((2.0, 1.5, 1.2, 1.0), 1)]
+    groups = [
+        ("group", name, bits, bits - 0.2, bits + 0.3) for name, bits in (("low", 1.0), ("high", 2.0), ("mid", 1.5))
+    ]
+    drift = pd.DataFrame(places + groups, columns=["what", "name", "bits", "low", "high"])
+    many = pd.DataFrame({"index": range(1, 2502), "bits": [2.0 - n / 2500 for n in range(2501)]})
+    within, between, below = drift_figure(drift, many).axes
+    assert within.lines[0].get_xydata().tolist() == [[12.5, 2.0], [37.5, 1.5], [62.5, 1.2], [87.5, 1.0]]
+    dots, means = between.lines
+    assert len(dots.get_xdata()) == 1000
+    assert (dots.get_xdata()[0], dots.get_xdata()[-1]) == (1, 2501)  # from the first to the last
+    assert (dots.get_ydata() == 2.0 - (dots.get_xdata() - 1) / 2500).all()
+    assert title(between) == "from plan to plan (1,000 of 2,501 drawn)"
+    assert len(means.get_xdata()) == 20
+    assert means.get_ydata().tolist() == pytest.approx((2.0 - (means.get_xdata() - 1) / 2500).tolist())
+    assert [label.get_text() for label in below.get_yticklabels()] == ["low", "mid", "high"]  # from below
+    bars = [line.get_xdata().tolist() for line in below.lines if len(line.get_xdata()) == 2]
+    assert bars == [pytest.approx([bits - 0.2, bits + 0.3]) for bits in (1.0, 1.5, 2.0)]
+
+
+def test_intervals_end_where_the_axis_does():
+    """Of sequences an interval may be wide: the axis is by the ratios."""
+    rows = [("a b c", 2.0, 0.01, 400.0, 9), ("c b a", 0.5, 0.3, 0.6, 8)]
+    (axes,) = motif_figure(pd.DataFrame(rows, columns=["sequence", "ratio", "low", "high", "count"])).axes
+    bars = [[*line.get_xdata()] for line in axes.lines if len(line.get_xdata()) == 2][1:]  # the first is at 1
+    below, above = sorted(bars, key=lambda bar: bar[1])
+    assert below == pytest.approx([2**-1.25, 0.6])
+    assert above == pytest.approx([2**-1.25, 2**1.25])
+
+
+def test_plans_stand_in_their_own_order_and_not_by_name():
+    """One action a plan, so that each row has one colour; parts of a plan are in one row."""
+    actions = torch.tensor([[0, 0], [1, 1], [2, 2], [1, 1]])
+    plans = Plans(actions, 3, plan_names=("c", "a", "b", "a"), group=torch.zeros(4, dtype=torch.long))
+    for some, want in (([0, 1, 2], [0, 1, 2]), ([1, 2, 0], [1, 2, 0]), ([0, 1, 3, 2], [0, 1, 2])):
+        (axes,) = ethogram_figure(plans[torch.tensor(some)]).axes
+        column = axes.images[0].get_array()[:, 0]
+        shown = [tuple(color[:3]) for color in column if color[3] == 1]
+        assert [*dict.fromkeys(shown)] == [to_rgb(STRIPS[action]) for action in want]
+
+
+def test_models_have_the_colours_of_their_orders():
+    assert [*colors(["markov-0", "markov-1", "markov", "Markov-2, with context", "markov-40"])] == [
+        *(MARKOV[k] for k in (0, 1, 1, 2)),
+        MARKOV[-1],
+    ]
+    others = [*colors(["mine", "gru", "yours", "uniform"])]
+    assert others == [SPARE[0], KINDS["gru"], SPARE[1], KINDS["uniform"]]

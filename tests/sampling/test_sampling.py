@@ -380,3 +380,15 @@ def test_in_world_refuses(change, word):
     arguments = {"prior": UniformPrior(3), "state": torch.tensor([0]), "num_plans": 2, "length": 2}
     with refuses(word):
         sample_in_world(world=random_world(0), **(arguments | change))
+
+
+@pytest.mark.parametrize("asked", [{}, {"keep_states": False}, {"keep_states": True}])
+def test_states_on_the_way_are_kept_where_they_are_asked_for(asked):
+    world = random_world(0)
+    plans, rollout = sample_in_world(UniformPrior(3), world, torch.tensor([0, 4]), 5, 4, generator=seeded(0), **asked)
+    due = world.rollout(torch.tensor([0, 4]), plans, keep_states=True)
+    assert rollout.final_state.equal(due.final_state)
+    assert rollout.rewards.equal(due.rewards)
+    assert (rollout.states is not None) == asked.get("keep_states", False)
+    if rollout.states is not None:
+        assert rollout.states.equal(due.states)
