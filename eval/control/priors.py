@@ -60,7 +60,7 @@ def check_prior_name(name: str) -> None:
 def _parted(name: str) -> tuple[str, int | None]:
     """A name's parts: what is before and behind a hyphen, if a number is behind it."""
     base, _, number = name.rpartition("-")
-    return (base, int(number)) if base and number.isdigit() and int(number) else (name, None)
+    return (base, int(number)) if base and number.isdecimal() and int(number) else (name, None)
 
 
 def sees_state(name: str) -> bool:

@@ -45,12 +45,10 @@ def control_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
     rows = runs.seed_means(frame, PLACE, "return", ["seconds"])
     gaps = differences(frame)
     saved = savings(frame)
-    nats = runs.seed_means(
-        runs.frame_of(results, "likelihoods").assign(task=lambda rows: rows["world"]),
-        ["task", "prior"],
-        "nats",
-        ["fit_seconds", "for_80", "for_95"],
-    )
+    scored, more = runs.frame_of(results, "likelihoods"), ["fit_seconds", "for_80", "for_95"]
+    nats = scored  # empty where the plain planner is alone
+    if len(scored):
+        nats = runs.seed_means(scored.assign(task=scored["world"]), ["task", "prior"], "nats", more)
     sections, leads = [], []
     for task in rows["task"].unique():
         about = next(one["about"] for one in results if one["world"] == task)
@@ -74,7 +72,8 @@ def control_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
             leads.append(runs.significance(gaps[gaps["world"] == task], f"{task}, with a prior minus without"))
     if len(saved):
         sections.insert(0, Section("Candidates saved", tables=[saving_table(saved)]))
-    sections.append(Section("Likelihoods", tables=[likelihood_table(nats)] if len(nats) else []))
+    if len(nats):
+        sections.append(Section("Likelihoods", tables=[likelihood_table(nats)]))
     alone = runs.frame_of(results, "alone")
     if len(alone):
         alone = runs.seed_means(alone.assign(task=alone["world"]), ["task", "condition", "prior"], "return")

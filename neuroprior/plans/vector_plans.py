@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, check_share, is_integer
+from neuroprior._checks import check_range, check_share, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.sequences import Sequences
 
@@ -39,12 +40,13 @@ class VectorPlans(Sequences):
     action_names: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        actions = _numbers("actions", self.actions)
+        actions = as_floats("actions", self.actions)
         if actions.dim() != 3:
             raise ValueError(f"actions: shape [N, L, D] is expected, not {list(actions.shape)}")
+        object.__setattr__(self, "actions", actions)
         num, length, size = actions.shape
         for name in ("action_low", "action_high"):
-            bound = _numbers(name, getattr(self, name)).to(actions.device)
+            bound = as_floats(name, getattr(self, name)).to(actions.device)
             if bound.shape != (size,) or not bound.isfinite().all():
                 raise ValueError(f"{name}: {size} finite numbers are expected, one a dimension, not {bound.tolist()}")
             object.__setattr__(self, name, bound)
@@ -54,8 +56,9 @@ class VectorPlans(Sequences):
                 f"action_low[{d}]: {float(self.action_low[d]):g} is not below action_high[{d}],"
                 f" {float(self.action_high[d]):g}"
             )
+        check_widths(self.action_low, self.action_high)
         if self.lengths is not None:
-            lengths = torch.as_tensor(self.lengths)
+            lengths = _integers("lengths", self.lengths)
             if lengths.shape != (num,):
                 raise ValueError(f"lengths: shape [{num}] is expected, not {list(lengths.shape)}")
             check_range("lengths", lengths, length + 1, "possible lengths")
@@ -74,7 +77,7 @@ class VectorPlans(Sequences):
         kept = actions.clamp(self.action_low, self.action_high)
         object.__setattr__(self, "actions", kept.masked_fill(~self.mask()[..., None], 0))
         if self.group is not None:
-            group = torch.as_tensor(self.group)
+            group = _integers("group", self.group)
             if not is_integer(group) or group.shape != (num,):
                 raise ValueError(
                     f"group: integers of shape [{num}] are expected, not {group.dtype} {list(group.shape)}"
@@ -83,12 +86,14 @@ class VectorPlans(Sequences):
         if self.context is not None:
             self._check_context(num, length)
         if self.action_names is not None:
-            if isinstance(self.action_names, str) or len(self.action_names) != size:
+            if not isinstance(self.action_names, Sequence | np.ndarray) or isinstance(self.action_names, str):
+                raise ValueError(f"action_names: a list is expected, not {type(self.action_names).__name__}")
+            if len(self.action_names) != size:
                 raise ValueError(f"action_names: {size} are expected, one a dimension, not {self.action_names!r}")
             check_distinct("action_names", self.action_names)
 
     def _check_context(self, num: int, length: int) -> None:
-        context = _numbers("context", self.context)
+        context = as_floats("context", self.context)
         shape = tuple(context.shape)
         if shape[:-1] not in ((num,), (num, length)):
             raise ValueError(
@@ -149,7 +154,12 @@ class VectorPlans(Sequences):
         )
 
     def windows(self, length: int) -> Tensor:
-        """All windows of `length` consecutive vectors, `[M, length, D]`, plan by plan in order; M may be 0."""
+        """All windows of `length` consecutive vectors, `[M, length, D]`, plan by plan in order; M may be 0.
+
+        Raises:
+            ValueError: `length` is no integer of at least 1.
+        """
+        check_sizes(length=length)
         if self.max_length < length:
             return self.actions.new_zeros(0, length, self.action_size)
         every = self.actions.unfold(1, length, 1).transpose(2, 3)
@@ -164,12 +174,44 @@ class VectorPlans(Sequences):
         return near[self.mask()].float().mean(0)
 
 
-def _numbers(name: str, values: object) -> Tensor:
+COARSEST = 1e-4
+"""The least width of a range, as a share of its bounds: float32 has about a thousand numbers in it."""
+
+WIDTHS = 1e-30, 1e30
+"""Between which a range's width lies, so that its square can be computed with."""
+
+
+def check_widths(low: Tensor, high: Tensor) -> None:
+    """Raise ValueError where the numbers between bounds `low` and `high [D]` are too few, or too large, for float32."""
+    width = high - low
+    fits = (width > COARSEST * torch.maximum(low.abs(), high.abs())) & (width > WIDTHS[0]) & (width < WIDTHS[1])
+    if not fits.all():
+        d = int((~fits).nonzero()[0, 0])
+        raise ValueError(
+            f"action_low[{d}], action_high[{d}]: a range that float32 resolves is expected (1e-30 to 1e30 wide, and at"
+            f" least {COARSEST:g} of its bounds), not {float(low[d]):g} to {float(high[d]):g}"
+        )
+
+
+def same_bounds(bound: Tensor, other: Tensor, width: Tensor) -> bool:
+    """Whether two bounds `[D]` of ranges of `width [D]` are the same, but for a hundred-thousandth of the range."""
+    return bound.shape == other.shape and bool(((bound - other).abs() <= 1e-5 * width).all())
+
+
+def as_floats(name: str, values: object) -> Tensor:
     """Floating point numbers as float32; ValueError for anything else."""
     try:
         tensor = torch.as_tensor(values)
-    except (RuntimeError, TypeError, ValueError):
+    except (OverflowError, RuntimeError, TypeError, ValueError):
         raise ValueError(f"{name}: an array of numbers is expected, not {type(values).__name__}") from None
     if not tensor.is_floating_point() and not is_integer(tensor):
         raise ValueError(f"{name}: numbers are expected, not {tensor.dtype}")
-    return tensor.float()
+    return tensor.detach().float()
+
+
+def _integers(name: str, values: object) -> Tensor:
+    """As a tensor; ValueError for what can be none. Its type is checked later."""
+    try:
+        return torch.as_tensor(values)
+    except (OverflowError, RuntimeError, TypeError, ValueError):
+        raise ValueError(f"{name}: integers are expected, not {type(values).__name__}") from None

@@ -242,7 +242,8 @@ def _check_copies(prior: VectorPrior, length: int, generator: torch.Generator) -
         require(got.device.type == device, f"log_prob on {device} came back on {got.device}")
         gap = float((got.cpu() - want).abs().max())
         require(gap < 1e-3 * (1 + float(want.abs().max())), f"saved, loaded and moved to {device}: {gap:.2g} nats")
-    wider = VectorPlans(plans.actions, prior.action_low - 1, prior.action_high, context=plans.context)
+    below = prior.action_low - prior.half_range
+    wider = VectorPlans(plans.actions, below, prior.action_high, context=plans.context)
     require(raises(lambda: prior.log_prob(wider)), "log_prob must raise ValueError for plans with other bounds")
     require(
         raises(lambda: prior.sample(2, 0, plans.context)), "sample must raise ValueError for plans without a vector"

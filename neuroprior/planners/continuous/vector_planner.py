@@ -12,6 +12,7 @@ from torch import Tensor
 from neuroprior._checks import check_share, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import check_objective, value_of
+from neuroprior.plans.vector_plans import same_bounds
 from neuroprior.priors.vectors import VectorPrior
 from neuroprior.worlds.continuous import ContinuousWorld
 
@@ -163,7 +164,7 @@ class VectorPlanner(ABC):
         if self.prior is not None:
             for name in ("action_low", "action_high"):
                 own, there = getattr(self.prior, name), getattr(world, name).to(self.prior.device)
-                if not own.equal(there) and (own.shape != there.shape or not own.allclose(there)):
+                if not same_bounds(own, there, 2 * self.prior.half_range):
                     raise ValueError(f"prior: its {name} is {own.tolist()}, the world's {there.tolist()}")
         if memory is None:
             observed = world.observe(state)

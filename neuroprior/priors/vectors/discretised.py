@@ -46,7 +46,12 @@ class DiscretisedPrior(VectorPrior):
         size, self.num_bins = self.action_size, num_bins
         if tokens is None:
             tokens = MarkovPrior(num_bins + 2, size, num_contexts=size)
-        made = SavedModule.known[tokens["prior"]](**tokens["config"]) if isinstance(tokens, Mapping) else tokens
+        made: object = tokens
+        if isinstance(tokens, Mapping):
+            kind = SavedModule.known.get(str(tokens.get("prior")))
+            if kind is None or not isinstance(tokens.get("config"), Mapping):
+                raise ValueError(f"tokens: the name of a known prior and its config are expected, not {dict(tokens)!r}")
+            made = kind(**tokens["config"])
         if not isinstance(made, Prior) or made.num_actions != num_bins + 2:
             raise ValueError(f"tokens: a prior of num_bins + 2 = {num_bins + 2} actions is expected, not {made!r}")
         if made.takes_context and made.num_contexts != size:

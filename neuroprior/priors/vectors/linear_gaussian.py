@@ -81,7 +81,9 @@ class LinearGaussianPrior(VectorPrior):
             known, cross = covariance[past, past], covariance[past, last]
             if h:
                 level = known.diagonal().mean() * ridge + LEAST_STD**2 * 1e-3
-                weights = torch.linalg.solve(known + level * torch.eye(h * size, dtype=torch.double), cross)
+                weights = torch.linalg.solve(
+                    known + level * torch.eye(h * size, dtype=torch.double, device=mean.device), cross
+                )
             else:
                 weights = cross
             rest = covariance[last, last] - cross.T @ weights
@@ -147,8 +149,7 @@ class LinearGaussianPrior(VectorPrior):
             now[:, 0] = free[:, 0].clamp(-1, 1)
             for d in range(1, size):
                 now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
-        plans: Tensor = self.middle + self.half_range * vectors[:, known:]
-        return plans.clamp(self.action_low, self.action_high).view(batch, num_plans, length, size)
+        return self.unscaled(vectors[:, known:]).view(batch, num_plans, length, size)
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
         self.check_plans(plans)
@@ -169,8 +170,6 @@ class LinearGaussianPrior(VectorPrior):
         """Nats `[...]` of scaled `values [..., D]`, in the units of the bounds."""
         means = means + (values - means) @ self.coupling[h].T
         ones = torch.ones_like(self.half_range)
-        # Rounding must not turn a value at a bound into one beside it.
-        values = torch.where(values.abs() > 1 - 1e-6, values.sign(), values)
         each = censored_log_prob(values, means, self.std[h], -ones, ones)
         nats: Tensor = (each - (values.abs() < 1) * self.half_range.log()).sum(-1)
         return nats
@@ -230,5 +229,5 @@ def moments_or_white(windows: Tensor, values: Tensor, memory: int) -> tuple[Tens
     if len(windows):
         return window_moments(windows)
     mean, covariance = window_moments(values[:, None])
-    eye = torch.eye(memory + 1, dtype=torch.double)
+    eye = torch.eye(memory + 1, dtype=torch.double, device=values.device)
     return mean.repeat(memory + 1), torch.kron(eye, covariance)

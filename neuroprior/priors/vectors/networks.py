@@ -89,7 +89,7 @@ class VectorNetwork(VectorPrior):
         super().__init__(action_low, action_high, context_size)
         check_sizes(width=width, num_layers=num_layers, num_components=num_components, lags=lags)
         check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
-        if not 0 <= dropout < 1:
+        if not isinstance(dropout, int | float) or not 0 <= dropout < 1:
             raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
         self.width, self.num_layers, self.num_components, self.lags = width, num_layers, num_components, lags
         self.coupled, self.dropout = coupled, dropout
@@ -161,7 +161,8 @@ class VectorNetwork(VectorPrior):
         return self._after(torch.cat([kept, self._entries(action), features], 1)[:, None], state[:, :last])
 
     def read(self, past: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
-        whole = self.memory is None or past.shape[1] <= self.memory
+        # A past as long as `memory` may be the end of a longer one, and is read as such.
+        whole = self.memory is None or past.shape[1] < self.memory
         entries = self._entries(past if whole else past[:, past.shape[1] - (self.memory or 0) :])
         if whole:
             entries = functional.pad(entries, (0, 0, 1, 0))
@@ -383,7 +384,8 @@ class VectorTransformer(VectorNetwork):
     def encode(self, vectors: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
         past = None
         if hidden is not None:
-            past = hidden.view(len(hidden), -1, self.num_layers, 2 * self.width)
+            numbers = self.num_layers * 2 * self.width
+            past = hidden.view(len(hidden), hidden.shape[1] // numbers, self.num_layers, 2 * self.width)
         caches = []
         for layer, block in enumerate(self.blocks):
             vectors, cache = block(vectors, None if past is None else past[:, :, layer], self.memory)

@@ -41,8 +41,10 @@ class NoisePrior(LinearGaussianPrior):
         super().__init__(action_low, action_high)
         check_count("memory", memory)
         for name, value in (("exponent", exponent), ("scale", scale)):
-            if value is not None and not 0 <= value < float("inf"):
-                raise ValueError(f"{name}: a number of at least 0 is expected, not {value!r}")
+            real = isinstance(value, int | float) and not isinstance(value, bool)
+            least = "of at least 0" if name == "exponent" else "above 0"
+            if value is not None and not (real and 0 <= value < float("inf") and (value or name == "exponent")):
+                raise ValueError(f"{name}: a number {least} is expected, not {value!r}")
         self._given = {"exponent": exponent, "scale": scale, "memory": memory}
         self.exponent = exponent or 0.0
         self._colour(self.exponent, torch.zeros(self.action_size), torch.full((self.action_size,), scale or 1.0))

@@ -17,6 +17,9 @@ BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
 NOISES = (0.02, 0.05, 0.1, 0.2, 0.4)
 """That `fit` tries, around the stored vectors."""
 
+BANDWIDTH, NOISE = 0.2, 0.1
+"""Before `fit`, and where no plans can be held out to choose on."""
+
 MOST_CHOSEN_WITH, MOST_CHOSEN_ON = 1_000, 500
 """Stored windows with which bandwidths are chosen, and vectors on which, at most; in the end all are stored."""
 
@@ -61,11 +64,12 @@ class StoredWindows(VectorPrior):
         check_sizes(horizon=horizon, max_windows=max_windows)
         check_count("match", match)
         for name, value in (("bandwidth", bandwidth), ("noise", noise)):
-            if value is not None and not 0 < value < float("inf"):
+            real = isinstance(value, int | float) and not isinstance(value, bool)
+            if value is not None and not (real and 0 < value < float("inf")):
                 raise ValueError(f"{name}: a number above 0 is expected, not {value!r}")
         self.match, self.horizon, self.max_windows = match, horizon, max_windows
         self._given = {"bandwidth": bandwidth, "noise": noise}
-        self.bandwidth, self.noise = bandwidth or 0.2, noise or 0.1
+        self.bandwidth, self.noise = bandwidth or BANDWIDTH, noise or NOISE
         self.memory = match
         # Before anything is learned, one segment in the middle of the range.
         self.register_buffer("segments", torch.zeros(1, match + horizon, self.action_size))
@@ -87,6 +91,8 @@ class StoredWindows(VectorPrior):
         shape = (number, self.match + self.horizon, self.action_size)
         check_memory(4 * shape[0] * shape[1] * shape[2], num_segments=number)
         self.bandwidth, self.noise = float(learned["bandwidth"]), float(learned["noise"])
+        if not (0 < self.bandwidth < float("inf") and 0 < self.noise < float("inf")):
+            raise ValueError(f"bandwidth, noise: numbers above 0 are expected, not {self.bandwidth}, {self.noise}")
         self.register_buffer("segments", torch.zeros(shape, device=self.device))
 
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
@@ -94,6 +100,11 @@ class StoredWindows(VectorPrior):
         plans = self.training_plans(plans)
         if None in self._given.values():
             learning, held_out = held_out_split(plans, generator_on(generator, "cpu"))
+            if not len(learning.windows(self.match + self.horizon)):
+                # Too few to hold any out: on those that are stored the least noise would look best.
+                self.bandwidth, self.noise = self._given["bandwidth"] or BANDWIDTH, self._given["noise"] or NOISE
+                self._store(plans, self.max_windows)
+                return self
             self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH))
             held_out = held_out[: max(MOST_CHOSEN_ON // held_out.max_length, 1)].steps(0, MOST_CHOSEN_ON)
             bandwidths = (self._given["bandwidth"],) if self._given["bandwidth"] else BANDWIDTHS
@@ -132,7 +143,6 @@ class StoredWindows(VectorPrior):
             return self._begin(torch.cat([head, past], 1))
         ones = torch.ones(self.action_size, device=self.device)
         due = self.segments[:, self.match + place]
-        value = torch.where(value.abs() > 1 - 1e-6, value.sign(), value)
         nats = censored_log_prob(value[:, None], due, self.noise * ones, -ones, ones).sum(-1)
         weights = (state[:, 2 + size :] + nats).log_softmax(-1)
         return self._forecast(torch.cat([head, past, weights], 1), place + 1)
@@ -159,7 +169,7 @@ class StoredWindows(VectorPrior):
         return (-distances / (2 * self.bandwidth**2)).log_softmax(-1)
 
     def _forecast(self, state: Tensor, place: int) -> tuple[GaussianForecast, Tensor]:
-        mean = (self.middle + self.half_range * self.segments[:, self.match + place]).expand(len(state), -1, -1)
+        mean = self.unscaled(self.segments[:, self.match + place]).expand(len(state), -1, -1)
         weights = state[:, 2 + self.match * self.action_size :]
         return GaussianForecast(mean, self.noise * self.half_range, self.action_low, self.action_high, weights), state
 
@@ -184,6 +194,4 @@ class StoredWindows(VectorPrior):
                 last = torch.cat([last, parts[-1].flatten(1)], 1)[:, steps * self.action_size :]
                 known = min(known + steps, self.match)
                 weights = self._matches(last, known)
-        scaled = torch.cat(parts, 1)
-        plans = (self.middle + self.half_range * scaled).clamp(self.action_low, self.action_high)
-        return plans.view(batch, num_plans, length, self.action_size)
+        return self.unscaled(torch.cat(parts, 1)).view(batch, num_plans, length, self.action_size)

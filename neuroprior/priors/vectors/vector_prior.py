@@ -10,8 +10,12 @@ from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
-from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.plans.vector_plans import VectorPlans, as_floats, check_widths, same_bounds
 from neuroprior.priors.saved import SavedModule
+from neuroprior.worlds.continuous.continuous_world import check_vectors
+
+INNERMOST = 1 - 2**-24
+"""The largest float32 number below 1."""
 
 
 class Forecast(Protocol):
@@ -140,15 +144,14 @@ class VectorPrior(SavedModule):
 
     def __init__(self, action_low: Any, action_high: Any, context_size: int | None = None) -> None:
         super().__init__()
-        low, high = (
-            torch.as_tensor(bound, dtype=torch.float32).detach().clone() for bound in (action_low, action_high)
-        )
+        low, high = as_floats("action_low", action_low).clone(), as_floats("action_high", action_high).clone()
         if low.dim() != 1 or low.shape != high.shape or not len(low):
             raise ValueError(
                 f"action_low, action_high: D numbers each are expected, not {list(low.shape)} and {list(high.shape)}"
             )
         if not bool((low < high).all() & low.isfinite().all() & high.isfinite().all()):
             raise ValueError(f"action_low, action_high: finite, low below high, not {low.tolist()} and {high.tolist()}")
+        check_widths(low, high)
         if context_size is not None:
             check_sizes(context_size=context_size)
         self.context_size = context_size
@@ -183,8 +186,19 @@ class VectorPrior(SavedModule):
         return (self.action_high - self.action_low) / 2
 
     def scaled(self, vectors: Tensor) -> Tensor:
-        """`vectors [..., D]` in units of half the range, from its middle."""
-        return (vectors - self.middle) / self.half_range
+        """`vectors [..., D]` in units of half the range, from its middle: -1 and 1 at the bounds, and there alone.
+
+        Rounding would otherwise turn the probability of being at a bound into a density beside it.
+        """
+        inside = ((vectors - self.middle) / self.half_range).clamp(-INNERMOST, INNERMOST)
+        above = torch.where(vectors >= self.action_high, 1.0, inside)
+        return torch.where(vectors <= self.action_low, -1.0, above)
+
+    def unscaled(self, scaled: Tensor) -> Tensor:
+        """The vectors between the bounds that are `scaled [..., D]`: at a bound just where these are at -1 or 1."""
+        inside = (self.middle + self.half_range * scaled).clamp(self.action_low, self.action_high)
+        above = torch.where(scaled >= 1, self.action_high, inside)
+        return torch.where(scaled <= -1, self.action_low, above)
 
     @property
     def device(self) -> torch.device:
@@ -280,11 +294,23 @@ class VectorPrior(SavedModule):
             ValueError: an argument is out of range, or does not fit this prior.
         """
         check_sizes(num_plans=num_plans, length=length)
-        batch = 1 if context is None else len(context)
-        past = torch.zeros(batch, 0, self.action_size, device=self.device) if past is None else past
+        if context is not None:
+            context = as_floats("context", context).to(self.device)
+        batch = len(context) if context is not None and context.dim() else 1
+        past = torch.zeros(batch, 0, self.action_size) if past is None else as_floats("past", past)
+        past = past.to(self.device)
         if past.dim() != 3 or past.shape[2] != self.action_size or not bool(past.isfinite().all()):
             raise ValueError(f"past: finite vectors [B, T, {self.action_size}] are expected, not {list(past.shape)}")
+        check_vectors("past", past, self.action_low, self.action_high)
         self.check_context(context, len(past))
+        if context is not None and context.dim() == 3 and context.shape[1] != past.shape[1] + 1:
+            raise ValueError(
+                f"context: features {[len(past), past.shape[1] + 1, self.context_size]}, one before each vector of the"
+                f" past and those of the next, are expected, not {list(context.shape)}"
+            )
+        if context is not None and not context.isfinite().all():
+            where = (~context.isfinite()).nonzero()[0].tolist()
+            raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
         return self.continuations(num_plans, length, past, context, generator_on(generator, self.device))
 
     def continuations(
@@ -348,7 +374,7 @@ class VectorPrior(SavedModule):
             raise ValueError(f"plans: VectorPlans are expected, not {type(plans).__name__}")
         for name in ("action_low", "action_high"):
             own, theirs = getattr(self, name).cpu(), getattr(plans, name).cpu()
-            if own.shape != theirs.shape or not own.allclose(theirs):
+            if not same_bounds(own, theirs, 2 * self.half_range.cpu()):
                 raise ValueError(f"{name}: {theirs.tolist()} in the plans, {own.tolist()} in this prior")
         self.check_context(plans.context, len(plans))
 

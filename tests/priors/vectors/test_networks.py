@@ -45,7 +45,7 @@ def test_scoring_whole_plans_equals_stepping_and_reading_beyond_the_training_win
     assert prior.memory == 4
     whole = prior.action_log_probs(data)
     assert whole.allclose(VectorPrior.action_log_probs(prior, data), atol=1e-4)
-    for t in range(5):  # where the past is no longer than `memory`, reading is stepping
+    for t in range(4):  # where the past is shorter than `memory`, reading is stepping
         context = data.context
         if context is not None and context.dim() == 3:
             context = context[:, : t + 1]

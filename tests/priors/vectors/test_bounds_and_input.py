@@ -1,0 +1,176 @@
+"""Priors over vectors: bounds of any place and width, values at the bounds, and what a caller may give."""
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+import torch
+
+from neuroprior.plans import VectorPlans
+from neuroprior.priors import (
+    AutoregressivePrior,
+    DiscretisedPrior,
+    NoisePrior,
+    StepSynergies,
+    StoredWindows,
+    VectorGRU,
+    VectorTransformer,
+    WindowSynergies,
+)
+from neuroprior.testing import check_prior
+
+RANGES = [(-0.4, 0.7), (9.3, 10.9), (100.1, 101.3), (-1e-6, 1e-6), (-1e6, 1e6), (1000.0, 1001.0)]
+CLOSED = {
+    "noise": lambda low, high: NoisePrior(low, high, None, memory=4),
+    "autoregressive": lambda low, high: AutoregressivePrior(low, high, 2),
+    "window synergies": lambda low, high: WindowSynergies(low, high, window=4),
+    "step synergies": lambda low, high: StepSynergies(low, high),
+    "stored windows": lambda low, high: StoredWindows(low, high, 2, 4, max_windows=20),
+}
+KINDS = CLOSED | {
+    "discretised": lambda low, high: DiscretisedPrior(low, high, 6),
+    "gru": lambda low, high: VectorGRU(low, high, width=8),
+    "transformer": lambda low, high: VectorTransformer(low, high, width=8, num_heads=2),
+}
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def source(low, high, num=10, length=30, seed=0):
+    """A random walk that is drawn back, a tenth of whose values are exactly at a bound."""
+    low, high = torch.tensor([low]), torch.tensor([high])
+    now, rows = torch.zeros(num, 1), []
+    noise = 0.4 * torch.randn(num, length, 1, generator=seeded(seed))
+    for t in range(length):
+        now = (0.9 * now + noise[:, t]).clamp(-1, 1)
+        rows.append(now)
+    share = torch.stack(rows, 1)
+    values = ((low + high) / 2 + (high - low) / 2 * share).clamp(low, high)
+    values = torch.where(share <= -1, low, torch.where(share >= 1, high, values))
+    return VectorPlans(values, low, high)
+
+
+@pytest.mark.parametrize("bounds", RANGES)
+@pytest.mark.parametrize("kind", CLOSED)
+def test_conformance_between_any_bounds(kind, bounds):
+    """A mass at a bound is one in scores as in samples, wherever the bounds are: rounding must not move it beside."""
+    plans = source(*bounds)
+    prior = CLOSED[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded())
+    check_prior(prior, length=3, num_plans=1000)
+
+
+@pytest.mark.parametrize("kind", CLOSED)
+def test_densities_are_the_same_in_other_units(kind):
+    """Nats of the same plans between other bounds differ by the logarithm of the ratio of ranges, of numbers inside."""
+    plans = source(-1.0, 1.0)
+    other = source(100.1, 101.3)
+    nats = [
+        CLOSED[kind](each.action_low, each.action_high).fit(each, generator=seeded()).action_log_probs(each)
+        for each in (plans, other)
+    ]
+    inside = (plans.actions.abs() < 1)[..., 0]
+    half = float(other.action_high - other.action_low) / 2
+    expected = nats[0] - inside * torch.tensor(half).log()
+    assert (~inside).sum() > 10
+    assert (nats[1] - expected).abs().max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-3e38, 3e38), (1000.0, 1000.0001), (-inf, 1.0), (0.0, 1e-40), (2e38, 3.3e38)]
+)
+def test_ranges_that_float32_does_not_resolve_are_refused(low, high):
+    with pytest.raises(ValueError, match="action_low"):
+        NoisePrior([low], [high])
+    with pytest.raises(ValueError, match="action_low"):
+        VectorPlans(torch.full((1, 2, 1), 1000.0), [low], [high])
+
+
+def test_bounds_are_compared_by_their_range():
+    plans = VectorPlans(torch.full((2, 3, 1), 1000.5), [1000.0], [1001.0])
+    with pytest.raises(ValueError, match="action_low"):
+        NoisePrior([1000.005], [1001.0]).log_prob(plans)
+    assert NoisePrior([1000.0], [1001.0]).log_prob(plans).isfinite().all()
+
+
+@pytest.mark.parametrize("kind", ["gru", "transformer"])
+def test_a_fitted_network_reads_its_memory_and_no_more(kind):
+    plans = source(-1.0, 1.0, length=12)
+    prior = KINDS[kind]([-1.0], [1.0]).fit(plans, generator=seeded(), max_steps=3, progress=False, window=4)
+    assert prior.memory == 4
+    whole, last = (prior.read(past)[0].log_prob(plans.actions[:, 0]) for past in (plans.actions, plans.actions[:, -4:]))
+    torch.testing.assert_close(whole, last, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_past_of_any_numbers(kind):
+    prior, past = KINDS[kind]([-1.0], [1.0]), torch.tensor([[[0.0], [1.0]], [[-1.0], [1.0]]])
+    expected = prior.sample(3, 2, past=past, generator=seeded())
+    assert expected.dtype == torch.float32
+    for same in (past.double(), past.long(), past.numpy(), past.numpy().astype(np.float16), past.tolist()):
+        assert prior.sample(3, 2, past=same, generator=seeded()).equal(expected)
+    assert prior.sample(3, 2, past=past[:0], generator=seeded()).shape == (0, 3, 2, 1)
+    forecast, _ = prior.step(torch.zeros(0, 1), prior.start(0)[1])
+    assert forecast.log_prob(torch.zeros(0, 1)).shape == (0,)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("past", "said"),
+    [
+        (torch.full((1, 2, 1), 1.5), "past.*between the bounds"),
+        (torch.full((1, 2, 1), nan), "past"),
+        (torch.zeros(1, 2), "past"),
+        (torch.zeros(1, 2, 1, dtype=torch.complex64), "past: numbers"),
+        ("abc", "past: an array of numbers"),
+    ],
+)
+def test_what_is_no_past_is_refused(kind, past, said):
+    with pytest.raises(ValueError, match=said):
+        KINDS[kind]([-1.0], [1.0]).sample(2, 3, past=past)
+
+
+@pytest.mark.parametrize("make", [VectorGRU, lambda *how: VectorTransformer(*how, width=8, num_heads=2)])
+def test_contexts_that_do_not_fit_the_past_are_refused(make):
+    prior, past = make([-1.0], [1.0], 2), torch.zeros(3, 4, 1)
+    assert prior.sample(2, 3, torch.zeros(3, 5, 2).numpy(), past=past.numpy()).shape == (3, 2, 3, 1)
+    for rows in (1, 3, 4, 6, 9):
+        with pytest.raises(ValueError, match=r"context: .*\[3, 5, 2\]"):
+            prior.sample(2, 3, torch.zeros(3, rows, 2), past=past)
+    for bad in (torch.full((3, 2), nan), torch.full((3, 5, 2), inf)):
+        with pytest.raises(ValueError, match=r"context.*finite"):
+            prior.sample(2, 3, bad, past=past)
+    for wrong in ("abc", torch.zeros(3, 2, dtype=torch.bool), torch.zeros(2, 2), torch.zeros(3, 3), None):
+        with pytest.raises(ValueError, match="context"):
+            prior.sample(2, 3, wrong, past=past)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: NoisePrior("a", "b"), "action_low"),
+        (lambda: NoisePrior(None, None), "action_low"),
+        (lambda: NoisePrior([-1.0], [1.0], 1.0, scale=0.0), "scale: a number above 0"),
+        (lambda: NoisePrior([-1.0], [1.0], "pink"), "exponent"),
+        (lambda: StoredWindows([-1.0], [1.0], noise="a"), "noise"),
+        (lambda: VectorGRU([-1.0], [1.0], dropout="a"), "dropout"),
+        (lambda: DiscretisedPrior([-1.0], [1.0], 6, {"prior": "Nothing", "config": {}}), "tokens"),
+        (lambda: DiscretisedPrior([-1.0], [1.0], 6, {"config": {}}), "tokens"),
+    ],
+)
+def test_wrong_arguments(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+@pytest.mark.parametrize("num", [1, 10])
+def test_stored_windows_where_too_few_plans_can_be_held_out(num):
+    """One run just longer than a window, or one long plan among short ones, can be learned from."""
+    plans = source(-1.0, 1.0, num, 26)
+    lengths = torch.tensor([26] + [5] * (num - 1))
+    few = VectorPlans(plans.actions, plans.action_low, plans.action_high, lengths)
+    for seed in range(5):
+        prior = StoredWindows([-1.0], [1.0]).fit(few, generator=seeded(seed))
+        assert len(prior.segments) == 3
+        assert prior.log_prob(few).isfinite().all()
