@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from neuroprior.analysis.comparison import score_bits, units
-from neuroprior.plans import Plans
+from neuroprior.plans import PastDurations, Plans
 from neuroprior.plans.folds import folds
-from neuroprior.priors import MarkovPrior, UniformPrior
+from neuroprior.priors import GRUPrior, MarkovPrior, UniformPrior
 from neuroprior.report.fits import ACTIONS, CONTEXT, DURATIONS, Design, Job, score_arrays
 from neuroprior.report.scores import (
     Evaluation,
@@ -162,6 +162,14 @@ def test_saved_priors_are_compared_with_the_first():
         assert one.calibration.sums[..., 2].sum((1,)).tolist()[:3] == [27, 27, 0]
     due = score_arrays(priors["a"], plans, made.mask, units(plans, made.mask))["bits"]
     assert made.models[1].bits.numpy() == pytest.approx(due)
+
+
+def test_a_saved_prior_of_durations_says_so():
+    plans = replace(PLANS, durations=torch.rand(6, 4, generator=seeded(1)) + 0.5)
+    prior = GRUPrior(3, context_size=2, hidden_size=4)
+    prior.past_durations = PastDurations.of(plans)
+    (one,) = evaluate_saved({"it": prior}, plans, 0).models
+    assert one.label == "it, with durations"
 
 
 def test_a_digest_is_of_all_that_plans_hold():
