@@ -1,12 +1,18 @@
 """`neuroprior score`: the scores of the library, by plan and by group, in files."""
 
+import math
+import re
+from dataclasses import replace
+
 import pandas as pd
 import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans, save
+from neuroprior.cli import score as command
 from neuroprior.cli.__main__ import main
 from neuroprior.plans import write_plans
+from neuroprior.priors.scoring import keep_learned
 from tests.support.sources import seeded
 
 
@@ -24,3 +30,72 @@ def test_ends_are_scored_but_are_no_actions(tmp_path):
     assert scores["log_likelihood"].tolist() == pytest.approx(due.tolist(), abs=1e-4)
     assert groups["actions"].tolist() == [int(lengths[k::4].sum()) for k in range(4)]
     assert groups["log_likelihood"].tolist() == pytest.approx([float(due[k::4].sum()) for k in range(4)], abs=1e-4)
+
+
+def scored(folder, plans, learned=(), **options):
+    """The tables and the words of `score` for a chain of order 1 that has counted these plans."""
+    prior = MarkovPrior(plans.num_actions, 1).fit(plans)
+    save(prior, folder / "prior")
+    if learned:
+        keep_learned(folder / "prior", *learned)
+    write_plans(plans, folder / "plans.npz")
+    command.score(str(folder / "prior"), str(folder / "plans.npz"), out=str(folder / "out"), **options)
+    return prior, {path.stem: pd.read_csv(path) for path in (folder / "out").glob("*.csv")}
+
+
+def drawn(num, **more):
+    return Plans(torch.randint(3, (num, 5), generator=seeded(0)), 3, **more)
+
+
+def test_groups_and_conditions_have_tables_of_their_own(tmp_path, capsys):
+    """Nine plans of three animals, two of which were treated; printed are the animals."""
+    group, condition = torch.arange(9) % 3, (torch.arange(9) % 3 > 0).long()
+    plans = drawn(9, group=group, condition=condition)
+    prior, frames = scored(tmp_path, plans)
+    assert set(frames) == {"plans", "groups", "conditions"}
+    due = prior.log_prob(plans)
+    for name, label in (("groups", group), ("conditions", condition)):
+        sums = [float(due[label == one].sum()) for one in label.unique()]
+        assert frames[name]["log_likelihood"].tolist() == pytest.approx(sums, abs=1e-4)
+    words = " ".join(capsys.readouterr().out.split())
+    assert "3 groups are too few for a verdict" in words
+    low, high = (float(word) for word in re.search(r"interval ([\d.]+) to ([\d.]+) over groups", words).groups())
+    mean = float(re.search(r"([\d.]+) bits per action, 95", words).group(1))
+    assert low < mean < high
+    assert mean == pytest.approx(-float(due.sum()) / 45 / math.log(2), abs=1e-4)
+    assert all(name in words for name in ("plans.csv", "groups.csv", "conditions.csv"))
+
+
+@pytest.mark.parametrize("number", [20, 21])
+def test_no_more_than_twenty_plans_are_printed(number, tmp_path, capsys):
+    scored(tmp_path, drawn(number))
+    words = capsys.readouterr().out
+    assert ("the first 20 of 21" in words) == (number == 21)
+    # Rows begin with the number of the plan.
+    assert len(re.findall(r"^\W*\d+\W+5\W+-", words, re.MULTILINE)) == 20
+    assert "too few" not in words
+    assert "Training data" not in words
+
+
+def test_plans_that_were_learned_from_are_marked(tmp_path, capsys):
+    plans = drawn(8)
+    _, frames = scored(tmp_path, plans.with_end(), [plans[:3]])
+    assert frames["plans"]["training_data"].tolist() == [True] * 3 + [False] * 5
+    assert "3 of 8 plans are the same" in " ".join(capsys.readouterr().out.split())
+
+
+def test_how_a_file_is_read_is_passed_on(tmp_path, monkeypatch, capsys):
+    """All options; the prior's names go with tables alone, unless others are given; notes are printed."""
+    plans, asked = replace(drawn(8, action_names=("a", "b", "c")), notes=("something was odd",)), []
+    save(MarkovPrior(3, 1).fit(plans), tmp_path / "prior")
+    monkeypatch.setattr(command, "read_plans", lambda *given, **options: asked.append((given, options)) or plans)
+    options = {"missing": "label", "merge_repeats": True, "max_gap": 3.5, "columns": object(), "num_actions": 3}
+    names = {"plans.CSV": ["a", "b", "c"], "plans.tsv": ["a", "b", "c"], "plans.npz": None}
+    for file in names:
+        command.score(str(tmp_path / "prior"), file, out=str(tmp_path / "out"), **options)
+    command.score(
+        str(tmp_path / "prior"), "plans.csv", action_names=["b", "a", "c"], out=str(tmp_path / "out"), **options
+    )
+    files = {**names, "plans.csv": ["b", "a", "c"]}
+    assert asked == [((file,), {**options, "action_names": own}) for file, own in files.items()]
+    assert capsys.readouterr().out.count("note: something was odd") == 4

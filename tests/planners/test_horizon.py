@@ -3,6 +3,7 @@
 import json
 import re
 import warnings
+from statistics import NormalDist
 
 import pytest
 import torch
@@ -200,3 +201,81 @@ def test_where_actions_only_cost_it_warns():
         for reward in ([0.0] * 5, [0.0, 0.0, 0.0, 0.0, 1.0], [-1.0, 3.0, -1.0, -1.0, -1.0]):
             HorizonPlanner(UniformPrior(2), 6, 400, objective="return").plan(corridor(reward), start, seeded(0))
         HorizonPlanner(UniformPrior(2), 6, 400).plan(world, start, seeded(0))
+
+
+def oracle(scores, best, left, actions):
+    """The horizon `[B]` by its definition, one start after the other, with Python's own normal distribution.
+
+    Args:
+        scores: `[B, P, L]`: of the best prefix so far.
+        best: `[B]`: the best score so far.
+    """
+    horizons = []
+    starts, number, length = len(scores), len(scores[0]), len(scores[0][0])
+    for start in range(starts):
+        gains = []
+        for d in range(length):
+            own = [plan[d] for plan in scores[start]]
+            everyone = [plan[d] for one in scores for plan in one]
+            # Four of the average score, and of the average square, are added to a start's own.
+            first, second = (
+                (sum(x**k for x in own) + 4 * sum(x**k for x in everyone) / (starts * number)) / (number + 4)
+                for k in (1, 2)
+            )
+            spread, tries = max(second - first**2, 0) ** 0.5, min(left // (d + 1), actions ** (d + 1))
+            quantiles = (((q + 0.5) / 16) ** (1 / tries) for q in range(16))
+            best_of = [first + spread * NormalDist().inv_cdf(q) for q in quantiles]
+            gains.append(sum(max(x - best[start], 0) for x in best_of) / 16)
+        horizons.append(max(range(length), key=lambda d: (gains[d], d)) + 1)
+    return horizons
+
+
+@pytest.mark.parametrize(("actions", "left"), [(100, 60), (3, 60), (100, 9)])
+def test_the_horizon_is_that_with_the_greatest_expected_improvement(actions, left):
+    """Of 40 starts with scores of other means and variances at each horizon."""
+    generator = seeded(1)
+    spread = torch.rand(40, 1, 3, generator=generator, dtype=torch.float64)
+    mean = torch.rand(40, 1, 3, generator=generator, dtype=torch.float64).mul(0.5).cumsum(2)
+    scores = (mean + spread * torch.randn(40, 5, 3, generator=generator, dtype=torch.float64)).cummax(2).values
+    found = gathered(scores.tolist())
+    best = scores.amax((1, 2))
+    found = found._replace(decision=found.decision._replace(score=best))
+    chosen = HorizonPlanner(UniformPrior(actions), 3, 60)._best_horizon(found, left).tolist()
+    assert chosen == oracle(scores.tolist(), best.tolist(), left, actions)
+    assert {2, 3} <= set(chosen)
+
+
+class Watched(HorizonPlanner):
+    """Tries plans of a given horizon, and keeps what it would have chosen by."""
+
+    def _best_horizon(self, found, left):
+        self.seen = [*getattr(self, "seen", []), (found.moments, left)]
+        return torch.full((len(found.steps),), self.horizon)
+
+
+@pytest.mark.parametrize("horizon", [2, 3])
+def test_what_is_known_of_each_horizon(horizon):
+    """A single action: returns of 1, -1 and 2 after one, two and three steps; of the best prefix so far 1, 1 and 2.
+
+    Of eight plans' 24 steps, twelve are for three rounds of four: two more plans of two steps, or one of three.
+    """
+    world = TabularWorld(torch.tensor([[1], [2], [3], [3]]), torch.tensor([0.0, 1.0, -2.0, 3.0]))
+    planner = Watched(UniformPrior(1), 3, 8, objective="return")
+    planner.horizon = horizon
+    planner.plan(world, torch.zeros(2, dtype=torch.long), seeded(0))
+    assert [left for _, left in planner.seen] == [12, 8, 4]
+    for turn, (moments, _) in enumerate(planner.seen):
+        more = turn * (4 // horizon)
+        number = [4 + more, 4 + more, 4 + more * (horizon == 3)]
+        due = [[n, n * score, n * score**2] for n, score in zip(number, (1, 1, 2), strict=True)]
+        assert moments.tolist() == [due] * 2
+
+
+def test_equals_of_the_best_are_counted_anew_after_a_better_one():
+    """Four plans of a score of 0 at first, then four of 1, each in a round: chi-square over 8,000 decisions."""
+    table = torch.arange(6)[:, None].repeat(1, 5)
+    table[0] = torch.arange(1, 6)
+    world = TabularWorld(table, torch.tensor([0.0, 0, 1, 1, 1, 1]))
+    decision = HorizonPlanner(Turns(), 1, 8, rounds=4).plan(world, torch.zeros(8000, dtype=torch.long), seeded(0))
+    assert (decision.score == 1).all()
+    assert p_value(decision.plan[:, 0].long() - 1, torch.ones(4)) > FALSE_ALARM

@@ -398,3 +398,127 @@ def test_one_number_of_plans_is_not_fewer_than_itself():
     found = Results(runs, (256,)).reasons
     assert len(found) == 3
     assert found["early"].isna().all()
+
+
+def test_the_median_of_the_numbers_of_plans_is_shown():
+    """In whatever order they were asked for; of two in the middle the larger."""
+    runs = worlds(["maze"], 2)
+    assert Results(runs, [4096, 16, 256]).shown == 256
+    assert Results(runs, [256, 16, 4096, 1024]).shown == 1024
+    early = explained(0.7, 0.7, (1.5, 1.2), 0.1)
+    backwards = Results(early.runs, ASKED[::-1])
+    assert records(backwards.reasons) == records(early.reasons)
+
+
+def test_worlds_with_other_numbers_of_rounds_are_asked_the_same():
+    """After one round in one world and after two in the other: both are corrected together."""
+    runs = [*worlds(["maze"], 6, rounds=1), *worlds(["taxi"], 6, rounds=2)]
+    words = Results(runs, [16]).words
+    after = words[words["rounds"] > 0]
+    assert after["rounds"].tolist() == [1, 2]
+    assert after["p_holm"].tolist() == pytest.approx(holm(after["p_value"]).tolist())
+    assert (after["p_holm"] > after["p_value"]).any()
+
+
+def test_plans_needed_are_of_seeds_with_random_plans():
+    """A seed without random plans has nothing to reach."""
+    runs = [run("maze", s, [entry("uniform", curve(1)), entry("gru", curve(4))]) for s in range(3)]
+    runs[1]["entries"].pop(0)
+    (row,) = found(Results(runs, ASKED).efficiency, prior="gru")
+    assert (row["seeds"], row["reached"], row["needed"]) == (2, 2, pytest.approx(1024))
+
+
+def test_what_random_plans_need_is_by_their_climbing_curve():
+    """Scores of 0.5 at all numbers but the last two, 0.9 and 0.1: made to climb 0.5 throughout, reached at once."""
+    noisy = [0.5] * 11 + [0.9, 0.1]
+    runs = [run("maze", s, [entry("uniform", noisy), entry("gru", [0.4] * 3 + [0.6] * 10)]) for s in range(6)]
+    uniform, gru = records(Results(runs, ASKED).efficiency)
+    assert (uniform["needed"], uniform["factor"]) == pytest.approx((1, 1))
+    assert gru["needed"] == pytest.approx(2**2.5)
+    assert gru["factor"] == pytest.approx(2**-2.5)
+
+
+def test_bits_are_compared_with_chains_before_the_curriculum_seed_by_seed():
+    """After the curriculum too; seeds in which either lacks its bits are left out; one seed has no difference."""
+    runs = []
+    for s, (before, after) in enumerate([(1.5, 1.0), (1.25, 1.25), (1.5, 1.75), (None, 2.0)]):
+        entries = [entry("gru", curve(1), rounds=1, bits=after - 0.25), entry("markov-1", curve(1), bits=before)]
+        runs.append(run("maze", s, [*entries, entry("markov-1", curve(1), rounds=1, bits=after)]))
+    (row,) = found(Results(runs, ASKED).bits, prior="gru")
+    due = paired_difference([0.75, 1.0, 1.5], [1.5, 1.25, 1.5])
+    assert tuple(row[name] for name in ("more", "more_low", "more_high", "p_value")) == pytest.approx(due)
+    (chain,) = found(Results(runs, ASKED).bits, prior="markov-1", rounds=1)
+    assert chain["more"] == pytest.approx((-0.5 + 0 + 0.25) / 3)
+    (two_seeds,) = found(Results(runs[:2], ASKED).bits, prior="gru")
+    assert (two_seeds["more"], two_seeds["p_value"] is None) == (pytest.approx(-0.5), False)
+
+
+def test_reasons_take_the_fewest_bits_before_the_curriculum():
+    """Of two networks and two chains; bits after the curriculum, which are fewer, do not count."""
+    runs = []
+    for s in range(6):
+        bits = {"gru": 1.5, "transformer": 1.25, "markov-1": 1.75, "markov-2": 1.625}
+        entries = [entry(name, [0.7] * 13, bits=own) for name, own in bits.items()]
+        entries += [entry(name, [0.7] * 13, rounds=1, bits=0.5) for name in bits]
+        runs.append(run("maze", s, entries))
+    before, after = records(Results(runs, ASKED).reasons)
+    for row in (before, after):
+        assert (row["neural_bits"], row["markov_bits"]) == (1.25, 1.625)
+
+
+def test_pairs_over_worlds_are_alike_in_context_and_curriculum():
+    runs = worlds(["maze", "taxi"], 3, {**TIMES, "runs/mine": 3.0}, context=("none", "initial"), rounds=2)
+    across = Results(runs, ASKED).across
+    assert set(across["rounds"]) == {0, 1}
+    rows = list(across[["prior", "context", "rounds", "baseline"]].itertuples(index=False, name=None))
+    assert len(rows) == len(set(rows))
+    ways = [(context, after) for context in ("none", "initial") for after in (0, 1)]
+    against = [(one, chain) for one in ("gru", "runs/mine") for chain in ("markov-1", "markov-2")]
+    against += [(one, "uniform") for one in ("gru", "runs/mine", "markov-1", "markov-2")]
+    assert set(rows) == {(one, *way, other) for one, other in against for way in ways}
+    # At the number of plans that is shown, one of each pair's own kind: none is counted twice.
+    assert (across["seeds"] == 3).all()
+
+
+def test_after_any_number_of_rounds_is_compared_with_before():
+    made = Results(worlds(["maze"], 4, rounds=2), [16]).paired
+    assert len(found(made, what="after minus before the curriculum", rounds="2 - 0")) == 3
+
+
+def test_headlines_of_a_single_seed_are_of_the_first_network_and_the_last_chain():
+    """The best cannot be chosen then."""
+    one = answer(worlds(["maze"], 1))
+    assert (one["what"], one["first"], one["second"]) == ("neural minus Markov", "gru", "markov-2")
+
+
+def test_the_better_of_several_is_corrected_for_their_number():
+    """Three alternatives against one, and one against three, by hand: Bonferroni over the side that has three."""
+    values = np.random.default_rng(2).normal(0, 1, (4, 8))
+    values[0] += 2
+    for first, second, sign in ((values[:3], values[3:], 1), (values[3:], values[:3], -1)):
+        gap = best_difference(first, second)
+        tests = [stats.ttest_rel(one, values[3], alternative="greater") for one in values[:3]]
+        below = [stats.ttest_rel(one, values[3], alternative="less").pvalue for one in values[:3]]
+        assert gap.p_value == pytest.approx(min(1, 2 * min(3 * min(t.pvalue for t in tests), max(below))))
+        gaps = values[:3] - values[3]
+        error = gaps.std(1, ddof=1) / 8**0.5
+        low = (gaps.mean(1) - stats.t.ppf(1 - 0.025 / 3, 7) * error).max()
+        high = (gaps.mean(1) + stats.t.ppf(0.975, 7) * error).max()
+        assert (gap.low, gap.high) == pytest.approx((low, high) if sign == 1 else (-high, -low))
+
+
+def test_an_estimate_lies_in_its_interval():
+    """Chosen on one half, the best is far worse on the other: the estimate is moved to the interval's end."""
+    rng = np.random.default_rng(0)
+    found = [
+        best_difference(*np.split(rng.normal(0, 1, (12, 4)) + 3 * rng.normal(0, 1, (12, 1)), 2)) for _ in range(500)
+    ]
+    assert all(one.low <= one.mean <= one.high for one in found)
+    assert all(0 <= one.p_value <= 1 for one in found)
+
+
+def test_the_middle_of_two_numbers_of_plans_one_of_which_is_infinite_is_on_the_safe_side():
+    """Half of the seeds never get there: more plans than there are; times fewer than random plans, none."""
+    runs = [run("maze", s, [entry("uniform", curve(1)), entry("gru", curve(0.5 if s < 3 else 2))]) for s in range(6)]
+    (row,) = found(Results(runs, ASKED).efficiency, prior="gru")
+    assert (row["needed"], row["factor"], row["reached"]) == (None, None, 3)
