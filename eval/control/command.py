@@ -37,10 +37,11 @@ def control_experiment(
     priors: Sequence[str] = (NONE, "autoregressive", "synergies", "stored"),
     planners: Sequence[PlannerName] = ("icem",),
     budgets: Sequence[PositiveInt] = (8, 16, 32),
+    plain_budgets: Sequence[PositiveInt] = (100,),
     seeds: PositiveInt = 3,
     steps: PositiveInt = 60,
     training_runs: PositiveInt = 4,
-    training_budget: PositiveInt = 64,
+    training_budget: PositiveInt = 100,
     tuning_budget: PositiveInt = 16,
     tuning_seeds: PositiveInt = 1,
     seed: runs.Seed = 0,
@@ -53,8 +54,8 @@ def control_experiment(
 
     A plain planner (iCEM) controls a simulator; priors learn from what it executed. Then planners draw a share of their
     candidates from each prior: in the same world, with all masses 1.4 times as large, and with a new goal. The noise of
-    each planner and the share of each prior are chosen on validation seeds. Prints tables; writes them (CSV),
-    results.json, report.html and figures to a folder. Interrupted, the same command goes on.
+    each planner, the share of each prior, and whether it proposes plans or noise are chosen on validation seeds. Prints
+    tables; writes them (CSV), results.json, report.html and figures to a folder. Interrupted, the same command goes on.
 
     Args:
         tasks: simulators; all but the arm and the double integrator need the extra mujoco.
@@ -62,6 +63,7 @@ def control_experiment(
             four components.
         planners: that are given the proposals.
         budgets: candidates that a decision simulates.
+        plain_budgets: further ones, for the plain planner alone.
         seeds: repeats of each task, each with training plans, priors and starts of its own; intervals are over them.
         steps: that a run lasts.
         training_runs: runs of the plain planner that priors learn from.
@@ -74,7 +76,7 @@ def control_experiment(
         out: folder for the report and for finished runs.
         animation: draw a run in this task, with stored windows and the most candidates, as TASK.gif in the folder.
     """
-    runs.check_distinct(tasks=tasks, priors=priors, planners=planners, budgets=budgets)
+    runs.check_distinct(tasks=tasks, priors=priors, planners=planners, budgets=budgets, plain_budgets=plain_budgets)
     for name in priors:
         check_prior_name(name)
     if NONE not in priors:
@@ -86,6 +88,7 @@ def control_experiment(
         tuple(planners),
         tuple(priors),
         numbers,
+        tuple(sorted(set(map(int, plain_budgets)) - set(numbers))),
         int(steps),
         int(training_runs),
         int(training_budget),

@@ -42,7 +42,7 @@ RESAMPLES = 1000
 def control_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
     """The tables and figures of the results of `control_run`."""
     frame = runs.frame_of(results).assign(task=lambda rows: rows["world"])
-    rows = runs.seed_means(frame, PLACE, "return", ["seconds"])
+    rows = runs.seed_means(frame, PLACE, "return", ["seconds", "sampling"])
     gaps = differences(frame)
     saved = savings(frame)
     scored, more = runs.frame_of(results, "likelihoods"), ["fit_seconds", "for_80", "for_95"]
@@ -92,52 +92,60 @@ def differences(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def savings(frame: pd.DataFrame) -> pd.DataFrame:
-    """How many candidates reach what the plain planner reaches with `REFERENCE`.
+    """How many candidates reach what the plain planner reaches with `REFERENCE`, and how much time that takes.
 
-    Returns are interpolated between budgets, linearly in the logarithm of the budget. The interval is a bootstrap over
-    seeds, of the prior and the plain planner together.
+    Returns and times are interpolated between budgets, linearly in the logarithm of the budget. The interval is a
+    bootstrap over seeds, of the prior and the plain planner together.
 
     Returns:
         A row for each task, condition, planner and prior: `reference`, candidates of the plain planner; `needed`, of
         the planner with the prior, infinite where the largest budget does not suffice; `low`, `high` (missing with
-        fewer than five seeds).
+        fewer than five seeds); `faster`: the time of a decision of the plain planner with `reference` candidates over
+        that of the planner with the prior and `needed`, missing where this is infinite.
     """
     rows = []
     for place, own in frame.groupby(["task", "condition", "planner"], sort=False):
         curves = {
-            prior: some.pivot_table("return", "seed", "budget").to_numpy()
+            prior: [some.pivot_table(name, "seed", "budget") for name in ("return", "seconds")]
             for prior, some in own.groupby("prior", sort=False)
         }
         if NONE not in curves:
             continue
-        budgets = np.sort(own["budget"].unique()).astype(float)
-        reference = min(float(REFERENCE), budgets[-1])
-        seeds = len(curves[NONE])
+        plain_curve, plain_seconds = curves.pop(NONE)
+        plain_budgets, plain = plain_curve.columns.to_numpy(float), plain_curve.to_numpy()
+        reference, seeds = min(float(REFERENCE), plain_budgets[-1]), len(plain)
         draws = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))
-        for prior, curve in curves.items():
-            if prior == NONE:
-                continue
-            needed = candidates_needed(budgets, curve.mean(0), curves[NONE].mean(0), reference)
+        seconds = interpolated(reference, plain_budgets, plain_seconds.to_numpy().mean(0))
+        for prior, (returns, times) in curves.items():
+            budgets, curve = returns.columns.to_numpy(float), returns.to_numpy()
+            needed = candidates_needed(budgets, curve.mean(0), interpolated(reference, plain_budgets, plain.mean(0)))
             low = high = float("nan")
             if seeds >= 5:
                 sampled = [
-                    candidates_needed(budgets, curve[draw].mean(0), curves[NONE][draw].mean(0), reference)
+                    candidates_needed(
+                        budgets, curve[draw].mean(0), interpolated(reference, plain_budgets, plain[draw].mean(0))
+                    )
                     for draw in draws
                 ]
                 low, high = np.quantile(sampled, [0.025, 0.975], method="inverted_cdf")
-            rows.append((*place, prior, reference, needed, low, high, seeds))
-    names = ["task", "condition", "planner", "prior", "reference", "needed", "low", "high", "seeds"]
+            faster = float("nan")
+            if np.isfinite(needed):
+                faster = seconds / interpolated(needed, budgets, times.to_numpy().mean(0))
+            rows.append((*place, prior, reference, needed, low, high, faster, seeds))
+    names = ["task", "condition", "planner", "prior", "reference", "needed", "low", "high", "faster", "seeds"]
     return pd.DataFrame(rows, columns=names)
 
 
-def candidates_needed(
-    budgets: NDArray[np.float64], returns: NDArray[np.float64], plain: NDArray[np.float64], reference: float
-) -> float:
-    """The budget at which `returns` first reach what `plain` has at `reference`; infinite if they never do.
+def interpolated(budget: float, budgets: NDArray[np.float64], values: NDArray[np.float64]) -> float:
+    """A value between those of the neighbouring budgets, linear in the logarithm of the budget."""
+    return float(np.interp(np.log(budget), np.log(budgets), values))
+
+
+def candidates_needed(budgets: NDArray[np.float64], returns: NDArray[np.float64], goal: float) -> float:
+    """The budget at which `returns` first reach `goal`; infinite if they never do.
 
     At the smallest budget already reached, it is that one: fewer candidates were not tried.
     """
-    goal = np.interp(np.log(reference), np.log(budgets), plain)
     if returns[0] >= goal:
         return float(budgets[0])
     for k in range(1, len(budgets)):
@@ -152,9 +160,10 @@ def return_table(rows: pd.DataFrame, about: str) -> Table:
     first = rows.iloc[0]
     cells = [runs.plus_minus(row, "return", 1).replace(" ", "") for _, row in rows.iterrows()]
     title = f"{first['task']}, {first['condition']}, {first['planner']}: return by candidates a decision"
-    caption = f"{about}. {runs.over_seeds(rows)} ms: of a decision with the most candidates."
+    timed = int(rows.groupby("prior")["budget"].max().min())  # the plain planner is tried with more
+    caption = f"{about}. {runs.over_seeds(rows)} ms: of a decision with {timed} candidates."
     rows = rows.rename(columns={"seconds": "seconds_per_decision"})
-    return runs.table_by(rows, {"prior": "prior"}, "budget", cells, caption, title, timed=int(rows["budget"].max()))
+    return runs.table_by(rows, {"prior": "prior"}, "budget", cells, caption, title, timed)
 
 
 def gap_table(gaps: pd.DataFrame) -> Table:
@@ -176,7 +185,9 @@ def saving_table(saved: pd.DataFrame) -> Table:
         return "more" if np.isinf(value) else f"{value:.0f}"
 
     cells = [
-        text(row["needed"]) + ("" if pd.isna(row["low"]) else f" ({text(row['low'])} to {text(row['high'])})")
+        text(row["needed"])
+        + ("" if pd.isna(row["low"]) else f" ({text(row['low'])} to {text(row['high'])})")
+        + ("" if pd.isna(row["faster"]) else f", {row['faster']:.1f}x")
         for _, row in saved.iterrows()
     ]
     labels = ["task", "planner", "prior"]
@@ -188,7 +199,7 @@ def saving_table(saved: pd.DataFrame) -> Table:
     caption = (
         f"Candidates a decision with which the return of the plain planner with {reference:.0f} is reached; more: than"
         " were tried; the fewest tried where these suffice. In brackets: 95 % bootstrap interval over seeds, with at"
-        " least five."
+        " least five. x: so many times as fast is a decision, drawing from the prior included."
     )
     return table(order, columns, caption, align="lll" + "r" * (order.shape[1] - 3))
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
+from statistics import median
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
@@ -15,6 +16,9 @@ from neuroprior.planners import Control, ICEMPlanner, MPPIPlanner, ShootingPlann
 from neuroprior.priors import VectorPrior
 from neuroprior.worlds.continuous import ContinuousWorld
 
+Choices = Mapping[str, Mapping[str, Mapping[str, Sequence[Any]]]]
+"""The numbers of a `Choice` by task, planner and prior."""
+
 PlannerName = Literal["icem", "mppi", "shooting"]
 PLANNERS: dict[str, type[ICEMPlanner] | type[MPPIPlanner] | type[ShootingPlanner]] = {
     "icem": ICEMPlanner,
@@ -22,14 +26,26 @@ PLANNERS: dict[str, type[ICEMPlanner] | type[MPPIPlanner] | type[ShootingPlanner
     "shooting": ShootingPlanner,
 }
 
-NOISES = tuple(product((0.3, 0.6, 1.0), (0.0, 1.0, 2.5)))
+NOISES = tuple(product((0.05, 0.12, 0.3, 0.6, 1.0), (0.0, 1.0, 2.5)))
 """Standard deviations and spectral exponents of the planner's own noise that validation tries."""
 
-SHARES = ((0.25, 0), (0.5, 0), (0.5, 1), (0.8, 1))
-"""Shares of the prior's candidates that validation tries, and in how many of iCEM's iterations; 0: in all."""
+PROPOSALS: tuple[dict[str, Any], ...] = (
+    {"share": 0.25},
+    {"share": 0.5, "iterations": 1},
+    {"share": 0.8, "iterations": 1},
+    {"share": 0.5, "proposes": "noise"},
+    {"share": 0.9, "proposes": "noise"},
+)
+"""What validation tries of a prior, as parts of a `Choice`."""
 
 VALIDATION = 10_000
 """Added to the numbers of seeds for validation."""
+
+VALIDATION_STARTS = 4
+"""Runs of each setting on a validation seed."""
+
+TIMED = 5
+"""How often drawing a decision's candidates from a prior is timed; the median counts."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +55,15 @@ class ControlSettings:
     planners: tuple[str, ...]
     priors: tuple[str, ...]
     budgets: tuple[int, ...]
+    plain_budgets: tuple[int, ...]
     steps: int
     training_runs: int
     training_budget: int
     tuning_budget: int
     seed: int
-    choices: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]] = field(default_factory=dict)
+    choices: Choices = field(default_factory=dict)
 
-    def with_choices(self, choices: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> "ControlSettings":
+    def with_choices(self, choices: Choices) -> "ControlSettings":
         """The same, with what `chosen` found for each task."""
         return replace(self, choices=choices)
 
@@ -58,18 +75,20 @@ class Choice(NamedTuple):
         std, exponent: of the planner's own noise.
         share: of the prior's candidates; 0 for the plain planner.
         iterations: of iCEM in which the prior proposes; 0: all.
+        proposes: "plans" or "noise", see `VectorPlanner`.
     """
 
     std: float
     exponent: float
     share: float = 0.0
     iterations: int = 0
+    proposes: str = "plans"
 
 
 def planner_of(name: str, horizon: int, budget: int, choice: Choice, prior: VectorPrior | None) -> VectorPlanner:
     """A planner by name, with what was chosen for it."""
     how: dict[str, Any] = {"std": choice.std, "noise_beta": choice.exponent, "prior": prior}
-    how["prior_share"] = choice.share if prior is not None else 0.0
+    how |= {"prior_share": choice.share if prior is not None else 0.0, "prior_as": choice.proposes}
     if name == "icem":
         how["prior_iterations"] = choice.iterations or None
     return PLANNERS[name](horizon, budget, **how)
@@ -104,43 +123,32 @@ def tuning_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
     """The return of every setting on one validation seed, in the world before it changed.
 
     Returns:
-        `plain`: of each planner the returns of `NOISES`; `shares`: of each planner and prior the returns of `SHARES`,
-        with the noise that was best for this seed.
+        `plain`: of each planner the returns of `NOISES`; `with_prior`: of each planner and prior the returns of
+        `PROPOSALS`, with the noise that was best for this seed.
     """
     task, seed, budget = TASKS[run.world], VALIDATION + run.seed, settings.tuning_budget
     world = task.make("same")
+
+    def returned(name: str, choice: Choice, prior: VectorPrior | None = None) -> float:
+        planner = planner_of(name, task.horizon, budget, choice, prior)
+        return _return_of(controlled(planner, world, settings, seed, VALIDATION_STARTS))
+
     plain: dict[str, list[float]] = {}
     best: dict[str, Choice] = {}
     for name in dict.fromkeys(("icem", *settings.planners)):
-        plain[name] = [
-            _return_of(
-                controlled(planner_of(name, task.horizon, budget, Choice(*noise), None), world, settings, seed, 1)
-            )
-            for noise in NOISES
-        ]
+        plain[name] = [returned(name, Choice(*noise)) for noise in NOISES]
         best[name] = Choice(*NOISES[_highest(plain[name])])
     plans = training_plans(task, settings, seed, best["icem"]).plans
-    shares: dict[str, dict[str, list[float]]] = {name: {} for name in settings.planners}
+    with_prior: dict[str, dict[str, list[float]]] = {name: {} for name in settings.planners}
     for prior_name in settings.priors:
         if prior_name == NONE:
             continue
         prior = fitted(prior_name, plans, task.horizon, generator_of(settings, seed, prior_name))
         for name in settings.planners:
-            shares[name][prior_name] = [
-                _return_of(
-                    controlled(
-                        planner_of(
-                            name, task.horizon, budget, best[name]._replace(share=share, iterations=number), prior
-                        ),
-                        world,
-                        settings,
-                        seed,
-                        1,
-                    )
-                )
-                for share, number in SHARES
+            with_prior[name][prior_name] = [
+                returned(name, best[name]._replace(**proposal), prior) for proposal in PROPOSALS
             ]
-    return run._asdict() | {"plain": plain, "shares": shares}
+    return run._asdict() | {"plain": plain, "with_prior": with_prior}
 
 
 def chosen(results: Sequence[dict[str, Any]], settings: ControlSettings) -> dict[str, dict[str, Choice]]:
@@ -152,9 +160,8 @@ def chosen(results: Sequence[dict[str, Any]], settings: ControlSettings) -> dict
         found[name] = {NONE: plain}
         for prior in settings.priors if name in settings.planners else ():
             if prior != NONE:
-                means = torch.tensor([one["shares"][name][prior] for one in results]).mean(0).tolist()
-                share, number = SHARES[_highest(means)]
-                found[name][prior] = plain._replace(share=share, iterations=number)
+                means = torch.tensor([one["with_prior"][name][prior] for one in results]).mean(0).tolist()
+                found[name][prior] = plain._replace(**PROPOSALS[_highest(means)])
     return found
 
 
@@ -162,9 +169,10 @@ def control_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
     """Collect plans, fit every prior to them, and plan in every condition.
 
     Returns:
-        `entries`, one of each condition, planner, prior and budget: `return`, the sum of rewards, and `seconds`, of a
-        decision; `alone`, the returns of behaviour cloning; `likelihoods`, one of each prior: held-out `nats` a vector,
-        `fit_seconds`, and how many components explain 80 and 95 % of the variance.
+        `entries`, one of each condition, planner, prior and budget: `return`, the sum of rewards, `seconds`, of a
+        decision, and `sampling`, those of them in which the prior is drawn from; `alone`, the returns of behaviour
+        cloning; `likelihoods`, one of each prior: held-out `nats` a vector, `fit_seconds`, and how many components
+        explain 80 and 95 % of the variance.
     """
     task = TASKS[run.world]
     own = {
@@ -217,18 +225,39 @@ def _entries(
 ) -> Iterator[dict[str, Any]]:
     for condition in CONDITIONS:
         world = task.make(condition)
-        for name, (prior_name, prior), budget in product(settings.planners, priors.items(), settings.budgets):
-            planner = planner_of(name, task.horizon, budget, own[name][prior_name], prior)
-            done = controlled(planner, world, settings, run.seed, 1, name, prior_name, budget)
-            decisions = int(done.plans.mask().sum())
-            yield {
-                "condition": condition,
-                "planner": name,
-                "prior": prior_name,
-                "budget": budget,
-                "return": _return_of(done),
-                "seconds": done.seconds / max(decisions, 1),
-            }
+        for name, (prior_name, prior) in product(settings.planners, priors.items()):
+            choice = own[name][prior_name]
+            for budget in (*settings.budgets, *(settings.plain_budgets if prior is None else ())):
+                planner = planner_of(name, task.horizon, budget, choice, prior)
+                done = controlled(planner, world, settings, run.seed, 1, name, prior_name, budget)
+                yield {
+                    "condition": condition,
+                    "planner": name,
+                    "prior": prior_name,
+                    "budget": budget,
+                    "return": _return_of(done),
+                    "seconds": done.seconds / max(int(done.plans.mask().sum()), 1),
+                    "sampling": sampling_seconds(planner, done),
+                }
+
+
+def sampling_seconds(planner: VectorPlanner, done: Control) -> float:
+    """How long the planner's prior takes to draw what a decision needs, after all of a run; 0 without a prior."""
+    number = round(planner.prior_share * planner.num_plans)
+    if planner.prior is None or not number:
+        return 0.0
+    context = done.plans.context
+    assert context is not None
+    past, generator = done.plans.actions[:1, : int(done.plans.mask()[0].sum())], torch.Generator().manual_seed(0)
+    # The observation before the next step is not among those of the run.
+    seen = torch.cat([context[:1, : past.shape[1]], context[:1, :1]], 1) if planner.prior.takes_context else None
+    times = []
+    for _ in range(TIMED):
+        began = perf_counter()
+        drawn = number * (1 + (planner.prior_as == "noise"))
+        planner.prior.sample(drawn, planner.length, seen, past=past, generator=generator)
+        times.append(perf_counter() - began)
+    return median(times)
 
 
 def _return_of(done: Control) -> float:

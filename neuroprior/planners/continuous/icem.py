@@ -42,6 +42,7 @@ class ICEMPlanner(VectorPlanner):
 
     A prior's candidates are among those of the first iteration (`prior_iterations`), mixed with the planner's own: the
     elites are chosen from, and the distribution is refitted to, all of them; later iterations search around the best.
+    As noise (`prior_as`), what it proposes in a later iteration is scaled as the standard deviation is.
     At `prior_share=1` the prior draws all of them but shifted elites.
 
     Args:
@@ -108,7 +109,7 @@ class ICEMPlanner(VectorPlanner):
         low, high = world.action_low.to(state.device), world.action_high.to(state.device)
         middle, half = middle_and_half(world, state.device)
         mean = filled(memory.mean, len(state), self.length, middle, repeat=True)
-        std = (self.std * half).expand_as(mean)
+        std = first = (self.std * half).expand_as(mean)
         shifted = self._shifted(memory.elites, mean, std, generator)
         # An iteration draws at least one candidate.
         again = [min(shifted.shape[1], self.populations[0] - 1)] + [0] * (len(self.populations) - 1)
@@ -122,7 +123,7 @@ class ICEMPlanner(VectorPlanner):
         best, best_score = mean, torch.full((len(state),), -torch.inf, device=state.device)
         for i, (number, from_prior) in enumerate(zip(drawn, counts, strict=True)):
             noise = coloured_noise((len(state), number - from_prior, *mean.shape[1:]), self.noise_beta, generator)
-            parts = [mean[:, None] + std[:, None] * noise, proposals[i]]
+            parts = [mean[:, None] + std[:, None] * noise, self.around(mean, proposals[i], (std / first)[:, None])]
             if i == len(drawn) - 1 and with_mean:
                 parts.append(mean[:, None])
             if again[i]:

@@ -92,7 +92,8 @@ class MPPIPlanner(VectorPlanner):
         for number, from_prior, proposed in zip(drawn, counts, proposals, strict=True):
             own = number - from_prior
             noise = coloured_noise((len(state), own, *mean.shape[1:]), self.noise_beta, generator)
-            plans = torch.cat([mean[:, None] + self.std * half * noise, proposed], 1).clamp(low, high)
+            parts = [mean[:, None] + self.std * half * noise, self.around(mean, proposed)]
+            plans = torch.cat(parts, 1).clamp(low, high)
             score = self.scores(world, state, plans, generator)
             logits = self._logits(score)
             if self.control_cost and own:

@@ -60,15 +60,15 @@ class ShootingPlanner(VectorPlanner):
         generator, memory = self.begin(world, state, generator, memory)
         middle, half = middle_and_half(world, state.device)
         last = memory.mean if self.warm_start else None
-        mean = filled(last, len(state), self.length, middle, repeat=True)[:, None]
+        mean = filled(last, len(state), self.length, middle, repeat=True)
         # A single candidate is drawn: else the plan would never change.
         again = last is not None and self.num_plans > 1
         drawn = self.num_plans - again
         (from_prior,) = self.prior_counts([drawn])
         proposals = self.proposals(from_prior, world, state, memory, generator)
-        noise = coloured_noise((len(state), drawn - from_prior, *mean.shape[2:]), self.noise_beta, generator)
-        own = mean + self.std * half * noise
-        plans = torch.cat([mean, own, proposals] if again else [own, proposals], 1)
+        noise = coloured_noise((len(state), drawn - from_prior, *mean.shape[1:]), self.noise_beta, generator)
+        drawn_plans = [mean[:, None] + self.std * half * noise, self.around(mean, proposals)]
+        plans = torch.cat([mean[:, None], *drawn_plans] if again else drawn_plans, 1)
         plans = plans.clamp(world.action_low.to(plans), world.action_high.to(plans))
         score = self.scores(world, state, plans, generator)
         best, row = random_best(score, generator), torch.arange(len(state), device=state.device)

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from math import ceil
-from typing import NamedTuple, TypedDict
+from typing import Literal, NamedTuple, TypedDict
 
 import torch
 from torch import Tensor
@@ -80,6 +80,7 @@ class Proposal(TypedDict, total=False):
 
     prior: VectorPrior | None
     prior_share: float | None
+    prior_as: Literal["plans", "noise"]
     discount: float
     value: Callable[[Tensor], Tensor] | None
 
@@ -96,6 +97,9 @@ class VectorPlanner(ABC):
         prior_share: the share, from 0 to 1, of the candidates that are drawn which the prior proposes, rounded to a
             whole number; between 0 and 1 at least one candidate is the prior's and one the planner's own, if two are
             drawn. At 0 the plain algorithm, number for number. None: one half with a prior.
+        prior_as: "plans": a candidate is what the prior draws, given what was executed. "noise": it is the mean around
+            which the planner searches plus the difference of two such draws, divided by the square root of two: noise
+            with the prior's covariance over time and dimensions, wherever the plan is.
         discount: of the reward of each further step, above 0 and at most 1.
         value: its value of the final state, times `discount ** L`, is added to a plan's score.
 
@@ -115,6 +119,7 @@ class VectorPlanner(ABC):
         *,
         prior: VectorPrior | None = None,
         prior_share: float | None = None,
+        prior_as: Literal["plans", "noise"] = "plans",
         discount: float = 1.0,
         value: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
@@ -126,8 +131,10 @@ class VectorPlanner(ABC):
         check_share("prior_share", share)
         if share and prior is None:
             raise ValueError("prior_share: there is no prior; give prior=")
+        if prior_as not in ("plans", "noise"):
+            raise ValueError(f'prior_as: "plans" or "noise" is expected, not {prior_as!r}')
         self.length, self.num_plans, self.discount, self.value = length, num_plans, discount, value
-        self.prior, self.prior_share = prior, share
+        self.prior, self.prior_share, self.prior_as = prior, share, prior_as
 
     @property
     def keep(self) -> int | None:
@@ -189,14 +196,20 @@ class VectorPlanner(ABC):
     def proposals(
         self, number: int, world: ContinuousWorld, state: Tensor, memory: Memory, generator: torch.Generator
     ) -> Tensor:
-        """So many candidates from the prior for each start: `[B, number, L, D]`."""
+        """So many candidates from the prior for each start, or so much noise: `[B, number, L, D]`; see `around`."""
         if self.prior is None or not number:
             return torch.zeros(len(state), 0, self.length, world.action_size, device=state.device)
         context = None
         if self.prior.takes_context:
             context = torch.cat([memory.observations, world.observe(state)[:, None]], 1)
-        drawn = self.prior.sample(number, self.length, context, past=memory.past, generator=generator)
-        return drawn.to(state.device)
+        noise = self.prior_as == "noise"
+        drawn = self.prior.sample(number * (1 + noise), self.length, context, past=memory.past, generator=generator)
+        drawn = drawn.to(state.device)
+        return (drawn[:, :number] - drawn[:, number:]) / 2**0.5 if noise else drawn
+
+    def around(self, mean: Tensor, proposals: Tensor, scale: Tensor | float = 1.0) -> Tensor:
+        """The prior's candidates `[B, number, L, D]`: its proposals, or `mean [B, L, D]` plus `scale` times them."""
+        return mean[:, None] + scale * proposals if self.prior_as == "noise" else proposals
 
     def scores(self, world: ContinuousWorld, state: Tensor, plans: Tensor, generator: torch.Generator) -> Tensor:
         """The scores `[B, P]` of the candidates `plans [B, P, L, D]`, each simulated once.

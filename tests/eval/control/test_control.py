@@ -11,8 +11,8 @@ import torch
 from eval.__main__ import main
 from eval.control.animation import pictures
 from eval.control.priors import check_prior_name, fitted, shuffled
-from eval.control.report import candidates_needed, differences, savings
-from eval.control.run import NOISES, SHARES, Choice, ControlSettings, chosen, planner_of
+from eval.control.report import candidates_needed, differences, interpolated, savings
+from eval.control.run import NOISES, PROPOSALS, Choice, ControlSettings, chosen, planner_of
 from eval.control.tasks import CONDITIONS, TASKS
 from neuroprior.plans import VectorPlans
 from neuroprior.worlds import PlanarArm
@@ -21,6 +21,7 @@ from tests.support.sources import seeded
 pytestmark = pytest.mark.usefixtures("undrawn")
 
 SMALL = ["control", "--tasks", "double_integrator", "--seeds", "2", "--steps", "9", "--budgets", "4", "8"]
+SMALL += ["--plain_budgets", "16"]
 SMALL += ["--training_runs", "2", "--training_budget", "4", "--tuning_budget", "4", "--processes", "1"]
 SMALL += ["--priors", "none", "autoregressive", "synergies-2"]
 
@@ -35,8 +36,9 @@ def test_a_small_run(tmp_path, capsys):
         (condition, "shooting", prior, budget)
         for condition in CONDITIONS
         for prior in ("none", "autoregressive", "synergies-2")
-        for budget in (4, 8)
+        for budget in ((4, 8, 16) if prior == "none" else (4, 8))
     }
+    assert all((row["sampling"] > 0) == (row["prior"] != "none") for row in results["rows"])
     assert len(results["rows"]) == len(places)
     at = {(r["condition"], r["planner"], r["prior"], r["budget"]): r for r in results["rows"]}
     for row in results["rows"]:
@@ -76,19 +78,20 @@ def test_bad_options_get_one_line(options, said, tmp_path, capsys):
 
 def test_candidates_needed_by_hand():
     """Interpolated in the logarithm of the budget; the least tried where it suffices, infinite where none does."""
-    budgets, plain = np.array([8.0, 16.0, 32.0, 128.0]), np.array([1.0, 2.0, 3.0, 5.0])
-    assert candidates_needed(budgets, np.array([0.0, 4.0, 6.0, 7.0]), plain, 128) == pytest.approx(16 * 2**0.5)
-    assert candidates_needed(budgets, np.array([5.0, 5.0, 5.0, 5.0]), plain, 128) == 8
-    assert candidates_needed(budgets, np.array([4.0, 4.0, 4.0, 4.9]), plain, 128) == inf
-    at_64 = 3 + 2 * log(2) / log(4)
-    assert candidates_needed(budgets, plain, plain, 64) == pytest.approx(64)
-    assert candidates_needed(budgets, np.array([0, 0, at_64, 9]), plain, 64) == pytest.approx(32)
+    budgets = np.array([8.0, 16.0, 32.0, 128.0])
+    assert candidates_needed(budgets, np.array([0.0, 4.0, 6.0, 7.0]), 5) == pytest.approx(16 * 2**0.5)
+    assert candidates_needed(budgets, np.array([5.0, 5.0, 5.0, 5.0]), 5) == 8
+    assert candidates_needed(budgets, np.array([4.0, 4.0, 4.0, 4.9]), 5) == inf
+    plain = np.array([1.0, 2.0, 3.0, 5.0])
+    at_64 = interpolated(64, budgets, plain)
+    assert at_64 == pytest.approx(3 + 2 * log(2) / log(4))
+    assert candidates_needed(budgets, plain, at_64) == pytest.approx(64)
 
 
 def made_up(seeds=6):
     rows = [
         {"world": "w", "task": "w", "seed": seed, "condition": "same", "planner": "icem", "prior": prior}
-        | {"budget": budget, "return": value + seed}
+        | {"budget": budget, "return": value + seed, "seconds": budget * (1 if prior == "none" else 2)}
         for seed in range(seeds)
         for prior, values in (("none", (1, 2, 3)), ("good", (2, 4, 5)), ("bad", (0, 0, 1)))
         for budget, value in zip((25, 50, 100), values, strict=True)
@@ -102,6 +105,9 @@ def test_savings_and_differences_of_made_up_returns():
     assert saved.loc["good", "reference"] == 100
     assert saved.loc["good", ["needed", "low", "high"]].tolist() == pytest.approx([25 * 2**0.5] * 3)
     assert saved.loc["bad", ["needed", "low", "high"]].tolist() == [inf] * 3
+    # Between 50 and 100 units of time, at the geometric middle of 25 and 50 candidates.
+    assert saved.loc["good", "faster"] == pytest.approx(100 / 75)
+    assert np.isnan(saved.loc["bad", "faster"])
     assert savings(made_up(4))["low"].isna().all()
     gaps = differences(made_up()).set_index(["prior", "budget"])
     assert gaps.loc[("good", 50), "difference"] == 2
@@ -109,20 +115,21 @@ def test_savings_and_differences_of_made_up_returns():
 
 
 def test_settings_are_chosen_by_their_mean_over_validation_seeds():
-    settings = ControlSettings(("shooting",), ("none", "stored"), (8,), 10, 1, 8, 8, 0)
+    settings = ControlSettings(("shooting",), ("none", "stored"), (8,), (), 10, 1, 8, 8, 0)
     first, second = [0.0] * len(NOISES), [0.0] * len(NOISES)
     first[1], second[1], second[4] = 3.0, 1.0, 3.5  # means 2 and 1.75
-    shares = [{"stored": [0.0, 1.0, 5.0, 0.0]}, {"stored": [0.0, 6.0, 1.0, 0.0]}]
+    shares = [{"stored": [0.0, 1.0, 5.0, 0.0, 0.0]}, {"stored": [0.0, 6.0, 1.0, 0.0, 0.0]}]
     results = [
-        {"plain": {"icem": [*first[1:], 0.0], "shooting": plain}, "shares": {"shooting": some}}
+        {"plain": {"icem": [*first[1:], 0.0], "shooting": plain}, "with_prior": {"shooting": some}}
         for plain, some in ((first, shares[0]), (second, shares[1]))
     ]
     found = chosen(results, settings)
     assert found["shooting"]["none"] == Choice(*NOISES[1])
-    assert found["shooting"]["stored"] == Choice(*NOISES[1], *SHARES[1])
+    assert found["shooting"]["stored"] == Choice(*NOISES[1])._replace(**PROPOSALS[1])
     assert found["icem"]["none"] == Choice(*NOISES[0])
-    planner = planner_of("icem", 5, 30, Choice(0.4, 2.0, 0.25, 0), fitted("noise", _plans(), 5, seeded(0)))
-    assert (planner.std, planner.noise_beta, planner.prior_share) == (0.4, 2.0, 0.25)
+    choice = Choice(0.4, 2.0, 0.25, 0, "noise")
+    planner = planner_of("icem", 5, 30, choice, fitted("noise", _plans(), 5, seeded(0)))
+    assert (planner.std, planner.noise_beta, planner.prior_share, planner.prior_as) == (0.4, 2.0, 0.25, "noise")
     assert planner.prior_iterations == len(planner.populations)
     assert planner_of("icem", 5, 30, Choice(0.4, 2.0, 0.25, 1), planner.prior).prior_iterations == 1
     assert planner_of("shooting", 5, 30, Choice(0.4, 2.0, 0.25, 1), None).prior_share == 0

@@ -19,6 +19,7 @@ def test_the_plain_planner_alone_has_a_report(tmp_path, seeds, capsys):
         training_runs=1,
         training_budget=4,
         tuning_budget=4,
+        plain_budgets=[4],
         processes=1,
         out=str(tmp_path),
     )

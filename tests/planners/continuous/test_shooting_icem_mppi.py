@@ -81,6 +81,44 @@ def test_a_prior_goes_on_from_the_past_and_the_context(make):
     assert torch.allclose(world.tried[0][:, 0], wanted[:, None].expand(2, 4, 2), atol=1e-6)
 
 
+@pytest.mark.parametrize("make", PLANNERS)
+def test_noise_of_a_prior_is_around_the_mean(make):
+    """Whatever the prior goes on with; its variance is that of a random walk, .1 * t, with false alarms below 1e-6."""
+    world = Seen()
+    state = world.reset(1, seeded(0))
+    mean = torch.tensor([[[0.1, 0.2], [0.0, 0.3], [-0.2, 0.25]]])
+    memory = Memory(torch.full((1, 1, 2), 0.4), world.observe(state)[:, None], mean)
+    prior = drift(world, std=1e-9)
+    make(3, 9, prior=prior, prior_share=1.0, prior_as="noise").plan(world, state, seeded(1), memory)
+    assert torch.allclose(world.tried[0], mean[:, None].expand(1, world.tried[0].shape[1], 3, 2), atol=1e-6)
+    world.tried.clear()
+    free = drift(world, std=0.01)
+    planner = make(3, 4000, prior=free, prior_share=1.0, prior_as="noise")
+    planner.plan(world, state, seeded(1), memory._replace(past=torch.full((1, 1, 2), 0.25)))
+    tried = world.tried[0][0] - mean[0]
+    variance, count = tried.square().mean((0, 2)), 2 * len(tried)
+    assert torch.allclose(variance / variance[0], torch.tensor([1.0, 2.0, 3.0]), rtol=5 * 2 * (2 / count) ** 0.5)
+    assert variance[0].sqrt() == pytest.approx(0.01, rel=5 * (0.5 / count) ** 0.5)
+
+
+def test_icem_scales_noise_of_a_prior_as_its_own():
+    """The second round is the mean and the spread of the elites of the first, times the same proposals."""
+    world = Seen()
+    state = world.reset(1, seeded(0))
+    how = {"prior": drift(world, std=0.1), "prior_share": 1.0, "prior_as": "noise", "prior_iterations": None}
+    planner = ICEMPlanner(3, 60, iterations=2, momentum=0.0, keep_elites=0.0, std=0.7, **how)
+    planner.plan(world, state, seeded(1))
+    first, second = (tried[0] for tried in world.tried)
+    elites = first[world.rollout(state, first[None])[1][0].sum(-1).topk(planner.num_elites).indices]
+    mean, std = elites.mean(0), elites.std(0, correction=0)
+    drawn = drift(world, std=0.1).sample(2 * 59, 3, past=torch.zeros(1, 0, 2), generator=seeded(1))[0]
+    noise = ((drawn[:59] - drawn[59:]) / 2**0.5)[len(first) :]
+    half = (world.action_high - world.action_low) / 2
+    wanted = (mean + std / (0.7 * half) * noise).clamp(world.action_low, world.action_high)
+    assert torch.allclose(second[:-1], wanted, atol=1e-5)
+    assert torch.allclose(second[-1], mean, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("number", "sizes", "elites"),
     [
@@ -207,6 +245,7 @@ def test_the_objective_has_a_discount_and_a_value(make):
         (MPPIPlanner, {"control_cost": True, "noise_beta": 1.0}, "control_cost"),
         (MPPIPlanner, {"prior_share": 0.5}, "prior_share"),
         (MPPIPlanner, {"prior": 3}, "prior"),
+        (MPPIPlanner, {"prior_as": "changes"}, "prior_as"),
     ],
 )
 def test_bad_settings_are_named(make, how, word):
