@@ -60,6 +60,7 @@ def test_numbers_of_a_command_line_are_plain_where_they_go_to_other_processes(mo
     for name, number in numbers.items():
         kept = getattr(given[0], name.replace("-", "_"))
         assert (kept, type(kept)) == (number, int)
+    assert [(number, type(number)) for number in given[0].num_plans] == [(4, int)]
 
 
 def test_whatever_changes_results_makes_another_folder(tmp_path):

@@ -372,10 +372,12 @@ def test_plans_are_named_as_in_the_file(tmp_path):
 
 
 @pytest.mark.parametrize(("suffix", "delimiter"), [(".csv", ","), (".csv", ";"), (".tsv", "\t")])
-def test_a_row_may_be_longer_than_a_cell_can_be(suffix, delimiter, tmp_path):
+@pytest.mark.parametrize("header", [False, True])
+def test_a_row_may_be_longer_than_a_cell_can_be(suffix, delimiter, header, tmp_path):
     """Plans of 70,000 actions: for each other delimiter a line is a single cell, of more than `csv` takes."""
     actions = torch.arange(140_000).view(2, -1) % 3
-    rows = [list(map(str, row)) for row in actions.tolist()]
+    rows = [[f"action_{t}" for t in range(1, 70_001)]] if header else []
+    rows += [list(map(str, row)) for row in actions.tolist()]
     (tmp_path / f"plans{suffix}").write_text("\n".join(map(delimiter.join, rows)) + "\n")
     assert read_plans(tmp_path / f"plans{suffix}").actions.equal(actions)
 
