@@ -69,11 +69,6 @@ class Settings:
     priors: tuple[str, ...] = ()
     lengths: tuple[int, ...] = ()
 
-    def __post_init__(self) -> None:
-        # Numbers of a command line may be of jsonargparse's types, which other processes cannot unpickle.
-        for name in ("rounds", "steps", "starts", "training_starts", "seed"):
-            object.__setattr__(self, name, int(getattr(self, name)))
-
     @property
     def budgets(self) -> list[int]:
         """All powers of two up to the most candidates."""

@@ -503,6 +503,16 @@ def test_plans_without_actions_and_actions_that_an_animal_never_takes():
     assert family.values[[0, 1, 2, 4, 5, 6, 7]].isfinite().all()
     assert family.means.isfinite().all()
     assert family.p_values.isfinite().all()
+    # The interval is one of the other three animals of its condition.
+    condition = int(plans.condition[plans.group == 3][0])
+    others = [int(g) for g in plans.group[plans.condition == condition].unique() if g != 3]
+    taken = (actions == 2)[:, :-1] & (torch.arange(1, actions.shape[1]) < lengths[:, None])
+    n = np.array([int(taken[plans.group == animal].sum()) for animal in others])
+    weight, values = (n / (n + SMOOTHING))[:, None], family.values[others][:, after].numpy()
+    mean = (weight * values).sum(0) / weight.sum()
+    half = stats.t.ppf(0.975, 2) * np.sqrt(3 / 2 * (weight**2 * (values - mean) ** 2).sum(0)) / weight.sum()
+    for found_here, due in ((family.means, mean), (family.low, mean - half), (family.high, mean + half)):
+        np.testing.assert_allclose(found_here[condition, after], due)
 
 
 def test_what_never_varies_does_not_differ():

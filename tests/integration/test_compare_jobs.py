@@ -47,6 +47,22 @@ def test_results_are_those_of_the_runs_in_order(tmp_path):
     assert not list(tmp_path.rglob("*.partial"))
 
 
+def test_numbers_of_a_command_line_are_plain_where_they_go_to_other_processes(monkeypatch, tmp_path):
+    """Those of types that the command makes could not be read where its module is not imported."""
+    given = []
+    monkeypatch.setattr(command, "compare_run", lambda run, settings: given.append(settings) or made_up(run, settings))
+    numbers = {"training-starts": 9, "steps": 5, "starts": 7, "rounds": 3, "seed": 2}
+    options = [f"--{name}={number}" for name, number in numbers.items()]
+    assert (
+        main(["compare", "--worlds=maze", "--seeds=1", "--num-plans=4", *options, "--processes=1", f"--out={tmp_path}"])
+        == 0
+    )
+    for name, number in numbers.items():
+        kept = getattr(given[0], name.replace("-", "_"))
+        assert (kept, type(kept)) == (number, int)
+    assert [(number, type(number)) for number in given[0].num_plans] == [(4, int)]
+
+
 def test_whatever_changes_results_makes_another_folder(tmp_path):
     base = jobs_in(tmp_path)
     assert jobs_in(tmp_path).folder == base.folder

@@ -5,12 +5,14 @@ import itertools
 import json
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 from scipy import stats
 
 from eval.__main__ import main
-from eval.mice.experiment import MiceSettings, PriorName, _count_based, collected
+from eval.mice import experiment
+from eval.mice.experiment import NEURAL, MiceSettings, PriorName, _count_based, collected, simulate
 from eval.mice.figures import far_from_water, left_turns, passages
 from eval.worlds.labyrinth import DATA, reaching_planner, shares_reached
 from eval.worlds.labyrinth_drawing import ENTRANCE, coordinates
@@ -171,6 +173,44 @@ def test_orders_are_chosen_on_some_plans_and_then_all_are_counted():
     assert learned["markov_order_moves"].tolist() == [best]
     moves, chosen = Plans(actions, 4), priors[PriorName("markov", "mice", "moves")]
     assert torch.equal(chosen.log_prob(moves), MarkovPrior(4, best).fit(moves).log_prob(moves))
+
+
+def test_networks_learn_from_the_source_and_context_that_they_are_called_after(monkeypatch):
+    """And the oracle and every planner start where no water is, at most at as many nodes as asked for."""
+    fitted = []
+
+    class Recorder(UniformPrior):
+        def __init__(self, num_actions, num_contexts=None, seed=0):
+            super().__init__(num_actions)
+            self.made = (num_contexts, seed)
+
+        def fit(self, plans, *, generator=None, progress=True, max_steps=None):
+            fitted.append((type(self).__name__, *self.made, plans, max_steps))
+            return self
+
+    class Other(Recorder):
+        pass
+
+    monkeypatch.setattr(experiment, "GRUPrior", Recorder)
+    monkeypatch.setattr(experiment, "TransformerPrior", Other)
+    world, plans = labyrinth(absorbing=True), read_plans(DATA)[:4]
+    settings = MiceSettings(2, 6, (2, 8), (4,), 200, 5, 0)
+    rows, priors, learned = simulate(settings, world, plans, lambda _: None)
+    sources = collected(settings, world, plans, DRY, seeded(0))
+    assert learned["source"].tolist() == list(sources)
+    assert learned["plans"].tolist() == [len(some) for some in sources.values()]
+    assert len({seed for _, _, seed, *_ in fitted}) == len(fitted) == 2 * len(NEURAL)
+    for name, (kind, contexts, _, some, steps) in zip(NEURAL * 2, fitted, strict=True):
+        assert kind == {"gru": "Recorder", "transformer": "Other"}[name.prior]
+        assert contexts == {"moves": None, "node": 127}[name.context]
+        assert some.actions.equal(sources[name.learned_from].actions)
+        assert steps == 5
+    assert set(NEURAL) <= set(priors)
+    # By the optimum, no prior reaches the water more often: within 8 moves 6 starts may all reach it.
+    best = rows[rows["prior"] == "oracle"].set_index(["seed", "length"])["reached"]
+    assert (
+        (rows["reached"] - best.reindex(pd.MultiIndex.from_frame(rows[["seed", "length"]])).to_numpy()) < 1e-9
+    ).all()
 
 
 OPTIONS = ["--seeds=2", "--starts=6", "--training-plans=200", "--steps=5"]

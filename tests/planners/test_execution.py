@@ -83,3 +83,15 @@ def test_refuses_to_execute_beyond_the_prefix_that_won():
     world = TabularWorld(torch.tensor([[1], [2], [2]]), torch.tensor([0.0, 1.0, 0.0]))
     with refuses("fewer"):
         execute(ExhaustivePlanner(3, any_prefix=True), world, torch.tensor([0]), 3, replan_every=3)
+
+
+def test_of_many_starts_the_shortest_prefix_that_won_says_how_many_actions_there_are():
+    """The reward is a step from the first start, and two steps from the second."""
+    world = TabularWorld(torch.tensor([[1], [3], [0], [3]]), torch.tensor([0.0, 1.0, 0.0, 0.0]))
+    planner, state = ExhaustivePlanner(2, any_prefix=True), torch.tensor([0, 2])
+    assert planner.plan(world, state).lengths.tolist() == [1, 2]
+    for some, every in ((state, 2), (state.flip(0), 2)):
+        with refuses("fewer"):
+            execute(planner, world, some, 2, replan_every=every)
+    assert execute(planner, world, state[1:], 2, replan_every=2).states.tolist() == [[0, 1]]
+    assert execute(planner, world, state, 2).states.tolist() == [[1, 3], [0, 1]]

@@ -340,6 +340,15 @@ def test_parts_of_a_plan_have_its_name(tmp_path, name):
     assert_same(read_plans(tmp_path / name, num_actions=4), parted(), numbering=False)
 
 
+def test_plans_of_one_name_are_parts_of_one_plan_in_one_group_alone(tmp_path):
+    """The first session of the second mouse follows the one of the first mouse, and is called as that is."""
+    group = torch.tensor([0, 0, 1, 1, 1])
+    own = {"group": group, "group_names": ["m1", "m2"], "plan_names": ["day 2", "day 1", "day 1", "day 1", "day 2"]}
+    some = Plans(torch.arange(15).view(5, 3) % 4, 4, durations=torch.ones(5, 3), **own)
+    write_plans(some, tmp_path / "a.csv", layout="step")
+    assert_same(read_plans(tmp_path / "a.csv", num_actions=4), some, numbering=False)
+
+
 def test_in_csv_parts_that_are_not_together_are_numbered(tmp_path):
     some = parted()[torch.tensor([0, 3, 1])]
     assert some.plan_names == ("day 2", "day 1", "day 2")
@@ -360,3 +369,36 @@ def test_plans_are_named_as_in_the_file(tmp_path):
     (tmp_path / "d.jsonl").write_text('{"actions": [0], "plan": "x"}\n{"actions": [1]}\n')
     with pytest.raises(ValueError, match="line 2: plan: a name in every plan, or in none"):
         read_plans(tmp_path / "d.jsonl")
+
+
+@pytest.mark.parametrize(("suffix", "delimiter"), [(".csv", ","), (".csv", ";"), (".tsv", "\t")])
+@pytest.mark.parametrize("header", [False, True])
+def test_a_row_may_be_longer_than_a_cell_can_be(suffix, delimiter, header, tmp_path):
+    """Plans of 70,000 actions: for each other delimiter a line is a single cell, of more than `csv` takes."""
+    actions = torch.arange(140_000).view(2, -1) % 3
+    rows = [[f"action_{t}" for t in range(1, 70_001)]] if header else []
+    rows += [list(map(str, row)) for row in actions.tolist()]
+    (tmp_path / f"plans{suffix}").write_text("\n".join(map(delimiter.join, rows)) + "\n")
+    assert read_plans(tmp_path / f"plans{suffix}").actions.equal(actions)
+
+
+@pytest.mark.parametrize("gap", ["", " ", "NA"])
+def test_a_plan_in_a_row_ends_where_a_label_is_missing(gap, tmp_path):
+    """And goes on as another behind it: what is before and after was not one after the other."""
+    rows = ["plan,group,action_1,action_2,action_3,action_4", f"x,a,0,{gap},1,2", f"y,b,{gap},1,2,", "z,b,2,0,,"]
+    (tmp_path / "plans.csv").write_text("\n".join(rows) + "\n")
+    plans = read_plans(tmp_path / "plans.csv")
+    parts = [row[:length] for row, length in zip(plans.actions.tolist(), plans.lengths.tolist(), strict=True)]
+    assert parts == [[0], [1, 2], [1, 2], [2, 0]]
+    assert plans.plan_names == ("x", "x", "y", "z")
+    assert plans.group.tolist() == [0, 0, 1, 1]
+    assert "2 rows have no label" in plans.notes
+
+
+@pytest.mark.parametrize("name", ["A.CSV", "a.Tsv", "a.JSONL", "a.NPZ"])
+def test_suffixes_may_be_in_capitals(name, tmp_path):
+    some = parted() if name != "a.Tsv" else Plans(parted().actions, 4)
+    write_plans(some, tmp_path / name)
+    assert read_plans(tmp_path / name, num_actions=4).plan_names == some.plan_names
+    write_plans(some, tmp_path / name.lower())
+    assert (tmp_path / name).read_bytes() == (tmp_path / name.lower()).read_bytes()

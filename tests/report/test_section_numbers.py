@@ -23,6 +23,7 @@ from neuroprior.analysis import (
     two_sample_tests,
 )
 from neuroprior.priors import MarkovPrior, UniformPrior
+from neuroprior.report.conditions import condition_section
 from neuroprior.report.fits import ACTIONS, CONTEXT
 from neuroprior.report.scores import Evaluation, evaluate_saved
 from neuroprior.report.sections import (
@@ -85,6 +86,21 @@ def test_what_is_in_the_file(plans, found):
     assert cells(part, 1) == rows
     assert cells(part) == [["12", "105", "4", "20", "3", "5", "2 contexts, once a plan"]]
     assert action_frame(plans)["median_duration"].tolist() == pytest.approx([float(row[4]) for row in rows], rel=5e-3)
+
+
+@pytest.mark.parametrize("section", [file_section, transition_section, condition_section])
+def test_all_plans_are_described_whichever_were_scored_and_sampled(section, plans, found):
+    described = replace(plans, condition=GROUP % 2)
+    parts = []
+    for scored, sampled in ((plans, plans), (plans[:4], plans[5:7])):
+        some = replace(found, plans=described, scored=scored, mask=scored.mask(), sampled=sampled)
+        parts.append(section(some))
+    first, second = parts
+    assert [table.rows for table in first.section.tables] == [table.rows for table in second.section.tables]
+    assert first.section.tables
+    assert first.frames.keys() == second.frames.keys()
+    for name, frame in first.frames.items():
+        pd.testing.assert_frame_equal(frame, second.frames[name])
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,17 @@ def spoilt(spoil):
     return Spoilt
 
 
+def remembering(mean, elites=None):
+    """Keeps another mean, or elites that are made of it."""
+
+    def spoil(decision, world):
+        changed = {"mean": mean} if mean else {"elites": elites}
+        changed = {name: change(decision.memory.mean) for name, change in changed.items()}
+        return decision._replace(memory=decision.memory._replace(**changed))
+
+    return spoilt(spoil)
+
+
 class Careless(ShootingPlanner):
     """Reads the global generator."""
 
@@ -81,6 +92,10 @@ class Eager(ShootingPlanner):
         (spoilt(lambda decision, world: decision._replace(plan=decision.plan + 5)), "bounds"),
         (spoilt(lambda decision, world: decision._replace(plan=decision.plan[:, :, :1])), "shapes"),
         (spoilt(lambda decision, world: decision._replace(model_steps=decision.model_steps + 1)), "model_steps"),
+        (remembering(lambda mean: mean[:1]), "memory: mean of shape [1, "),
+        (remembering(lambda mean: mean[:, 1:]), "memory: mean"),
+        (remembering(lambda mean: mean[..., :1]), "memory: mean"),
+        (remembering(None, lambda mean: mean[:1, None]), "memory: elites of shape [1, "),
         (Careless, "global generator"),
         (Unchecked, "bounds"),
         (Together, "model_steps"),

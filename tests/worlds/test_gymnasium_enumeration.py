@@ -74,6 +74,10 @@ class Slotted:
         self.number = number
 
 
+class SlottedBefore(Slotted):
+    """Has a place for any attribute, and keeps its number in the slot of its base class."""
+
+
 class Private:
     __slots__ = ("__number",)
 
@@ -101,6 +105,7 @@ WAYS_TO_KEEP = {
     "tensor": (torch.tensor, int),
     "object": (Box, lambda kept: kept.number),
     "slots": (Slotted, lambda kept: kept.number),
+    "inherited slots": (SlottedBefore, lambda kept: kept.number),
     "private slots": (Private, lambda kept: kept.number()),
     "deep": (lambda n: {"a": [(Box(n),)]}, lambda kept: kept["a"][0][0].number),
     "set": (lambda n: {n}, min),

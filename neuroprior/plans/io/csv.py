@@ -4,6 +4,7 @@ import csv
 import math
 import re
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import chain, islice
@@ -244,8 +245,8 @@ class _Sheet:
         self.header = [cell.strip() for cell in first]
         self.has_header = given is not None or any(OUR_WORDS.fullmatch(name) for name in names)
         if self.has_header:
-            known = [name for name in names if OUR_COLUMNS.fullmatch(name)]
-            twice = next((name for name in known if known.count(name) > 1), None)
+            known = Counter(name for name in names if OUR_COLUMNS.fullmatch(name))
+            twice = next((name for name, times in known.items() if times > 1), None)
             if twice is not None:
                 raise ValueError(f"{path}, line {self.top}: the column {twice!r} is there twice")
         elif other := next((name for name in names if OTHER_WORDS.fullmatch(name)), None):

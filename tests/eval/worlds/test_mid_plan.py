@@ -7,6 +7,7 @@ from eval.worlds.suite import TASKS, best_score
 from neuroprior import ExhaustivePlanner, SamplingPlanner, UniformPrior, collect
 from neuroprior.testing import check_world
 from neuroprior.worlds import labyrinth, maze
+from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.labyrinth import WATER
 from tests.support.sources import seeded
 
@@ -46,6 +47,18 @@ def test_it_terminates_where_the_inner_world_does():
     state = torch.tensor([[WATER, 0, 0], [5, 0, 0]])
     assert world.terminated(state).tolist() == [True, False]
     assert torch.equal(world.legal_actions(state), world.world.legal_actions(state[:, 0]))
+
+
+def test_it_is_solved_where_the_inner_world_is_and_not_where_that_ends_in_a_pit():
+    table = torch.tensor([[0, 1], [2, 3], [2, 2], [3, 3]])  # 2 is a pit, 3 the goal
+    ended, reward = torch.tensor([False, False, True, True]), torch.zeros(1, 4, 2)
+    reward[0, 1, 1] = 1.0
+    inner = EpisodicWorld(table, reward, ["left", "right"], torch.tensor([1.0, 0, 0, 0]), ended)
+    world = MidPlanWorld(inner, ExhaustivePlanner(2), 1)
+    state = torch.tensor([[cell, left] for cell in range(4) for left in range(2)])
+    assert world.has_goal
+    assert world.terminated(state).tolist() == [False] * 4 + [True] * 4
+    assert world.solved(state).tolist() == [False] * 6 + [True] * 2
 
 
 def test_plans_come_in_the_groups_of_the_inner_world():

@@ -117,6 +117,33 @@ def test_a_plan_has_its_probability_in_the_mixture_of_experts_and_pool():
     assert float(by_hand.sum()) == pytest.approx(1, abs=1e-5)
 
 
+class Sure(Prior):
+    """Knows nothing but action 0: all others have no probability."""
+
+    def start(self, batch_size, context=None):
+        return torch.tensor([0.0, -torch.inf, -torch.inf]).repeat(batch_size, 1), torch.zeros(batch_size, 0)
+
+    def step(self, action, state, context=None):
+        return self.start(len(action))
+
+    def fit(self, plans, *, generator=None, **settings):
+        return self
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("powers", [[0.5, 0.5], [0.0, 1.0]])
+def test_what_an_expert_thinks_impossible_is_unlikely_in_the_pool(powers):
+    """The pool takes its probability for exp(-30), also of an expert whose power is 0."""
+    prior, plans = CombinedPrior(A, [Sure(A), independent([0.2, 0.3, 0.5])]), every_plan(A, 3)
+    prior.powers = torch.tensor(powers)
+    taken = torch.tensor([[0.0, -30.0, -30.0], torch.tensor([0.2, 0.3, 0.5]).log().tolist()])
+    pool = (prior.powers[:, None] * taken).sum(0).log_softmax(-1)
+    own = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.2, 0.3, 0.5]), pool.exp()
+    due = sum(probs[plans].prod(1) for probs in own) / 3
+    assert prior.log_prob(plans).exp().allclose(due, rtol=1e-4, atol=0)
+    assert float(due.sum()) == pytest.approx(1, abs=1e-5)
+
+
 def test_powers_are_found_where_the_source_is_a_pool():
     """Of 20,000 actions; the standard error of a power is below .02, and .1 a false alarm of 1e-6."""
     one, two = [0.6, 0.3, 0.1], [0.1, 0.3, 0.6]

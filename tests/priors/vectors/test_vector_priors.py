@@ -23,6 +23,7 @@ from neuroprior.priors import (
     save,
 )
 from neuroprior.testing import check_prior
+from tests.support.vectors import Drift
 
 LOW, HIGH = [-1.0, -2.0], [1.0, 3.0]
 KINDS = {
@@ -299,3 +300,21 @@ def test_folders_say_what_they_hold(tmp_path):
     (tmp_path / "vectors" / "config.json").write_text(text.replace('"memory": ', '"memory": 1000000000'))
     with pytest.raises(ValueError, match=r"config\.json|does not fit"):
         load(tmp_path / "vectors", kind="vectors")
+
+
+class Echo(Drift):
+    """The vector before the last one comes again: its state is the last one."""
+
+    memory = 2
+
+    def step(self, action, state, context=None):
+        return self._forecast(state)[0], action
+
+
+def test_each_plan_goes_on_from_its_own_past():
+    """In plans sampled for several pasts at once, steps and all: the two last vectors of a past take turns."""
+    past = torch.tensor([[[0.1, 0.2], [0.3, -0.4]], [[-0.5, 0.6], [0.7, 1.5]], [[0.0, -1.0], [-0.9, 2.0]]])
+    plans = Echo(LOW, HIGH, std=1e-4).sample(4, 5, past=past, generator=seeded())
+    due = past[:, [0, 1, 0, 1, 0]][:, None].expand(-1, 4, -1, -1)
+    assert plans.shape == (3, 4, 5, 2)
+    assert torch.allclose(plans, due, atol=1e-2)
