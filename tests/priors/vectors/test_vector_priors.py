@@ -318,3 +318,14 @@ def test_each_plan_goes_on_from_its_own_past():
     due = past[:, [0, 1, 0, 1, 0]][:, None].expand(-1, 4, -1, -1)
     assert plans.shape == (3, 4, 5, 2)
     assert torch.allclose(plans, due, atol=1e-2)
+
+
+def test_shorter_plans_are_learned_from():
+    """White noise has the mean and the variance of all vectors, whatever the lengths of their plans."""
+    actions = torch.tensor([[[0.1], [0.3], [-0.2]], [[0.9], [0.0], [0.0]], [[0.5], [0.5], [0.0]]])
+    plans = VectorPlans(actions, [-1.0], [1.0], lengths=torch.tensor([3, 1, 0]))
+    prior = NoisePrior([-1.0], [1.0]).fit(plans)
+    all_of_them = torch.tensor([0.1, 0.3, -0.2, 0.9])
+    forecast, _ = prior.start(1)
+    assert float(forecast.mean) == pytest.approx(float(all_of_them.mean()))
+    assert float(forecast.std) == pytest.approx(float(all_of_them.std(correction=0)), rel=1e-4)
