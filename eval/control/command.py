@@ -81,7 +81,7 @@ def control_experiment(
         check_prior_name(name)
     if NONE not in priors:
         raise ValueError('priors: "none", the plain planner, is needed to compare with')
-    for task in tasks:
+    for task in (*tasks, *([] if animation is None else [animation])):
         check_there(task)
     numbers = tuple(map(int, sorted(budgets)))
     settings = ControlSettings(

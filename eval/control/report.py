@@ -33,7 +33,7 @@ LINES = {
 """Colours and styles of the lines of figures."""
 
 REFERENCE = 100
-"""Candidates of the plain planner whose return is to be reached with fewer, or the most that are tried."""
+"""Candidates of the plain planner whose return is to be reached with fewer, or the nearest number that is tried."""
 
 RESAMPLES = 1000
 """Of seeds, for the intervals of `savings`."""
@@ -113,7 +113,7 @@ def savings(frame: pd.DataFrame) -> pd.DataFrame:
             continue
         plain_curve, plain_seconds = curves.pop(NONE)
         plain_budgets, plain = plain_curve.columns.to_numpy(float), plain_curve.to_numpy()
-        reference, seeds = min(float(REFERENCE), plain_budgets[-1]), len(plain)
+        reference, seeds = float(np.clip(REFERENCE, plain_budgets[0], plain_budgets[-1])), len(plain)
         draws = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))
         seconds = interpolated(reference, plain_budgets, plain_seconds.to_numpy().mean(0))
         for prior, (returns, times) in curves.items():

@@ -75,7 +75,7 @@ class Table:
     rows: Sequence[Sequence[str]]  # the first cell of each names its row
     caption: str = ""  # what the numbers are, and what their intervals go over
     align: str | None = None  # K letters, "l" or "r" (right, for numbers); None: the first column left, others right
-    title: str = ""  # above it in the terminal; by default that of its section
+    title: str = ""  # above it; by default, in the terminal, that of its section
 
     def __post_init__(self) -> None:
         wide = len(self.headings)

@@ -1,11 +1,13 @@
 """The conformance suite of worlds."""
 
 from functools import partial
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import is_integer
+from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.testing.chi_square import alike
 from neuroprior.testing.rules import FALSE_ALARM, raises, require, same
 from neuroprior.worlds import TabularWorld, World
@@ -21,8 +23,8 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     says so, and its rollouts have the distribution of its steps (chi-square tests, with a false-alarm probability of
     1e-6 together); those of a table use common random numbers for all plans of a start.
 
-    Of a `ContinuousWorld` also: its bounds are finite and in order; `rollout` refuses vectors beyond them, NaN in
-    plans and NaN in states; terminated states stay, and give a reward of 0.
+    Of a `ContinuousWorld` also: its bounds are finite and in order, its names one a dimension; `rollout` refuses
+    vectors beyond the bounds, NaN in plans and NaN in states; terminated states stay, and give a reward of 0.
 
     Args:
         world: the world to check.
@@ -36,7 +38,9 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     generator = torch.Generator().manual_seed(seed)
     state = world.reset(num_states, torch.Generator().manual_seed(seed))
     again = world.reset(num_states, torch.Generator().manual_seed(seed))
+    require(isinstance(state, Tensor), f"reset must return a tensor, not {type(state).__name__}")
     require(len(state) == num_states, f"reset({num_states}) gave {len(state)} states")
+    require(not state.isnan().any(), "reset: NaN in the states")
     require(state.equal(again), "reset: the same seed gave other states")
     if isinstance(world, ContinuousWorld):
         plans, wrong_plans = _vectors(world, state, length, generator)
@@ -44,6 +48,8 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
         plans, wrong_plans = _numbers(world, state, length, generator)
     _check_step(world, state, plans[:, 0, 0], seed)
     _check_queries(world, state)
+    if isinstance(world, ContinuousWorld):
+        _check_ends(world, state, plans, generator)
     by_steps, rewards, random = _step_through(world, state, plans, seed)
     rollout = world.rollout(state, plans, torch.Generator().manual_seed(seed))
     require(
@@ -80,24 +86,16 @@ def _numbers(world: World, state: Tensor, length: int, generator: torch.Generato
 def _vectors(
     world: ContinuousWorld, state: Tensor, length: int, generator: torch.Generator
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Random plans of vectors `[N, 3, L, D]`, and wrong ones; what holds for worlds of vectors only is checked."""
+    """Random plans of vectors `[N, 3, L, D]`, and wrong ones; bounds and names are checked."""
     low, high = world.action_low, world.action_high
-    for name, bound in (("action_low", low), ("action_high", high)):
-        fits = bound.dim() == 1 and len(bound) == world.action_size and bound.dtype == torch.float32
-        require(fits and bool(bound.isfinite().all()), f"{name} must be finite float32 numbers, one a dimension")
-    require(bool((low < high).all()), "action_low must be below action_high in each dimension")
-    plans = low + (high - low) * torch.rand(len(state), 3, length, len(low), generator=generator).to(state.device)
-    if state.is_floating_point():
-        wrong = torch.full_like(state, torch.nan)
-        require(raises(partial(world.rollout, wrong, plans)), "rollout must raise ValueError for states of NaN")
-    ends = world.rollout(state, plans, torch.Generator().manual_seed(0), keep_states=True).states
-    require(ends is not None, "rollout: no states, though keep_states is True")
-    ends = torch.cat([state, ends.flatten(0, 2)]) if ends is not None else state
-    ends = ends[world.terminated(ends)]
-    if len(ends):
-        after, reward = world.step(ends, low.expand(len(ends), -1), generator)
-        require(after.equal(ends), "step: terminated states must stay as they are")
-        require(not reward.any(), "step: the reward from terminated states must be 0")
+    try:
+        world.check_bounds()
+        world.check_state(state)
+        VectorPlans(torch.zeros(0, length, len(low)), low.cpu(), high.cpu(), action_names=world.action_names)
+    except ValueError as error:
+        raise AssertionError(str(error)) from error
+    plans = low + (high - low) * torch.rand(len(state), 3, length, len(low), generator=generator).to(low.device)
+    plans = plans.to(state.device)
     return plans, {
         "plans of integers": plans.long(),
         "vectors above action_high": plans + (high - low),
@@ -107,16 +105,36 @@ def _vectors(
     }
 
 
+def _check_ends(world: ContinuousWorld, state: Tensor, plans: Tensor, generator: torch.Generator) -> None:
+    """States of NaN are refused; terminated states stay, and give nothing."""
+    if state.is_floating_point():
+        wrong = torch.full_like(state, torch.nan)
+        require(raises(partial(world.rollout, wrong, plans)), "rollout must raise ValueError for states of NaN")
+    ends = world.rollout(state, plans, torch.Generator().manual_seed(0), keep_states=True).states
+    require(ends is not None, "rollout: no states, though keep_states is True")
+    ends = torch.cat([state, ends.flatten(0, 2)]) if ends is not None else state
+    ends = ends[world.terminated(ends)]
+    if len(ends):
+        after, reward = world.step(ends, plans[:1, 0, 0].expand(len(ends), -1), generator)
+        require(after.equal(ends), "step: terminated states must stay as they are")
+        require(not reward.any(), "step: the reward from terminated states must be 0")
+
+
 def _check_step(world: World | ContinuousWorld, state: Tensor, action: Tensor, seed: int) -> None:
     """`step`: shapes, dtypes, seeds, and no change to what it was given."""
-    kept = state.clone()
-    after, reward = world.step(state, action, torch.Generator().manual_seed(seed))
-    require(state.equal(kept), "step changed the state that it was given")
+    kept = state.clone(), action.clone()
+    outcome: object = world.step(state, action, torch.Generator().manual_seed(seed))
+    pair = isinstance(outcome, tuple) and [isinstance(part, Tensor) for part in outcome] == [True, True]
+    require(pair, "step must return a tuple of two tensors: the next state and the reward")
+    after, reward = cast(tuple[Tensor, Tensor], outcome)
+    require(state.equal(kept[0]), "step changed the state that it was given")
+    require(action.equal(kept[1]), "step changed the action that it was given")
     require(after.shape == state.shape, f"step: state {list(after.shape)}, not {list(state.shape)}")
     require(after.dtype == state.dtype, f"step: state of {after.dtype}, not {state.dtype}")
     require(reward.shape == action.shape[:1], f"step: reward {list(reward.shape)}, not {list(action.shape[:1])}")
     require(reward.is_floating_point(), f"step: reward of {reward.dtype}, not floating point")
     require(not reward.isnan().any(), "step: NaN in the reward")
+    require(not after.isnan().any(), "step: NaN in the next state")
     again, _ = world.step(state, action, torch.Generator().manual_seed(seed))
     require(after.equal(again), "step: the same seed gave other states")
 
@@ -124,13 +142,19 @@ def _check_step(world: World | ContinuousWorld, state: Tensor, action: Tensor, s
 def _check_queries(world: World | ContinuousWorld, state: Tensor) -> None:
     """`observe`, `terminated` and `legal_actions`."""
     observed = world.observe(state)
+    require(isinstance(observed, Tensor), f"observe must return a tensor, not {type(observed).__name__}")
     fits = (is_integer(observed) and observed.dim() in (1, 2)) or (observed.is_floating_point() and observed.dim() == 2)
     require(
         len(observed) == len(state) and fits,
         "observe must give indices [N] or [N, F] or floating point features [N, C],"
         f" not {observed.dtype} {list(observed.shape)}",
     )
+    require(not observed.isnan().any(), "observe: NaN in the observations")
+    half = len(state) // 2
+    alone = same(world.observe(state[half:]), observed[half:])
+    require(alone, "observe: what is observed in a state depends on its batch")
     ended = world.terminated(state)
+    require(isinstance(ended, Tensor), f"terminated must return a tensor, not {type(ended).__name__}")
     require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
     if isinstance(world, ContinuousWorld):
         require(observed.is_floating_point(), f"observe must give floating point features, not {observed.dtype}")
@@ -157,11 +181,12 @@ def _step_through(
         now, row = state, []
         for t in range(length):
             after, reward = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed))
-            other, _ = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed + 1))
-            random = random or not other.equal(after)
+            other = world.step(now, plans[:, p, t], torch.Generator().manual_seed(seed + 1))
+            random = random or not (other[0].equal(after) and other[1].equal(reward))
             if not random:
-                half, _ = world.step(now[batch // 2 :], plans[batch // 2 :, p, t])
-                require(same(half, after[batch // 2 :]), "step: what happens in a state depends on its batch")
+                half = world.step(now[batch // 2 :], plans[batch // 2 :, p, t])
+                alone = same(half[0], after[batch // 2 :]) and same(half[1], reward[batch // 2 :])
+                require(alone, "step: what happens in a state depends on its batch")
             now = after
             row.append(reward)
         finals.append(now)

@@ -11,6 +11,7 @@ from neuroprior._random import generator_on
 from neuroprior.planners.continuous.vector_planner import Memory, VectorPlanner
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.worlds.continuous import ContinuousWorld
+from neuroprior.worlds.continuous.continuous_world import outcome_of
 
 
 class Control(NamedTuple):
@@ -55,22 +56,25 @@ def control(
             open one.
 
     Raises:
-        ValueError: an argument is out of range, or plans are too short.
+        ValueError: an argument is out of range, plans are too short, or a method of the world returns what it must not.
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
     if replan_every > planner.length:
         raise ValueError(
             f"replan_every: at most the {planner.length} vectors of a plan are expected, not {replan_every}"
         )
+    world.check_bounds()
     world.check_state(state)
     generator, batch, seconds = generator_on(generator, state.device), len(state), 0.0
     actions = torch.zeros(batch, num_steps, world.action_size, device=state.device)
     observed = world.observe(state)
+    if not isinstance(observed, Tensor) or not observed.is_floating_point() or observed.shape[:-1] != (batch,):
+        raise ValueError(f"observe: floating point features [{batch}, C] are expected, not {_kind(observed)}")
     seen = observed.new_zeros(batch, num_steps, *observed.shape[1:])
     rewards = torch.zeros(batch, num_steps, device=state.device)
     states = state[:, None].repeat(1, num_steps + 1, *[1] * (state.dim() - 1))
     model_steps = torch.zeros(batch, dtype=torch.long, device=state.device)
-    going = ~world.terminated(state)
+    going = ~_ended(world, state)
     # Runs that terminated are left out, so that nothing is planned or simulated for them.
     running, now = going.nonzero()[:, 0], state[going]
     lengths, plan = torch.zeros_like(model_steps), actions[:0]
@@ -86,12 +90,12 @@ def control(
             model_steps[running] += decision.model_steps
         assert memory is not None
         action, observation = plan[:, t % replan_every], world.observe(now)
-        now, reward = world.step(now, action, generator)
+        now, reward = outcome_of(now, world.step(now, action, generator))
         actions[running, t], seen[running, t], rewards[running, t] = action, observation, reward.to(rewards.dtype)
         states[running, t + 1] = now
         lengths[running] += 1
         memory = memory.moved_on(action[:, None], observation[:, None], planner.keep)
-        going = ~world.terminated(now)
+        going = ~_ended(world, now)
         if not going.all():
             states[running[~going], t + 1 :] = now[~going][:, None]
             running, now, plan, memory = running[going], now[going], plan[going], memory.rows(going)
@@ -105,3 +109,15 @@ def control(
         world.action_names,
     )
     return Control(plans, rewards, states, model_steps, seconds)
+
+
+def _ended(world: ContinuousWorld, state: Tensor) -> Tensor:
+    """`world.terminated(state)`, checked: integers would be taken for the numbers of runs."""
+    ended = world.terminated(state)
+    if not isinstance(ended, Tensor) or ended.dtype != torch.bool or ended.shape != state.shape[:1]:
+        raise ValueError(f"terminated: bool [{len(state)}] is expected, not {_kind(ended)}")
+    return ended
+
+
+def _kind(value: object) -> str:
+    return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__

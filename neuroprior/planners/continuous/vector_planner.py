@@ -158,14 +158,15 @@ class VectorPlanner(ABC):
             memory: of the decisions before; None: runs begin.
 
         Raises:
-            ValueError: these are no states of the world, the prior has other bounds than the world, the memory is of
-                other runs, or a reward is NaN.
+            ValueError: these are no states of the world, its bounds are none, the prior has other bounds, the memory is
+                of other runs, a step returns something else than a state and rewards, or a reward is NaN.
         """
 
     def begin(
         self, world: ContinuousWorld, state: Tensor, generator: torch.Generator | None, memory: Memory | None
     ) -> tuple[torch.Generator, Memory]:
         """Check the arguments of `plan`; the generator to draw with, and the memory, empty where runs begin."""
+        world.check_bounds()
         world.check_state(state)
         size = world.action_size
         if self.prior is not None:

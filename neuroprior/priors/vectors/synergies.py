@@ -40,7 +40,9 @@ class WindowSynergies(LinearGaussianPrior):
 
     def __init__(self, action_low: Any, action_high: Any, num_components: int | None = None, window: int = 20) -> None:
         super().__init__(action_low, action_high)
-        check_sizes(window=window - 1 if isinstance(window, int) else window)
+        check_sizes(window=window)
+        if window < 2:
+            raise ValueError(f"window: an integer of at least 2 is expected, not {window}")
         if num_components is not None:
             check_sizes(num_components=num_components)
         self.num_components, self.window = num_components, window

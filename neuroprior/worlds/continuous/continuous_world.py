@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from neuroprior.plans.vector_plans import check_widths
 from neuroprior.worlds.world import Rollout, join_states
 
 
@@ -67,7 +68,7 @@ class ContinuousWorld(ABC):
             Final states `[B, P, ...]`, rewards `[B, P, L]`, and states `[B, P, L, ...]` or None.
 
         Raises:
-            ValueError: a shape, dtype or value is wrong; the message says which.
+            ValueError: a shape, dtype or value is wrong, or what `step` returns; the message says which.
         """
         self.check_state(state)
         self.check_plans(plans, len(state))
@@ -75,7 +76,7 @@ class ContinuousWorld(ABC):
         now = state.repeat_interleave(num_plans, 0)
         rewards, states = [torch.zeros(batch, num_plans, 0, device=state.device)], []
         for t in range(length):
-            now, reward = self.step(now, plans[:, :, t].flatten(0, 1), generator)
+            now, reward = outcome_of(now, self.step(now, plans[:, :, t].flatten(0, 1), generator))
             rewards.append(reward.view(batch, num_plans, 1))
             if keep_states:
                 states.append(now)
@@ -84,12 +85,27 @@ class ContinuousWorld(ABC):
         return Rollout(now.view(shape), torch.cat(rewards, -1), kept)
 
     def observe(self, state: Tensor) -> Tensor:
-        """The observation in `state [N, ...]`: floating point features `[N, C]`. Default: the state itself."""
-        return state.flatten(1).float()
+        """The observation in `state [N, ...]`: floating point features `[N, C]`. Default: the state, flattened."""
+        return state[:, None].flatten(1).float()
 
     def terminated(self, state: Tensor) -> Tensor:
         """Which of `state [N, ...]` are final: `[N]` bool. Default: none."""
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
+
+    def check_bounds(self) -> None:
+        """Raise ValueError unless the bounds are tensors `[D]` of finite float32 numbers, the lower below the upper."""
+        for name in ("action_low", "action_high"):
+            bound = getattr(self, name)
+            known = isinstance(bound, Tensor) and bound.dtype == torch.float32 and bound.dim() == 1 and len(bound)
+            if not known or not bound.isfinite().all():
+                raise ValueError(f"{name}: a tensor [D] of finite float32 numbers is expected, not {bound!r}")
+        low, high = self.action_low, self.action_high
+        if low.shape != high.shape or not (low < high).all():
+            raise ValueError(
+                f"action_low, action_high: each number below its fellow is expected, not {low.tolist()} and"
+                f" {high.tolist()}"
+            )
+        check_widths(low, high)
 
     def check_state(self, state: Tensor) -> None:
         """Raise ValueError where `state` cannot be a batch of this world's states, or is not finite."""
@@ -112,6 +128,28 @@ class ContinuousWorld(ABC):
             given = list(plans.shape) if isinstance(plans, Tensor) else type(plans).__name__
             raise ValueError(f"plans: shape [B, P, L, D] with B = {batch_size} starts is expected, not {given}")
         check_vectors("plans", plans, self.action_low, self.action_high)
+
+
+def outcome_of(state: Tensor, outcome: object) -> tuple[Tensor, Tensor]:
+    """`outcome` of a step from `state [N, ...]`: the next state and the reward.
+
+    Raises:
+        ValueError: it is not a state of the same shape and dtype, and a floating point reward `[N]`.
+    """
+    if not isinstance(outcome, tuple) or [isinstance(part, Tensor) for part in outcome] != [True, True]:
+        kinds = [type(part).__name__ for part in outcome] if isinstance(outcome, tuple) else type(outcome).__name__
+        raise ValueError(f"step: a tuple of two tensors, the next state and the reward, is expected, not {kinds}")
+    after, reward = outcome
+    if after.shape != state.shape or after.dtype != state.dtype:
+        raise ValueError(
+            f"step: a next state of {state.dtype} {list(state.shape)}, as the state, is expected, not {after.dtype}"
+            f" {list(after.shape)}"
+        )
+    if reward.shape != state.shape[:1] or not reward.is_floating_point():
+        raise ValueError(
+            f"step: a floating point reward [{len(state)}] is expected, not {reward.dtype} {list(reward.shape)}"
+        )
+    return after, reward
 
 
 def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None:

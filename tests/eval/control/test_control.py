@@ -114,6 +114,21 @@ def test_savings_and_differences_of_made_up_returns():
     assert gaps.loc[("bad", 100), "high"] == -2
 
 
+def test_the_reference_is_a_number_of_candidates_that_was_tried():
+    """With 200 and more in all runs, nothing is known of 100."""
+    more = made_up().assign(budget=lambda rows: rows["budget"] * 8)
+    saved = savings(more).set_index("prior")
+    assert saved["reference"].tolist() == [200, 200]
+    assert saved.loc["good", "needed"] == 200  # reaches there, with the fewest that were tried, more than the plain one
+
+
+def test_a_moving_picture_without_its_simulator_is_refused_before_anything_is_done(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("eval.control.tasks.find_spec", lambda name: None)
+    assert main([*SMALL, "--animation", "hopper", "--out", str(tmp_path / "out")]) == 2
+    assert 'hopper needs mujoco: pip install "neuroprior[mujoco]"' in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_settings_are_chosen_by_their_mean_over_validation_seeds():
     settings = ControlSettings(("shooting",), ("none", "stored"), (8,), (), 10, 1, 8, 8, 0)
     first, second = [0.0] * len(NOISES), [0.0] * len(NOISES)

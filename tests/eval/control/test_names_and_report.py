@@ -27,6 +27,9 @@ def test_the_plain_planner_alone_has_a_report(tmp_path, seeds, capsys):
     assert {(row["prior"], row["condition"]) for row in rows} == {
         ("none", condition) for condition in ("same", "masses", "goal")
     }
+    page = (tmp_path / "report.html").read_text()
+    for condition in ("same", "masses", "goal"):  # tables of one task can be told apart
+        assert f"<strong>double_integrator, {condition}, icem: return by candidates a decision.</strong>" in page
 
 
 @pytest.mark.parametrize("name", ["synergies-0", "synergies-\u00b2", "synergies-", "gru-4", "-4", "", "Stored"])

@@ -265,7 +265,7 @@ def test_constant_plans_and_a_single_vector_can_be_learned():
         (lambda: AutoregressivePrior([-1.0], [1.0], -1), "order"),
         (lambda: AutoregressivePrior([-1.0], [1.0], 1.5), "order"),
         (lambda: WindowSynergies([-1.0], [1.0], 0), "num_components"),
-        (lambda: WindowSynergies([-1.0], [1.0], window=1), "window"),
+        (lambda: WindowSynergies([-1.0], [1.0], window=1), "window: .*at least 2 is expected, not 1"),
         (lambda: StepSynergies([-1.0], [1.0], 2), "at most 1"),
         (lambda: StoredWindows([-1.0], [1.0], horizon=0), "horizon"),
         (lambda: StoredWindows([-1.0], [1.0], bandwidth=0.0), "bandwidth"),
