@@ -7,6 +7,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_memory, is_integer
 from neuroprior._random import generator_on
+from neuroprior._threads import share
 from neuroprior.plans import is_per_step
 from neuroprior.plans.plans import action_dtype
 from neuroprior.sampling.draws import Draw, check_temperature, levels_worth_splitting, shuffled_rows, worth_splitting
@@ -14,7 +15,7 @@ from neuroprior.sampling.rows import rows_of
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import Rollout, World, join_states
 
-CACHED, FEWEST = 2**19, 1024
+CACHED, FEWEST = 2**17, 1024
 """On a CPU, as many plans are stepped together as have so many numbers in their states, or logits; at least so many."""
 
 
@@ -221,11 +222,15 @@ def _sample_one_by_one(
     """The actions `[N, len(steps)]` of N plans at these `steps`; plan i continues row `row[i]` of logits and state."""
     actions = torch.empty(len(row), len(steps), dtype=draw.dtype, device=row.device)
     uniform = draw.uniform((len(steps), len(row)), logits)
-    together = len(row)
+    parts = 1
     if row.device.type == "cpu":  # states that fit a cache are read several times as fast
         together = max(CACHED // max(state[0].numel(), logits.shape[1], 1), FEWEST)
-    for at in range(0, len(row), together):
-        part = slice(at, at + together)
+        parts = -(-len(row) // together)
+        if stepper.shares and len(row) >= 2 * FEWEST:
+            parts = -(-parts // torch.get_num_threads()) * torch.get_num_threads()
+
+    def draw_part(number: int) -> None:
+        part = slice(len(row) * number // parts, len(row) * (number + 1) // parts)
         now, hidden = _taken(row[part], logits, state)
         for k, t in enumerate(steps):
             action = draw.actions(now, uniform[k, part])
@@ -233,4 +238,10 @@ def _sample_one_by_one(
             if k + 1 < len(steps):
                 given = None if context is None else context[row[part], t + 1]
                 now, hidden = stepper.step(action, hidden, given, len(steps) - k - 2)
+
+    if stepper.shares:
+        share(draw_part, range(parts))
+    else:
+        for number in range(parts):
+            draw_part(number)
     return actions

@@ -24,6 +24,7 @@ class Steppable(Protocol):
     - `end`: the action that ends a plan.
     - `advance(action, state, context, room)`: as `step`, but may overwrite the state; `room` more steps will follow.
     - `device`: where the prior computes; a prior that takes a context computes on the CPU without it.
+    - `shares_steps`: true where steps of different plans may be taken on several threads at once.
 
     Attributes:
         num_actions: A.
@@ -50,6 +51,7 @@ class Stepper:
         num_actions: A.
         context_per: "plan" or "step"; None for a prior without context.
         end: the end symbol; None for a prior without one.
+        shares: whether several threads may step at once.
     """
 
     def __init__(self, prior: Steppable, in_place: bool = True) -> None:
@@ -57,6 +59,7 @@ class Stepper:
         self.num_actions = prior.num_actions
         self.context_per: Literal["plan", "step"] | None = getattr(prior, "context_per", None)
         self.end: int | None = getattr(prior, "end", None)
+        self.shares: bool = getattr(prior, "shares_steps", False)
         self._advance = getattr(prior, "advance", None) if in_place else None
 
     @property

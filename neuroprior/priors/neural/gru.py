@@ -1,5 +1,6 @@
 """The GRU prior: a recurrent network over the actions so far."""
 
+import sys
 from typing import Any
 
 import torch
@@ -7,7 +8,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuroprior._checks import check_memory, check_sizes
+from neuroprior._compiled import compiled
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
+
+COMPILE_FROM: int | None = 4096
+"""Numbers in the hidden states from which a compiled loop is worth its call, where numba is installed; None: never."""
 
 
 class GRUPrior(NeuralPrior):
@@ -112,16 +117,29 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
     Returns:
         The output `[N, width]`, and the new `layers`.
     """
-    size, after = gru.hidden_size, []
+    after = []
     for layer, before in enumerate(layers):
         w_in, w_hidden, b_in, b_hidden = gru.all_weights[layer]
-        bias = torch.cat([b_in[: 2 * size] + b_hidden[: 2 * size], b_in[2 * size :]])
-        gates = functional.linear(below, w_in, bias)
-        if layer == 0 and rows is not None:
-            gates = gates.index_select(0, rows)
-        share, new = gates[:, : 2 * size], gates[:, 2 * size :]
-        share.addmm_(before, w_hidden[: 2 * size].T).sigmoid_()
-        new.addcmul_(share[:, :size], functional.linear(before, w_hidden[2 * size :], b_hidden[2 * size :])).tanh_()
-        below = torch.lerp(new, before, share[:, size:])
+        if layer > 0 or rows is None:
+            rows = torch.arange(len(before), dtype=torch.int32)
+        given, hidden = functional.linear(below, w_in, b_in), functional.linear(before, w_hidden, b_hidden)
+        able = COMPILE_FROM is not None and before.numel() >= COMPILE_FROM and before.dtype == torch.float32
+        fast = compiled("neuroprior.priors.neural.compiled_gru") if able and before.stride(1) == 1 else None
+        below = (fast or sys.modules[__name__]).gates(given, rows, hidden, before)
         after.append(below)
     return below, after[0][None] if len(after) == 1 else torch.stack(after)
+
+
+def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor:
+    """The new hidden states `[N, width]` of one layer (Cho et al. 2014).
+
+    Args:
+        given: `[M, 3 * width]`: what distinct inputs add to the reset gate, the update gate and the new state.
+        rows: integers `[N]`: which of the inputs each row reads.
+        hidden: `[N, 3 * width]`: what the hidden states add, of which the reset gate lets a share into the new state.
+        before: `[N, width]`: the hidden states.
+    """
+    size, given = before.shape[1], given.index_select(0, rows)
+    share = hidden[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_()
+    new = given[:, 2 * size :].addcmul_(share[:, :size], hidden[:, 2 * size :]).tanh_()
+    return torch.lerp(new, before, share[:, size:])

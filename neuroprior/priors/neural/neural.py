@@ -94,6 +94,7 @@ class NeuralPrior(Prior):
     """
 
     actions_at_once = 2**18
+    shares_steps = True
 
     def __init__(
         self,

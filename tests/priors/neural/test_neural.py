@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, Plans, TransformerPrior, load, save
+from neuroprior._compiled import compiled
+from neuroprior.priors.neural import gru
 from tests.support.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
 
 BOTH = pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
@@ -170,8 +172,10 @@ def test_refuses_settings(name):
 @pytest.mark.parametrize("lags", [1, 3])
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("takes", [{}, {"num_contexts": 3}, {"context_size": 2}])
-def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes, monkeypatch):
-    """Without gradients a step has a path of its own; with them it is `nn.GRU`'s."""
+@pytest.mark.parametrize("compile_from", [None, 0])
+def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes, compile_from, monkeypatch):
+    """Without gradients a step has a path of its own, compiled or not; with them it is `nn.GRU`'s."""
+    monkeypatch.setattr(gru, "COMPILE_FROM", compile_from)
     prior = GRUPrior(4, hidden_size=8, num_layers=num_layers, lags=lags, dropout=0.3, seed=1, **takes)
     action = torch.randint(4, (6, batch), generator=seeded(0))
     context = {"num_contexts": torch.arange(batch) % 3, "context_size": torch.rand(batch, 2, generator=seeded(1))}
@@ -198,6 +202,18 @@ def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes
     for one, other, third in zip(fast, plain, rough, strict=True):
         torch.testing.assert_close(one, other.detach(), atol=1e-6, rtol=1e-5)
         torch.testing.assert_close(third.float(), one, atol=0.05, rtol=0.05)
+
+
+def test_compiled_gates_are_those_of_torch():
+    """Over the whole range of activations, of states that have other numbers beside them."""
+    module = compiled("neuroprior.priors.neural.compiled_gru")
+    if module is None:
+        pytest.skip("numba is not installed")
+    given, rows = torch.randn(3, 3 * 16, generator=seeded(0)) * 5, torch.tensor([2, 0, 1, 1, 2], dtype=torch.int32)
+    hidden, state = torch.randn(5, 3 * 16, generator=seeded(1)) * 20, torch.rand(5, 17, generator=seeded(2)) * 2 - 1
+    fast = module.gates(given, rows, hidden, state[:, :16])
+    assert torch.allclose(fast, gru.gates(given, rows, hidden, state[:, :16]), atol=1e-6)
+    assert module.gates(given, rows[:0], hidden[:0], state[:0, :16]).shape == (0, 16)
 
 
 @pytest.mark.parametrize("lags", [1, 3])

@@ -1,0 +1,44 @@
+"""Work that is shared among threads."""
+
+import pytest
+import torch
+
+from neuroprior import GRUPrior
+from neuroprior._threads import share
+from neuroprior.sampling import ancestral
+from tests.support.sources import seeded
+
+
+@pytest.fixture(params=[1, 3])
+def threads(request):
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+@torch.no_grad()
+def test_each_part_is_done_once_on_one_thread_of_torch(threads):
+    seen = []
+    share(lambda part: seen.append((part, torch.get_num_threads(), torch.is_grad_enabled())), range(7))
+    assert sorted(seen) == [(part, 1, False) for part in range(7)]
+    assert torch.get_num_threads() == threads
+    share(seen.append, [])
+    assert len(seen) == 7
+
+
+def test_an_error_in_a_part_is_raised(threads):
+    with pytest.raises(ZeroDivisionError):
+        share(lambda part: 1 / part, [1, 0, 2])
+    assert torch.get_num_threads() == threads
+
+
+def test_plans_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
+    monkeypatch.setattr(ancestral, "CACHED", 1)
+    prior, parts = GRUPrior(3, 8, num_contexts=2), []
+    context = torch.randint(2, (50, 6), generator=seeded(1))
+    whole = prior.sample(50, 6, context, generator=seeded(0))
+    monkeypatch.setattr(ancestral, "FEWEST", 8)
+    monkeypatch.setattr(ancestral, "share", lambda work, given: parts.append(len(given)) or share(work, given))
+    assert torch.equal(prior.sample(50, 6, context, generator=seeded(0)), whole)
+    assert parts == [{1: 7, 3: 9}[threads]]
