@@ -6,11 +6,13 @@ after shorter histories are sums of these.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from threading import Lock
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from neuroprior._threads import share
 from neuroprior.plans import Plans, is_per_step
 
 ACTIONS_AT_ONCE = 2**18
@@ -163,13 +165,18 @@ def _ngrams(actions: Tensor, length: int, num_actions: int, size: int, device: t
     `size` plans are read at a time.
     """
     times = torch.zeros(num_actions**length, dtype=torch.long, device=device)
-    last = actions.shape[1] - length + 1
-    for part in actions.split(size):
+    last, alone = actions.shape[1] - length + 1, Lock()
+
+    def count(part: Tensor) -> None:
         part = part.to(device)
         code = part[:, :last].to(torch.int32, copy=True)
         for place in range(1, length):
             code = code.mul_(num_actions).add_(part[:, place : place + last])
-        times += code.flatten().bincount(minlength=len(times))
+        found = code.flatten().bincount(minlength=len(times))
+        with alone:
+            times.add_(found)
+
+    share(count, actions.split(size))
     codes = times.nonzero()[:, 0]
     base = num_actions ** torch.arange(length - 1, -1, -1, device=device)
     return codes[:, None] // base % num_actions, times[codes]
