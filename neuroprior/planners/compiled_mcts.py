@@ -428,11 +428,12 @@ def search_all(
     batch, actions, length = len(state), world.num_actions, planner.length
     steps = planner.num_plans * length
     policy = policy_of(planner.prior, world, planner.temperature)
-    if any(np.isnan(part).any() for part in policy if isinstance(part, np.ndarray)):
+    if any(np.isnan(part).any() for part in policy[4:13]):
         raise ValueError("prior: its logits are NaN")
     logits, hidden = Stepper(planner.prior).start_in(world, state)
-    size, shape = len(policy.recurrent), (batch, steps + 1, actions)
-    # What is not written to takes no memory.
+    size, most = len(policy.recurrent), batch * length * (1 + actions)
+    room, number = max(min(DRAWS // most, 2 * planner.num_plans), 1), 0
+    shape = (batch, min(room, steps) + 1, actions)
     nodes = Nodes(
         np.empty(shape, np.int64), np.empty(shape, np.int32), np.empty(shape), np.empty(shape, np.bool_),
         np.empty(shape), np.full(batch, np.inf), np.full(batch, -np.inf),
@@ -454,9 +455,10 @@ def search_all(
     discounts = np.empty(0)
     if planner.objective == "return":
         discounts = (planner.discount ** torch.arange(length, dtype=torch.float64)).numpy()
-    found, most = list[tuple[Tensor, ...]](), batch * length * (1 + actions)
-    room, number = max(min(DRAWS // most, planner.num_plans), 1), 0
+    found = list[tuple[Tensor, ...]]()
     while not found or number == room:
+        if known.size.max() + room > nodes.child.shape[1]:  # each simulation adds a node
+            nodes, known = (type(part)(*map(_widened, part)) for part in (nodes, known))
         kinds = action_dtype(actions), torch.float64, torch.int64
         out = *(torch.empty(room, batch, length, dtype=kind) for kind in kinds), torch.empty(room, batch) > 0
         before = generator.get_state()
@@ -471,6 +473,11 @@ def search_all(
     plans, rewards, states, done = (torch.cat(parts).transpose(0, 1) for parts in zip(*found, strict=True))
     taken = int(steps - known.left.min())
     return plans, rewards.to(world.reward.dtype), states if planner.any_prefix else states[:, :, -1:], done, taken
+
+
+def _widened(values: Array) -> Array:
+    """Numbers of nodes, `[B, M, ...]`, with room for twice as many; those of starts, `[B]`, are left alone."""
+    return values if values.ndim == 1 else np.concatenate([values, np.empty_like(values)], 1)
 
 
 def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:

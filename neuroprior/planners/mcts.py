@@ -25,9 +25,9 @@ class MCTSPlanner(PriorPlanner):
     (Silver et al. 2017, Methods; Schrittwieser et al. 2020, Appendix B). The first untried action adds a node, and the
     prior draws the rest of the plan. The decision is the best of all simulated plans.
 
-    Nodes keep their states, those of the prior and its probabilities, so that a simulation steps the world and the prior
-    only from its new node on; actions after which everything has been tried are closed. With a large enough budget it
-    finds the optimum.
+    Nodes keep their states, those of the prior and its probabilities, so that a simulation steps the world and the
+    prior only from its new node on; actions after which everything has been tried are closed. With a large enough
+    budget it finds the optimum.
 
     Args:
         prior: the policy.
@@ -67,8 +67,9 @@ class MCTSPlanner(PriorPlanner):
         generator = self._check(world, state, generator)
         able = self.compile and state.device.type == "cpu"
         module = compiled("neuroprior.planners.compiled_mcts") if able else None
-        # Each node has numbers for each action.
-        numbers = max(world.num_actions, self._state_size(world, state) // PER_ACTION)
+        numbers = world.num_actions  # that each node has
+        if module is None or not module.can_search(self, world, state):
+            numbers = max(numbers, self._state_size(world, state) // PER_ACTION)
         chunks = self.chunks(state, self.num_plans * self.length * numbers)
         return join_decisions((self._plan(module, world, some, generator) for some in chunks), len(state))
 
