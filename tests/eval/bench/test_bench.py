@@ -19,9 +19,10 @@ from eval.bench.jobs import (
     on_device,
     our_table_1,
     quickest,
+    simulations,
     source,
 )
-from neuroprior import GRUPrior, MarkovPrior, TabularWorld, UniformPrior, gridworld
+from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
 from neuroprior.plans import all_plans
 from tests.support.sources import FALSE_ALARM, p_value, seeded
 
@@ -161,13 +162,11 @@ def test_mctx_is_given_the_same_policy(prior):
     assert np.allclose(np.stack([np.asarray(x) for x in found], 1), want, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["trees_uniform_1", "trees_markov_64", "trees_gru_64"])
-def test_trees_are_as_large(name):
-    """As many plans as mctx has simulations, each of at most 8 steps and on average of more than one."""
+def test_a_simulation_adds_a_node_and_follows_the_plan_to_its_end():
+    """A single action: 3 + 2 + 1 steps, and then all has been tried."""
     pytest.importorskip("numba")
-    planner = JOBS[name](0.1).make(torch.device("cpu"))
-    decision = planner()
-    assert decision.model_steps <= 6 * 8
+    world = TabularWorld(torch.tensor([[1], [0]]), torch.tensor([0.0, 1.0]))
+    assert simulations(MCTSPlanner(UniformPrior(1), 3, 9), world, torch.zeros(2, dtype=torch.long)) == 3
 
 
 @pytest.mark.slow
