@@ -359,12 +359,14 @@ JOBS: dict[str, Callable[[float], Job]] = {
         *(sample_short, sample_long, sample_gru, sample_markov, fit_markov, fit_tree),
         *(evaluate, table_1, train, shoot, decide),
     )
-} | {
+}
+"""By name; each makes its job at a scale: 1 is the size of the goals."""
+
+JOBS |= {
     f"trees_{policy.split('-')[0].lower()}_{starts}": partial(trees, policy, starts)
     for policy in ("uniform", "Markov-2", "GRU-64")
     for starts in (1, 64, 1024)
 }
-"""By name; each makes its job at a scale: 1 is the size of the goals."""
 
 ON_DEVICES = ("sample_short", "sample_long", "sample_gru", "sample_markov", "evaluate", "decide")
 """Jobs that can be done on other devices than the CPU."""

@@ -422,7 +422,7 @@ def search(
 
 
 def search_all(
-    planner: PriorPlanner, world: TabularWorld, state: Tensor, generator: torch.Generator
+    planner: Any, world: TabularWorld, state: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
     """What `neuroprior.planners.mcts` looks for; see `_Trees.search` there."""
     batch, actions, length = len(state), world.num_actions, planner.length
@@ -458,7 +458,7 @@ def search_all(
     found = list[tuple[Tensor, ...]]()
     while not found or number == room:
         if known.size.max() + room > nodes.child.shape[1]:  # each simulation adds a node
-            nodes, known = (type(part)(*map(_widened, part)) for part in (nodes, known))
+            nodes, known = Nodes(*map(_widened, nodes)), Known(*map(_widened, known))
         kinds = action_dtype(actions), torch.float64, torch.int64
         out = *(torch.empty(room, batch, length, dtype=kind) for kind in kinds), torch.empty(room, batch) > 0
         before = generator.get_state()
@@ -502,7 +502,7 @@ def _knows(prior: Steppable, length: int) -> bool:
     if isinstance(prior, HistoryPrior):
         own = type(prior)
         same = own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
-        return same and prior.advance.__func__ is Prior.advance and prior.log_probs.dtype == torch.float32
+        return same and own.advance is Prior.advance and prior.log_probs.dtype == torch.float32
     if type(prior) is not GRUPrior or prior.num_layers > 1 or prior.training:
         return False
     return (prior.window is None or length <= prior.window + 1) and prior.head.weight.dtype == torch.float32
@@ -531,9 +531,10 @@ def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
     weights = ((logits - logits.amax(1, keepdim=True)) / temperature).exp().T.cumsum(0).T
     probs = (logits.double() / temperature).softmax(1)
     kinds = (torch.int64, torch.int64, torch.float32, torch.float64)
-    tables = [x.to(kind).contiguous().numpy() for x, kind in zip((after, row, weights, probs), kinds, strict=True)]
-    network = [x.detach().float().contiguous().numpy() for x in gates]
-    return Policy(context.numpy(), each_step, *tables, *network, float(temperature))
+    tables: Any = [x.to(kind).contiguous().numpy() for x, kind in zip((after, row, weights, probs), kinds, strict=True)]
+    network: Any = [x.detach().float().contiguous().numpy() for x in gates]
+    parts: Any = (context.numpy(), each_step, *tables, *network, float(temperature))
+    return Policy(*parts)
 
 
 def _network(prior: GRUPrior, observed: Tensor) -> tuple[Tensor, ...]:

@@ -122,7 +122,7 @@ class _Trees:
         self.stepper = Stepper(planner.prior, in_place=False)
         self.logits, hidden = self.stepper.start_in(world, state)
         # The loop draws as many numbers as are needed at most: of one type, so that it can give back what is left.
-        self.module = module if self.logits.dtype == torch.float32 else None
+        self.module: Any = module if self.logits.dtype == torch.float32 else None
         self.child = torch.zeros(batch, 1, actions, dtype=torch.long, device=state.device)
         self.visits, self.closed = self.child.int(), self.child.bool()
         self.total, self.probs = self.child.double(), self.child.double()
@@ -144,7 +144,7 @@ class _Trees:
             is a plan, `[B, N]`; and the simulator steps of the start that took most. Unless any prefix may win, there
             are only the states at the end: `[B, N, 1, ...]`.
         """
-        found = []
+        found = list[tuple[Tensor, ...]]()
         while len(rows := self.unfinished()) or not found:
             found.append(self.simulate(rows))
         plans, rewards, states, done = (torch.stack(parts, 1) for parts in zip(*found, strict=True))
