@@ -20,9 +20,11 @@ from neuroprior import (
     ExhaustivePlanner,
     GRUPrior,
     MarkovPrior,
+    MCTSPlanner,
     Planner,
     Prior,
     SamplingPlanner,
+    TabularWorld,
     TransformerPrior,
     UniformPrior,
     from_gymnasium,
@@ -308,25 +310,47 @@ def shoot(scale: float) -> Job:
 
 
 def decide(scale: float) -> Job:
-    """One decision from many starts, against trees with as many model steps, of which an eighth are timed."""
-    starts, steps, simulations = scaled(4096, scale), 256 * 8, 256
+    """One decision from many starts."""
+    starts = scaled(4096, scale)
     world = gridworld(20, 20, "torus", num_worlds=10)
     state = world.reset(starts, torch.Generator().manual_seed(0))
-    search = partial(peers.mctx_search, world.next_state, world.reward, state, simulations, 8)
 
     def make(device: torch.device) -> Run:
         prior = MarkovPrior(4, 2).fit(chain_plans(10_000, 16)).to(device)
         return partial(SamplingPlanner(prior, 8, 256, objective="return").plan, world.to(device), state.to(device))
 
-    kinds = {"MuZero": False, "Gumbel MuZero": True}
-    return Job(
-        f"one decision with 256 candidates of 8 steps from {starts:,} starts",
-        make,
-        tuple(
-            Peer(f"mctx, {name}", partial(search, gumbel), 3, simulations / steps, "mctx")
-            for name, gumbel in kinds.items()
-        ),
-    )
+    return Job(f"one decision with 256 candidates of 8 steps from {starts:,} starts", make, ())
+
+
+def trees(policy: str, starts: int, scale: float) -> Job:
+    """Tree search with the same policy and as many simulations, each of which is followed to the end of its plan."""
+    world = gridworld(20, 20, "torus", num_worlds=10)
+    state = world.reset(starts, torch.Generator().manual_seed(0))
+    prior: Prior = UniformPrior(4)
+    if policy == "Markov-2":
+        prior = source()
+    elif policy == "GRU-64":
+        prior = GRUPrior(4, 64, lags=1)
+    planner = MCTSPlanner(prior, 8, scaled(64, scale), objective="return")
+
+    def decision() -> Any:
+        return planner.plan(world, state, torch.Generator().manual_seed(0))
+
+    def mctx() -> Run:
+        return peers.mctx_search(world, state, prior, simulations(planner, world, state), planner.length)
+
+    peer = Peer("mctx", mctx, 1.5 if policy == "GRU-64" else 3, needs="mctx")
+    about = f"tree search of 64 x 8 steps, {policy}, from {starts:,} start" + "s" * (starts > 1)
+    return Job(about, lambda device: decision, (peer,), "numba")
+
+
+@torch.no_grad()
+def simulations(planner: MCTSPlanner, world: TabularWorld, state: Tensor) -> int:
+    """How many plans the planner simulates from each start, on average."""
+    from neuroprior.planners.compiled_mcts import search_all  # needs numba
+
+    done = search_all(planner, world, state, torch.Generator().manual_seed(0))[3]
+    return round(float(done.sum(1).double().mean()))
 
 
 JOBS: dict[str, Callable[[float], Job]] = {
@@ -337,6 +361,12 @@ JOBS: dict[str, Callable[[float], Job]] = {
     )
 }
 """By name; each makes its job at a scale: 1 is the size of the goals."""
+
+JOBS |= {
+    f"trees_{policy.split('-')[0].lower()}_{starts}": partial(trees, policy, starts)
+    for policy in ("uniform", "Markov-2", "GRU-64")
+    for starts in (1, 64, 1024)
+}
 
 ON_DEVICES = ("sample_short", "sample_long", "sample_gru", "sample_markov", "evaluate", "decide")
 """Jobs that can be done on other devices than the CPU."""

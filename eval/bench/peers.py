@@ -4,6 +4,7 @@ First plain numpy and PyTorch; then other packages, each imported only where it 
 job and return what is timed.
 """
 
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
 from eval.bench.timing import Run
+from neuroprior import GRUPrior, MarkovPrior, Prior, TabularWorld
 
 Array = NDArray[Any]
 
@@ -293,29 +295,87 @@ def vector_env(name: str, plans: Tensor) -> Run:
     return run
 
 
-def mctx_search(next_state: Tensor, reward: Tensor, state: Tensor, simulations: int, depth: int, gumbel: bool) -> Run:
-    """mctx searches from `state [B]`, a model step a simulation, with a uniform policy and no values."""
+def jax_policy(prior: Prior) -> tuple[Callable[[int], Any], Callable[[Any, Any], Any]]:
+    """A prior without context in jax: uniform, a Markov chain, or a GRU of one layer that is shown one action (`lags`).
+
+    Returns:
+        Functions that give logits `[N, A]` and a memory `[N, ...]`: of N plans before the first action, and after
+        actions `[N]` and the memory before them.
+    """
+    from jax import nn, numpy
+
+    def array(values: Tensor) -> Any:
+        return numpy.asarray(values.detach().numpy())
+
+    if isinstance(prior, MarkovPrior):
+        after, logits, first = array(prior.next_node), array(prior.log_probs), int(prior.start_node)
+        return (
+            lambda number: (logits[numpy.full(number, first)], numpy.full(number, first)),
+            lambda action, node: (logits[after[node, action]], after[node, action]),
+        )
+    if not isinstance(prior, GRUPrior):
+        zeros = numpy.zeros((1, prior.num_actions))
+        return (
+            lambda number: (zeros.repeat(number, 0), numpy.zeros(number)),
+            lambda action, nothing: (zeros.repeat(len(action), 0), nothing),
+        )
+    vectors, head, head_bias = map(array, (prior.embedding.action.weight, prior.head.weight.T, prior.head.bias))
+    w_in, w_hidden, b_in, b_hidden = map(array, prior.gru.all_weights[0])
+
+    def step(action: Any, hidden: Any) -> Any:
+        given, own = vectors[action] @ w_in.T + b_in, hidden @ w_hidden.T + b_hidden
+        (r, z, n), (own_r, own_z, own_n) = (numpy.split(gates, 3, -1) for gates in (given, own))
+        new, share = numpy.tanh(n + nn.sigmoid(r + own_r) * own_n), nn.sigmoid(z + own_z)
+        hidden = new + share * (hidden - new)
+        return hidden @ head + head_bias, hidden
+
+    size, start = prior.hidden_size, prior.num_actions
+    return lambda number: step(numpy.full(number, start), numpy.zeros((number, size))), step
+
+
+def mctx_search(world: TabularWorld, state: Tensor, prior: Prior, simulations: int, length: int) -> Run:
+    """mctx searches from `state [B]` for plans of `length` actions, with a prior's policy.
+
+    As in `MCTSPlanner`, the value of a new node is the sum of the rewards of the rest of the plan, drawn from the
+    prior, and there is no noise at the root. Gives the first actions.
+    """
     import jax
     import mctx
+    from jax import numpy
 
-    table, gained = jax.numpy.asarray(next_state.numpy()), jax.numpy.asarray(reward.numpy())
-    cells, actions = table.shape
-    begin = jax.numpy.asarray(state.numpy())
-    nothing = jax.numpy.zeros((len(begin), actions)), jax.numpy.zeros(len(begin))
+    table, gained = numpy.asarray(world.next_state.int().numpy()), numpy.asarray(world.reward.numpy())
+    cells, batch = len(table), len(state)
+    begin, (start, follow) = numpy.asarray(state.int().numpy()), jax_policy(prior)
+
+    def move(now: Any, action: Any) -> Any:
+        after = table[now % cells, action]
+        return now // cells * cells + after, gained[now // cells, after]
 
     def step(parameters: Any, key: Any, action: Any, embedding: Any) -> Any:
-        after = table[embedding % cells, action]
-        got = gained[embedding // cells, after]
-        logits, value = nothing
-        out = {"reward": got, "discount": jax.numpy.ones_like(got), "prior_logits": logits, "value": value}
-        return mctx.RecurrentFnOutput(**out), embedding // cells * cells + after
+        now, depth, memory = embedding
+        (now, reward), depth = move(now, action), depth + 1
+        logits, memory = follow(action, memory)
 
-    policy = mctx.gumbel_muzero_policy if gumbel else mctx.muzero_policy
+        def further(t: Any, rollout: Any) -> Any:
+            now, value, key, logits, memory = rollout
+            key, own = jax.random.split(key)
+            action = jax.random.categorical(own, logits)
+            after, reward = move(now, action)
+            return after, value + numpy.where(depth + t < length, reward, 0), key, *follow(action, memory)
+
+        rollout = now, numpy.zeros(batch), key, logits, memory
+        value = jax.lax.fori_loop(0, length - depth.min(), further, rollout)[1]
+        ones = numpy.ones(batch)
+        out = mctx.RecurrentFnOutput(reward=reward, discount=ones, prior_logits=logits, value=value)
+        return out, (now, depth, memory)
 
     @jax.jit  # type: ignore[untyped-decorator]
     def search(key: Any) -> Any:
-        root = mctx.RootFnOutput(prior_logits=nothing[0], value=nothing[1], embedding=begin)
-        return policy((), key, root, step, simulations, max_depth=depth).action
+        logits, memory = start(batch)
+        embedding = begin, numpy.zeros(batch, int), memory
+        root = mctx.RootFnOutput(prior_logits=logits, value=numpy.zeros(batch), embedding=embedding)
+        how = {"max_depth": length, "dirichlet_fraction": 0.0}
+        return mctx.muzero_policy((), key, root, step, simulations, **how).action
 
     key = jax.random.PRNGKey(0)
     return lambda: search(key).block_until_ready()

@@ -19,9 +19,10 @@ from eval.bench.jobs import (
     on_device,
     our_table_1,
     quickest,
+    simulations,
     source,
 )
-from neuroprior import MarkovPrior, UniformPrior, gridworld
+from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
 from neuroprior.plans import all_plans
 from tests.support.sources import FALSE_ALARM, p_value, seeded
 
@@ -139,13 +140,33 @@ def test_gymnasium_takes_the_plans(make):
         assert found[1] == 0
 
 
-@pytest.mark.parametrize("gumbel", [False, True])
-def test_mctx_finds_the_action_that_pays(gumbel):
+def test_mctx_finds_the_actions_that_pay():
+    """A reward for action 2 alone, and more for whoever goes on with it."""
     pytest.importorskip("mctx")
-    next_state, reward = torch.tensor([[0, 0, 1, 0], [1, 1, 1, 1]]), torch.tensor([[0.0, 1.0]])
-    state = torch.zeros(20, dtype=torch.long)
-    action = peers.mctx_search(next_state, reward, state, 64, 4, gumbel)()
+    world = TabularWorld(torch.tensor([[0, 0, 1, 0], [1, 1, 1, 1]]), torch.tensor([[0.0, 1.0]]))
+    action = peers.mctx_search(world, torch.zeros(20, dtype=torch.long), UniformPrior(4), 64, 4)()
     assert np.asarray(action).tolist().count(2) >= 15
+
+
+@pytest.mark.parametrize("prior", [UniformPrior(4), source(), GRUPrior(4, 8, lags=1)], ids=lambda p: type(p).__name__)
+def test_mctx_is_given_the_same_policy(prior):
+    pytest.importorskip("jax")
+    start, follow = peers.jax_policy(prior)
+    plans = UniformPrior(4).sample(7, 5, generator=seeded(0)).long()
+    logits, memory = start(7)
+    found = [logits]
+    for t in range(4):
+        logits, memory = follow(plans[:, t].numpy(), memory)
+        found.append(logits)
+    want = prior(plans).detach()
+    assert np.allclose(np.stack([np.asarray(x) for x in found], 1), want, atol=1e-5)
+
+
+def test_a_simulation_adds_a_node_and_follows_the_plan_to_its_end():
+    """A single action: 3 + 2 + 1 steps, and then all has been tried."""
+    pytest.importorskip("numba")
+    world = TabularWorld(torch.tensor([[1], [0]]), torch.tensor([0.0, 1.0]))
+    assert simulations(MCTSPlanner(UniformPrior(1), 3, 9), world, torch.zeros(2, dtype=torch.long)) == 3
 
 
 @pytest.mark.slow

@@ -1,0 +1,555 @@
+"""Monte Carlo tree search by compiled loops, for `neuroprior.planners.mcts`; importing this loads numba.
+
+`descend` and `back_up` serve every world and prior; `search` also steps a table and evaluates a prior itself.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from neuroprior.planners.planner import PriorPlanner
+from neuroprior.plans import action_dtype
+from neuroprior.priors.counts.history_prior import HistoryPrior
+from neuroprior.priors.neural.gru import GRUPrior
+from neuroprior.priors.prior import Prior
+from neuroprior.priors.uniform import UniformPrior
+from neuroprior.sampling.stepping import Steppable, Stepper
+from neuroprior.worlds.tabular import TabularWorld
+from neuroprior.worlds.world import World
+
+Array = np.ndarray[Any, Any]
+
+DRAWS = 2**18
+"""Uniform numbers that are drawn at once."""
+
+BLOCK = 64
+"""Rows of a matrix product: their results stay in the cache."""
+
+
+class Nodes(NamedTuple):
+    """What selection and backup need of the trees; see `neuroprior.planners.mcts.Trees`."""
+
+    child: Array
+    visits: Array
+    total: Array
+    closed: Array
+    probs: Array
+    low: Array
+    high: Array
+
+
+class Known(NamedTuple):
+    """What is kept of each node beside `Nodes`, and of each start, where the loop steps the world and the prior.
+
+    Attributes:
+        state: int64 `[B, M]`.
+        reward: float64 `[B, M]`, of the step into the node.
+        code: int64 `[B, M]`: the history, for a prior that is a table.
+        hidden: float32 `[B, M, H]`: the hidden state of a network.
+        size, left, over: `[B]`: nodes so far, simulator steps left, and whether they are too few for the next plan.
+    """
+
+    state: Array
+    reward: Array
+    code: Array
+    hidden: Array
+    size: Array
+    left: Array
+    over: Array
+
+
+class Moves(NamedTuple):
+    """A deterministic table.
+
+    Attributes:
+        after: int64 `[S * A]`: the cell that each action leads to.
+        reward: float64: `[W * S]` on arrival, `[W * S * A]` on acting.
+        on_arrival: which of the two.
+        cells: S.
+    """
+
+    after: Array
+    reward: Array
+    on_arrival: bool
+    cells: int
+
+
+class Policy(NamedTuple):
+    """A prior: a table of histories, or a gated recurrent network of one layer.
+
+    Attributes:
+        context: int64 `[W * S]`: the context in each state; empty: there is none.
+        each_step: whether the context is that of each state, not of the start alone.
+        after: int64 `[F, A]`: the history after each history and action.
+        row: int64 `[F, C]`: the row of the tables for each history and context.
+        weights: float32 `[R, A]`: cumulative unnormalised probabilities.
+        probs: float64 `[R, A]`.
+        action: float32 `[A + 1, 3 H]`: what the last action adds to the gates, with their biases.
+        past: float32 `[lags, A + 1, 3 H]`: what each of the last actions adds.
+        seen: float32 `[C, 3 H]`: what each context adds.
+        recurrent: float32 `[H, 3 H]`, and `bias [H]` of its last part.
+        head: float32 `[H, A]`, and `head_bias [A]`.
+        temperature: divides logits.
+    """
+
+    context: Array
+    each_step: bool
+    after: Array
+    row: Array
+    weights: Array
+    probs: Array
+    action: Array
+    past: Array
+    seen: Array
+    recurrent: Array
+    bias: Array
+    head: Array
+    head_bias: Array
+    temperature: float
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def descend(
+    nodes: Nodes, rows: Array, exploration: float, draws: Array, path: Array, plan: Array, depth: Array, first: Array
+) -> int:
+    """Follow PUCT in the trees of the starts `rows [K]` down to an action that was not tried yet.
+
+    Args:
+        nodes: the trees.
+        rows: int64 `[K]`.
+        exploration: c.
+        draws: float32: uniform numbers, at least K * L * (1 + A). At each depth K numbers are left to draw actions
+            with, and each tree that is still descended in takes A to break ties.
+        path: int64 `[K, L]`: gets the nodes; -1 beyond.
+        plan: int64 `[K, L]`: gets the actions up to the one that was not tried.
+        depth: int64 `[K]`: gets how many actions come before it.
+        first: int64 `[L]`: gets where in `draws` the K numbers of each depth begin.
+
+    Returns:
+        How many numbers were taken.
+    """
+    batch, length = path.shape
+    actions = nodes.child.shape[2]
+    path[:] = -1
+    depth[:] = -1
+    now = np.zeros(batch, dtype=np.int64)
+    used = 0
+    for t in range(length):
+        first[t] = used
+        used += batch
+        for k in range(batch):
+            if depth[k] >= 0:
+                continue
+            b, node = rows[k], now[k]
+            tries, whole = 0, 0.0
+            for a in range(actions):
+                tries += nodes.visits[b, node, a]
+                whole += nodes.total[b, node, a]
+            low, span = nodes.low[b], nodes.high[b] - nodes.low[b]
+            root = np.sqrt(float(max(tries, 1)))
+            best, top, chosen = -np.inf, -1.0, -1
+            for a in range(actions):
+                if nodes.closed[b, node, a]:
+                    continue
+                n, value = nodes.visits[b, node, a], 0.5
+                if tries > 0 and span > 0:
+                    value = ((nodes.total[b, node, a] / n if n > 0 else whole / tries) - low) / span
+                merit = value + exploration * nodes.probs[b, node, a] * root / (1 + n)
+                draw = draws[used + a]
+                if merit > best or chosen < 0 or (merit == best and draw > top):
+                    best, top, chosen = merit, draw, a
+            used += actions
+            path[k, t], plan[k, t] = node, chosen
+            now[k] = nodes.child[b, node, chosen]
+            if now[k] == 0:
+                depth[k] = t
+    return used
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def back_up(nodes: Nodes, rows: Array, path: Array, plan: Array, score: Array) -> None:
+    """Count plans `[K, L]` and their scores (float64) at the nodes of their `path [K, L]` (-1: outside of the tree)."""
+    actions = nodes.child.shape[2]
+    for k in range(len(rows)):
+        b, own = rows[k], score[k]
+        if np.isfinite(own):
+            nodes.low[b], nodes.high[b] = min(nodes.low[b], own), max(nodes.high[b], own)
+        else:  # counts as the lowest, or highest, finite one so far
+            own = nodes.high[b] if own > 0 else nodes.low[b]
+            own = own if np.isfinite(own) else 0.0
+        finished = path[k, -1] >= 0  # after the last action there is nothing more to try
+        for t in range(path.shape[1] - 1, -1, -1):
+            node = path[k, t]
+            if node < 0:
+                continue
+            nodes.visits[b, node, plan[k, t]] += 1
+            nodes.total[b, node, plan[k, t]] += own
+            nodes.closed[b, node, plan[k, t]] |= finished
+            finished = True
+            for a in range(actions):
+                finished &= nodes.closed[b, node, a]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _exp(x: Any) -> Any:
+    """e to the power of a float32, to 1e-7 of it; of arithmetic alone, so that loops over it are vectorised."""
+    x = min(max(x, np.float32(-87)), np.float32(87))
+    # x = n log 2 + r: n is rounded by adding what leaves no digits behind the point, log 2 is split in two.
+    n = (x * np.float32(1.4426950408889634) + np.float32(12582912)) - np.float32(12582912)
+    r = (x - n * np.float32(0.693359375)) + n * np.float32(2.1219444005469057e-4)
+    series = np.float32(1 / 5040)
+    for factor in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
+        series = series * r + np.float32(factor)
+    return series * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gates(policy: Policy, plan: Array, t: int, seen: int, out: Array) -> None:
+    """Write what the inputs after the action of step `t` add to the gates to `out [3 H]`."""
+    out[:] = policy.action[plan[t]]
+    for lag in range(min(len(policy.past), t + 2)):
+        before = plan[t - lag] if lag <= t else len(policy.action) - 1  # the start symbol
+        for j in range(len(out)):
+            out[j] += policy.past[lag, before, j]
+    if len(policy.context):
+        for j in range(len(out)):
+            out[j] += policy.seen[policy.context[seen], j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _recur(policy: Policy, gates: Array, product: Array, hidden: Array) -> None:
+    """A step of the network: `hidden [H]` is overwritten, from `product [3 H]`, it times `recurrent`."""
+    size, one = len(hidden), np.float32(1)
+    for j in range(2 * size):
+        gates[j] = one / (one + _exp(-(gates[j] + product[j])))
+    for j in range(size):
+        new = gates[2 * size + j] + gates[j] * (product[2 * size + j] + policy.bias[j])
+        new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
+        hidden[j] = new + gates[size + j] * (hidden[j] - new)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _predict(policy: Policy, hidden: Array, weights: Array, probs: Array) -> None:
+    """Write cumulative unnormalised probabilities, float32 `[A]`, and probabilities, float64 `[A]`."""
+    weights[:] = policy.head_bias
+    for j in range(len(hidden)):
+        for a in range(len(weights)):
+            weights[a] += hidden[j] * policy.head[j, a]
+    top = weights.max()
+    total = 0.0
+    for a in range(len(weights)):
+        probs[a] = np.exp((weights[a] - top) / policy.temperature)
+        total += probs[a]
+    cumulative = 0.0
+    for a in range(len(weights)):
+        cumulative += probs[a]
+        weights[a] = cumulative
+        probs[a] /= total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _evaluate(
+    policy: Policy,
+    which: Array,
+    plans: Array,
+    t: int,
+    seen: Array,
+    code: Array,
+    hidden: Array,
+    weights: Array,
+    probs: Array,
+    work: tuple[Array, Array, Array],
+) -> None:
+    """Step the prior after the actions of step `t` of the plans `which [n]`, of all K.
+
+    Args:
+        policy: the prior.
+        which: the plans that it is stepped for.
+        plans: `[K, L]`.
+        t: the step.
+        seen: `[K]`: the states whose contexts the prior is given.
+        code, hidden: `[K]` and `[K, H]`: its state, which is overwritten.
+        weights, probs: `[K, A]`: get its predictions.
+        work: room for `BLOCK` rows of hidden states, products and gates.
+    """
+    if hidden.shape[1] == 0:
+        for k in which:
+            code[k] = policy.after[code[k], plans[k, t]]
+            row = policy.row[code[k], policy.context[seen[k]] if len(policy.context) else 0]
+            for a in range(weights.shape[1]):
+                weights[k, a], probs[k, a] = policy.weights[row, a], policy.probs[row, a]
+        return
+    before, product, gates = work
+    for begin in range(0, len(which), BLOCK):
+        some = which[begin : begin + BLOCK]
+        for i in range(len(some)):
+            before[i] = hidden[some[i]]
+        np.dot(before[: len(some)], policy.recurrent, product[: len(some)])
+        for i in range(len(some)):
+            k = some[i]
+            _gates(policy, plans[k], t, seen[k], gates[i])
+            _recur(policy, gates[i], product[i], hidden[k])
+            _predict(policy, hidden[k], weights[k], probs[k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def search(
+    nodes: Nodes,
+    known: Known,
+    moves: Moves,
+    policy: Policy,
+    discounts: Array,
+    any_prefix: bool,
+    exploration: float,
+    draws: Array,
+    plans: Array,
+    rewards: Array,
+    states: Array,
+    done: Array,
+) -> tuple[int, int]:
+    """Simulate plans, one from each unfinished start at a time.
+
+    Args:
+        nodes, known: the trees; extended.
+        moves, policy: the world and the prior.
+        discounts: float64 `[L]`: weights of rewards in a return; empty: the last reward counts.
+        any_prefix: whether a plan is worth its best prefix.
+        exploration: c.
+        draws: float32: uniform numbers.
+        plans, rewards, states: `[N, B, L]`: get the plans, the reward of each step (float64) and the state after it.
+        done: bool `[N, B]`: gets which plans there are.
+
+    Returns:
+        Simulations that were made: fewer than N where all starts are finished, or where the `draws` do not suffice for
+        another one for sure; and the draws that were taken.
+    """
+    batch, length, actions, size = len(known.left), plans.shape[2], nodes.child.shape[2], known.hidden.shape[2]
+    every = np.arange(batch)
+    path, depth, first = np.empty((batch, length), np.int64), np.empty(batch, np.int64), np.empty(length, np.int64)
+    chosen, alive, score = np.empty((batch, length), np.int64), np.empty(batch, np.bool_), np.empty(batch)
+    cell, code, hidden = np.empty(batch, np.int64), np.empty(batch, np.int64), np.empty((batch, size), np.float32)
+    seen, which = np.empty(batch, np.int64), np.empty(batch, np.int64)
+    weights, probs = np.empty((batch, actions), np.float32), np.empty((batch, actions))
+    wide = BLOCK if size else 0
+    work = (
+        np.empty((wide, size), np.float32),
+        np.empty((wide, 3 * size), np.float32),
+        np.empty((wide, 3 * size), np.float32),
+    )
+    used = 0
+    for simulation in range(len(plans)):
+        number = 0
+        for b in range(batch):
+            if known.left[b] > 0 and not known.over[b] and not nodes.closed[b, 0].all():
+                every[number] = b
+                number += 1
+        rows = every[:number]
+        if number == 0 or len(draws) - used < number * length * (1 + actions):
+            return simulation, used
+        own, path_of, plan_of = draws[used:], path[:number], chosen[:number]
+        used += descend(nodes, rows, exploration, own, path_of, plan_of, depth[:number], first)
+        done[simulation] = False
+        for k in range(number):
+            b = rows[k]
+            # A plan that the budget does not allow to the end is not begun.
+            alive[k] = known.left[b] >= length - depth[k]
+            known.over[b] |= not alive[k]
+            done[simulation, b] = alive[k]
+            seen[k] = known.state[b, 0]
+            for t in range(depth[k]):
+                child = path[k, t + 1]
+                states[simulation, b, t], rewards[simulation, b, t] = known.state[b, child], known.reward[b, child]
+        for t in range(length):
+            going = 0
+            for k in range(number):
+                if depth[k] > t or not alive[k]:
+                    continue
+                b, action = rows[k], chosen[k, t]
+                if depth[k] == t:
+                    node = path[k, t]
+                    cell[k], code[k] = known.state[b, node], known.code[b, node]
+                    hidden[k] = known.hidden[b, node]
+                else:
+                    total, action = weights[k, actions - 1], 0
+                    mark = own[first[t] + k] * total
+                    while weights[k, action] <= mark and weights[k, action] < total:
+                        action += 1
+                    chosen[k, t] = action
+                at = cell[k] % moves.cells
+                maps = cell[k] - at
+                taken = at * actions + action
+                cell[k] = moves.after[taken] + maps
+                gained = moves.reward[cell[k] if moves.on_arrival else taken + maps * actions]
+                states[simulation, b, t], rewards[simulation, b, t] = cell[k], gained
+                known.left[b] -= 1
+                if policy.each_step:
+                    seen[k] = cell[k]
+                which[going] = k
+                going += 1
+            if t + 1 < length:
+                _evaluate(policy, which[:going], chosen, t, seen, code, hidden, weights, probs, work)
+            for i in range(going):
+                k = which[i]
+                if depth[k] != t:
+                    continue
+                b = rows[k]
+                new = known.size[b]
+                known.size[b] += 1
+                nodes.child[b, path[k, t], chosen[k, t]] = new
+                nodes.child[b, new], nodes.visits[b, new], nodes.total[b, new] = 0, 0, 0
+                nodes.closed[b, new], nodes.probs[b, new] = False, probs[k]
+                known.state[b, new], known.reward[b, new] = cell[k], rewards[simulation, b, t]
+                known.code[b, new], known.hidden[b, new] = code[k], hidden[k]
+        going = 0
+        for k in range(number):
+            if not alive[k]:
+                continue
+            b = rows[k]
+            total, best = 0.0, -np.inf
+            for t in range(length):
+                plans[simulation, b, t] = chosen[k, t]
+                gained = rewards[simulation, b, t]
+                total = total + gained * discounts[t] if len(discounts) else gained
+                best = max(best, total)
+            rows[going], score[going] = b, best if any_prefix else total
+            path[going], chosen[going] = path[k], chosen[k]
+            going += 1
+        back_up(nodes, rows[:going], path[:going], chosen[:going], score[:going])
+    return len(plans), used
+
+
+def search_all(
+    planner: Any, world: TabularWorld, state: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    """What `neuroprior.planners.mcts` looks for; see `_Trees.search` there."""
+    batch, actions, length = len(state), world.num_actions, planner.length
+    steps = planner.num_plans * length
+    policy = policy_of(planner.prior, world, planner.temperature)
+    if any(np.isnan(part).any() for part in policy[4:13]):
+        raise ValueError("prior: its logits are NaN")
+    logits, hidden = Stepper(planner.prior).start_in(world, state)
+    size, most = len(policy.recurrent), batch * length * (1 + actions)
+    room, number = max(min(DRAWS // most, 2 * planner.num_plans), 1), 0
+    shape = (batch, min(room, steps) + 1, actions)
+    nodes = Nodes(
+        np.empty(shape, np.int64), np.empty(shape, np.int32), np.empty(shape), np.empty(shape, np.bool_),
+        np.empty(shape), np.full(batch, np.inf), np.full(batch, -np.inf),
+    )  # fmt: skip
+    known = Known(
+        np.empty(shape[:2], np.int64), np.empty(shape[:2]), np.empty(shape[:2], np.int64),
+        np.empty((*shape[:2], size), np.float32), np.ones(batch, np.int64), np.full(batch, steps),
+        np.zeros(batch, np.bool_),
+    )  # fmt: skip
+    nodes.child[:, 0], nodes.visits[:, 0], nodes.total[:, 0], nodes.closed[:, 0] = 0, 0, 0, False
+    nodes.probs[:, 0] = (logits.double() / planner.temperature).softmax(1).numpy()
+    known.state[:, 0] = state.numpy()
+    known.code[:, 0] = int(planner.prior.start_node) if isinstance(planner.prior, HistoryPrior) else 0
+    if size:
+        known.hidden[:, 0] = hidden[:, :size].numpy()
+    moves = Moves(
+        world.next_state.view(-1).numpy(), world.reward.reshape(-1).numpy(), world.reward.dim() == 2, world.num_states
+    )
+    discounts = np.empty(0)
+    if planner.objective == "return":
+        discounts = (planner.discount ** torch.arange(length, dtype=torch.float64)).numpy()
+    found = list[tuple[Tensor, ...]]()
+    while not found or number == room:
+        if known.size.max() + room > nodes.child.shape[1]:  # each simulation adds a node
+            nodes, known = Nodes(*map(_widened, nodes)), Known(*map(_widened, known))
+        kinds = action_dtype(actions), torch.float64, torch.int64
+        out = *(torch.empty(room, batch, length, dtype=kind) for kind in kinds), torch.empty(room, batch) > 0
+        before = generator.get_state()
+        draws = torch.rand(room * most, generator=generator)
+        number, used = search(
+            nodes, known, moves, policy, discounts, planner.any_prefix, planner.exploration, draws.numpy(),
+            *(part.numpy() for part in out),
+        )  # fmt: skip
+        generator.set_state(before)
+        torch.rand(used, generator=generator)  # those that were not used are given back
+        found.append(tuple(part[:number] for part in out))
+    plans, rewards, states, done = (torch.cat(parts).transpose(0, 1) for parts in zip(*found, strict=True))
+    taken = int(steps - known.left.min())
+    return plans, rewards.to(world.reward.dtype), states if planner.any_prefix else states[:, :, -1:], done, taken
+
+
+def _widened(values: Array) -> Array:
+    """Numbers of nodes, `[B, M, ...]`, with room for twice as many; those of starts, `[B]`, are left alone."""
+    return values if values.ndim == 1 else np.concatenate([values, np.empty_like(values)], 1)
+
+
+def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
+    """Whether `search` knows the world and the prior, and its tables have no more rows than it may have nodes."""
+    prior = planner.prior
+    if not isinstance(world, TabularWorld) or getattr(world.step, "__func__", None) is not TabularWorld.step:
+        return False
+    known = world.all_legal and world.outcomes is None and planner.value is None
+    known = known and world.reward.dtype in (torch.float32, torch.float64)
+    if not known or len(state) == 0 or not _knows(prior, planner.length) or Stepper(prior).device != state.device:
+        return False
+    rows = len(prior.next_node) * (prior.num_contexts or 1) if isinstance(prior, HistoryPrior) else 0
+    if getattr(prior, "context_per", None) is not None:
+        rows += world.num_maps * world.num_states
+    return rows <= len(state) * planner.num_plans * planner.length
+
+
+def _knows(prior: Steppable, length: int) -> bool:
+    """Whether `policy_of` can be told the prior, for plans of so many actions."""
+    if type(prior) is UniformPrior:
+        return True
+    if isinstance(prior, HistoryPrior):
+        own = type(prior)
+        same = own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
+        return same and own.advance is Prior.advance and prior.log_probs.dtype == torch.float32
+    if type(prior) is not GRUPrior or prior.num_layers > 1 or prior.training:
+        return False
+    return (prior.window is None or length <= prior.window + 1) and prior.head.weight.dtype == torch.float32
+
+
+def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
+    """A prior for `search`."""
+    context, each_step, actions = torch.empty(0, dtype=torch.long), True, world.num_actions
+    observed = torch.empty(0)
+    if isinstance(prior, HistoryPrior | GRUPrior) and prior.takes_context:
+        each_step = prior.context_per == "step"
+        observed = world.observe(torch.arange(world.num_maps * world.num_states))
+        context = torch.arange(len(observed))
+    after, row, logits = torch.zeros(1, actions), torch.zeros(1, 1), torch.zeros(1, actions)
+    gates: tuple[Tensor, ...] = (
+        torch.empty(0, 0), torch.empty(0, 0, 0), torch.empty(0, 0), torch.empty(0, 0),
+        torch.empty(0), torch.empty(0, actions), torch.empty(0),
+    )  # fmt: skip
+    if isinstance(prior, HistoryPrior):
+        after, number = prior.next_node, prior.num_contexts or 1
+        node = torch.arange(len(after)).repeat_interleave(number)
+        row = prior._row(node, torch.arange(number).repeat(len(after))).view(len(after), number)
+        logits, context = prior.log_probs, observed.long()
+    elif isinstance(prior, GRUPrior):
+        gates = _network(prior, observed)
+    weights = ((logits - logits.amax(1, keepdim=True)) / temperature).exp().T.cumsum(0).T
+    probs = (logits.double() / temperature).softmax(1)
+    kinds = (torch.int64, torch.int64, torch.float32, torch.float64)
+    tables: Any = [x.to(kind).contiguous().numpy() for x, kind in zip((after, row, weights, probs), kinds, strict=True)]
+    network: Any = [x.detach().float().contiguous().numpy() for x in gates]
+    parts: Any = (context.numpy(), each_step, *tables, *network, float(temperature))
+    return Policy(*parts)
+
+
+def _network(prior: GRUPrior, observed: Tensor) -> tuple[Tensor, ...]:
+    """The parts of a network in `Policy`, from `action` on; `observed [W * S, ...]` are the contexts of all states."""
+    embedding, size = prior.embedding, prior.hidden_size
+    weight, recurrent, bias, recurrent_bias = prior.gru.all_weights[0]
+    both = bias + torch.cat([recurrent_bias[: 2 * size], torch.zeros(size)])
+    action = embedding.action.weight @ weight.T + both
+    past, seen = torch.empty(0, 0, 3 * size), torch.empty(0, 3 * size)
+    if embedding.past is not None and embedding.mix is not None:
+        # The last tap of the convolution is that of the last action.
+        past = torch.einsum("av,hvk->kah", embedding.past.weight[:-1], embedding.mix.weight).flip(0) @ weight.T
+    if embedding.index is not None:
+        seen = embedding.index(observed.long()) @ weight.T
+    elif embedding.features is not None:
+        seen = embedding.features(observed.float()) @ weight.T
+    head = prior.head
+    return action, past, seen, recurrent.T, recurrent_bias[2 * size :], head.weight.T, head.bias
