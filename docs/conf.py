@@ -41,7 +41,7 @@ myst_heading_anchors = 4
 
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120
+nb_execution_timeout = 600  # of a cell; each notebook takes seconds on a free machine
 nb_merge_streams = True
 nb_output_stderr = "remove"  # progress
 
