@@ -22,6 +22,8 @@ author = "The neuroprior developers"
 copyright = author
 version = release = neuroprior.__version__
 
+smartquotes = False  # "lower" is a value
+
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "myst_nb", "sphinx_design"]
 templates_path = ["_templates"]
 exclude_patterns = ["_build", "_templates", "**/runs"]
