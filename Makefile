@@ -1,9 +1,9 @@
-# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands.
+# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site.
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHONPATH :=
 
-.PHONY: paper mice mice-planner test check bench clean
+.PHONY: paper mice mice-planner test check bench docs clean
 
 paper: .venv/cli
 	$(BIN)/python -m eval paper
@@ -25,6 +25,11 @@ check: .venv/dev
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench
+
+# -n -W: a name that leads nowhere, and any other warning, is an error. The notebooks are run.
+docs: .venv/docs
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m sphinx -b html -q -n -W --keep-going docs docs/_build/html
+	@echo docs/_build/html/index.html
 
 clean:
 	rm -rf .venv

@@ -99,7 +99,7 @@ class PermutationDesign:
 
     @property
     def possible(self) -> int:
-        """The number of labelings: ways to give the blocks their conditions."""
+        """The number of labelings, of ways to give the blocks their conditions."""
         if self.kind == "within":
             every: int = factorial(len(self.conditions)) ** len(self.units)
             return every
@@ -108,7 +108,7 @@ class PermutationDesign:
 
     @property
     def equivalent(self) -> int:
-        """How many labelings are one and the same division, with conditions renamed: their statistics are equal."""
+        """How many labelings are one and the same division, with conditions renamed; their statistics are equal."""
         return prod(map(factorial, Counter(self.sizes).values()))
 
     def smallest_p(self, drawn: int) -> float:

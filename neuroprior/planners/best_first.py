@@ -90,7 +90,7 @@ class BestFirstPlanner(Planner):
     steps_at_once = 2**20
 
     order: tuple[int, float] = (0, 1.0)
-    """For the compiled loop: 0 for d / pi, 1 for depth + weight * heuristic; and the weight."""
+    """For the compiled loop, 0 for d / pi, 1 for depth + weight * heuristic; and the weight."""
 
     reroot = False
     """Whether nodes nearer to the goal than all before them on their path are new roots, see `LevinPlanner`."""

@@ -72,7 +72,8 @@ def best_sampling(
     In a stochastic world what is chosen is scored by new rollouts, so that varied candidates do not win by luck.
 
     Args:
-        prior, length, num_plans, num_rollouts, **goal: see `SamplingPlanner`.
+        prior, length, num_plans, num_rollouts: see `SamplingPlanner`.
+        **goal: `objective` and `discount`, see `SamplingPlanner`.
         world: a world that the prior did not learn from: where it did, it is overconfident.
         state: starts `[B, ...]` in it, at least one; with hundreds the best setting is told from the others.
         temperatures, uniform_shares: what is tried; of settings with equal scores, the first.

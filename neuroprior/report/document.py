@@ -52,7 +52,7 @@ class Document:
 
     @property
     def written(self) -> dict[str, pd.DataFrame]:
-        """The frames as files hold them: with their columns under former names, too."""
+        """The frames as files hold them, with their columns under former names, too."""
         former = self.former_names
         return {
             name: frame.assign(**{former[column]: frame[column] for column in frame.columns if column in former})

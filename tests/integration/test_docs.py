@@ -21,7 +21,8 @@ from neuroprior.cli.example import example
 from neuroprior.testing import study
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "train/README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SITE = sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts)
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "train/README.md", *SITE]
 OWN_DATA = ROOT / "docs/your-own-data.md"
 PROGRAMS = {"neuroprior": "neuroprior.cli.__main__", "eval": "eval.__main__"}
 
@@ -111,8 +112,16 @@ def test_every_picture_is_shown() -> None:
 
 
 def test_every_page_is_listed() -> None:
-    pages = {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    assert pages <= set(re.findall(r"\]\(([\w\-]+\.md)\)", (ROOT / "docs/index.md").read_text(encoding="utf-8")))
+    """In a table of contents of the site."""
+    listed = {ROOT / "docs/index.md"}
+    for page in SITE:
+        for block in blocks(page, "{toctree}"):
+            listed |= {
+                (page.parent / f"{line}.md").resolve()
+                for line in block.splitlines()
+                if line[:1].isalnum() or line[:1] == "."
+            }
+    assert set(SITE) <= listed
 
 
 def exists(dotted: str) -> bool:

@@ -138,7 +138,7 @@ class VectorPlanner(ABC):
 
     @property
     def keep(self) -> int | None:
-        """How many of the last executed vectors the planner reads; None: all."""
+        """How many of the last executed vectors the planner reads; None if all."""
         return self.prior.memory if self.prior is not None and self.prior_share else 0
 
     @abstractmethod

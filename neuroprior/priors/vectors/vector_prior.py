@@ -140,7 +140,7 @@ class VectorPrior(SavedModule):
     """
 
     memory: int | None = None
-    """How many of the last vectors predictions depend on, at most; None: on all."""
+    """How many of the last vectors predictions depend on, at most; None if on all."""
 
     def __init__(self, action_low: Any, action_high: Any, context_size: int | None = None) -> None:
         super().__init__()

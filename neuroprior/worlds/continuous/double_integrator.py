@@ -15,8 +15,8 @@ class DoubleIntegrator(ContinuousWorld):
 
     A state is `[N, 2 * D]` float32: position (m), then velocity (m/s). The force (N) is constant during a step, so that
     the step is exact: with the acceleration a = force / mass, velocity grows by a t and position by v t + a t² / 2.
-    The reward of a step is minus `step_seconds` times (|position - goal|² + `velocity_cost` |velocity|² +
-    `force_cost` |force|²), of the position and velocity at its end. Without bounds the best control is the linear
+    The reward of a step is minus `step_seconds` times (`|position - goal|²` + `velocity_cost` `|velocity|²` +
+    `force_cost` `|force|²`), of the position and velocity at its end. Without bounds the best control is the linear
     quadratic regulator (Anderson and Moore, Optimal Control, chapter 2).
 
     Args:
