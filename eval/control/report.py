@@ -1,7 +1,7 @@
 """The report of `python -m eval control`: returns against candidates, and how many candidates a prior saves."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from eval.control.priors import NONE
-from eval.control.tasks import CONDITIONS
+from eval.control.tasks import CONDITIONS, TASKS
 from eval.worlds import runs
 from neuroprior.report.document import Column, Document, table
 from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
@@ -39,19 +39,34 @@ RESAMPLES = 1000
 """Of seeds, for the intervals of `savings`."""
 
 
-def control_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
-    """The tables and figures of the results of `control_run`."""
-    frame = runs.frame_of(results).assign(task=lambda rows: rows["world"])
+class Results(NamedTuple):
+    """What the runs of the experiment found, a row each; see `eval.control.run`.
+
+    Attributes:
+        entries: of planners, a row a task (`world`), condition, planner, prior, budget and seed.
+        likelihoods: of priors, a row a task, prior and seed; may be empty.
+        alone: of behaviour cloning, a row a task, condition and seed; may be empty.
+    """
+
+    entries: pd.DataFrame
+    likelihoods: pd.DataFrame
+    alone: pd.DataFrame
+
+
+def control_document(results: Results, settings: Mapping[str, Any], command: str) -> Document:
+    """The tables and figures of the results."""
+    frame = results.entries.assign(task=results.entries["world"])
     rows = runs.seed_means(frame, PLACE, "return", ["seconds", "sampling"])
     gaps = differences(frame)
     saved = savings(frame)
-    scored, more = runs.frame_of(results, "likelihoods"), ["fit_seconds", "for_80", "for_95"]
+    scored, more = results.likelihoods, ["fit_seconds", "for_80", "for_95"]
     nats = scored  # empty where the plain planner is alone
     if len(scored):
+        scored = scored.astype({"for_80": float, "for_95": float})
         nats = runs.seed_means(scored.assign(task=scored["world"]), ["task", "prior"], "nats", more)
     sections, leads = [], []
     for task in rows["task"].unique():
-        about = next(one["about"] for one in results if one["world"] == task)
+        about = TASKS[task].about
         own = rows[rows["task"] == task]
         tables = [return_table(some, about) for _, some in own.groupby(["condition", "planner"], sort=False)]
         if len(gaps):
@@ -74,7 +89,7 @@ def control_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str
         sections.insert(0, Section("Candidates saved", tables=[saving_table(saved)]))
     if len(nats):
         sections.append(Section("Likelihoods", tables=[likelihood_table(nats)]))
-    alone = runs.frame_of(results, "alone")
+    alone = results.alone
     if len(alone):
         alone = runs.seed_means(alone.assign(task=alone["world"]), ["task", "condition", "prior"], "return")
         sections.append(Section("Behaviour cloning", tables=[alone_table(alone)]))
