@@ -143,7 +143,9 @@ def control_experiment(
     # Seed by seed, so that an experiment that is cut off has all of some seeds.
     for number in range(seeds):
         collecting = [
-            Collecting(task, number, alone[task, "icem", NONE], held_out) for task in tasks for held_out in (False, True)
+            Collecting(task, number, alone[task, "icem", NONE], held_out)
+            for task in tasks
+            for held_out in (False, True)
         ]
         plans = done("plans", collecting_run, collecting, **how_kept, suffix=".npz") if learned or scored else []
         of = {(job.world, job.held_out): some for job, some in zip(collecting, plans, strict=bool(plans))}

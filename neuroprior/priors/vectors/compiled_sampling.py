@@ -14,8 +14,8 @@ Array = np.ndarray[Any, Any]
 
 def draw_linear(prior: Any, vectors: Tensor, known: int, noise: Tensor) -> None:
     """As `neuroprior.priors.vectors.linear_gaussian.draw_linear`, of float32 on the CPU."""
-    numbers = (prior.weights, prior.offset, prior.std, prior.coupling, noise)
-    _linear(vectors.numpy(), known, prior.memory, *(each.numpy() for each in numbers))
+    weights, offset, std, coupling = (each.numpy() for each in (prior.weights, prior.offset, prior.std, prior.coupling))
+    _linear(vectors.numpy(), known, prior.memory, weights, offset, std, coupling, noise.numpy())
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -100,7 +100,10 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, chance: Tensor, 
     if prior.coupling is not None:
         coupling = prior.coupling.tril(-1) * (prior._half[:, None] / prior._half)
     vectors = noise.new_empty(noise.shape)
-    rest = (given, given_bias, prior.head.weight, prior.head.bias, prior.linear.weight, coupling)
+    first, first_bias, head, head_bias, direct, coupled = (
+        np.ascontiguousarray(each.detach().numpy())
+        for each in (given, given_bias, prior.head.weight, prior.head.bias, prior.linear.weight, coupling)
+    )
     _recurrent(
         vectors.numpy(),
         hidden.numpy(),
@@ -111,7 +114,12 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, chance: Tensor, 
         above_bias,
         own,
         own_bias,
-        *(np.ascontiguousarray(each.detach().numpy()) for each in rest),
+        first,
+        first_bias,
+        head,
+        head_bias,
+        direct,
+        coupled,
         np.stack([each.numpy() for each in (prior._centre, prior._half, prior.action_low, prior.action_high)]),
         prior.num_components,
         prior.entry_size * prior.lags,
