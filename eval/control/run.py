@@ -256,9 +256,9 @@ def planning_run(run: Planning, settings: ControlSettings) -> dict[str, Any]:
     """Fit a prior, and control the world with it, once with each budget.
 
     Returns:
-        `entries`, one of each budget: `return`, the sum of rewards; `seconds`, processor time of a decision, which other
-        programs on the machine do not change; and `sampling`, those of them in which the prior is drawn from. `alone`:
-        of behaviour cloning the return without a planner, else None.
+        `entries`, one of each budget: `return`, the sum of rewards; `seconds`, processor time of a decision, which
+        other programs on the machine change less than wall-clock; and `sampling`, those of them in which the prior is
+        drawn from. `alone`: of behaviour cloning the return without a planner, else None.
     """
     task = TASKS[run.world]
     world, place = task.make(run.condition), {"world": run.world, "seed": run.seed, "condition": run.condition}

@@ -1,5 +1,4 @@
-"""The tasks of `python -m eval control`, each in three conditions (the same world, new masses, a new goal), and one more
-in which settings are validated."""
+"""The tasks of `python -m eval control`, each in three conditions: the same world, new masses, a new goal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
