@@ -140,7 +140,7 @@ def against_simple(values: pd.DataFrame, by: Sequence[str], value: str) -> pd.Da
         kind = own["prior"].map(lambda name: parted(name)[0])
         simple, networks = own[kind.isin(SIMPLE)], own[kind.isin([*NETWORKS, CLONING])]
         if len(simple):
-            best = simple.groupby("prior", sort=False)[value].mean().idxmax()
+            best = str(simple.groupby("prior", sort=False)[value].mean().idxmax())
             second = networks["seed"].map(simple[simple["prior"] == best].set_index("seed")[value])
             parts.append(networks.assign(first=networks[value], second=second, baseline=best))
     pairs = pd.concat(parts) if parts else values.assign(first=0.0, second=0.0, baseline="")[:0]
