@@ -71,7 +71,10 @@ def control_document(results: Results, settings: Mapping[str, Any], command: str
     tables += [nats_table(scored_networks)] if len(scored_networks) else []
     tables += [network_table(networks)] if len(networks) else []
     sections += [Section("Sequence models", tables=tables)] if tables else []
-    sections += [Section("Synergies", tables=[synergy_table(windows)])] if len(windows) else []
+    explained = nats[nats["for_80"].notna()] if len(nats) else nats
+    tables = [component_table(explained)] if len(explained) else []
+    tables += [synergy_table(windows)] if len(windows) else []
+    sections += [Section("Synergies", tables=tables)] if tables else []
     alone = results.alone
     if len(alone):
         alone = runs.seed_means(alone.assign(task=alone["world"]), ["task", "condition", "prior"], "return")
@@ -176,15 +179,19 @@ def likelihood_table(nats: pd.DataFrame) -> Table:
         "prior": "prior",
         "nats a vector": lambda row: runs.plus_minus(row, "nats", 1, 2),
         "fit, s": "fit_seconds:.1f",
-        "80 %": "for_80:.0f",
-        "95 %": "for_95:.0f",
     }
+    caption = "Log-density of vectors that the plain planner executed in other runs, nats; the higher the better. "
+    return table(nats, columns, caption + runs.over_seeds(nats), align="llrr")
+
+
+def component_table(nats: pd.DataFrame) -> Table:
+    """How many components explain the variance, a row a task and prior."""
+    columns: dict[str, Column] = {"task": "task", "prior": "prior", "80 %": "for_80:.1f", "95 %": "for_95:.1f"}
     caption = (
-        "Log-density of vectors that the plain planner executed in other runs, nats; the higher the better. "
-        + runs.over_seeds(nats)
-        + " 80 %, 95 %: components that explain so much of the variance (of windows, or of single vectors), mean."
+        "synergies: of windows as long as the planner's plans; step-synergies: of single vectors. Means over seeds."
     )
-    return table(nats, columns, caption, align="llrrrr")
+    title = "Components that explain 80 and 95 % of the variance"
+    return table(nats, columns, caption, title, "llrr")
 
 
 def alone_table(alone: pd.DataFrame) -> Table:
