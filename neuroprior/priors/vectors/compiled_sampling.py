@@ -91,10 +91,9 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, chance: Tensor, 
     given = (layers[0][0] @ prior.inputs.weight).T
     given_bias = layers[0][0] @ prior.inputs.bias + layers[0][2]
     # Gates of higher layers are given what the layer below has found; the first layer's place is not read.
-    above = np.stack([layer[0].detach().numpy().T for layer in layers])
-    above_bias = np.stack([layer[2].detach().numpy() for layer in layers])
-    own = np.stack([layer[1].detach().numpy().T for layer in layers])
-    own_bias = np.stack([layer[3].detach().numpy() for layer in layers])
+    above, own, above_bias, own_bias = (
+        np.array([layer[i].detach().numpy().T for layer in layers], order="C") for i in range(4)
+    )
     size = prior.action_size
     coupling = noise.new_zeros(size, size)
     if prior.coupling is not None:

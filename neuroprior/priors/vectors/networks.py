@@ -178,7 +178,7 @@ class VectorNetwork(VectorPrior):
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
         forecast, state = self.read(past, context)
-        forecast, state = forecast.repeat_interleave(num_plans), state.repeat_interleave(num_plans, 0)
+        state = state.repeat_interleave(num_plans, 0)
         # All random numbers at once, so that compiled loops draw the same.
         chance = torch.rand(len(state), length, generator=generator, device=self.device)
         noise = torch.randn(len(state), length, self.action_size, generator=generator, device=self.device)
@@ -188,10 +188,12 @@ class VectorNetwork(VectorPrior):
         """The next vectors `[N, L, D]` that random numbers make; see `GaussianForecast.drawn`.
 
         Args:
-            forecast, state: as `step` returned them.
+            forecast: of M rows, each for N / M successive rows of the state.
+            state: `[N, ...]`, as `step` returned it.
             chance: `[N, L]`, uniform from 0 to 1.
             noise: `[N, L, D]`, standard normal.
         """
+        forecast = forecast.repeat_interleave(len(state) // max(len(forecast.mean), 1))
         vectors = [forecast.drawn(chance[:, 0], noise[:, 0])]
         for t in range(1, noise.shape[1]):
             forecast, state = self.step(vectors[-1], state)
