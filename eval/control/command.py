@@ -31,7 +31,7 @@ from eval.control.run import (
 from eval.control.tasks import CONDITIONS, TASKS, TaskName, check_there
 from eval.worlds import runs
 from neuroprior._jobs import JobRun
-from neuroprior.plans import read_vector_plans, write_vector_plans
+from neuroprior.plans import VectorPlans, read_vector_plans, write_vector_plans
 from neuroprior.report.document import publish, write_figures
 
 FEW = ("half_cheetah", "arm")
@@ -138,19 +138,21 @@ def control_experiment(
             for prior in learned
         ]
     )
-    entries, likelihoods, cloned = [], [], []
+    entries: list[Any] = []
+    likelihoods: list[Any] = []
+    cloned: list[Any] = []
     how_kept = {"save": lambda path, plans: write_vector_plans(plans, path), "load": read_vector_plans}
+
+    def collected(number: int, held_out: bool) -> dict[str, VectorPlans]:
+        collecting = [Collecting(task, number, alone[task, "icem", NONE], held_out) for task in tasks]
+        plans = done("plans", collecting_run, collecting, **how_kept, suffix=".npz")
+        return dict(zip(tasks, plans, strict=True))
+
     # Seed by seed, so that an experiment that is cut off has all of some seeds.
     for number in range(seeds):
-        collecting = [
-            Collecting(task, number, alone[task, "icem", NONE], held_out)
-            for task in tasks
-            for held_out in (False, True)
-        ]
-        plans = done("plans", collecting_run, collecting, **how_kept, suffix=".npz") if learned or scored else []
-        of = {(job.world, job.held_out): some for job, some in zip(collecting, plans, strict=bool(plans))}
+        plans = collected(number, False) if learned else {}
         planning = [
-            Planning(task, number, condition, planner, prior, choices[task, planner, prior], of.get((task, False)))
+            Planning(task, number, condition, planner, prior, choices[task, planner, prior], plans.get(task))
             for task in tasks
             for condition in CONDITIONS
             if condition in conditions
@@ -160,8 +162,10 @@ def control_experiment(
         for found in done("planning", planning_run, planning):
             entries += found["entries"]
             cloned += [found["alone"]] if found["alone"] is not None else []
+    for number in range(seeds if learned or scored else 0):
+        plans, held_out = collected(number, False), collected(number, True)
         scoring = [
-            Scoring(task, number, prior, of[task, False], of[task, True])
+            Scoring(task, number, prior, plans[task], held_out[task])
             for task in tasks
             for prior in dict.fromkeys((*learned, *scored))
         ]
