@@ -21,7 +21,7 @@ test: check
 check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy neuroprior train eval
+	$(BIN)/mypy neuroprior train eval tests/typing
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench

@@ -8,8 +8,6 @@ import pkgutil
 import re
 import runpy
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import chdir, redirect_stdout, suppress
 from functools import lru_cache
@@ -187,9 +185,3 @@ def test_make_has_these_targets() -> None:
     asked = {line.split()[1] for _, line in commands() if line.startswith("make ")}
     assert asked
     assert not [target for target in asked if target not in targets and re.sub("/.*", "/%", target) not in targets]
-
-
-def test_import_leaves_lightning_for_training() -> None:
-    heavy = "import sys, neuroprior; print([m for m in ('lightning', 'scipy', 'matplotlib') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.strip() == "[]"

@@ -1,6 +1,9 @@
-"""What a release says of itself is the same everywhere."""
+"""What a release promises: one version everywhere, versions of packages, extras, types, and the time of an import."""
 
 import re
+import runpy
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -40,3 +43,34 @@ def test_lowest_versions_are_those_that_are_promised() -> None:
 def test_each_extra_is_tried() -> None:
     tried = {path.stem.removeprefix("extra_") for path in (ROOT / ".ci/smoke").glob("extra_*.py")}
     assert tried == set(PROJECT["optional-dependencies"]) - {"all"}
+
+
+def test_code_of_a_user_runs(tmp_path: Path) -> None:
+    """`make check` reads its types."""
+    runpy.run_path(str(ROOT / "tests/typing/user_code.py"))["main"](tmp_path)
+
+
+HEAVY = {"gymnasium", "jinja2", "joblib", "jsonargparse", "lightning", "matplotlib", "numba", "pandas", "rich", "scipy"}
+"""What an import of the library leaves for when it is needed."""
+
+BUDGET = 0.5
+"""Most that an import of the library may take beyond that of torch, as a share of that of torch."""
+
+
+def imported() -> tuple[float, set[str]]:
+    """How much longer than torch an import of the library takes, as a share of torch's time; and what is imported."""
+    command = [sys.executable, "-X", "importtime", "-c", "import torch, neuroprior"]
+    said = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True).stderr
+    lines = re.findall(r"\| +(\d+) \| ( *)(\S+)$", said, re.MULTILINE)
+    seconds = {name: float(cumulative) for cumulative, _, name in lines}
+    return seconds["neuroprior"] / seconds["torch"], {name.partition(".")[0] for name in seconds}
+
+
+def test_import_is_light() -> None:
+    """The least of three times counts: on a machine at work one may take long."""
+    share, packages = imported()
+    assert "torch" in packages
+    assert not packages & HEAVY
+    if share > BUDGET:
+        share = min(imported()[0] for _ in range(2))
+    assert share <= BUDGET
