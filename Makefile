@@ -1,9 +1,9 @@
-# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site.
+# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site. make results: all that the pages of results show, half a day; it goes on where it was interrupted.
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHONPATH :=
 
-.PHONY: paper mice mice-planner test check bench docs clean
+.PHONY: paper mice mice-planner results test check bench docs clean
 
 paper: .venv/cli
 	$(BIN)/python -m eval paper
@@ -13,6 +13,9 @@ mice: .venv/cli
 
 mice-planner: .venv/cli
 	$(BIN)/python -m eval mice --out runs/mice-planner
+
+results: .venv/all
+	$(BIN)/python -m eval pages
 
 # One thread a process: two processes of two threads each wait for one another.
 test: check
