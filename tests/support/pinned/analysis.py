@@ -1,5 +1,6 @@
 """Statistics of plans, comparisons of priors on held-out plans, intervals and tests."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,8 +45,8 @@ from neuroprior.analysis import (
     unit_name,
     units,
 )
-from neuroprior.priors import ContextTreePrior, MarkovPrior, UniformPrior
-from neuroprior.worlds import gridworld
+from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior
+from neuroprior.worlds import cube, gridworld
 from tests.support.pinned.data import behaviour, timed
 from tests.support.sources import seeded
 from tests.support.studies import between, study, within
@@ -97,6 +98,17 @@ def sequences():
             "transitions": transitions(plans, 99, seeded(0)),
             "unit": [unit_name(plans), units(plans, plans.mask())],
         }
+    for name, some in {
+        "ungrouped": replace(behaviour(9), group=None),
+        "of one group": replace(behaviour(9), group=torch.full((9,), 3)),
+        "alone": behaviour(1, 90),
+    }.items():
+        mask = some.mask() & (torch.arange(some.max_length) > 2)
+        found[f"units, {name}"] = [unit_name(some, mask), units(some, mask)]
+        found[f"transitions, {name}"] = transitions(some, 49, seeded(0)).p_value
+        found[f"lags, {name}"] = mutual_information(some, 2, generator=seeded(0))
+    few = replace(behaviour(4, 60), group=torch.tensor([0, 1, 1, 2]))
+    found["few plans of a group"] = transitions(few, 99, seeded(0))
     found["orders of contexts"] = order_selection(behaviour(30, context="step"), 2, 3)
     found["chi-square"] = transitions(behaviour(300, 30), 99, seeded(0), max_work=10)
     found["pieces"] = pieces(behaviour(9, 30), 5, 12, seeded(0)).actions
@@ -122,6 +134,12 @@ def comparisons():
         "drift by position": by_position(held_out, bits, mask, 4),
         "drift of actions": action_drift(held_out),
     }
+    many = replace(behaviour(40, 8, seed=3), group=torch.arange(40) % 3)
+    rising = torch.arange(40.0)[:, None].double() + torch.rand(40, 8, generator=seeded(0))
+    found["rising drift"] = [by_plan(many, rising, many.mask()), by_plan(many, -rising, many.mask())]
+    found["drift of one group"] = by_plan(replace(many, group=None), rising.sin(), many.mask())
+    few = by_plan(many[:9], rising[:9].cos(), many[:9].mask())
+    found["drift of few"] = [few, by_group(many[:9], rising[:9], many[:9].mask())]
     context = behaviour(40, context="step")
     found["baselines with context"] = [
         [one.model, one.how, one.validation_bits] for one in baselines(context, behaviour(9, context="step", seed=2), 3)
@@ -170,6 +188,8 @@ def modes():
     plans = behaviour(30, 20)
     choice = choose_modes(plans, (1, 2), generator=seeded(0), max_iterations=5, restarts=2)
     prior = choice.priors[2]
+    context = behaviour(30, context="plan", context_names=("a", "b", "c"), action_names=("x", "y", "z"))
+    known = SwitchingPrior(3, 2, num_contexts=3, max_iterations=4, restarts=1).fit(context, generator=seeded(0))
     return {
         "choice": [choice.chosen, choice.stability, choice.frame()],
         "stable": choice.stable(2),
@@ -177,6 +197,8 @@ def modes():
         "frame": mode_frame(prior, plans[:5]),
         "plans": mode_plans(prior, plans).actions,
         "transitions": mode_transitions(prior, plans),
+        "with contexts": mode_frame(known, context[:6]),
+        "table with contexts": mode_table(known, context),
     }
 
 
@@ -197,6 +219,13 @@ def intentions():
         found[f"forecast {within_}"] = forecast(
             priors, world, state, posteriors["even"], 4, 50, targets=targets, within=within_, generator=seeded(1)
         )
+    cube_ = cube(scramble=2)
+    state = cube_.reset(3, seeded(0))
+    found["forecast of cubes"] = forecast(
+        [UniformPrior(cube_.num_actions)], cube_, state, torch.ones(3, 1), 2, 200, targets=state, generator=seeded(1)
+    )
+    closed = {name: MarkovPrior(3, 1).fit(behaviour(20, 6, 2, seed=seed).with_end()) for seed, name in enumerate("ab")}
+    found["with an end"] = [infer(closed, behaviour(4, 5, 2, seed=3).with_end()), infer(closed, actions[:3] % 2)]
     return found
 
 

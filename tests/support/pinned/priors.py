@@ -5,25 +5,33 @@ from typing import Any
 
 import torch
 
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, VectorPlans
 from neuroprior.priors import (
+    AutoregressivePrior,
     BoardNetwork,
     CombinedPrior,
     ContextTreePrior,
+    DiscretisedPrior,
     DurationModel,
     GRUPrior,
     LogLinearPrior,
     MacroPrior,
     MarkovPrior,
     MixturePrior,
+    NoisePrior,
     PatternCounts,
     PatternNetwork,
     Prior,
     SemiMarkovPrior,
     StackedPrior,
+    StepSynergies,
+    StoredWindows,
     SwitchingPrior,
     TransformerPrior,
     UniformPrior,
+    VectorGRU,
+    VectorTransformer,
+    WindowSynergies,
     decode,
     fit,
     learn_macros,
@@ -135,6 +143,20 @@ def combined_of_chains():
             found[f"{name} {share}"] |= {"weights": weights}
             other = behaviour(10, context="plan", seed=4)
             found[f"{name} {share}"]["recounted"] = prior.recount(other).log_prob(other)
+    return found
+
+
+@case(relative=2e-3)
+def experts_of_every_kind():
+    """All networks and what counts, with a context; and plans of so few groups that these are split."""
+    plans, found = behaviour(24, 10, context="plan"), {}
+    quick = {**QUICK, "max_steps": 2}
+    prior = CombinedPrior(3, effort="full", num_contexts=3).fit(plans, generator=seeded(0), **quick)
+    found["full"] = of_prior(prior, plans) | {"experts": [expert.config for expert in prior.experts]}
+    for groups in (2, 12):
+        grouped = replace(behaviour(36), group=torch.arange(36) % groups)
+        chains = [MarkovPrior(3, 1), MarkovPrior(3, 3)]
+        found[f"{groups} groups"] = MixturePrior(3, chains).fit(grouped, generator=seeded(0)).log_prob(plans.actions)
     return found
 
 
@@ -275,4 +297,52 @@ def fitted_by_name():
                 prior.log_prob(plans).sum(),
                 decode(prior.sample(2, 3, generator=seeded(0)), prior),
             ]
+    return found
+
+
+def motion(num: int = 10, length: int = 12, context: bool = False) -> VectorPlans:
+    """A damped rotation driven by noise, of unequal lengths, between unlike bounds; the context is its phase."""
+    generator = seeded(0)
+    noise, now, rows = 0.3 * torch.randn(num, length, 2, generator=generator), torch.zeros(num, 2), []
+    turn = 0.9 * torch.tensor([[0.9, -0.43], [0.43, 0.9]])
+    for t in range(length):
+        now = (now @ turn.T + noise[:, t]).clamp(-1, 1)
+        rows.append(now)
+    low, high = torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 3.0])
+    actions = low + (torch.stack(rows, 1) + 1) / 2 * (high - low)
+    lengths = torch.randint(6, length + 1, (num,), generator=generator)
+    features = torch.sin(torch.arange(length) / 3).expand(num, -1)[..., None]
+    return VectorPlans(actions, low, high, lengths, context=features if context else None)
+
+
+@case(relative=2e-3)
+def priors_of_vectors():
+    plans, found = motion(), {}
+    ends = (plans.action_low, plans.action_high)
+    few: dict[str, Any] = {"max_steps": 5, "batch_size": 4, "progress": False}
+    for name, prior, how in (
+        ("white", NoisePrior(*ends), {}),
+        ("coloured", NoisePrior(*ends, None, memory=5), {}),
+        ("autoregressive", AutoregressivePrior(*ends), {}),
+        ("window synergies", WindowSynergies(*ends, window=5), {}),
+        ("step synergies", StepSynergies(*ends, 1, order=2), {}),
+        ("stored", StoredWindows(*ends, match=2, horizon=4, max_windows=20), {}),
+        ("discretised", DiscretisedPrior(*ends, 5, MarkovPrior(7, 3)), {}),
+        ("gru", VectorGRU(*ends, width=8, num_components=2, lags=2), few),
+        ("gru, coupled", VectorGRU(*ends, 1, width=8, coupled=True), few),
+        ("transformer", VectorTransformer(*ends, width=8, num_layers=1, num_heads=2), few),
+    ):
+        known = motion(context=prior.context_size is not None)
+        prior.fit(known, generator=seeded(0), **how)
+        context = None if known.context is None else known.context[:4]
+        with torch.no_grad():
+            found[name] = {
+                "log_prob": prior.log_prob(known),
+                "actions": prior.action_log_probs(known[:2]),
+                "drawn": prior.sample(4, 5, None if context is None else context[:, :1], generator=seeded(1)),
+                "goes on": prior.sample(
+                    4, 3, None if context is None else context[:, :5], past=known.actions[:4, :4], generator=seeded(2)
+                ),
+                "config": prior.config,
+            }
     return found
