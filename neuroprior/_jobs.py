@@ -24,6 +24,9 @@ from neuroprior._threads import one_thread
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
+SCHEDULER_SECONDS = 10
+"""In which a Dask scheduler has to answer."""
+
 PACKAGES = ("neuroprior", "eval")
 """Packages whose source counts in `code_version`."""
 
@@ -206,7 +209,7 @@ def _cluster(address: str | None) -> Iterator[None]:
     except ImportError as error:
         raise ImportError("dask: install it with pip install 'neuroprior[dask]'") from error
     try:
-        client = Client(address, timeout=10)
+        client = Client(address, timeout=SCHEDULER_SECONDS)
     except (OSError, ValueError) as error:
         raise ValueError(f"dask: no scheduler answers at {address}") from error
     try:

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from neuroprior import _files
+from neuroprior import _files, _jobs
 from neuroprior._jobs import Failure, JobRun, Progress, _digest, code_version
 from tests.support import jobs
 
@@ -251,8 +251,9 @@ def test_a_cluster_does_the_jobs_though_a_worker_is_killed(cluster, tmp_path: Pa
     assert workers[1].pid in {result["process"] for result in found}
 
 
-def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
+def test_a_cluster_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
+    monkeypatch.setattr(_jobs, "SCHEDULER_SECONDS", 1)
     began = time.monotonic()
     with pytest.raises(ValueError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1"):
         JobRun(jobs.square, tmp_path, {}).do([1, 2], dask="tcp://127.0.0.1:1")

@@ -1,6 +1,6 @@
 """Normalised scores against the number of candidate plans: what a planner reaches that samples from a prior."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import product
 from time import perf_counter
 from typing import NamedTuple
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from eval.worlds.starts import Starts, worth
 from neuroprior import Prior, SamplingPlanner, UniformPrior
+from neuroprior.planners import proposers
 from neuroprior.planners.sampling import uniform_plans
 from neuroprior.planners.tuning import TEMPERATURES, UNIFORM_SHARES, choices
 
@@ -21,20 +22,27 @@ ROWS = 2**15
 
 
 class Sampling(NamedTuple):
-    """How candidates are drawn: at a temperature, and a share of them uniformly."""
+    """How candidates are drawn: at a temperature, a share of them uniformly, the others by one of `proposers`."""
 
     temperature: float = 1.0
     uniform_share: float = 0.0
+    proposer: int = 0
 
 
 SETTINGS = tuple(Sampling(*both) for both in product(TEMPERATURES, UNIFORM_SHARES))
 """How priors may be sampled: an overconfident prior tries the same plans again and again."""
 
 
+def settings_of(prior: Prior) -> list[Sampling]:
+    """All ways of sampling a prior: with `SETTINGS`, and by each of its `proposers`."""
+    return [one._replace(proposer=number) for number in range(len(proposers(prior))) for one in SETTINGS]
+
+
 def planner_of(starts: Starts, prior: Prior, num_plans: int, sampling: Sampling) -> SamplingPlanner:
     """A planner that samples its candidates from a prior."""
-    how = starts.task.scoring | {"num_rollouts": ROLLOUTS} | sampling._asdict()
-    return SamplingPlanner(prior, starts.length, num_plans, **how)
+    temperature, share, proposer = sampling
+    how = starts.task.scoring | {"num_rollouts": ROLLOUTS, "temperature": temperature, "uniform_share": share}
+    return SamplingPlanner(proposers(prior)[proposer], starts.length, num_plans, **how)
 
 
 class Drawn(NamedTuple):
@@ -49,9 +57,9 @@ class Drawn(NamedTuple):
     exact: Tensor
 
 
-def drawn(starts: Starts, prior: Prior, num_plans: int, temperature: float, generator: torch.Generator) -> Drawn:
-    """So many candidates of a prior for each start."""
-    planner, estimates, scores = planner_of(starts, prior, num_plans, Sampling(temperature)), [], []
+def drawn(starts: Starts, prior: Prior, num_plans: int, sampling: Sampling, generator: torch.Generator) -> Drawn:
+    """So many candidates of a prior for each start, none of them uniform."""
+    planner, estimates, scores = planner_of(starts, prior, num_plans, sampling._replace(uniform_share=0.0)), [], []
     for state in starts.state.split(max(ROWS // num_plans, 1)):
         plans, score, _ = planner.candidates(starts.world, state, generator)
         if score.dim() == 3:  # any prefix may win
@@ -64,7 +72,7 @@ def drawn(starts: Starts, prior: Prior, num_plans: int, temperature: float, gene
 def drawn_uniformly(starts: Starts, share: float, num_plans: int, generator: torch.Generator) -> Drawn | None:
     """As many uniform candidates for each start as are among so many candidates; None where there are none."""
     number = uniform_plans(share, num_plans)
-    return drawn(starts, UniformPrior(starts.world.num_actions), number, 1.0, generator) if number else None
+    return drawn(starts, UniformPrior(starts.world.num_actions), number, Sampling(), generator) if number else None
 
 
 def decided(own: Drawn, uniform: Drawn | None, num_plans: int, share: float) -> Tensor:
@@ -78,23 +86,24 @@ def tried(
     prior: Prior,
     generator: torch.Generator,
     numbers: Sequence[int],
-    settings: Sequence[Sampling] = SETTINGS,
+    settings: Sequence[Sampling] | None = None,
 ) -> dict[int, dict[Sampling, float]]:
     """For each number of candidates the normalised score of each way of sampling them, all from the same draws."""
-    most, found = max(numbers), {number: dict.fromkeys(settings, 0.0) for number in numbers}
-    uniform = drawn_uniformly(starts, max(one.uniform_share for one in settings), most, generator)
-    for temperature in dict.fromkeys(one.temperature for one in settings):
-        own = drawn(starts, prior, most, temperature, generator)
-        for one in (one for one in settings if one.temperature == temperature):
+    ways = settings_of(prior) if settings is None else settings
+    most, found = max(numbers), {number: dict.fromkeys(ways, 0.0) for number in numbers}
+    uniform = drawn_uniformly(starts, max(one.uniform_share for one in ways), most, generator)
+    for alike in dict.fromkeys(one._replace(uniform_share=0.0) for one in ways):
+        own = drawn(starts, prior, most, alike, generator)
+        for one in (one for one in ways if one._replace(uniform_share=0.0) == alike):
             for number in numbers:
                 score = decided(own, uniform, number, one.uniform_share)
                 found[number][one] = starts.reached(score)["share"]
     return found
 
 
-def best(table: Mapping[Sampling, float]) -> Sampling:
-    """The way of sampling with the highest score, of equals the first."""
-    return max(table, key=lambda one: table[one])
+def best(tables: Collection[Mapping[Sampling, float]]) -> Sampling:
+    """The way of sampling with the highest mean score over tables, of equals the first."""
+    return max(next(iter(tables)), key=lambda one: sum(table[one] for table in tables))
 
 
 def curve(
@@ -108,9 +117,9 @@ def curve(
     Returns:
         See `Starts.reached`, a list for all numbers.
     """
-    heat, share = sampling
+    share = sampling.uniform_share
     uniform = drawn_uniformly(starts, share, max(budgets), generator)
-    own = drawn(starts, prior, max(budgets), heat, generator)
+    own = drawn(starts, prior, max(budgets), sampling, generator)
     found = [starts.reached(decided(own, uniform, number, share)) for number in budgets]
     return {name: [one[name] for one in found] for name in found[0]}
 

@@ -15,7 +15,7 @@ from neuroprior.report.document import Column, Document, table
 from neuroprior.report.figures import transition_figure
 from neuroprior.report.page import FigureBox, Section, Table, breakable
 
-FRAMES = {name: name for name in ("rows", "paired", "efficiency", "bits", "words", "reasons", "across")}
+FRAMES = {name: name for name in ("rows", "paired", "efficiency", "bits", "words", "reasons", "across", "combined")}
 FRAMES |= {"growth": "curriculum"}
 """The tables of `Results` that are written to files, by the names of the files."""
 
@@ -166,6 +166,10 @@ def headlines(results: Results) -> Section:
         unit = f"the normalised score, % of the optimum, with {results.shown:,} candidate plans"
         names = {"prior": "label", "baseline": "baseline"}
         tables.append(across_table(_labelled(across), names, "score", "baseline's", unit, 100))
+    if len(combined := results.combined):
+        unit = "the normalised score, % of the optimum; most: the last context that each world offers"
+        names = {"other prior": "label", "candidates": "num_plans"}
+        tables.append(across_table(_labelled(combined), names, "combined", "other", unit, 100))
     return Section("Neural priors against Markov chains", text, tables, boxes)
 
 

@@ -30,8 +30,8 @@ LEARNED = ("neural", "markov", "other")
 PRIOR = ["prior", "context", "rounds"]
 """Columns that name a prior: its label, its context, and its rounds of the horizon curriculum."""
 
-SAMPLING = ["temperature", "uniform_share"]
-"""How candidates were drawn; in tables, its mean over seeds."""
+SAMPLING = ["temperature", "uniform_share", "alone"]
+"""How candidates were drawn, `alone`: by one expert of a combined prior; in tables, the means over seeds."""
 
 CLOSE = 1e-9
 """Normalised scores that differ by less are the same."""
@@ -290,6 +290,24 @@ class Results:
         pairs = pd.concat([others, own[own["kind"] != "uniform"].merge(random, on=["world", "seed"])])
         names = {"prior_x": "prior", "prior_y": "baseline", "share_x": "first", "share_y": "second"}
         return across_worlds(pairs.rename(columns=names), ["prior", "context", "rounds", "baseline"])
+
+    @cached_property
+    def combined(self) -> pd.DataFrame:
+        """The combined prior (`first`) against each other one (`second`) over the worlds, see `across_worlds`.
+
+        A row a prior, context (`none`; `most`: the last that each world offers), `rounds` (1 after the curriculum) and
+        number of plans.
+        """
+        own = self.scores[self.scores["num_plans"].isin(self.num_plans) & self.scores["prior"].notna()]
+        own = own[own["prior"] != "uniform"].assign(rounds=(own["rounds"] > 0).astype("int64"))
+        last = own["context"] == own.groupby("world")["context"].transform("last")
+        plain = own["context"] == "none"
+        parts = [own[plain], own[last].assign(context="most")] if (plain != last).any() else [own[plain]]
+        own = pd.concat(parts)[["world", "seed", *PRIOR, "num_plans", "share"]]
+        like = [name for name in own.columns if name not in ("prior", "share")]
+        pairs = own[own["prior"] != COMBINED].merge(own[own["prior"] == COMBINED], on=like)
+        names = {"prior_x": "prior", "share_y": "first", "share_x": "second"}
+        return across_worlds(pairs.rename(columns=names), [*PRIOR, "num_plans"])
 
 
 def grouped(frame: pd.DataFrame, by: Sequence[str]) -> Iterator[tuple[Any, pd.DataFrame]]:

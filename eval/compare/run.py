@@ -35,7 +35,7 @@ CURRICULUM_PLANS = 64
 """Candidate plans in the rounds of the horizon curriculum."""
 
 VALIDATION_PLANS = 256
-"""Candidate plans with which ways of sampling are chosen, and rounds of the curriculum are compared."""
+"""Candidate plans with which rounds of the curriculum are compared; ways to sample are chosen with at most as many."""
 
 VALIDATION_TIMES = 2
 """For each held-out start so many in the validation worlds, to choose there how to sample: differences are small."""
@@ -73,6 +73,11 @@ class Settings:
     def budgets(self) -> list[int]:
         """All powers of two up to the most candidates."""
         return [2**k for k in range(max(self.num_plans).bit_length())]
+
+    @property
+    def validated(self) -> list[int]:
+        """The numbers of candidates over which the mean score decides how to sample: all that are not too many."""
+        return [number for number in self.num_plans if number <= VALIDATION_PLANS] or [VALIDATION_PLANS]
 
     @property
     def asked(self) -> dict[str, Any]:
@@ -249,7 +254,9 @@ class Contest:
             "prior": one.label,
             "context": one.context,
             "rounds": one.rounds,
-            **sampling._asdict(),
+            "temperature": sampling.temperature,
+            "uniform_share": sampling.uniform_share,
+            "alone": float(sampling.proposer > 0),
             **reached,
             "seconds": [timed[number][0] if number in timed else None for number in budgets],
             "model_steps": [timed[number][1] if number in timed else None for number in budgets],
@@ -271,8 +278,8 @@ class Contest:
             return Sampling()
         key = one.label, one.context, one.rounds, length
         if key not in self._samplings:
-            tables = tried(self.validation_at[length], one.prior, self.generator, [VALIDATION_PLANS])
-            self._samplings[key] = best(tables[VALIDATION_PLANS])
+            tables = tried(self.validation_at[length], one.prior, self.generator, self.settings.validated)
+            self._samplings[key] = best(tables.values())
         return self._samplings[key]
 
     def exhaustive(self) -> list[dict[str, Any]]:

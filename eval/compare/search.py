@@ -157,7 +157,7 @@ def _entries(contest: Contest, one: Contestant, name: str, prior: Prior) -> list
     )
     ways = {
         way: {
-            number: best({setting: score for setting, score in table.items() if allowed(setting)})
+            number: best([{setting: score for setting, score in table.items() if allowed(setting)}])
             for number, table in chances.items()
         }
         for way, allowed in LIMITED.items()

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from jsonargparse.typing import extend_base_type, restricted_number_type
 from neuroprior._jobs import JobRun
 from neuroprior.analysis.statistics import (
     holm,
+    interquartile_gap,
     interquartile_mean,
     mean_intervals,
     paired_difference,
@@ -155,8 +157,9 @@ def across_worlds(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
     Returns:
         A row for each group with at least two worlds, and two seeds that all its worlds have: the columns `by`;
-        `worlds` and `seeds`, how many; `first` and `second`, the interquartile means over worlds; `improvement`, the
-        probability that `first` is higher in a world drawn at random; each with its `_low` and `_high`.
+        `worlds` and `seeds`, how many; `first` and `second`, the interquartile means over worlds, and `difference`, how
+        much higher the first is; `improvement`, the probability that `first` is higher in a world drawn at random; each
+        with its `_low` and `_high`.
     """
     rows = []
     for place, own in pairs.groupby(list(by), sort=False):
@@ -164,9 +167,9 @@ def across_worlds(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
         seeds = first.columns[first.notna().all() & second.notna().all()]
         if len(first) > 1 and len(seeds) > 1:
             a, b = first[seeds].to_numpy(), second[seeds].to_numpy()
-            aggregates = (*interquartile_mean(a), *interquartile_mean(b), *probability_of_improvement(a, b))
-            rows.append((*place, *a.shape, *aggregates))
-    names = [name + end for name in ("first", "second", "improvement") for end in ("", "_low", "_high")]
+            aggregates = (interquartile_mean(a), interquartile_mean(b), interquartile_gap(a, b))
+            rows.append((*place, *a.shape, *chain(*aggregates, probability_of_improvement(a, b))))
+    names = [name + end for name in ("first", "second", "difference", "improvement") for end in ("", "_low", "_high")]
     return pd.DataFrame(rows, columns=[*by, "worlds", "seeds", *names])
 
 
@@ -231,13 +234,15 @@ def across_table(
         "worlds": "worlds",
         first: lambda row: plus_minus(row, "first", factor, ends="first_"),
         second: lambda row: plus_minus(row, "second", factor, ends="second_"),
+        "difference": lambda row: plus_minus(row, "difference", factor, sign="+", ends="difference_"),
         "P(better)": lambda row: "{improvement:.2f} ({improvement_low:.2f} to {improvement_high:.2f})".format(**row),
     }
     caption = (
-        f"Interquartile means over worlds of {unit}, and the probability of improvement in a world drawn at random;"
+        f"Interquartile means over worlds of {unit}, their difference, paired by seed, and the probability of"
+        " improvement in a world drawn at random;"
         " Student's 95 % intervals over seeds."
     )
-    return table(found, columns, caption, "Over worlds", "l" * len(names) + "rrrr")
+    return table(found, columns, caption, "Over worlds", "l" * len(names) + "rrrrr")
 
 
 def over_seeds(rows: pd.DataFrame) -> str:

@@ -36,7 +36,7 @@ LEAST_VARIANCE = 1e-6
 """Of all variance: the least that counts as that within conditions, as units may agree at random."""
 
 TIE = 1e-8
-"""Statistics that differ by less than this share are tied, as rounding depends on the order of sums."""
+"""Statistics that differ by less than this, or by less than this share, are tied: rounding depends on sums' order."""
 
 NUMBERS_AT_ONCE = 2**20
 """Statistics that are in memory at a time."""
@@ -287,9 +287,9 @@ def _tested(numbers: _Numbers, design: PermutationDesign, labelings: Tensor) -> 
     for part in labelings.split(size, 1):
         statistics = _statistics(numbers.smoothed, design, part)
         greatest.append(statistics.amax(0))
-        reached += (statistics >= observed * (1 - TIE)).sum(1)
+        reached += (statistics >= _least(observed)).sum(1)
     most = torch.cat(greatest)
-    above = len(most) - torch.searchsorted(most.sort().values, observed[:, 0] * (1 - TIE))
+    above = len(most) - torch.searchsorted(most.sort().values, _least(observed[:, 0]))
     means, low, high, difference = _estimates(numbers, design)
     corrected = above.double() / len(most)
     family = ConditionFamily(
@@ -306,6 +306,11 @@ def _tested(numbers: _Numbers, design: PermutationDesign, labelings: Tensor) -> 
         float(corrected.min()),
     )
     return family, most
+
+
+def _least(statistic: Tensor) -> Tensor:
+    """What counts as at least this statistic."""
+    return statistic - TIE * (1 + statistic)
 
 
 def _statistics(values: Tensor, design: PermutationDesign, labelings: Tensor) -> Tensor:

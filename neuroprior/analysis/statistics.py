@@ -114,6 +114,23 @@ def interquartile_mean(values: ArrayLike, level: float = 0.95) -> Interval:
     return mean_interval(stats.trim_mean(_matrix("values", values), 0.25, axis=0), level)
 
 
+def interquartile_gap(first: ArrayLike, second: ArrayLike, level: float = 0.95) -> Interval:
+    """How much higher the `interquartile_mean` of `first` is than that of `second`, paired by seed.
+
+    Args:
+        first: `[W, G]`, G >= 2: scores in W worlds with G seeds.
+        second: `[W, G]`: of the other method, with the same worlds and seeds.
+        level: of confidence.
+
+    Raises:
+        ValueError: unequal shapes, fewer than two seeds, or values that are not finite.
+    """
+    a, b = _alike(first, second)
+    gap = stats.trim_mean(a, 0.25, axis=0) - stats.trim_mean(b, 0.25, axis=0)
+    # Rounded, so that differences that are equal but for rounding errors have no spread.
+    return mean_interval(np.round(gap, 12), level)
+
+
 def probability_of_improvement(first: ArrayLike, second: ArrayLike, level: float = 0.95) -> Interval:
     """The share of worlds in which `first` is better than `second`, with Student's interval over seeds.
 
@@ -128,9 +145,7 @@ def probability_of_improvement(first: ArrayLike, second: ArrayLike, level: float
     Raises:
         ValueError: unequal shapes, fewer than two seeds, or values that are not finite.
     """
-    a, b = _matrix("first", first), _matrix("second", second)
-    if a.shape != b.shape:
-        raise ValueError(f"second: shape {list(a.shape)}, that of first, is expected, not {list(b.shape)}")
+    a, b = _alike(first, second)
     mean, low, high = mean_interval(((a > b) + (a == b) / 2).mean(0), level)
     return Interval(mean, max(low, 0.0), min(high, 1.0))
 
@@ -234,6 +249,14 @@ def _matrix(name: str, values: ArrayLike) -> np.ndarray[tuple[int, int], np.dtyp
     if len(wrong):
         raise ValueError(f"{name}{wrong[0].tolist()}: {matrix[tuple(wrong[0])]} is not a finite number")
     return matrix
+
+
+def _alike(first: ArrayLike, second: ArrayLike) -> list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]:
+    """Two matrices of equal shape."""
+    a, b = _matrix("first", first), _matrix("second", second)
+    if a.shape != b.shape:
+        raise ValueError(f"second: shape {list(a.shape)}, that of first, is expected, not {list(b.shape)}")
+    return [a, b]
 
 
 def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -25,7 +25,7 @@ from neuroprior.planners.options import OptionPlanner
 from neuroprior.planners.planner import Decision, Planner, PriorPlanner, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
-from neuroprior.planners.tuning import Tuned, best_sampling, sampling_for, search_weights
+from neuroprior.planners.tuning import Tuned, best_sampling, proposers, sampling_for, search_weights
 
 __all__ = [
     "AStarPlanner",
@@ -63,6 +63,7 @@ __all__ = [
     "extend_horizon",
     "mean_scores",
     "oracle",
+    "proposers",
     "random_best",
     "sampling_for",
     "search_weights",

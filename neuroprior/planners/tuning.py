@@ -1,4 +1,4 @@
-"""What helps a planner that samples: the temperature and the share of uniform plans, and plans that are hard to find.
+"""What helps a planner that samples: who proposes, at which temperature, with how many uniform plans, and hard plans.
 
 The likeliest plans are not the best candidates: those are likely and different. `best_sampling` chooses by what is
 found in a world, `sampling_for` without one, and `search_weights` says which plans to learn from.
@@ -7,7 +7,7 @@ found in a world, `sampling_for` without one, and `search_weights` says which pl
 from collections.abc import Mapping, Sequence
 from itertools import product
 from math import inf, log
-from typing import Any, NamedTuple, Unpack
+from typing import Any, NamedTuple, Unpack, cast
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from neuroprior.planners.planner import Objective
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner, uniform_plans
 from neuroprior.plans import Plans
+from neuroprior.priors.ensembles.mixture import MixturePrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.draws import check_temperature
@@ -41,16 +42,28 @@ class Tuned(NamedTuple):
     """What `best_sampling` chose.
 
     Attributes:
-        planner: samples at this temperature and with this share.
-        temperature: divides the prior's logits.
+        planner: samples in this way.
+        prior: who proposes: the prior itself, or one of its experts (`proposers`).
+        temperature: divides the logits of `prior`.
         uniform_share: the share of uniform plans.
-        scores: of each (temperature, uniform share) that was tried, the mean score of its decisions.
+        scores: of each (prior, temperature, uniform share) that was tried, the mean score of its decisions.
     """
 
     planner: SamplingPlanner
+    prior: Steppable
     temperature: float
     uniform_share: float
-    scores: Mapping[tuple[float, float], float]
+    scores: Mapping[tuple[Steppable, float, float], float]
+
+
+def proposers(prior: Steppable) -> tuple[Steppable, ...]:
+    """Who may propose candidates: the prior, and where it is a mixture of several, each of its experts alone.
+
+    The mixture that predicts plans best need not be the best to search with. An expert that is unsure of what it does
+    not know proposes more plans that differ.
+    """
+    experts = tuple(prior.experts) if isinstance(prior, MixturePrior) else ()
+    return (prior, *cast(tuple[Prior, ...], experts)) if len(experts) > 1 else (prior,)
 
 
 def best_sampling(
@@ -66,10 +79,11 @@ def best_sampling(
     generator: torch.Generator | None = None,
     **goal: Unpack[Objective],
 ) -> Tuned:
-    """The temperature and the share of uniform plans whose decisions score highest from some starts.
+    """Who proposes, the temperature and the share of uniform plans whose decisions score highest from some starts.
 
-    Candidates are drawn once at each temperature, and uniform ones once: each setting decides among some of both.
-    In a stochastic world what is chosen is scored by new rollouts, so that varied candidates do not win by luck.
+    Candidates are drawn once from each of `proposers(prior)` at each temperature, and uniform ones once: each setting
+    decides among some of both. In a stochastic world what is chosen is scored by new rollouts, so that varied
+    candidates do not win by luck.
 
     Args:
         prior, length, num_plans, num_rollouts: see `SamplingPlanner`.
@@ -91,21 +105,21 @@ def best_sampling(
         how: dict[str, Any] = {"num_rollouts": num_rollouts, "temperature": temperature, "uniform_share": share}
         return SamplingPlanner(prior, length, number, **how, **goal)
 
-    own = {heat: planner(prior, num_plans, heat) for heat in temperatures}
+    own = {(who, heat): planner(who, num_plans, heat) for who, heat in product(proposers(prior), temperatures)}
     uniform = max(uniform_plans(share, num_plans) for share in uniform_shares)
     even = planner(UniformPrior(world.num_actions), uniform) if uniform else None
-    totals = dict.fromkeys(product(temperatures, uniform_shares), 0.0)
+    totals = {(*which, share): 0.0 for which, share in product(own, uniform_shares)}
     steps = next(iter(own.values())).model_steps(world)
     for some in planner(prior, num_plans).chunks(state, steps):
         others = None if even is None else even.candidates(world, some, generator)[:2]
-        for heat in own:
-            drawn = own[heat].candidates(world, some, generator)[:2]
+        for which, planning in own.items():
+            drawn = planning.candidates(world, some, generator)[:2]
             for share in uniform_shares:
-                scores = _decided(own[heat], world, some, drawn, others, share, generator)
-                totals[heat, share] += float(scores.double().sum())
+                scores = _decided(planning, world, some, drawn, others, share, generator)
+                totals[*which, share] += float(scores.double().sum())
     best = max(totals, key=lambda setting: totals[setting])
     means = {setting: total / len(state) for setting, total in totals.items()}
-    return Tuned(planner(prior, num_plans, *best), *best, means)
+    return Tuned(planner(best[0], num_plans, *best[1:]), *best, means)
 
 
 def _decided(

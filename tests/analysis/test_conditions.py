@@ -523,6 +523,15 @@ def test_what_never_varies_does_not_differ():
     assert found.prediction.accuracy == 0.5
 
 
+@pytest.mark.parametrize("order", [[0, 1, 2, 3], [3, 1, 0, 2], [2, 3, 1, 0]])
+def test_conditions_with_the_same_mean_do_not_differ(order):
+    """Animals of both conditions take action 0 equally often: whatever rounding leaves of the difference is a tie."""
+    often = [3, 7, 12, 18]
+    rows = [[0] * k + [1] * (20 - k) for k in [*often, *(often[place] for place in order)]]
+    plans = Plans(torch.tensor(rows), 2, group=torch.arange(8), condition=torch.arange(8) // 4)
+    assert family_of(compare_conditions(plans), "actions").p_values.tolist() == [1, 1]
+
+
 def move(probs: Tensor, condition: Tensor) -> None:
     """After action 0, most of what would be action 1 is action 2 in condition 1."""
     probs[:, 0] = 0.5 * probs[:, 0] + 0.5 * torch.tensor([0.1, 0.4, 0.2, 0.1, 0.1, 0.1])

@@ -11,6 +11,7 @@ from scipy import stats
 
 from neuroprior.analysis.statistics import (
     best_of,
+    interquartile_gap,
     interquartile_mean,
     mean_interval,
     mean_intervals,
@@ -41,6 +42,7 @@ HIGH, LOW = np.array([[3.0, 5, 8, 4], [1.0, 2, 9, 4], [0.0, 7, 1, 2]]), np.array
     [
         lambda level: mean_interval(HIGH[0], level),
         lambda level: interquartile_mean(HIGH, level),
+        lambda level: interquartile_gap(HIGH, LOW, level),
         lambda level: probability_of_improvement(HIGH, LOW, level),
         lambda level: paired_difference(HIGH[0], LOW[0], level),
         lambda level: ratio_difference(HIGH[0], LOW[0], level),
@@ -56,6 +58,15 @@ def test_widths_are_those_of_the_level(interval: Callable[[float], tuple[float, 
         assert (wide[k] - wide[0]) / (narrow[k] - narrow[0]) == pytest.approx(
             stats.t.ppf(0.75, 3) / stats.t.ppf(0.6, 3)
         )
+
+
+def test_interquartile_gap_is_paired_by_seed() -> None:
+    """Of four worlds the highest and the lowest are left out, of each method's own: 4 - 2, 5 - 3 and 6 - 5."""
+    first = [[0.0, 1, 2], [3, 4, 5], [5, 6, 7], [9, 9, 9]]
+    second = [[2.0, 3, 5], [2, 3, 5], [8, 7, 9], [1, 0, 0]]
+    assert interquartile_gap(first, second) == pytest.approx(mean_interval([4 - 2, 5 - 3, 6 - 5]))
+    with pytest.raises(ValueError, match=r"second: shape \[4, 3\], that of first, is expected, not \[3, 3\]"):
+        interquartile_gap(first, second[1:])
 
 
 def test_share_interval_is_wilsons() -> None:

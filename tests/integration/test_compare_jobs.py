@@ -121,7 +121,8 @@ def test_a_damaged_file_is_named(tmp_path, capsys):
     assert f"{path}: damaged" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("how", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL])
+@pytest.mark.slow  # tests/test_jobs.py interrupts jobs of a function that takes no time to load
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_command_goes_on(how, alone, tmp_path):
     """Ctrl-C or a killed main process: no process is left, and another command gives the same files to the byte."""
     running = subprocess.Popen(

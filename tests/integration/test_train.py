@@ -173,6 +173,7 @@ def test_an_end_symbol(tmp_path):
     assert drawn[2:7].sum() > 3600
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_does(tmp_path):
     exactly = ["--model.prior.dropout", "0"]
     two = run([*small("gru", tmp_path / "two"), *exactly, "--trainer.devices", "2", "--trainer.strategy", "ddp"])

@@ -106,9 +106,9 @@ def test_searches_are_those_of_a_heap(kind: str, heuristic: Any) -> None:
     prior: Prior = MarkovPrior(3, 2).fit(torch.randint(3, (30, 5), generator=torch.Generator().manual_seed(0)))
     if kind == "additive":
         prior = UniformPrior(3)
-    for seed in range(3):
+    for seed in range(2):
         world = random_table(seed)
-        state = torch.randint(200, (12,), generator=torch.Generator().manual_seed(seed))
+        state = torch.randint(200, (8,), generator=torch.Generator().manual_seed(seed))
         state[0] = 199  # solved already
         for budget in (1, 30, 400):
             planner: BestFirstPlanner = LevinPlanner(prior, budget, heuristic=heuristic, reroot=kind == "rerooted")

@@ -6,8 +6,8 @@ from math import log
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
-from neuroprior.planners import best_sampling, sampling_for, search_weights
+from neuroprior import MarkovPrior, MixturePrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
+from neuroprior.planners import best_sampling, proposers, sampling_for, search_weights
 from neuroprior.planners.tuning import choices, log_chance
 from neuroprior.testing import check_planner
 from neuroprior.worlds import gridworld
@@ -98,13 +98,37 @@ def test_a_prior_that_is_wrong_needs_heat_or_uniform_plans():
     assert (wrong.temperature, wrong.uniform_share) == (1, 0.5)
     assert wrong.planner.uniform_share == 0.5
     # Two uniform plans and two that fail, but for 2 in 1,000: 3/4; four draws from 200 starts, 5 errors.
-    assert wrong.scores[1, 0.5] == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 200) ** 0.5)
-    assert wrong.scores[1, 0] < 0.1
+    assert wrong.scores[wrong.prior, 1, 0.5] == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 200) ** 0.5)
+    assert wrong.scores[wrong.prior, 1, 0] < 0.1
     hot = best_sampling(sure_of(1), world, state, 1, 4, uniform_shares=(0,), generator=seeded(0))
     assert (hot.temperature, hot.planner.temperature) == (2.0, 2.0)
     right = best_sampling(sure_of(0), world, state, 1, 4, uniform_shares=(0, 1.0), generator=seeded(0))
     assert (right.temperature, right.uniform_share) == (1.0, 0)
-    assert set(right.scores) == set(product((1.0, 1.5, 2.0), (0, 1.0)))
+    assert set(right.scores) == set(product([right.prior], (1.0, 1.5, 2.0), (0, 1.0)))
+
+
+def test_an_expert_proposes_alone_where_the_mixture_is_wrong():
+    """The mixture gives the expert that is right a weight of 1/1,000; alone it always finds the reward."""
+    wrong, right = sure_of(1), sure_of(0)
+    mixture = MixturePrior(2, [wrong, right])
+    mixture.first = torch.tensor([0.999, 0.001]).log()
+    assert proposers(mixture) == (mixture, *mixture.experts)
+    assert proposers(right) == (right,)
+    world, state = bandit(), torch.zeros(200, dtype=torch.long)
+    how = {"temperatures": (1.0,), "uniform_shares": (0.0,), "generator": seeded(0)}
+    found = best_sampling(mixture, world, state, 1, 4, **how)
+    assert found.prior is mixture.experts[1]
+    assert found.planner.prior is found.prior
+    assert [one for one, _, _ in found.scores] == [mixture, *mixture.experts]
+    assert found.scores[found.prior, 1.0, 0.0] > 0.95
+    # Of equals the mixture itself comes first.
+    alike = MixturePrior(2, [sure_of(0), sure_of(0)])
+    assert best_sampling(alike, world, state, 1, 64, **how).prior is alike
+
+
+def test_a_mixture_of_one_proposes_itself():
+    mixture = MixturePrior(2, [sure_of(0)])
+    assert proposers(mixture) == (mixture,)
 
 
 def test_luck_does_not_win_in_a_stochastic_world():

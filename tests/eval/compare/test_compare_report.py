@@ -41,7 +41,9 @@ def reported(runs, folder, asked=ASKED) -> tuple[dict, str, str]:
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory):
     """The report on two worlds with all there can be, its folder, and the runs."""
-    runs = worlds(SETTINGS["worlds"], 4, {**TIMES, "runs/mine": 3.0}, context=("none", "initial"), rounds=1)
+    runs = worlds(
+        SETTINGS["worlds"], 4, {**TIMES, "runs/mine": 3.0, "combined": 32.0}, context=("none", "initial"), rounds=1
+    )
     folder = tmp_path_factory.mktemp("compare")
     return *reported(runs, folder), folder, runs
 

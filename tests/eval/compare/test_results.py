@@ -12,6 +12,7 @@ from scipy import stats
 from eval.compare.results import AGAINST, BEST, Results, best_difference, chosen, needed
 from neuroprior.analysis.statistics import (
     holm,
+    interquartile_gap,
     interquartile_mean,
     mean_interval,
     paired_difference,
@@ -304,11 +305,42 @@ def test_aggregates_over_worlds():
         assert (row["second"], row["second_low"], row["second_high"]) == pytest.approx(interquartile_mean(second))
         better = (row["improvement"], row["improvement_low"], row["improvement_high"])
         assert better == pytest.approx(probability_of_improvement(first, second))
+        gap = (row["difference"], row["difference_low"], row["difference_high"])
+        assert gap == pytest.approx(interquartile_gap(first, second))
         assert (row["worlds"], row["seeds"]) == (5, 4)
     pairs = {(row["prior"], row["baseline"]) for row in records(made.across)}
     chains = {("gru", "markov-1"), ("gru", "markov-2")}
     assert pairs == chains | {(prior, "uniform") for prior in TIMES if prior != "uniform"}
     assert Results(worlds(["maze"], 4), ASKED).across.empty
+
+
+def test_the_combined_prior_over_worlds():
+    """Against each other prior, without context and with the last of each world, at each number of candidates."""
+    times = TIMES | {"combined": 32.0}
+    runs = worlds(["maze", "grid"], 4, times, context=("none", "initial"), rounds=2)
+    runs += worlds(["cube", "taxi", "cliff"], 4, times, rounds=1)
+    frame = Results(runs, ASKED).combined
+    assert set(frame["prior"]) == set(TIMES) - {"uniform"}
+    assert len(frame) == 3 * 2 * 2 * len(ASKED)  # priors, contexts, rounds
+
+    def scores(prior: str, number: int) -> np.ndarray:
+        of = {}
+        for made in runs:
+            for one in made["entries"]:
+                if one["prior"] == prior and one["rounds"]:
+                    of[made["world"], made["seed"]] = one["share"][made["budgets"].index(number)]  # the last context
+        return np.array(list(of.values())).reshape(5, 4)
+
+    for number in ASKED:
+        (row,) = found(frame, prior="gru", context="most", rounds=1, num_plans=number)
+        first, second = scores("combined", number), scores("gru", number)
+        assert row["first"] == pytest.approx(interquartile_mean(first).mean)
+        assert row["second"] == pytest.approx(interquartile_mean(second).mean)
+        gap = (row["difference"], row["difference_low"], row["difference_high"])
+        assert gap == pytest.approx(interquartile_gap(first, second))
+        assert (row["worlds"], row["seeds"]) == (5, 4)
+    assert Results(worlds(["maze", "grid"], 4), ASKED).combined.empty
+    assert set(Results(worlds(["maze", "grid"], 4, times), ASKED).combined["context"]) == {"none"}
 
 
 def test_bits():

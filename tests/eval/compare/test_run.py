@@ -26,7 +26,7 @@ from eval.worlds.runs import Run
 from eval.worlds.splits import Worlds, from_seeds
 from eval.worlds.starts import starts_of
 from eval.worlds.suite import TASKS, Task, best_score
-from neuroprior import ExhaustivePlanner, MarkovPrior, TabularWorld, UniformPrior, collect, save
+from neuroprior import ExhaustivePlanner, MarkovPrior, MixturePrior, TabularWorld, UniformPrior, collect, save
 from neuroprior.worlds import cube, four_rooms, goal_direction, local_view, maze
 from tests.support.sources import refuses, seeded
 
@@ -138,12 +138,40 @@ def test_the_best_way_of_sampling():
     starts = starts_of(one_step(world), world, 40, 1, seeded(0))
     tables = tried(starts, nearly_sure_of(1), seeded(1), (1, 8))
     assert {tuple(table) for table in tables.values()} == {SETTINGS}
-    assert best(tables[8]) == Sampling(2.0, 0.3)
-    assert tables[8][2.0, 0.0] > tables[8][1.0, 0.0]
-    assert tables[8][1.0, 0.3] > tables[8][1.0, 0.0]
+    assert best([tables[8]]) == Sampling(2.0, 0.3)
+    assert tables[8][Sampling(2.0)] > tables[8][Sampling(1.0)]
+    assert tables[8][Sampling(1.0, 0.3)] > tables[8][Sampling(1.0)]
     # A share of a single plan is none: of equals the first.
-    assert best(tables[1]).uniform_share == 0
-    assert best(tried(starts, nearly_sure_of(0), seeded(1), (1,))[1]) == Sampling(1.0, 0.0)
+    assert best([tables[1]]).uniform_share == 0
+    assert best(tried(starts, nearly_sure_of(0), seeded(1), (1,)).values()) == Sampling(1.0, 0.0)
+
+
+def test_the_mean_over_numbers_of_candidates_decides():
+    one, two = Sampling(1.0), Sampling(2.0)
+    assert best([{one: 0.9, two: 0.2}, {one: 0.1, two: 0.7}]) == one
+    assert best([{one: 0.9, two: 0.2}, {one: 0.1, two: 0.9}]) == two
+    assert replace(SMALL, num_plans=(4, 16)).validated == [4, 16]
+    assert replace(SMALL, num_plans=(64, 256, 1024)).validated == [64, 256]
+    assert replace(SMALL, num_plans=(1024,)).validated == [256]
+
+
+def test_an_expert_of_a_mixture_may_propose_alone():
+    """The mixture hardly heeds the expert that knows the plan that wins."""
+    world = bandit(2)
+    starts = starts_of(one_step(world), world, 40, 1, seeded(0))
+    mixture = MixturePrior(2, [nearly_sure_of(1), nearly_sure_of(0)])
+    mixture.first = torch.tensor([0.99, 0.01]).log()
+    tables = tried(starts, mixture, seeded(1), (8,))
+    assert len(tables[8]) == 3 * len(SETTINGS)
+    chosen = best(tables.values())
+    assert chosen.proposer == 2
+    assert planner_of(starts, mixture, 8, chosen).prior is mixture.experts[1]
+    assert planner_of(starts, mixture, 8, chosen._replace(proposer=0)).prior is mixture
+    # Of 4 candidates the expert misses with 0.03 ** 4, the mixture with 0.95 ** 4.
+    how = [1, 4], mixture, seeded(2)
+    alone, whole = (curve(starts, how[1], how[2], Sampling(proposer=who), how[0])["share"][1] for who in (2, 0))
+    assert alone > 0.97
+    assert whole < 0.6
 
 
 def test_settings_that_are_tried_score_as_in_the_curve():
@@ -177,7 +205,8 @@ def test_a_run_holds_every_prior_before_and_after_the_curriculum(run):
     assert json.loads(json.dumps(run))["budgets"] == [1, 2, 4, 8, 16]
     for one in run["entries"][1:]:
         assert len(one["share"]) == len(one["at_oracle"]) == len(one["seconds"]) == 5
-        assert (one["temperature"], one["uniform_share"]) in SETTINGS
+        assert Sampling(one["temperature"], one["uniform_share"]) in SETTINGS
+        assert one["alone"] == 0
         if not one["uniform_share"]:  # else larger blocks are not made of smaller ones
             assert one["share"] == sorted(one["share"])
         assert 0 < one["share"][0] <= one["share"][-1] <= 1 + 1e-12

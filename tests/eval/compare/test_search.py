@@ -20,8 +20,8 @@ SMALL = Settings((4, 16), ("markov", "gru"), ("per-step",), 1, 3, 4, 40, 0)
 def test_ways_of_sampling_differ_in_what_may_be_chosen():
     found = {name: [one for one in SETTINGS if allowed(one)] for name, allowed in LIMITED.items()}
     assert found["neither"] == [Sampling(1.0, 0.0)]
-    assert found["temperature"] == [(heat, 0.0) for heat in (1.0, 1.5, 2.0)]
-    assert found["uniform share"] == [(1.0, share) for share in (0.0, 0.1, 0.3)]
+    assert found["temperature"] == [Sampling(heat) for heat in (1.0, 1.5, 2.0)]
+    assert found["uniform share"] == [Sampling(1.0, share) for share in (0.0, 0.1, 0.3)]
     assert found[BOTH] == list(SETTINGS)
 
 

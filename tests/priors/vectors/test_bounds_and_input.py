@@ -25,7 +25,7 @@ CLOSED = {
     "autoregressive": lambda low, high: AutoregressivePrior(low, high, 2),
     "window synergies": lambda low, high: WindowSynergies(low, high, window=4),
     "step synergies": lambda low, high: StepSynergies(low, high),
-    "stored windows": lambda low, high: StoredWindows(low, high, 2, 4, max_windows=20),
+    "stored windows": lambda low, high: StoredWindows(low, high, 2, 4, max_windows=6),
 }
 KINDS = CLOSED | {
     "discretised": lambda low, high: DiscretisedPrior(low, high, 6),
