@@ -290,9 +290,6 @@ class Mixer(NeuralPrior):
         mixed = (self.weights(out)[..., None] * forecasts.unflatten(-1, (self.num_experts, -1))).sum(-2)
         return self.head(out) + mixed, last[0]
 
-    def hidden_size_of(self, state_size: int) -> int:
-        return self.width
-
 
 def context_for(expert: Prior, context: Tensor | None) -> Tensor | None:
     """The context, for an expert that takes one; else None."""

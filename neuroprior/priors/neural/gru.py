@@ -71,7 +71,7 @@ class GRUPrior(NeuralPrior):
         if layers is not None and recent is not None and self._may_step(inputs):
             out, layers, recent = self._one_step(inputs, layers, recent)
         else:
-            vectors, recent = self.embedding(inputs, recent)
+            vectors, recent = self.embedding(inputs, recent, self.window)
             out, layers = self.gru(self.drop(vectors), None if layers is None else layers.contiguous())
         hidden = layers.transpose(0, 1).flatten(1)
         return self.head(self.drop(out)), hidden if recent.shape[1] == 0 else torch.cat([hidden, recent], 1)
@@ -94,15 +94,12 @@ class GRUPrior(NeuralPrior):
         """
         # Input gates that depend on an action alone are looked up, where there are more plans than actions.
         if self.takes_context or self.lags > 1 or len(inputs) <= self.num_actions:
-            vectors, recent = self.embedding(inputs, recent)
+            vectors, recent = self.embedding(inputs, recent, self.window)
             out, layers = gru_step(self.gru, vectors[:, 0], layers)
         else:
             action = inputs[:, 0, 0].int()
             out, layers = gru_step(self.gru, self.embedding.action.weight, layers, rows=action)
         return out[:, None], layers, recent
-
-    def hidden_size_of(self, state_size: int) -> int:
-        return self.num_layers * self.hidden_size + self.lags - 1
 
 
 def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
