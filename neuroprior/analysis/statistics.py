@@ -25,6 +25,8 @@ from numpy.typing import ArrayLike
 from scipy import special, stats
 from torch import Tensor
 
+from neuroprior._checks import check_level
+
 ENOUGH_UNITS = 5
 """Independent units below which no verdict is drawn: intervals are given, and nothing is called significant."""
 
@@ -67,8 +69,9 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
         level: of confidence.
 
     Raises:
-        ValueError: fewer than two values.
+        ValueError: a level that is not between 0 and 1, or fewer than two values.
     """
+    check_level(level)
     values = _vector("values", values)
     mean, error = float(values.mean()), float(stats.sem(values))
     half = float(special.stdtrit(len(values) - 1, (1 + level) / 2)) * error
@@ -87,7 +90,11 @@ def mean_intervals(frame: Any, by: str | Sequence[str], value: str, level: float
     Returns:
         A pandas frame with a row for each group, in order of appearance: the columns `by`, then `mean`, `low`, `high`
         and `n`, the number of units. `low` and `high` are NaN for fewer than two units.
+
+    Raises:
+        ValueError: a level that is not between 0 and 1.
     """
+    check_level(level)
     by = [by] if isinstance(by, str) else list(by)
     groups = frame.groupby(by, sort=False, dropna=False)[value]
     found = groups.agg(mean="mean", error="sem", n="count")
@@ -109,7 +116,8 @@ def interquartile_mean(values: ArrayLike, level: float = 0.95) -> Interval:
         level: of confidence.
 
     Raises:
-        ValueError: another shape, fewer than two seeds, or values that are not finite.
+        ValueError: a level that is not between 0 and 1, another shape, fewer than two seeds, or values that are not
+            finite.
     """
     return mean_interval(stats.trim_mean(_matrix("values", values), 0.25, axis=0), level)
 
@@ -123,7 +131,8 @@ def interquartile_gap(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
         level: of confidence.
 
     Raises:
-        ValueError: unequal shapes, fewer than two seeds, or values that are not finite.
+        ValueError: a level that is not between 0 and 1, unequal shapes, fewer than two seeds, or values that are not
+            finite.
     """
     a, b = _alike(first, second)
     gap = stats.trim_mean(a, 0.25, axis=0) - stats.trim_mean(b, 0.25, axis=0)
@@ -143,7 +152,8 @@ def probability_of_improvement(first: ArrayLike, second: ArrayLike, level: float
         level: of confidence.
 
     Raises:
-        ValueError: unequal shapes, fewer than two seeds, or values that are not finite.
+        ValueError: a level that is not between 0 and 1, unequal shapes, fewer than two seeds, or values that are not
+            finite.
     """
     a, b = _alike(first, second)
     mean, low, high = mean_interval(((a > b) + (a == b) / 2).mean(0), level)
@@ -157,10 +167,11 @@ def share_interval(successes: int, trials: int, level: float = 0.95) -> Interval
     independent: take the `mean_interval` of their shares.
 
     Raises:
-        ValueError: no trials, or more successes than trials.
+        ValueError: a level that is not between 0 and 1, no trials, or more successes than trials.
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"share_interval: {successes} successes of {trials} trials")
+    check_level(level)
     low, high = stats.binomtest(successes, trials).proportion_ci(level, method="wilson")
     return Interval(successes / trials, float(low), float(high))
 
@@ -169,7 +180,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     """The mean of `first - second`, values `[G]` of the same G worlds (subjects, folds), with Student's paired test.
 
     Raises:
-        ValueError: different numbers of values, or fewer than two.
+        ValueError: a level that is not between 0 and 1, different numbers of values, or fewer than two.
     """
     a, b = _vector("first", first), _vector("second", second)
     if len(a) != len(b):
@@ -194,8 +205,10 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
         The ratio with its interval, and the p-value of a ratio of 0 (two-sided).
 
     Raises:
-        ValueError: fewer than two units, unequal numbers of totals and sizes, or sizes that sum to 0.
+        ValueError: a level that is not between 0 and 1, fewer than two units, unequal numbers of totals and sizes, or
+            sizes that sum to 0.
     """
+    check_level(level)
     above, below = _vector("totals", totals), _vector("sizes", sizes)
     if len(above) != len(below):
         raise ValueError(f"ratio_difference: {len(above)} totals and {len(below)} sizes")

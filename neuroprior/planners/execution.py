@@ -57,6 +57,7 @@ def execute(
         ValueError: an argument is out of range, or a plan is too short.
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
+    check_memory(8 * num_steps, num_steps=num_steps)
     generator = generator_on(generator, state.device)
     parts = []
     for at in range(0, num_steps, replan_every):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_seed, check_sizes
 from neuroprior.plans.plans import Plans, is_per_step
 
 FEWEST_UNITS = 2
@@ -41,9 +42,10 @@ def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor
     unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
     unit = torch.arange(len(plans)) if unit is None else unit
     count = int(unit.max()) + 1 if len(unit) else 0
-    if not 2 <= number <= count:
+    if not isinstance(number, int) or isinstance(number, bool) or not 2 <= number <= count:
         kind = "groups" if grouped else "plans"
-        raise ValueError(f"folds: between 2 and the number of {kind}, {count}, are expected, not {number}")
+        raise ValueError(f"folds: between 2 and the number of {kind}, {count}, are expected, not {number!r}")
+    check_seed(seed)
     drawn = torch.randperm(count, generator=torch.Generator().manual_seed(seed)) % number
     return [((drawn[unit] != fold).nonzero()[:, 0], (drawn[unit] == fold).nonzero()[:, 0]) for fold in range(number)]
 
@@ -54,8 +56,7 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
     Raises:
         ValueError: not a single plan, fewer actions than parts, or no parts.
     """
-    if number < 1:
-        raise ValueError(f"number: at least 1 is expected, not {number}")
+    check_sizes(number=number)
     length = int(plans.mask().sum())
     if len(plans) != 1 or length < number:
         raise ValueError(f"plans: a single one of at least {number} actions is expected, not {len(plans)} of {length}")

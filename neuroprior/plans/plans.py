@@ -2,17 +2,21 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import log2
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior._checks import check_range, check_sizes, is_integer
+from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.rows import check_readable, rows_of
 from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.tables import Columns, Missing, fields_of
+
+MOST_BITS = 48
+"""Binary digits of the largest number of plans that `all_plans` would list, on any machine."""
 
 MOST_ACTIONS = 2**31
 """Actions beyond which their numbers are something else."""
@@ -324,9 +328,10 @@ class Plans(Sequences):
         Raises:
             ValueError: `first` is negative, or `stop` is less than `first`.
         """
+        check_count("first", first, 0)
+        if stop is not None:
+            check_count("stop", stop, 0)
         stop = self.max_length if stop is None else min(stop, self.max_length)
-        if first < 0:
-            raise ValueError(f"first: at least 0 is expected, not {first}")
         if stop < min(first, self.max_length):
             raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
 
@@ -350,6 +355,11 @@ def check_are_plans(plans: object) -> None:
 
 def all_plans(num_actions: int, length: int) -> Tensor:
     """All A**L plans `[A**L, L]`, int64; row n is n written in base A."""
+    check_sizes(num_actions=num_actions)
+    check_count("length", length)
+    if length * log2(num_actions) > MOST_BITS:
+        raise ValueError(f"length: {num_actions}**{length} plans are too many; list fewer or shorter ones")
+    check_memory(8 * num_actions**length * max(length, 1), num_actions=num_actions, length=length)
     base = num_actions ** torch.arange(length - 1, -1, -1)
     return torch.arange(num_actions**length)[:, None].div(base, rounding_mode="floor") % num_actions
 

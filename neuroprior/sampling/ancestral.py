@@ -171,7 +171,7 @@ def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
     for name, number in (("num_plans", num_plans), ("length", length)):
-        if not isinstance(number, int):
+        if not isinstance(number, int) or isinstance(number, bool):
             raise ValueError(f"{name}: an integer is expected, not {number!r}")
     if num_plans < 0 or length < 0 or batch_size < 1:
         raise ValueError(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from math import ceil
 
+from neuroprior._checks import is_number
 from neuroprior.plans.sequences import Sequences
 
 FEWEST_STEPS, MOST_STEPS = 10, 100
@@ -66,8 +67,11 @@ class Settings:
                 raise ValueError(
                     f"{name}: a positive {'number' if kind is float else 'integer'} is expected, not {value}"
                 )
-        if self.weight_decay < 0:
-            raise ValueError(f"weight_decay: must not be negative, not {self.weight_decay}")
+        if not is_number(self.weight_decay) or not 0 <= self.weight_decay < float("inf"):
+            raise ValueError(f"weight_decay: a finite number of at least 0 is expected, not {self.weight_decay!r}")
+        share = self.validation
+        if not isinstance(share, Sequences) and (not is_number(share) or not 0 < share < 1):
+            raise ValueError(f"validation: a share above 0 and below 1, or plans, is expected, not {share!r}")
 
     def batches_of(self, longest: int) -> int:
         """The size of batches of plans of which the longest has so many actions."""
