@@ -76,6 +76,26 @@ class GRUPrior(NeuralPrior):
         hidden = layers.transpose(0, 1).flatten(1)
         return self.head(self.drop(out)), hidden if recent.shape[1] == 0 else torch.cat([hidden, recent], 1)
 
+    def advance_shared(
+        self, action: Tensor, state: Tensor, context: Tensor, row: Tensor, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        """As `advance`, where many plans get the same input; its vectors and gates are computed once.
+
+        Args:
+            action: integers `[K]`, the distinct ones.
+            state, room: see `advance`.
+            context: `[K]` or `[K, C]`: that of the next action, with each.
+            row: integers `[N]`: which of the K each plan gets.
+        """
+        own = type(self).encode is GRUPrior.encode and type(self).step is NeuralPrior.step
+        inputs = self._inputs(action, context, None)
+        if not own or self.lags > 1 or self.window == 0 or not self._may_step(inputs[:, None]):
+            return self.advance(action[row], state, context[row], room)
+        layers = state[:, self.input_size :].unflatten(1, (self.num_layers, self.hidden_size)).transpose(0, 1)
+        vectors, _ = self.embedding(inputs[:, None], None, self.window)
+        out, layers = gru_step(self.gru, vectors[:, 0], layers, row.int())
+        return self.head(out), torch.cat([inputs.index_select(0, row), layers.transpose(0, 1).flatten(1)], 1)
+
     def _may_step(self, inputs: Tensor) -> bool:
         """Whether `_one_step` gives the same as `nn.GRU`, and faster."""
         plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"))
