@@ -21,7 +21,7 @@ def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor
 
 
 @njit(fastmath=True)
-def _tanh(x: Any) -> Any:
+def tanh(x: Any) -> Any:
     """A rational approximation, as exact as float32 (the coefficients are those of Eigen, `generic_fast_tanh_float`).
 
     Unlike the system's own function it is computed for many numbers at once.
@@ -41,9 +41,9 @@ def _tanh(x: Any) -> Any:
 
 
 @njit(fastmath=True)
-def _sigmoid(x: Any) -> Any:
+def sigmoid(x: Any) -> Any:
     half = float32(0.5)
-    return half * _tanh(half * x) + half
+    return half * tanh(half * x) + half
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -53,7 +53,7 @@ def _gates(given: Array, rows: Array, hidden: Array, before: Array, stride: int,
     for n in range(len(after)):
         mine, own, last, new = given[rows[n]], hidden[n], before[n * stride : n * stride + width], after[n]
         for k in range(width):
-            reset = _sigmoid(mine[k] + own[k])
-            update = _sigmoid(mine[width + k] + own[width + k])
-            fresh = _tanh(mine[2 * width + k] + reset * own[2 * width + k])
+            reset = sigmoid(mine[k] + own[k])
+            update = sigmoid(mine[width + k] + own[width + k])
+            fresh = tanh(mine[2 * width + k] + reset * own[2 * width + k])
             new[k] = fresh + update * (last[k] - fresh)
