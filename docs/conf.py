@@ -70,6 +70,7 @@ ROOMS = {
     "neuroprior.priors.macros": "Macro-actions",
     "neuroprior.priors.neural": "Neural priors",
     "neuroprior.priors.patterns": "Priors of boards",
+    "neuroprior.priors.switching": "Priors with hidden modes",
     "neuroprior.priors.vectors": "Priors over vectors",
     "neuroprior.sampling": "Sampling",
     "neuroprior.worlds": "Worlds",
@@ -79,6 +80,7 @@ ROOMS = {
     "neuroprior.planners": "Planners",
     "neuroprior.planners.continuous": "Planners of vectors",
     "neuroprior.agents": "Agents",
+    "neuroprior": "The top level",
     "neuroprior.analysis": "Analysis",
     "neuroprior.report": "Reports",
     "neuroprior.training": "Training",
@@ -112,7 +114,7 @@ REFERENCE = re.compile(r"(?<![`:\w])`([^`]+)`(?![`_])")
 def target(written: str) -> str | None:
     """The full public name that a docstring means by `MarkovPrior`, `Plans.with_end` or `neuroprior.analysis.score`."""
     written = written.removesuffix("()")
-    if written in NAMES:
+    if written in NAMES or written in HOMES.values():
         return written
     for room in ("neuroprior", *NAMES):
         written = written.removeprefix(f"{room}.") if written.removeprefix(f"{room}.") in BY_NAME else written

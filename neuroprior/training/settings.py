@@ -44,6 +44,10 @@ class Settings:
 
     Raises:
         ValueError: a value out of range.
+
+    Example:
+        >>> Settings(max_steps=500, patience=3).max_steps
+        500
     """
 
     max_steps: int | None = None
