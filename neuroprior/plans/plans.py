@@ -150,8 +150,6 @@ class Plans(Sequences):
             raise IndexError(
                 f"plans[{index}]: a slice or a tensor is expected; plans[{index} : {index + 1}] is one plan"
             )
-        if isinstance(index, str | None):
-            raise IndexError(f"plans[{index!r}]: a slice or a tensor is expected")
 
         def pick(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[index]
