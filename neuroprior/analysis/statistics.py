@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from scipy import special, stats
 from torch import Tensor
 
-from neuroprior._checks import check_level
+from neuroprior._checks import check_count, check_level, check_sizes
 
 ENOUGH_UNITS = 5
 """Independent units below which no verdict is drawn: intervals are given, and nothing is called significant."""
@@ -58,10 +58,18 @@ def best_of(scores: Tensor, baselines: Sequence[int] | None = None) -> Tensor:
     Returns:
         `[K, ...]` bool.
 
+    Raises:
+        ValueError: a baseline that is not there or none, or a score that is NaN.
+
     Example:
         >>> best_of(torch.tensor([[0.9, 0.5], [0.8, 0.7]])).tolist()
         [[True, False], [False, True]]
     """
+    numbers = range(len(scores)) if baselines is None else list(baselines)
+    if not len(numbers) or not all(0 <= number < len(scores) for number in numbers):
+        raise ValueError(f"baselines: one or more of 0 to {len(scores) - 1} are expected, not {list(numbers)}")
+    if scores.isnan().any():
+        raise ValueError(f"scores{scores.isnan().nonzero()[0].tolist()}: NaN is no score")
     return scores >= (scores if baselines is None else scores[list(baselines)]).amax(0)
 
 
@@ -100,7 +108,7 @@ def mean_intervals(frame: Any, by: str | Sequence[str], value: str, level: float
         and `n`, the number of units. `low` and `high` are NaN for fewer than two units.
 
     Raises:
-        ValueError: a level that is not between 0 and 1.
+        ValueError: a level that is not between 0 and 1, or a column that is not there.
 
     Example:
         >>> import pandas as pd
@@ -110,6 +118,10 @@ def mean_intervals(frame: Any, by: str | Sequence[str], value: str, level: float
     """
     check_level(level)
     by = [by] if isinstance(by, str) else list(by)
+    if not hasattr(frame, "columns"):
+        raise ValueError(f"frame: a pandas frame is expected, not {type(frame).__name__}")
+    if missing := [name for name in [*by, value] if name not in frame.columns]:
+        raise ValueError(f"frame: no column {missing[0]!r}; there are {', '.join(map(str, frame.columns))}")
     groups = frame.groupby(by, sort=False, dropna=False)[value]
     found = groups.agg(mean="mean", error="sem", n="count")
     half = special.stdtrit(found["n"] - 1, (1 + level) / 2) * found["error"]
@@ -204,8 +216,10 @@ def share_interval(successes: int, trials: int, level: float = 0.95) -> Interval
         >>> share_interval(9, 10).mean
         0.9
     """
-    if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"share_interval: {successes} successes of {trials} trials")
+    check_count("successes", successes, 0)
+    check_sizes(trials=trials)
+    if successes > trials:
+        raise ValueError(f"successes: at most {trials}, the number of trials, is expected, not {successes}")
     check_level(level)
     low, high = stats.binomtest(successes, trials).proportion_ci(level, method="wilson")
     return Interval(successes / trials, float(low), float(high))
@@ -327,4 +341,7 @@ def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.
     vector = np.asarray(values, dtype=np.float64)
     if vector.ndim != 1 or len(vector) < 2:
         raise ValueError(f"{name}: at least two values, shape [G], are expected, not {list(vector.shape)}")
+    wrong = np.flatnonzero(np.isnan(vector))
+    if len(wrong):
+        raise ValueError(f"{name}[{wrong[0]}]: NaN is no number; leave it out")
     return vector

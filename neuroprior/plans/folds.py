@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_seed, check_sizes
-from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior.plans.plans import Plans, check_are_plans, is_per_step
 
 FEWEST_UNITS = 2
 """Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""
@@ -48,6 +48,7 @@ def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor
         >>> [(len(training), len(held_out)) for training, held_out in folds(plans, 3)]
         [(4, 2), (4, 2), (4, 2)]
     """
+    check_are_plans(plans)
     grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
     unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
     unit = torch.arange(len(plans)) if unit is None else unit

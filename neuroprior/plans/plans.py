@@ -95,6 +95,8 @@ class Plans(Sequences):
             actions = actions.masked_fill(~self.mask(), 0) if is_integer(actions) else actions
         check_range("actions", actions, self.num_actions, "actions")
         object.__setattr__(self, "actions", actions.to(action_dtype(self.num_actions)))
+        _check_texts("action_names", self.action_names)
+        _check_texts("notes", self.notes)
         if self.action_names is not None and len(self.action_names) != self.num_actions:
             raise ValueError(f"action_names: {self.num_actions} are expected, not {len(self.action_names)}")
         for what in ("group", "condition"):
@@ -133,7 +135,7 @@ class Plans(Sequences):
 
     def _check_end(self, actions: Tensor) -> None:
         """Check that `end` only closes plans; where lengths are not given, take them from it."""
-        if not isinstance(self.end, int) or not 0 <= self.end < self.num_actions:
+        if not isinstance(self.end, int) or isinstance(self.end, bool) or not 0 <= self.end < self.num_actions:
             raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {self.end!r}")
         position = torch.arange(1, actions.shape[1] + 1, device=actions.device)
         first = torch.where(actions == self.end, position, actions.shape[1]).amin(1) if actions.shape[1] else None
@@ -485,7 +487,9 @@ def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
 
 def _check_texts(what: str, names: Sequence[str] | None) -> bool:
     """Whether there are names; ValueError unless they are texts."""
-    if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
+    if names is not None and (
+        not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names)
+    ):
         raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
     return names is not None
 

@@ -375,6 +375,8 @@ def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
     """
     if isinstance(given, Prior):
         return given
+    if not isinstance(given, Mapping):
+        raise ValueError(f"a prior is expected, not {given!r}")
     made = SavedModule.known[given["prior"]](**given["config"])
     if not isinstance(made, Prior):
         raise ValueError(f"{given['prior']}: not a prior over numbered actions")
