@@ -87,12 +87,10 @@ class Sequence(torch.autograd.Function):
         length, num, width = after.shape
         to_given, to_hidden = torch.empty_like(opened), torch.empty_like(opened)
         carried = torch.zeros(num, width)
-        arrays: Any = (
-            *(part.numpy() for part in (after.contiguous(), carried, states, opened, hidden)),
-            *(to_given.numpy(), to_hidden.numpy()),
-        )
+        arrays = after.contiguous().numpy(), carried.numpy(), states.numpy(), opened.numpy(), hidden.numpy()
+        gradients = to_given.numpy(), to_hidden.numpy()
         for t in range(length - 1, -1, -1):
-            _backward(*arrays, t)
+            _backward(*arrays, *gradients, t)
             carried.addmm_(to_hidden[t], weight)
         every = to_hidden.flatten(0, 1)
         return to_given, carried, every.T @ states[:-1].flatten(0, 1), every.sum(0)
