@@ -1,9 +1,9 @@
-# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site.
+# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site. make results: all that the pages of results show, half a day; it goes on where it was interrupted.
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHONPATH :=
 
-.PHONY: paper mice mice-planner test check bench docs clean
+.PHONY: paper mice mice-planner results test check bench docs clean
 
 paper: .venv/cli
 	$(BIN)/python -m eval paper
@@ -14,6 +14,9 @@ mice: .venv/cli
 mice-planner: .venv/cli
 	$(BIN)/python -m eval mice --out runs/mice-planner
 
+results: .venv/all
+	$(BIN)/python -m eval pages
+
 # One thread a process: two processes of two threads each wait for one another.
 test: check
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
@@ -21,7 +24,7 @@ test: check
 check: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy neuroprior train eval
+	$(BIN)/mypy neuroprior train eval tests/typing
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench

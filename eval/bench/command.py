@@ -11,6 +11,7 @@ from jsonargparse.typing import PositiveInt
 from rich.console import Console
 
 from eval.bench import limits, sizes
+from eval.bench.against import compared, read_results, regression_table
 from eval.bench.figures import peers_figure, sizes_figure
 from eval.bench.jobs import JOBS, ON_DEVICES, against_peers, on_device
 from eval.bench.timing import Rows, import_times
@@ -27,6 +28,8 @@ def bench(
     jobs: Sequence[str] = tuple(JOBS),
     repetitions: PositiveInt = 5,
     scale: float = 1.0,
+    against: str | None = None,
+    measured: str | None = None,
     out: str = "runs/bench",
 ) -> None:
     """Measure the library's speed; prints tables, draws figures, writes CSV and results.json.
@@ -38,8 +41,16 @@ def bench(
         jobs: what to measure against peers.
         repetitions: how often each job is timed, in turn with its peers.
         scale: share of each job that is done, and of the largest size; the goals are for 1.
+        against: results.json of another run, such as of another commit: how many times as long everything takes now.
+        measured: results.json of a run that is compared with it; nothing is measured then.
         out: folder to write to.
     """
+    earlier = None if against is None else read_results(against)
+    if measured is not None and against is None:
+        raise ValueError("measured: with --against alone, the results that these are compared with")
+    if against is not None and earlier is not None and measured is not None:
+        Console().print(_regressions(earlier, read_results(measured), against))
+        return
     for name in set(jobs) - set(JOBS):
         raise ValueError(f"jobs: some of {', '.join(JOBS)} are expected, not {name}")
     if not 0 < scale <= 1:
@@ -81,7 +92,14 @@ def bench(
         console.print(printed(each.title, each))
     figures = {"peers": peers_figure, "sizes": sizes_figure}
     write_figures(folder, {part: draw(pd.DataFrame(found[part])) for part, draw in figures.items() if part in found})
+    if against is not None and earlier is not None:
+        console.print(_regressions(earlier, read_results(str(folder / "results.json")), against))
     console.print(f"written to {folder}")
+
+
+def _regressions(earlier: dict[str, Any], later: dict[str, Any], path: str) -> Any:
+    shown = regression_table(compared(earlier, later), path)
+    return printed(shown.title, shown)
 
 
 def tables(found: dict[str, Rows], settings: dict[str, Any]) -> list[Table]:

@@ -1,32 +1,38 @@
 """`python -m eval control`: do learned priors help planners of continuous actions?"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import pandas as pd
 import torch
 from jsonargparse.typing import PositiveInt
 
 from eval.control.animation import animate
 from eval.control.priors import NONE, check_prior_name, fitted
-from eval.control.report import control_document
+from eval.control.report import Results, control_document
 from eval.control.run import (
     Choice,
+    Collecting,
     ControlSettings,
     PlannerName,
-    chosen,
-    control_run,
+    Planning,
+    Scoring,
+    Tuning,
+    collecting_run,
     planner_of,
-    training_plans,
+    planning_run,
+    scoring_run,
     tuning_run,
 )
-from eval.control.tasks import TASKS, TaskName, check_there
+from eval.control.tasks import CONDITIONS, TASKS, TaskName, check_there
 from eval.worlds import runs
 from neuroprior._jobs import JobRun
-from neuroprior.report.document import write_figures
+from neuroprior.plans import VectorPlans, read_vector_plans, write_vector_plans
+from neuroprior.report.document import publish, write_figures
 
 FEW = ("half_cheetah", "arm")
 """Tasks of the default, which takes about five minutes."""
@@ -48,14 +54,18 @@ def control_experiment(
     processes: PositiveInt | None = None,
     dask: str | None = None,
     out: str = "runs/control",
+    scored: Sequence[str] = (),
+    conditions: Sequence[Literal["same", "masses", "goal"]] = CONDITIONS,  # type: ignore[assignment]
     animation: TaskName | None = None,
 ) -> None:
     """Do learned priors help planners of continuous actions?
 
     A plain planner (iCEM) controls a simulator; priors learn from what it executed. Then planners draw a share of their
     candidates from each prior: in the same world, with all masses 1.4 times as large, and with a new goal. The noise of
-    each planner, the share of each prior, and whether it proposes plans or noise are chosen on validation seeds. Prints
-    tables; writes them (CSV), results.json, report.html and figures to a folder. Interrupted, the same command goes on.
+    each planner, the share of each prior, and whether it proposes plans or noise are chosen on validation seeds, in the
+    same world and in one with other masses and another goal than these. Prints tables; writes them (CSV), results.json,
+    report.html and figures to a folder. Each prior, condition and seed is a run of its own: interrupted, or with more
+    priors or seeds, the same command goes on.
 
     Args:
         tasks: simulators; all but the arm and the double integrator need the extra mujoco.
@@ -71,66 +81,115 @@ def control_experiment(
         tuning_budget: candidates with which settings are chosen.
         tuning_seeds: validation seeds of each task.
         seed: of everything random.
-        processes: how many runs, a task and a seed each, are done at a time; all cores by default.
+        processes: how many runs are done at a time; all cores by default.
         dask: address of a Dask scheduler, tcp://host:port, whose workers do the runs.
         out: folder for the report and for finished runs.
+        scored: further priors that are only fitted and scored on held-out plans.
+        conditions: worlds in which planners are tried.
         animation: draw a run in this task, with stored windows and the most candidates, as TASK.gif in the folder.
     """
     runs.check_distinct(tasks=tasks, priors=priors, planners=planners, budgets=budgets, plain_budgets=plain_budgets)
-    for name in priors:
+    if scored:
+        runs.check_distinct(scored=scored)
+    runs.check_distinct(conditions=conditions)
+    for name in (*priors, *scored):
         check_prior_name(name)
+    if NONE in scored:
+        raise ValueError('scored: "none" is no prior')
     if NONE not in priors:
         raise ValueError('priors: "none", the plain planner, is needed to compare with')
     for task in (*tasks, *([] if animation is None else [animation])):
         check_there(task)
     numbers = tuple(map(int, sorted(budgets)))
     settings = ControlSettings(
-        tuple(planners),
-        tuple(priors),
         numbers,
         tuple(sorted(set(map(int, plain_budgets)) - set(numbers))),
         int(steps),
         int(training_runs),
         int(training_budget),
         int(tuning_budget),
+        int(tuning_seeds),
         int(seed),
     )
-    choices = _tuned(tasks, settings, tuning_seeds, out, processes, dask)
-    settings = settings.with_choices(choices)
-    how = tasks, seeds, out, processes, dask
-    document = runs.run_experiment("control", control_run, control_document, settings, *how)
+
+    def done(what: str, work: Callable[..., Any], jobs: Sequence[Any], **files: Any) -> list[Any]:
+        asked = {"command": f"control {what}", **asdict(settings)}
+        run: JobRun[Any, Any] = JobRun(
+            partial(work, settings=settings),
+            Path(out) / what,
+            asked,
+            name=attrgetter("name"),
+            packages=runs.MAKERS,
+            **files,
+        )
+        return run.do(jobs, processes=processes, dask=dask, title=what)
+
+    def tuned(jobs: Sequence[Tuning]) -> dict[tuple[str, str, str], Choice]:
+        found = done("tuning", tuning_run, jobs)
+        return {(job.world, job.planner, job.prior): Choice(*each) for job, each in zip(jobs, found, strict=True)}
+
+    alone = tuned([Tuning(task, planner) for task in tasks for planner in dict.fromkeys(("icem", *planners))])
+    learned = [prior for prior in priors if prior != NONE]
+    choices = alone | tuned(
+        [
+            Tuning(task, planner, prior, (alone[task, "icem", NONE], alone[task, planner, NONE]))
+            for task in tasks
+            for planner in planners
+            for prior in learned
+        ]
+    )
+    entries: list[Any] = []
+    likelihoods: list[Any] = []
+    cloned: list[Any] = []
+    how_kept = {"save": lambda path, plans: write_vector_plans(plans, path), "load": read_vector_plans}
+
+    def collected(number: int, held_out: bool) -> dict[str, VectorPlans]:
+        collecting = [Collecting(task, number, alone[task, "icem", NONE], held_out) for task in tasks]
+        plans = done("plans", collecting_run, collecting, **how_kept, suffix=".npz")
+        return dict(zip(tasks, plans, strict=True))
+
+    # Seed by seed, so that an experiment that is cut off has all of some seeds.
+    for number in range(seeds):
+        plans = collected(number, False) if learned else {}
+        planning = [
+            Planning(task, number, condition, planner, prior, choices[task, planner, prior], plans.get(task))
+            for task in tasks
+            for condition in CONDITIONS
+            if condition in conditions
+            for planner in planners
+            for prior in priors
+        ]
+        for found in done("planning", planning_run, planning):
+            entries += found["entries"]
+            cloned += [found["alone"]] if found["alone"] is not None else []
+    for number in range(seeds if learned or scored else 0):
+        plans, held_out = collected(number, False), collected(number, True)
+        scoring = [
+            Scoring(task, number, prior, plans[task], held_out[task])
+            for task in tasks
+            for prior in dict.fromkeys((*learned, *scored))
+        ]
+        likelihoods += done("scoring", scoring_run, scoring)
+    shown = {"tasks": list(tasks), "priors": list(priors), "planners": list(planners), "scored": list(scored)}
+    shown |= {"conditions": list(conditions), "seeds": seeds} | asdict(settings)
+    results = Results(pd.DataFrame(entries), pd.DataFrame(likelihoods), pd.DataFrame(cloned))
+    settled = {"/".join(place): choice._asdict() for place, choice in choices.items()}
+    document = control_document(results, shown | {"choices": settled}, runs.command_line("control"))
+    publish(document, Path(out))
     write_figures(Path(out), document.figures)
     if animation is not None:
-        _animated(animation, settings, Path(out))
+        _animated(animation, settings, alone.get((animation, "icem", NONE), Choice(0.6, 1.0)), Path(out))
 
 
-def _animated(task: str, settings: ControlSettings, out: Path) -> None:
+def _animated(task: str, settings: ControlSettings, choice: Choice, out: Path) -> None:
     """A moving picture of iCEM in the world before it changed; a line that says why, where there can be none."""
-    one = TASKS[task]
-    choice = Choice._make(settings.choices[task]["icem"][NONE]) if task in settings.choices else Choice(0.6, 1.0)
-    path = out / f"{task}.gif"
+    path, horizon = out / f"{task}.gif", TASKS[task].horizon
     try:
-        prior = fitted("stored", training_plans(one, settings, 0, choice).plans, one.horizon, torch.Generator())
-        planner = planner_of(
-            "icem", one.horizon, max(settings.budgets), choice._replace(share=0.5, iterations=1), prior
-        )
+        plans = collecting_run(Collecting(task, 0, choice), settings)
+        prior = fitted("stored", plans, horizon, torch.Generator())
+        choice = choice._replace(share=0.5, iterations=1)
+        planner = planner_of("icem", horizon, max(settings.budgets), choice, prior)
         animate(task, "same", planner, settings.steps, path, torch.Generator().manual_seed(settings.seed))
         print(f"animation: {path}")
     except ValueError as error:
         print(f"no animation: {error}")
-
-
-def _tuned(
-    tasks: Sequence[str],
-    settings: ControlSettings,
-    seeds: int,
-    out: str,
-    processes: int | None,
-    dask: str | None,
-) -> dict[str, Any]:
-    """The settings of each planner and prior in each task, chosen on validation seeds; see `chosen`."""
-    asked = {"command": "control tuning", **asdict(settings)}
-    work = partial(tuning_run, settings=settings)
-    jobs = JobRun(work, Path(out) / "tuning", asked, name=attrgetter("name"), packages=runs.MAKERS)
-    results = jobs.do(runs.runs_of(tasks, seeds), processes=processes, dask=dask, title="tuning")
-    return {task: chosen([one for one in results if one["world"] == task], settings) for task in tasks}

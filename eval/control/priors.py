@@ -51,13 +51,13 @@ CLONING = "cloning"
 
 def check_prior_name(name: str) -> None:
     """Raise ValueError for what is no name of a prior."""
-    base, number = _parted(name)
+    base, number = parted(name)
     known = (NONE, *SIMPLE, SHUFFLED, *NETWORKS, CLONING)
     if base not in known or (number is not None and base not in WITH_NUMBER):
         raise ValueError(f"priors: one of {', '.join(known)} is expected, or synergies-4, not {name!r}")
 
 
-def _parted(name: str) -> tuple[str, int | None]:
+def parted(name: str) -> tuple[str, int | None]:
     """A name's parts: what is before and behind a hyphen, if a number is behind it."""
     base, _, number = name.rpartition("-")
     return (base, int(number)) if base and number.isdecimal() and int(number) else (name, None)
@@ -77,7 +77,7 @@ def fitted(name: str, plans: VectorPlans, horizon: int, generator: torch.Generat
         horizon: vectors in a planner's plan.
         generator: source of randomness.
     """
-    base, number = _parted(name)
+    base, number = parted(name)
     bounds = plans.action_low, plans.action_high
     blind = plans.without_context()
     if base == SHUFFLED:

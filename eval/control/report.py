@@ -1,16 +1,17 @@
 """The report of `python -m eval control`: returns against candidates, and how many candidates a prior saves."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from eval.control.comparison import against_simple, differences, matches, over_budgets, savings, synergies
 from eval.control.priors import NONE
-from eval.control.tasks import CONDITIONS
+from eval.control.tasks import CONDITIONS, TASKS
 from eval.worlds import runs
+from neuroprior.analysis.statistics import ENOUGH_UNITS
 from neuroprior.report.document import Column, Document, table
 from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
 from neuroprior.report.page import FigureBox, Section, Table
@@ -32,127 +33,93 @@ LINES = {
 }
 """Colours and styles of the lines of figures."""
 
-REFERENCE = 100
-"""Candidates of the plain planner whose return is to be reached with fewer, or the nearest number that is tried."""
 
-RESAMPLES = 1000
-"""Of seeds, for the intervals of `savings`."""
+class Results(NamedTuple):
+    """What the runs of the experiment found, a row each; see `eval.control.run`.
+
+    Attributes:
+        entries: of planners, a row a task (`world`), condition, planner, prior, budget and seed.
+        likelihoods: of priors, a row a task, prior and seed; may be empty.
+        alone: of behaviour cloning, a row a task, condition and seed; may be empty.
+    """
+
+    entries: pd.DataFrame
+    likelihoods: pd.DataFrame
+    alone: pd.DataFrame
 
 
-def control_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
-    """The tables and figures of the results of `control_run`."""
-    frame = runs.frame_of(results).assign(task=lambda rows: rows["world"])
+def control_document(results: Results, settings: Mapping[str, Any], command: str) -> Document:
+    """The tables and figures of the results."""
+    frame = results.entries.assign(task=results.entries["world"])
     rows = runs.seed_means(frame, PLACE, "return", ["seconds", "sampling"])
-    gaps = differences(frame)
-    saved = savings(frame)
-    scored, more = runs.frame_of(results, "likelihoods"), ["fit_seconds", "for_80", "for_95"]
-    nats = scored  # empty where the plain planner is alone
+    gaps, saved, matched, drawn_shares = differences(frame), savings(frame), matches(frame), drawing(rows)
+    common = over_budgets(frame)
+    networks = against_simple(common, ["world", "condition", "planner"], "return")
+    windows = synergies(frame)
+    scored, nats = results.likelihoods, results.likelihoods  # empty where the plain planner is alone
+    scored_networks = windows[:0]
     if len(scored):
-        nats = runs.seed_means(scored.assign(task=scored["world"]), ["task", "prior"], "nats", more)
-    sections, leads = [], []
+        scored = scored.astype({"for_80": float, "for_95": float})
+        by_task = scored.assign(task=scored["world"])
+        nats = runs.seed_means(by_task, ["task", "prior"], "nats", ["fit_seconds", "for_80", "for_95"])
+        scored_networks = against_simple(scored, ["world"], "nats")
+    tables = [match_table(some) for _, some in matched.groupby(["planner", "condition"], sort=False)]
+    tables += [saving_table(some) for _, some in saved.groupby("planner", sort=False)]
+    tables += [drawing_table(some) for _, some in drawn_shares.groupby("planner", sort=False)]
+    sections = [Section("Candidates saved", tables=tables)]
+    tables = [likelihood_table(nats)] if len(nats) else []
+    tables += [nats_table(scored_networks)] if len(scored_networks) else []
+    tables += [network_table(networks)] if len(networks) else []
+    sections += [Section("Sequence models", tables=tables)] if tables else []
+    explained = nats[nats["for_80"].notna()] if len(nats) else nats
+    tables = [component_table(explained)] if len(explained) else []
+    tables += [synergy_table(windows)] if len(windows) else []
+    sections += [Section("Synergies", tables=tables)] if tables else []
+    alone = results.alone
+    if len(alone):
+        alone = runs.seed_means(alone.assign(task=alone["world"]), ["task", "condition", "prior"], "return")
+        sections.append(Section("Behaviour cloning", tables=[alone_table(alone)]))
+    leads, seeds = [], frame["seed"].nunique()
     for task in rows["task"].unique():
-        about = next(one["about"] for one in results if one["world"] == task)
         own = rows[rows["task"] == task]
-        tables = [return_table(some, about) for _, some in own.groupby(["condition", "planner"], sort=False)]
-        if len(gaps):
-            tables += [
-                gap_table(some) for _, some in gaps[gaps["world"] == task].groupby(["condition", "planner"], sort=False)
-            ]
+        places = ["condition", "planner"]
+        tables = [return_table(some, TASKS[task].about) for _, some in own.groupby(places, sort=False)]
+        tables += [gap_table(some) for _, some in gaps[gaps["world"] == task].groupby(places, sort=False)]
         boxes = [
             FigureBox(
                 return_figure(own[own["planner"] == planner]),
-                f"{about}. Bands: Student's 95 % intervals over seeds. {planner}, with candidates of each prior.",
+                f"{TASKS[task].about}. Bands: Student's 95 % intervals over seeds. {planner}, with candidates of each"
+                " prior.",
                 f"The return in {task} against the number of candidates, a line a prior; the numbers are in tables.",
                 f"{task}-{planner}",
             )
             for planner in own["planner"].unique()
         ]
         sections.append(Section(task, tables=tables, figures=boxes))
-        if len(gaps):
+        if len(gaps) and seeds >= ENOUGH_UNITS:
             leads.append(runs.significance(gaps[gaps["world"] == task], f"{task}, with a prior minus without"))
-    if len(saved):
-        sections.insert(0, Section("Candidates saved", tables=[saving_table(saved)]))
-    if len(nats):
-        sections.append(Section("Likelihoods", tables=[likelihood_table(nats)]))
-    alone = runs.frame_of(results, "alone")
-    if len(alone):
-        alone = runs.seed_means(alone.assign(task=alone["world"]), ["task", "condition", "prior"], "return")
-        sections.append(Section("Behaviour cloning", tables=[alone_table(alone)]))
-    frames = {"rows": rows, "paired": gaps, "savings": saved, "likelihoods": nats, "alone": alone}
-    lead = " ".join(leads) or "Differences need at least two seeds."
-    return Document("Priors that propose continuous actions", lead, sections, frames, settings, command)
+    few = f"{seeds} seeds are too few for a verdict; it takes {ENOUGH_UNITS}." if seeds < ENOUGH_UNITS else ""
+    frames = {
+        "rows": rows,
+        "paired": gaps,
+        "savings": saved,
+        "matches": matched,
+        "drawing": drawn_shares,
+        "likelihoods": nats,
+        "networks": networks,
+        "networks_scored": scored_networks,
+        "synergies": windows,
+        "alone": alone,
+    }
+    title = "Priors that propose continuous actions"
+    return Document(title, few or " ".join(leads), sections, frames, settings, command)
 
 
-def differences(frame: pd.DataFrame) -> pd.DataFrame:
-    """The return with each prior minus that of the plain planner, paired by seed; see `runs.paired_differences`."""
-    place = ["world", "condition", "planner", "budget"]
-    plain = frame.loc[frame["prior"] == NONE, [*place, "seed", "return"]].rename(columns={"return": "second"})
-    pairs = frame[frame["prior"] != NONE].rename(columns={"return": "first"}).merge(plain, on=[*place, "seed"])
-    return runs.paired_differences(pairs, [*place, "prior"])
-
-
-def savings(frame: pd.DataFrame) -> pd.DataFrame:
-    """How many candidates reach what the plain planner reaches with `REFERENCE`, and how much time that takes.
-
-    Returns and times are interpolated between budgets, linearly in the logarithm of the budget. The interval is a
-    bootstrap over seeds, of the prior and the plain planner together.
-
-    Returns:
-        A row for each task, condition, planner and prior: `reference`, candidates of the plain planner; `needed`, of
-        the planner with the prior, infinite where the largest budget does not suffice; `low`, `high` (missing with
-        fewer than five seeds); `faster`: the time of a decision of the plain planner with `reference` candidates over
-        that of the planner with the prior and `needed`, missing where this is infinite.
-    """
-    rows = []
-    for place, own in frame.groupby(["task", "condition", "planner"], sort=False):
-        curves = {
-            prior: [some.pivot_table(name, "seed", "budget") for name in ("return", "seconds")]
-            for prior, some in own.groupby("prior", sort=False)
-        }
-        if NONE not in curves:
-            continue
-        plain_curve, plain_seconds = curves.pop(NONE)
-        plain_budgets, plain = plain_curve.columns.to_numpy(float), plain_curve.to_numpy()
-        reference, seeds = float(np.clip(REFERENCE, plain_budgets[0], plain_budgets[-1])), len(plain)
-        draws = np.random.default_rng(0).integers(seeds, size=(RESAMPLES, seeds))
-        seconds = interpolated(reference, plain_budgets, plain_seconds.to_numpy().mean(0))
-        for prior, (returns, times) in curves.items():
-            budgets, curve = returns.columns.to_numpy(float), returns.to_numpy()
-            needed = candidates_needed(budgets, curve.mean(0), interpolated(reference, plain_budgets, plain.mean(0)))
-            low = high = float("nan")
-            if seeds >= 5:
-                sampled = [
-                    candidates_needed(
-                        budgets, curve[draw].mean(0), interpolated(reference, plain_budgets, plain[draw].mean(0))
-                    )
-                    for draw in draws
-                ]
-                low, high = np.quantile(sampled, [0.025, 0.975], method="inverted_cdf")
-            faster = float("nan")
-            if np.isfinite(needed):
-                faster = seconds / interpolated(needed, budgets, times.to_numpy().mean(0))
-            rows.append((*place, prior, reference, needed, low, high, faster, seeds))
-    names = ["task", "condition", "planner", "prior", "reference", "needed", "low", "high", "faster", "seeds"]
-    return pd.DataFrame(rows, columns=names)
-
-
-def interpolated(budget: float, budgets: NDArray[np.float64], values: NDArray[np.float64]) -> float:
-    """A value between those of the neighbouring budgets, linear in the logarithm of the budget."""
-    return float(np.interp(np.log(budget), np.log(budgets), values))
-
-
-def candidates_needed(budgets: NDArray[np.float64], returns: NDArray[np.float64], goal: float) -> float:
-    """The budget at which `returns` first reach `goal`; infinite if they never do.
-
-    At the smallest budget already reached, it is that one: fewer candidates were not tried.
-    """
-    if returns[0] >= goal:
-        return float(budgets[0])
-    for k in range(1, len(budgets)):
-        if returns[k] >= goal:
-            share = (goal - returns[k - 1]) / (returns[k] - returns[k - 1])
-            return float(budgets[k - 1] * (budgets[k] / budgets[k - 1]) ** share)
-    return float("inf")
+def drawing(rows: pd.DataFrame) -> pd.DataFrame:
+    """The share of a decision's time in which priors are drawn from, the largest of all conditions."""
+    shares = rows.assign(share=rows["sampling"] / rows["seconds"])
+    found = shares[shares["prior"] != NONE].groupby(["task", "planner", "prior", "budget"], sort=False)["share"].max()
+    return pd.DataFrame(found.reset_index())
 
 
 def return_table(rows: pd.DataFrame, about: str) -> Table:
@@ -179,7 +146,7 @@ def gap_table(gaps: pd.DataFrame) -> Table:
 
 
 def saving_table(saved: pd.DataFrame) -> Table:
-    """How many candidates reach the return of the plain planner, a row a task and prior and a column a condition."""
+    """Candidates that reach the return of one plain planner, a row a task and prior, a column a condition."""
 
     def text(value: float) -> str:
         return "more" if np.isinf(value) else f"{value:.0f}"
@@ -190,18 +157,19 @@ def saving_table(saved: pd.DataFrame) -> Table:
         + ("" if pd.isna(row["faster"]) else f", {row['faster']:.1f}x")
         for _, row in saved.iterrows()
     ]
-    labels = ["task", "planner", "prior"]
+    labels = ["task", "prior"]
     wide = saved.assign(cell=cells).pivot_table("cell", labels, "condition", aggfunc="first")
     wide = wide[[condition for condition in CONDITIONS if condition in wide]].reset_index()
     order = saved[labels].drop_duplicates().merge(wide, on=labels)
     columns = {str(name): str(name) for name in order.columns}
-    reference = saved["reference"].max()
+    reference, planner = saved["reference"].max(), saved["planner"].iloc[0]
     caption = (
         f"Candidates a decision with which the return of the plain planner with {reference:.0f} is reached; more: than"
         " were tried; the fewest tried where these suffice. In brackets: 95 % bootstrap interval over seeds, with at"
         " least five. x: so many times as fast is a decision, drawing from the prior included."
     )
-    return table(order, columns, caption, align="lll" + "r" * (order.shape[1] - 3))
+    title = f"{planner}: candidates needed, interpolated"
+    return table(order, columns, caption, title, "ll" + "r" * (order.shape[1] - 2))
 
 
 def likelihood_table(nats: pd.DataFrame) -> Table:
@@ -211,15 +179,19 @@ def likelihood_table(nats: pd.DataFrame) -> Table:
         "prior": "prior",
         "nats a vector": lambda row: runs.plus_minus(row, "nats", 1, 2),
         "fit, s": "fit_seconds:.1f",
-        "80 %": "for_80:.0f",
-        "95 %": "for_95:.0f",
     }
+    caption = "Log-density of vectors that the plain planner executed in other runs, nats; the higher the better. "
+    return table(nats, columns, caption + runs.over_seeds(nats), align="llrr")
+
+
+def component_table(nats: pd.DataFrame) -> Table:
+    """How many components explain the variance, a row a task and prior."""
+    columns: dict[str, Column] = {"task": "task", "prior": "prior", "80 %": "for_80:.1f", "95 %": "for_95:.1f"}
     caption = (
-        "Log-density of vectors that the plain planner executed in other runs, nats; the higher the better. "
-        + runs.over_seeds(nats)
-        + " 80 %, 95 %: components that explain so much of the variance (of windows, or of single vectors), mean."
+        "synergies: of windows as long as the planner's plans; step-synergies: of single vectors. Means over seeds."
     )
-    return table(nats, columns, caption, align="llrrrr")
+    title = "Components that explain 80 and 95 % of the variance"
+    return table(nats, columns, caption, title, "llrr")
 
 
 def alone_table(alone: pd.DataFrame) -> Table:
@@ -231,6 +203,77 @@ def alone_table(alone: pd.DataFrame) -> Table:
     }
     caption = f"The network's first draw is executed at each step, without simulations. {runs.over_seeds(alone)}"
     return table(alone, columns, caption, align="llr")
+
+
+def match_table(matched: pd.DataFrame) -> Table:
+    """Candidates that match the plain planner in one condition, a row a prior and a column a task."""
+
+    def text(value: float) -> str:
+        return "?" if pd.isna(value) else "more" if np.isinf(value) else f"{value:.0f}"
+
+    first = matched.iloc[0]
+    cells = [f"{text(row['equal'])} ({text(row['close'])})" for _, row in matched.iterrows()]
+    wide = matched.assign(cell=cells).pivot_table("cell", "prior", "task", aggfunc="first")
+    half = (matched[["equal", "close"]] <= matched["reference"].to_numpy()[:, None] / 2).astype(int)
+    counts = half.assign(prior=matched["prior"]).groupby("prior").sum()
+    wide = wide[matched["task"].unique()]
+    wide["tasks"] = [f"{counts.loc[prior, 'equal']} ({counts.loc[prior, 'close']})" for prior in wide.index]
+    wide = wide.loc[matched["prior"].unique()].reset_index()
+    reference = first["reference"]
+    caption = (
+        f"Fewest candidates of those tried with at least the mean return of the plain planner with {reference:.0f}; in"
+        " brackets: whose return is not significantly below it (the 95 % interval of the difference, paired by seed,"
+        f" reaches 0; no verdict from fewer than {ENOUGH_UNITS} seeds). more: than were tried. none: the plain planner"
+        f" itself. tasks: in how many this is at most {reference / 2:.0f}."
+    )
+    title = f"{first['condition']}, {first['planner']}: candidates that match {reference:.0f} of the plain planner"
+    return table(wide, {str(name): str(name) for name in wide.columns}, caption, title, "l" + "r" * (wide.shape[1] - 1))
+
+
+def drawing_table(shares: pd.DataFrame) -> Table:
+    """How long drawing takes, a row a task and prior and a column a budget."""
+    cells = [f"{100 * share:.1f}" for share in shares["share"]]
+    caption = "Per cent of the processor time of a decision, simulations included; the largest of all conditions."
+    title = f"{shares['planner'].iloc[0]}: share of a decision in which the prior is drawn, by candidates"
+    return runs.table_by(shares, {"task": "task", "prior": "prior"}, "budget", cells, caption, title)
+
+
+def nats_table(gaps: pd.DataFrame) -> Table:
+    """Networks against the best of the other priors, in likelihood."""
+    names: dict[str, Column] = {"task": "world", "network": "prior", "minus": "baseline"}
+    return _difference_table(gaps, names, "nats a vector", 2)
+
+
+def network_table(gaps: pd.DataFrame) -> Table:
+    """Networks against the best of the other priors, in planning."""
+    names: dict[str, Column] = {"task": "world", "condition": "condition", "network": "prior", "minus": "baseline"}
+    return _difference_table(gaps, names, "the return, mean over budgets", 1)
+
+
+def synergy_table(gaps: pd.DataFrame) -> Table:
+    """Synergies of windows against those per step, in planning."""
+    names: dict[str, Column] = {"task": "world", "condition": "condition", "components": "components"}
+    return _difference_table(
+        gaps, names, "the return, mean over budgets", 1, "Synergies of windows minus synergies per step"
+    )
+
+
+def _difference_table(
+    gaps: pd.DataFrame,
+    names: Mapping[str, Column],
+    unit: str,
+    digits: int,
+    title: str = "Networks minus the best other prior",
+) -> Table:
+    columns = dict(names) | {
+        "difference": lambda row: runs.plus_minus(row, "difference", 1, digits, "+"),
+        "p": lambda row: "" if pd.isna(row["p_holm"]) else f"{row['p_holm']:.3f}",
+    }
+    caption = (
+        f"Differences in {unit}, paired by seed, with half of Student's 95 % interval; p: Holm's correction for all"
+        f" tests of the table in a task; none from fewer than {ENOUGH_UNITS} seeds."
+    )
+    return table(gaps, columns, caption, f"{title}: {unit}", "l" * len(names) + "rr")
 
 
 @drawn

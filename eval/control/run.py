@@ -1,23 +1,20 @@
-"""What `python -m eval control` does: tune on validation seeds, then learn and plan for one task and seed."""
+"""What `python -m eval control` does in its runs: tune on validation seeds, collect plans, score priors, and plan."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import product
-from statistics import median
-from time import perf_counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from time import process_time
 from typing import Any, Literal, NamedTuple
 
 import torch
+from torch import Tensor
 
 from eval.control.priors import CLONING, NONE, fitted, sees_state
-from eval.control.tasks import CONDITIONS, TASKS, ControlTask
-from eval.worlds.runs import Run
+from eval.control.tasks import TASKS, Condition
 from neuroprior.planners import Control, ICEMPlanner, MPPIPlanner, ShootingPlanner, VectorPlanner, control
+from neuroprior.plans import VectorPlans
 from neuroprior.priors import VectorPrior
 from neuroprior.worlds.continuous import ContinuousWorld
-
-Choices = Mapping[str, Mapping[str, Mapping[str, Sequence[Any]]]]
-"""The numbers of a `Choice` by task, planner and prior."""
 
 PlannerName = Literal["icem", "mppi", "shooting"]
 PLANNERS: dict[str, type[ICEMPlanner] | type[MPPIPlanner] | type[ShootingPlanner]] = {
@@ -26,46 +23,41 @@ PLANNERS: dict[str, type[ICEMPlanner] | type[MPPIPlanner] | type[ShootingPlanner
     "shooting": ShootingPlanner,
 }
 
-NOISES = tuple(product((0.05, 0.12, 0.3, 0.6, 1.0), (0.0, 1.0, 2.5)))
-"""Standard deviations and spectral exponents of the planner's own noise that validation tries."""
+STDS = (0.05, 0.12, 0.3, 0.6, 1.0)
+EXPONENTS = (1.0, 0.0, 2.5)
+"""Standard deviations of the planner's own noise that validation tries with the first of the exponents of its spectrum,
+and the exponents, tried with the best of these."""
 
 PROPOSALS: tuple[dict[str, Any], ...] = (
     {"share": 0.25},
-    {"share": 0.5, "iterations": 1},
-    {"share": 0.8, "iterations": 1},
+    {"share": 0.6, "iterations": 1},
     {"share": 0.5, "proposes": "noise"},
-    {"share": 0.9, "proposes": "noise"},
 )
 """What validation tries of a prior, as parts of a `Choice`."""
+
+VALIDATION_WORLDS: tuple[Condition, ...] = ("same", "validation")
+"""Where settings are validated: in the world of the plans, and in one that changed in another way than those of the
+results."""
 
 VALIDATION = 10_000
 """Added to the numbers of seeds for validation."""
 
-VALIDATION_STARTS = 4
-"""Runs of each setting on a validation seed."""
-
-TIMED = 5
-"""How often drawing a decision's candidates from a prior is timed; the median counts."""
+VALIDATION_STARTS = 2
+"""Runs of each setting on a validation seed, in each world."""
 
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """How much is done; see `eval.control.command.control_experiment`."""
+    """What decides the result of each run; see `eval.control.command.control_experiment`."""
 
-    planners: tuple[str, ...]
-    priors: tuple[str, ...]
     budgets: tuple[int, ...]
     plain_budgets: tuple[int, ...]
     steps: int
     training_runs: int
     training_budget: int
     tuning_budget: int
+    tuning_seeds: int
     seed: int
-    choices: Choices = field(default_factory=dict)
-
-    def with_choices(self, choices: Choices) -> "ControlSettings":
-        """The same, with what `chosen` found for each task."""
-        return replace(self, choices=choices)
 
 
 class Choice(NamedTuple):
@@ -94,6 +86,79 @@ def planner_of(name: str, horizon: int, budget: int, choice: Choice, prior: Vect
     return PLANNERS[name](horizon, budget, **how)
 
 
+class Tuning(NamedTuple):
+    """A search for the settings of a planner, alone or with a prior, in a task.
+
+    Attributes:
+        world: name of the task.
+        planner, prior: their names; `NONE` for the planner alone.
+        choices: what was chosen for iCEM alone, which collects plans, and for the planner alone; None: nothing yet.
+    """
+
+    world: str
+    planner: str
+    prior: str = NONE
+    choices: tuple[Choice, Choice] | None = None
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and files."""
+        return f"{self.world}-{self.planner}-{self.prior}"
+
+
+class Collecting(NamedTuple):
+    """Runs of the plain planner in a task, in the world before it changed.
+
+    Attributes:
+        world: name of the task.
+        seed: of the runs.
+        choice: the settings of iCEM.
+        held_out: whether priors are scored on these runs, or learn from them.
+    """
+
+    world: str
+    seed: int
+    choice: Choice
+    held_out: bool = False
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and files."""
+        return f"{self.world}-{self.seed}" + "-held-out" * self.held_out
+
+
+class Scoring(NamedTuple):
+    """A prior in a task that is fitted to plans, and scored on others."""
+
+    world: str
+    seed: int
+    prior: str
+    plans: VectorPlans
+    held_out: VectorPlans
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and files."""
+        return f"{self.world}-{self.prior}-{self.seed}"
+
+
+class Planning(NamedTuple):
+    """A planner with a prior that is fitted to plans, or alone, in one condition of a task, with all budgets."""
+
+    world: str
+    seed: int
+    condition: Condition
+    planner: str
+    prior: str
+    choice: Choice
+    plans: VectorPlans | None
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and files."""
+        return f"{self.world}-{self.condition}-{self.planner}-{self.prior}-{self.seed}"
+
+
 def generator_of(settings: ControlSettings, seed: int, *place: object) -> torch.Generator:
     """The generator of one use of a seed: contestants of equal seeds meet equal starts, and are independent else."""
     number = (settings.seed * 1_000_003 + seed) * 1_000_003
@@ -111,161 +176,139 @@ def controlled(
     return control(planner, world, state, settings.steps, generator_of(settings, seed, *place))
 
 
-def training_plans(task: ControlTask, settings: ControlSettings, seed: int, choice: Choice) -> Control:
-    """What the plain planner executed in the world before it changed, in runs from other starts."""
-    world = task.make("same")
-    state = world.reset(settings.training_runs, generator_of(settings, seed, "training starts"))
-    planner = planner_of("icem", task.horizon, settings.training_budget, choice, None)
-    return control(planner, world, state, settings.steps, generator_of(settings, seed, "training"))
+def collecting_run(run: Collecting, settings: ControlSettings) -> VectorPlans:
+    """What the plain planner executed, in runs from starts of their own; half as many are held out as are learned from.
 
-
-def tuning_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
-    """The return of every setting on one validation seed, in the world before it changed.
-
-    Returns:
-        `plain`: of each planner the returns of `NOISES`; `with_prior`: of each planner and prior the returns of
-        `PROPOSALS`, with the noise that was best for this seed.
+    The context is what was observed before each vector.
     """
-    task, seed, budget = TASKS[run.world], VALIDATION + run.seed, settings.tuning_budget
-    world = task.make("same")
+    task, world, number = TASKS[run.world], TASKS[run.world].make("same"), settings.training_runs
+    what = "held out" if run.held_out else "training"
+    starts = max(number // 2, 1) if run.held_out else number
+    state = world.reset(starts, generator_of(settings, run.seed, what, "starts"))
+    planner = planner_of("icem", task.horizon, settings.training_budget, run.choice, None)
+    return control(planner, world, state, settings.steps, generator_of(settings, run.seed, what)).plans
 
-    def returned(name: str, choice: Choice, prior: VectorPrior | None = None) -> float:
-        planner = planner_of(name, task.horizon, budget, choice, prior)
-        return _return_of(controlled(planner, world, settings, seed, VALIDATION_STARTS))
 
-    plain: dict[str, list[float]] = {}
-    best: dict[str, Choice] = {}
-    for name in dict.fromkeys(("icem", *settings.planners)):
-        plain[name] = [returned(name, Choice(*noise)) for noise in NOISES]
-        best[name] = Choice(*NOISES[_highest(plain[name])])
-    plans = training_plans(task, settings, seed, best["icem"]).plans
-    with_prior: dict[str, dict[str, list[float]]] = {name: {} for name in settings.planners}
-    for prior_name in settings.priors:
-        if prior_name == NONE:
-            continue
-        prior = fitted(prior_name, plans, task.horizon, generator_of(settings, seed, prior_name))
-        for name in settings.planners:
-            with_prior[name][prior_name] = [
-                returned(name, best[name]._replace(**proposal), prior) for proposal in PROPOSALS
+def tuning_run(run: Tuning, settings: ControlSettings) -> Choice:
+    """The settings with the highest return in `VALIDATION_WORLDS`, over validation seeds.
+
+    Returns of a world are divided by the mean size of those of all settings in it, so that both worlds count alike.
+    """
+    task, seeds = TASKS[run.world], range(VALIDATION, VALIDATION + settings.tuning_seeds)
+    worlds = {name: task.make(name) for name in VALIDATION_WORLDS}
+    priors: dict[int, VectorPrior | None] = dict.fromkeys(seeds)
+    if run.prior != NONE:
+        assert run.choices is not None
+        for seed in seeds:
+            plans = collecting_run(Collecting(run.world, seed, run.choices[0]), settings)
+            priors[seed] = fitted(run.prior, plans, task.horizon, generator_of(settings, seed, run.prior))
+
+    def best(choices: Sequence[Choice]) -> Choice:
+        returns = torch.tensor(
+            [
+                [
+                    sum(
+                        _return_of(
+                            controlled(
+                                planner_of(run.planner, task.horizon, settings.tuning_budget, choice, priors[seed]),
+                                worlds[name],
+                                settings,
+                                seed,
+                                VALIDATION_STARTS,
+                            )
+                        )
+                        for seed in seeds
+                    )
+                    for name in worlds
+                ]
+                for choice in choices
             ]
-    return run._asdict() | {"plain": plain, "with_prior": with_prior}
+        )
+        shares = returns / returns.abs().mean(0)
+        return choices[int(shares.sum(1).argmax())]
+
+    if run.prior != NONE:
+        assert run.choices is not None
+        return best([run.choices[1]._replace(**proposal) for proposal in PROPOSALS])
+    first = best([Choice(std, EXPONENTS[0]) for std in STDS])
+    return best([first._replace(exponent=exponent) for exponent in EXPONENTS])
 
 
-def chosen(results: Sequence[dict[str, Any]], settings: ControlSettings) -> dict[str, dict[str, Choice]]:
-    """For each planner and prior the settings with the highest mean return over validation seeds of a task."""
-    found: dict[str, dict[str, Choice]] = {}
-    for name in dict.fromkeys(("icem", *settings.planners)):
-        means = torch.tensor([one["plain"][name] for one in results]).mean(0).tolist()
-        plain = Choice(*NOISES[_highest(means)])
-        found[name] = {NONE: plain}
-        for prior in settings.priors if name in settings.planners else ():
-            if prior != NONE:
-                means = torch.tensor([one["with_prior"][name][prior] for one in results]).mean(0).tolist()
-                found[name][prior] = plain._replace(**PROPOSALS[_highest(means)])
-    return found
-
-
-def control_run(run: Run, settings: ControlSettings) -> dict[str, Any]:
-    """Collect plans, fit every prior to them, and plan in every condition.
+def scoring_run(run: Scoring, settings: ControlSettings) -> dict[str, Any]:
+    """Fit a prior, and score held-out plans.
 
     Returns:
-        `entries`, one of each condition, planner, prior and budget: `return`, the sum of rewards, `seconds`, of a
-        decision, and `sampling`, those of them in which the prior is drawn from; `alone`, the returns of behaviour
-        cloning; `likelihoods`, one of each prior: held-out `nats` a vector, `fit_seconds`, and how many components
-        explain 80 and 95 % of the variance.
+        `nats`, the log-density of a vector of held-out plans; `fit_seconds`; `for_80`, `for_95`: how many components
+        explain so many per cent of the variance, None where there are none.
     """
     task = TASKS[run.world]
-    own = {
-        planner: {prior: Choice._make(numbers) for prior, numbers in some.items()}
-        for planner, some in settings.choices[run.world].items()
-    }
-    plans = training_plans(task, settings, run.seed, own["icem"][NONE]).plans
-    held_out = training_plans(task, settings, run.seed + 2 * VALIDATION, own["icem"][NONE]).plans
-    priors: dict[str, VectorPrior | None] = {}
-    likelihoods = []
-    for name in settings.priors:
-        if name == NONE:
-            priors[name] = None
-            continue
-        began = perf_counter()
-        prior = fitted(name, plans, task.horizon, generator_of(settings, run.seed, name))
-        seconds = perf_counter() - began
-        some = held_out if sees_state(name) else held_out.without_context()
-        nats = float(prior.action_log_probs(some).sum() / some.mask().sum())
-        explained = getattr(prior, "explained", ())
-        likelihoods.append(
-            {"prior": name, "nats": nats, "fit_seconds": seconds}
-            | {f"for_{share}": _components(explained, share / 100) for share in (80, 95)}
+    began = process_time()
+    prior = fitted(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
+    seconds = process_time() - began
+    held_out = run.held_out if sees_state(run.prior) else run.held_out.without_context()
+    nats = float(prior.log_prob(held_out).sum() / held_out.mask().sum())
+    explained = getattr(prior, "explained", ())
+    found = {"world": run.world, "seed": run.seed, "prior": run.prior, "nats": nats, "fit_seconds": seconds}
+    return found | {f"for_{share}": _components(explained, share / 100) for share in (80, 95)}
+
+
+def planning_run(run: Planning, settings: ControlSettings) -> dict[str, Any]:
+    """Fit a prior, and control the world with it, once with each budget.
+
+    Returns:
+        `entries`, one of each budget: `return`, the sum of rewards; `seconds`, processor time of a decision, which
+        other programs on the machine change less than wall-clock; and `sampling`, those of them in which the prior is
+        drawn from. `alone`: of behaviour cloning the return without a planner, else None.
+    """
+    task = TASKS[run.world]
+    world, place = task.make(run.condition), {"world": run.world, "seed": run.seed, "condition": run.condition}
+    prior = None
+    if run.prior != NONE:
+        assert run.plans is not None
+        prior = fitted(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
+    entries = []
+    for budget in (*settings.budgets, *(settings.plain_budgets if prior is None else ())):
+        planner = planner_of(run.planner, task.horizon, budget, run.choice, prior)
+        began = process_time()
+        with drawing(prior) as drawn:
+            done = controlled(planner, world, settings, run.seed, 1, run.planner, run.prior, budget)
+        seconds, decisions = process_time() - began, max(int(done.plans.mask().sum()), 1)
+        entries.append(
+            place
+            | {"planner": run.planner, "prior": run.prior, "budget": budget, "return": _return_of(done)}
+            | {"seconds": seconds / decisions, "sampling": drawn[0] / decisions}
         )
-        priors[name] = prior
-    entries = list(_entries(run, settings, task, own, priors))
-    alone = [] if CLONING not in priors else list(_alone(run, settings, task, priors[CLONING]))
-    found = {"entries": entries, "likelihoods": likelihoods, "alone": alone}
-    return run._asdict() | {"about": task.about} | found
+    alone = None
+    if run.prior == CLONING:
+        first = ShootingPlanner(1, 1, prior=prior, prior_share=1.0, warm_start=False)
+        alone = _return_of(controlled(first, world, settings, run.seed, 1, "alone"))
+    return {"entries": entries, "alone": place | {"prior": CLONING, "return": alone} if alone is not None else None}
 
 
-def _alone(
-    run: Run, settings: ControlSettings, task: ControlTask, prior: VectorPrior | None
-) -> Iterator[dict[str, Any]]:
-    """Behaviour cloning: the prior's first draw is executed at each step."""
-    for condition in CONDITIONS:
-        world = task.make(condition)
-        done = controlled(
-            ShootingPlanner(1, 1, prior=prior, prior_share=1.0, warm_start=False), world, settings, run.seed, 1, "alone"
-        )
-        yield {"condition": condition, "prior": CLONING, "return": _return_of(done)}
+@contextmanager
+def drawing(prior: VectorPrior | None) -> Iterator[list[float]]:
+    """While this is open, the list's only number is the processor time, in s, in which the prior drew plans."""
+    spent = [0.0]
+    if prior is None:
+        yield spent
+        return
+    sample = prior.sample
 
+    def timed(*args: Any, **how: Any) -> Tensor:
+        began = process_time()
+        plans = sample(*args, **how)
+        spent[0] += process_time() - began
+        return plans
 
-def _entries(
-    run: Run,
-    settings: ControlSettings,
-    task: ControlTask,
-    own: dict[str, dict[str, Choice]],
-    priors: dict[str, VectorPrior | None],
-) -> Iterator[dict[str, Any]]:
-    for condition in CONDITIONS:
-        world = task.make(condition)
-        for name, (prior_name, prior) in product(settings.planners, priors.items()):
-            choice = own[name][prior_name]
-            for budget in (*settings.budgets, *(settings.plain_budgets if prior is None else ())):
-                planner = planner_of(name, task.horizon, budget, choice, prior)
-                done = controlled(planner, world, settings, run.seed, 1, name, prior_name, budget)
-                yield {
-                    "condition": condition,
-                    "planner": name,
-                    "prior": prior_name,
-                    "budget": budget,
-                    "return": _return_of(done),
-                    "seconds": done.seconds / max(int(done.plans.mask().sum()), 1),
-                    "sampling": sampling_seconds(planner, done),
-                }
-
-
-def sampling_seconds(planner: VectorPlanner, done: Control) -> float:
-    """How long the planner's prior takes to draw what a decision needs, after all of a run; 0 without a prior."""
-    number = round(planner.prior_share * planner.num_plans)
-    if planner.prior is None or not number:
-        return 0.0
-    context = done.plans.context
-    assert context is not None
-    past, generator = done.plans.actions[:1, : int(done.plans.mask()[0].sum())], torch.Generator().manual_seed(0)
-    # The observation before the next step is not among those of the run.
-    seen = torch.cat([context[:1, : past.shape[1]], context[:1, :1]], 1) if planner.prior.takes_context else None
-    times = []
-    for _ in range(TIMED):
-        began = perf_counter()
-        drawn = number * (1 + (planner.prior_as == "noise"))
-        planner.prior.sample(drawn, planner.length, seen, past=past, generator=generator)
-        times.append(perf_counter() - began)
-    return median(times)
+    prior.sample = timed  # type: ignore[method-assign]
+    try:
+        yield spent
+    finally:
+        del prior.sample
 
 
 def _return_of(done: Control) -> float:
     return float(done.rewards.sum(1).mean())
-
-
-def _highest(values: Sequence[float]) -> int:
-    return max(range(len(values)), key=lambda index: values[index])
 
 
 def _components(explained: Sequence[float], share: float) -> int | None:

@@ -1,6 +1,6 @@
 """Executed plans in memory: actions with lengths, contexts and groups."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from neuroprior._checks import check_range, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
+from neuroprior.plans.rows import check_readable, rows_of
 from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.tables import Columns, Missing, fields_of
 
@@ -158,6 +159,10 @@ class Plans(Sequences):
             plan_names=None if self.plan_names is None else self._names_at(self.plan_names, index),
         )
 
+    def __iter__(self) -> Iterator["Plans"]:
+        """Each plan, as `Plans` of one."""
+        return (self[i : i + 1] for i in range(len(self)))
+
     def _names_at(self, names: Sequence[str], index: Tensor | slice) -> tuple[str, ...]:
         if isinstance(index, slice):
             return tuple(names[index])
@@ -218,6 +223,36 @@ class Plans(Sequences):
             action_names=action_names,
         )
         return cls(**fields)
+
+    def to_dataframe(self) -> Any:
+        """A pandas frame of these plans, one action a row, which `from_dataframe` reads.
+
+        Columns: `plan` and `action`, names where there are any, else numbers; and, where the plans have them, `context`
+        (or `context_1`, `context_2`, ..., features), `group`, `condition` and `duration`. A context per plan is
+        repeated on its rows, and read back as one per step. A row without an action is between two parts of one plan.
+
+        `Plans.from_dataframe(frame, num_actions=...)`, or with `action_names=`, gives the same plans; other names
+        are numbered in sorted order then.
+
+        Raises:
+            ValueError: plans with an end symbol, with patterns, or of which one has no action; or a name that would
+                not be read as a name.
+            ImportError: pandas is not installed.
+        """
+        import pandas as pd
+
+        check_readable(self, "plans", "a frame")
+        if self.context is not None and has_patterns(self.context):
+            raise ValueError(f"plans: context: a frame cannot hold patterns {list(self.context.shape)}; write .npz")
+        lengths = self.mask().sum(1)
+        if not lengths.all():
+            raise ValueError(f"plans: plan {int((lengths == 0).nonzero()[0])} has no actions, and so no row")
+        header, *rows = rows_of(self, True, is_per_step(self.context))
+        cells = [[None if cell == "" else cell for cell in row] for row in rows]
+        frame = pd.DataFrame(cells, columns=header, dtype=object)
+        whole = frame.columns[frame.notna().all()]  # beside gaps pandas would make numbers of actions floats
+        frame[whole] = frame[whole].infer_objects()
+        return frame.astype({"duration": float}) if self.durations is not None else frame
 
     def with_end(self, name: str = "end") -> "Plans":
         """The same plans, each closed by one action more, number A, that stands for the end of the plan.

@@ -3,6 +3,7 @@
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.durations import DurationLaw, DurationModel, SemiMarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
+from neuroprior.priors.estimator import PriorEstimator
 from neuroprior.priors.fitting import fit
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
 from neuroprior.priors.matching import decode, match_plans
@@ -47,6 +48,7 @@ __all__ = [
     "PatternNetwork",
     "PatternPrior",
     "Prior",
+    "PriorEstimator",
     "SemiMarkovPrior",
     "StackedPrior",
     "StepSynergies",

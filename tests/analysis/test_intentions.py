@@ -36,6 +36,17 @@ def likelihoods(actions):
     return torch.stack(columns, -1)
 
 
+@pytest.mark.parametrize("switch", [0.0, 0.4])
+def test_weights_of_each_plan_in_any_unit(switch):
+    """Each row for itself: as the posterior of its plan alone, from probabilities."""
+    rows = [[5.0, 2.0, 3.0], [0.1, 0.3, 0.6]]
+    found = infer(PRIORS, ACTIONS, weights=torch.tensor(rows), switch=switch).log_probs
+    for number, row in enumerate(rows):
+        alone = infer(PRIORS, ACTIONS[number][None], weights=[w / sum(row) for w in row], switch=switch).log_probs
+        torch.testing.assert_close(found[number], alone[0])
+    assert found.exp().sum(-1).allclose(torch.ones(2, 5).double())
+
+
 @pytest.mark.parametrize("switch", [0.0, 0.3, 1.0])
 def test_all_paths_of_intentions(switch):
     """The filter is the sum over all K^t paths."""

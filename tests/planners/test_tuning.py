@@ -235,6 +235,11 @@ def test_plans_of_several_lengths():
         for share in (0.0, 0.2, 0.6)
     }
     assert sampling_for(prior, plans, number, (1.0,), tuple(worth))[1] == max(worth, key=lambda share: worth[share])
+    # Of one action half of all uniform plans are right, of three an eighth: only together with the former a share pays.
+    plans = Plans(torch.tensor([[0, 0, 0], [1, 0, 0]]), 2, lengths=torch.tensor([3, 1]))
+    worth = {share: chance(prior, [0, 0, 0], 1.0, share, 2) + chance(prior, [1], 1.0, share, 2) for share in (0.0, 0.4)}
+    assert worth[0.4] > worth[0.0] + 0.2
+    assert sampling_for(prior, plans, 2, (1.0,), (0.0, 0.4)) == (1.0, 0.4)
 
 
 @pytest.mark.parametrize("number", [1, 2, 64, 4096])

@@ -557,3 +557,44 @@ def test_parts_of_a_plan_that_no_group_holds_together_are_written_as_plans(tmp_p
     assert again.actions.tolist() == plans.actions.tolist()
     assert again.group is None
     assert again.plan_names is None
+
+
+STEPS = torch.tensor([[0, 1, 1], [2, 0, 0], [1, 2, 0]])
+WRITTEN = {
+    "numbers": {},
+    "names": {"action_names": ("eat", "rest", "walk"), "plan_names": ("b", "a", "c")},
+    "context": {"context": torch.tensor([[0, 1, 0], [1, 1, 0], [0, 0, 0]]), "context_names": ("day", "night")},
+    "features": {"context": torch.tensor([[[0.5, 1], [2, 3], [4, 5]]]).repeat(3, 1, 1)},
+    "groups": {"group": torch.tensor([0, 1, 1]), "group_names": ("m1", "m2"), "condition": torch.tensor([1, 0, 0])},
+    "durations": {"durations": torch.tensor([[1.5, torch.nan, 2], [1, 0, 0], [0, 3, 0]])},
+    "parts of a plan": {"group": torch.tensor([0, 0, 1]), "plan_names": ("s1", "s1", "s1")},
+}
+
+
+@pytest.mark.parametrize("fields", WRITTEN.values(), ids=WRITTEN)
+def test_a_frame_and_back(fields):
+    plans = Plans(STEPS, 3, torch.tensor([3, 1, 2]), **fields)
+    frame = plans.to_dataframe()
+    assert list(frame["action"].dropna().map(str)) == [name for row in listed(plans) for name in map(str, row)]
+    back = Plans.from_dataframe(frame, num_actions=3, action_names=fields.get("action_names"))
+    for name in ("actions", "lengths", "context", "group", "condition", "durations"):
+        want, got = getattr(plans, name), getattr(back, name)
+        if want is None:
+            assert got is None
+        else:
+            want = want.masked_fill(~plans.mask().view(3, 3, *[1] * (want.dim() - 2)), 0) if want.dim() > 1 else want
+            assert torch.equal(got.double().nan_to_num(-1), want.double().nan_to_num(-1)), name
+    for name in ("action_names", "plan_names", "group_names", "context_names"):
+        if name in fields:
+            assert tuple(getattr(back, name)) == tuple(fields[name])
+
+
+def test_what_a_frame_cannot_hold():
+    with refuses("without_end"):
+        Plans(STEPS, 3).with_end().to_dataframe()
+    with refuses("patterns"):
+        Plans(STEPS, 3, context=torch.zeros(3, 3, 2, dtype=torch.int32)).to_dataframe()
+    with refuses("plan 1 has no actions"):
+        Plans(STEPS, 3, torch.tensor([3, 0, 2])).to_dataframe()
+    with refuses("'-'"):
+        Plans(STEPS, 3, action_names=("a", "-", "b")).to_dataframe()

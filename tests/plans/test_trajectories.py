@@ -234,3 +234,29 @@ def test_without_minari(monkeypatch):
     for call in (lambda: read_minari("a-v0"), lambda: write_minari(Plans(ACTIONS, 3), "a-v0")):
         with refuses("pip install 'neuroprior[gym]'", error=ImportError):
             call()
+
+
+def test_trajectories_of_imitation_are_read() -> None:
+    one = SimpleNamespace(acts=np.array([0, 2]), obs=np.array([[0.5], [1.0], [9.0]]), infos=None, terminal=True)
+    plans = from_trajectories([one], 3)
+    assert plans.actions.tolist() == [[0, 2]]
+    assert plans.context.tolist() == [[[0.5], [1.0]]]
+
+
+def test_trajectories_of_imitation_are_made() -> None:
+    plans = Plans(torch.tensor([[0, 1], [2, 0]]), 3, torch.tensor([2, 1]))
+    with refuses("kind"):
+        to_trajectories(plans, "imitations")
+    with refuses("context per step"):
+        to_trajectories(plans, "imitation")
+    types = pytest.importorskip("imitation.data.types", reason="imitation is not installed")
+    plans = Plans(plans.actions, 3, plans.lengths, context=torch.arange(4).view(2, 2))
+    first, second = to_trajectories(plans, "imitation")
+    assert isinstance(first, types.Trajectory)
+    assert (first.obs.tolist(), first.acts.tolist(), first.terminal) == ([0, 1, 1], [0, 1], True)
+    assert (second.obs.tolist(), second.acts.tolist()) == ([2, 2], [2])
+    back = from_trajectories([first, second], 3)
+    assert torch.equal(back.actions, plans.actions)
+    empty = Plans(plans.actions, 3, torch.tensor([2, 0]), context=plans.context)
+    with refuses("plan 1 has no actions"):
+        to_trajectories(empty, "imitation")

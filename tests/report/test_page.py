@@ -396,6 +396,8 @@ def test_every_action_has_its_color():
     assert to_hex(strip[0, 40, :3]) == OTHER
     assert [text.get_text() for text in figure.legends[0].texts][-1] == "46 other actions"
     assert len(figure.legends[0].texts) == len(STRIPS)
+    for real, generated in ((actions, often), (often, actions)):
+        assert raster_figure(real, generated, MANY).axes[0].get_xlim()[1] >= often.shape[1] - 0.5
     long = raster_figure(np.zeros((1, 2500), int), actions, ["a", "b"])
     assert long.axes[0].images[0].get_array().shape[1] == MOST_STEPS
     assert f"the first {MOST_STEPS}" in long.axes[1].get_xlabel()

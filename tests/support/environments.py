@@ -32,6 +32,15 @@ class Corridor(gymnasium.Env):
         return self.place, done * (1 - 0.9 * self.clock / 100), done, False, {}
 
 
+class NumpyClock(Corridor):
+    """Counts its steps with one of NumPy's integers."""
+
+    def reset(self, *, seed=None, options=None):
+        found = super().reset(seed=seed)
+        self.clock = np.int64(0)
+        return found
+
+
 class Layouts(Corridor):
     """The seed decides how long the corridor is, three to nine squares, and where one starts."""
 

@@ -40,8 +40,9 @@ def number_of_states(env):
     return len(found)
 
 
-def test_a_corridor_and_its_counter():
-    world = from_gymnasium(environments.Corridor(), observations=True)
+@pytest.mark.parametrize("kind", [environments.Corridor, environments.NumpyClock])
+def test_a_corridor_and_its_counter(kind):
+    world = from_gymnasium(kind(), observations=True)
     assert world.next_state.tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
     assert world.ended.tolist() == [False] * 4 + [True]
     assert world.reset(3).tolist() == [0] * 3

@@ -66,6 +66,15 @@ def test_steps_continue_from_any_state():
     assert other.observe(whole.final_state[0]).equal(world.observe(whole.final_state[0]))
 
 
+def test_the_last_observation_is_that_after_the_last_action():
+    """Of histories as long as the horizon, which differ in their last action alone."""
+    world = from_gymnasium("CartPole-v1", seeds=[0], horizon=3)
+    final = world.rollout(world.reset(1), torch.tensor([[[0, 1, 0], [0, 1, 1]]])).final_state[0]
+    env = gymnasium.make("CartPole-v1").unwrapped
+    for row, plan in zip(world.observe(final), ([0, 1, 0], [0, 1, 1]), strict=True):
+        assert row.tolist() == pytest.approx(real_trajectory(env, 0, plan)[0][-1].tolist())
+
+
 def test_an_end_is_kept():
     world = from_gymnasium("CartPole-v1", seeds=[0], horizon=20)
     fallen = world.rollout(world.reset(1), torch.ones(1, 1, 15, dtype=torch.long)).final_state[:, 0]

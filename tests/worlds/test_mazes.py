@@ -73,6 +73,8 @@ def test_four_rooms():
     assert world.walls[:, 6, 6].all()
     odd = four_rooms(5, 8, num_layouts=50)
     assert ((~odd.walls).flatten(1).sum(1) == 2 * (2 + 3) + 4).all()
+    arms = odd.walls[:, 1:2, 4], odd.walls[:, 3:4, 4], odd.walls[:, 2, 1:4], odd.walls[:, 2, 5:7]
+    assert all(((~arm).sum(1) == 1).all() for arm in arms)
     for walls in odd.walls:
         assert reached(squares(walls)) == squares(walls)
 

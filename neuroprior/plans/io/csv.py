@@ -5,7 +5,7 @@ import math
 import re
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -20,13 +20,11 @@ from neuroprior.plans.columns import (
     Floats,
     Integers,
     Names,
-    is_missing,
-    named,
-    number_in,
     open_text,
 )
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior.plans.rows import check_readable, rows_of
 from neuroprior.plans.tables import Columns, fields_of
 
 ROWS_AT_ONCE = 2**10
@@ -384,25 +382,8 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
     """Write a CSV file; `.tsv` has tabs."""
     if layout not in (None, "plan", "step"):
         raise ValueError(f"layout: 'plan', 'step' or None is expected, not {layout!r}")
-    if plans.end is not None:
-        raise ValueError(
-            f"{path}: CSV cannot say that an action is the end symbol; write plans.without_end(), or JSONL"
-        )
+    check_readable(plans, str(path), "CSV")
     lengths = plans.mask().sum(1)
-    if not lengths.any():
-        raise ValueError(f"{path}: CSV cannot hold plans of which none has an action")
-    for what in ("action", "context", "group", "condition", "plan"):
-        names = getattr(plans, f"{what}_names")
-        for name in names or ():
-            if not name.strip() or name != name.strip() or "\n" in name or "\r" in name:
-                raise ValueError(
-                    f"{path}: {what}_names: CSV cannot hold {name!r}; names without line breaks and without space at"
-                    " either end are expected"
-                )
-            if is_missing(name):
-                raise ValueError(f"{path}: {what}_names: CSV cannot hold {name!r}, which would be read as missing")
-            if what in ("action", "context") and number_in(name) is not None:
-                raise ValueError(f"{path}: {what}_names: CSV cannot hold {name!r}, which would be read as a number")
     per_step = is_per_step(plans.context) or plans.durations is not None
     by_step = layout == "step" or (layout is None and per_step)
     if per_step and not by_step:
@@ -415,78 +396,4 @@ def write_csv(plans: Plans, path: Path, layout: str | None) -> None:
         )
     with written_whole(path) as file:
         writer = csv.writer(file, delimiter="\t" if path.suffix.lower() == ".tsv" else ",", lineterminator="\n")
-        writer.writerows(_written(plans, by_step))
-
-
-def _written(plans: Plans, by_step: bool) -> Iterator[list[Any]]:
-    """The rows of a CSV file, the header first; with one step a row, plans without names are numbered from 0.
-
-    Between two parts of one plan there is a row without an action, a gap.
-    """
-    width, per_step = plans.max_length, is_per_step(plans.context)
-    plan_names, parted = _plan_column(plans) if by_step else (plans.plan_names, frozenset())
-    header = ["plan", "action"] if by_step else [f"action_{i + 1}" for i in range(width)]
-    header = ["plan", *header] if not by_step and plan_names is not None else header
-    if plans.context is not None:
-        features = plans.context.shape[-1] if plans.context.is_floating_point() else 0
-        header += [f"context_{i + 1}" for i in range(features)] or ["context"]
-    header += [what for what in ("group", "condition") if getattr(plans, what) is not None]
-    yield header + ["duration"] * (plans.durations is not None)
-    for start in range(0, len(plans), 2**14):
-        some = plans[start : start + 2**14]
-        none: list[list[Any]] = [[]] * len(some)
-        contexts = none if some.context is None else named(some.context.tolist(), plans.context_names)
-        own = [
-            named(values.tolist(), names)
-            for values, names in ((some.group, plans.group_names), (some.condition, plans.condition_names))
-            if values is not None
-        ]
-        groups = [list(entry) for entry in zip(*own, strict=True)] if own else none
-        times = None if some.durations is None else some.durations.tolist()
-        actions, lengths = named(some.actions.tolist(), plans.action_names), some.mask().sum(1).tolist()
-        for i, (taken, length, context, group) in enumerate(
-            zip(actions, lengths, contexts, groups, strict=True), start
-        ):
-            called = i if plan_names is None else plan_names[i]
-            if by_step:
-                if i in parted:
-                    blank = [""] * (len(_as_list(context[0] if per_step else context)))
-                    yield [called, "", *blank, *group, *([] if times is None else [""])]
-                yield from (
-                    [
-                        called,
-                        taken[t],
-                        *_as_list(context[t] if per_step else context),
-                        *group,
-                        *_time(times, i - start, t),
-                    ]
-                    for t in range(length)
-                )
-            else:
-                name = [] if plan_names is None else [called]
-                yield [*name, *taken[:length], *[""] * (width - length), *_as_list(context), *group]
-
-
-def _plan_column(plans: Plans) -> tuple[Sequence[str] | None, frozenset[int]]:
-    """The names of plans in a file with one step a row, and which plans are further parts of the one before.
-
-    None where rows of one name would not be read as the same plans again: parts that do not follow one another, or
-    that no group holds together.
-    """
-    names = plans.plan_names
-    if names is None:
-        return None, frozenset()
-    group = [None] * len(plans) if plans.group is None else plans.group.tolist()
-    whole = list(zip(names, group, strict=True))
-    again = frozenset(i for i in range(1, len(whole)) if whole[i] == whole[i - 1])
-    apart = len(whole) - len(again) != len(set(whole))
-    return (None, frozenset()) if apart or (again and plans.group is None) else (names, again)
-
-
-def _time(times: list[list[float]] | None, plan: int, step: int) -> list[float | str]:
-    """The duration of an action, in a list; empty where it is not known, none where there are no durations."""
-    return [] if times is None else [times[plan][step] if times[plan][step] == times[plan][step] else ""]
-
-
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
+        writer.writerows(rows_of(plans, by_step, is_per_step(plans.context)))

@@ -1,7 +1,8 @@
 """Plans from trajectories in memory, as Gymnasium's environments return them, and back."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from importlib import import_module
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
         trajectories: each a list of steps `(observation, action, reward, terminated, truncated, info)`, where the agent
             made the observation and then took the action (what follows the action is not used); or a dict or an object
             with `actions [T]` and perhaps `observations`, T of them or T + 1, of which the last is dropped (such are
-            the episodes of Minari).
+            the episodes of Minari), or with `acts` and `obs` (such are the trajectories of imitation).
         num_actions: A; actions are integers from 0 to A - 1.
         observations: "context" to make the observations the context per step: integers become indices, arrays features
             (flattened, float32). None to leave them out.
@@ -48,15 +49,43 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     return assembled("trajectories", lengths, np.concatenate(actions), num_actions, context=context, per_step=True)
 
 
-def to_trajectories(plans: Plans) -> list[dict[str, NDArray[Any]]]:
-    """Each plan as a dict of `actions [T]`, int64, and, of a context per step, `observations [T]` or `[T, C]`."""
+def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts") -> list[Any]:
+    """Each plan as a trajectory.
+
+    Args:
+        plans: N of them.
+        kind: "dicts" of `actions [T]`, int64, and, of a context per step, `observations [T]` or `[T, C]`; or those of
+            the package "imitation", `imitation.data.types.Trajectory`, whose observations `[T + 1]` or `[T + 1, C]` are
+            the context per step, the last one repeated, and each of which is terminal.
+
+    Raises:
+        ValueError: another kind; or, for imitation, plans without a context per step, or one without actions.
+        ImportError: imitation is asked for, and not installed.
+    """
+    if kind not in ("dicts", "imitation"):
+        raise ValueError(f"kind: 'dicts' or 'imitation' is expected, not {kind!r}")
     actions, lengths = plans.actions.long().cpu().numpy(), plans.mask().sum(1).tolist()
     context = plans.context if is_per_step(plans.context) else None
     found = [{"actions": row[:length].copy()} for row, length in zip(actions, lengths, strict=True)]
     if context is not None:
         for trajectory, row, length in zip(found, context.detach().cpu().numpy(), lengths, strict=True):
             trajectory["observations"] = row[:length].copy()
-    return found
+    if kind == "dicts":
+        return found
+    if context is None:
+        raise ValueError("plans: no context per step; imitation's trajectories need an observation for each step")
+    if lengths and not min(lengths):
+        raise ValueError(f"plans: plan {lengths.index(0)} has no actions; imitation's trajectories need some")
+    made = import_module("imitation.data.types").Trajectory
+    return [
+        made(
+            obs=np.concatenate([one["observations"], one["observations"][-1:]]),
+            acts=one["actions"],
+            infos=None,
+            terminal=True,
+        )
+        for one in found
+    ]
 
 
 def parts_of(trajectory: Any, place: str) -> tuple[Any, Any]:
@@ -67,6 +96,8 @@ def parts_of(trajectory: Any, place: str) -> tuple[Any, Any]:
         return trajectory["actions"], trajectory.get("observations")
     if hasattr(trajectory, "actions"):
         return trajectory.actions, getattr(trajectory, "observations", None)
+    if hasattr(trajectory, "acts"):
+        return trajectory.acts, getattr(trajectory, "obs", None)
     if not isinstance(trajectory, list | tuple):
         raise ValueError(
             f"{place}: a list of steps or a dict with 'actions' is expected, not {type(trajectory).__name__}"

@@ -22,7 +22,7 @@ def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor
 
 
 @njit(fastmath=True)
-def _tanh(x: Any) -> Any:
+def tanh(x: Any) -> Any:
     """A rational approximation, as exact as float32 (the coefficients are those of Eigen, `generic_fast_tanh_float`).
 
     Unlike the system's own function it is computed for many numbers at once.
@@ -42,9 +42,9 @@ def _tanh(x: Any) -> Any:
 
 
 @njit(fastmath=True)
-def _sigmoid(x: Any) -> Any:
+def sigmoid(x: Any) -> Any:
     half = float32(0.5)
-    return half * _tanh(half * x) + half
+    return half * tanh(half * x) + half
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
@@ -54,9 +54,9 @@ def _gates(given: Array, rows: Array, hidden: Array, before: Array, stride: int,
     for n in range(len(after)):
         mine, own, last, new = given[rows[n]], hidden[n], before[n * stride : n * stride + width], after[n]
         for k in range(width):
-            reset = _sigmoid(mine[k] + own[k])
-            update = _sigmoid(mine[width + k] + own[width + k])
-            fresh = _tanh(mine[2 * width + k] + reset * own[2 * width + k])
+            reset = sigmoid(mine[k] + own[k])
+            update = sigmoid(mine[width + k] + own[width + k])
+            fresh = tanh(mine[2 * width + k] + reset * own[2 * width + k])
             new[k] = fresh + update * (last[k] - fresh)
 
 
@@ -103,9 +103,9 @@ def _forward(given: Array, hidden: Array, states: Array, opened: Array, t: int) 
     for n in range(states.shape[1]):
         mine, own, gate, last, new = given[t, n], hidden[t, n], opened[t, n], states[t, n], states[t + 1, n]
         for k in range(2 * width):
-            gate[k] = _sigmoid(mine[k] + own[k])
+            gate[k] = sigmoid(mine[k] + own[k])
         for k in range(width):
-            fresh = _tanh(mine[2 * width + k] + gate[k] * own[2 * width + k])
+            fresh = tanh(mine[2 * width + k] + gate[k] * own[2 * width + k])
             gate[2 * width + k] = fresh
             new[k] = fresh + gate[width + k] * (last[k] - fresh)
 

@@ -136,6 +136,9 @@ def gru_sequence(gru: nn.GRU, inputs: Tensor, layers: Tensor | None = None) -> t
     plain = inputs.device.type == "cpu" and inputs.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
     able = plain and COMPILE_FROM is not None and inputs.numel() >= COMPILE_FROM
     fast = compiled("neuroprior.priors.neural.compiled_gru") if able else None
+    if layers is not None and inputs.shape[1] == 1 and plain and not torch.is_grad_enabled():
+        out, layers = gru_step(gru, inputs[:, 0], layers)
+        return out[:, None], layers
     if fast is None:
         out, layers = gru(inputs, None if layers is None else layers.contiguous())
         return out, layers

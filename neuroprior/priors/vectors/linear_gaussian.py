@@ -1,5 +1,6 @@
 """What priors share whose next vector is Gaussian and linear in the last ones: closed forms, and moments of windows."""
 
+import sys
 from abc import abstractmethod
 from collections.abc import Hashable, Mapping
 from typing import Any, Self, TypeVar
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count
+from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
@@ -136,19 +138,9 @@ class LinearGaussianPrior(VectorPrior):
         vectors = torch.empty(batch * num_plans, known + length, size, device=self.device)
         vectors[:, :known] = self.scaled(past[:, past.shape[1] - known :]).repeat_interleave(num_plans, 0)
         noise = torch.randn(batch * num_plans, length, size, generator=generator, device=self.device)
-        coupled = bool(self.coupling.any())
-        for t in range(known, known + length):
-            h = min(t, depth)
-            mean = self._means(vectors[:, t - h : t], h)
-            spread = noise[:, t - known] * self.std[h]
-            if not coupled:
-                vectors[:, t] = (mean + spread).clamp(-1, 1)
-                continue
-            free, coupling = mean + spread, self.coupling[h]
-            now = vectors[:, t]
-            now[:, 0] = free[:, 0].clamp(-1, 1)
-            for d in range(1, size):
-                now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
+        able = vectors.device.type == "cpu" and vectors.dtype == self.weights.dtype == torch.float32
+        fast = compiled("neuroprior.priors.vectors.compiled_sampling") if able else None
+        (fast or sys.modules[__name__]).draw_linear(self, vectors, known, noise)
         return self.unscaled(vectors[:, known:]).view(batch, num_plans, length, size)
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
@@ -183,6 +175,22 @@ class LinearGaussianPrior(VectorPrior):
     @abstractmethod
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         """Fit to plans with at least one vector; choices are made on held-out plans that `generator` draws."""
+
+
+def draw_linear(prior: LinearGaussianPrior, vectors: Tensor, known: int, noise: Tensor) -> None:
+    """Fill in `vectors [N, known + L, D]`, scaled, behind the first `known`, by standard normal `noise [N, L, D]`."""
+    depth, coupled = prior.memory or 0, bool(prior.coupling.any())
+    for t in range(known, vectors.shape[1]):
+        h = min(t, depth)
+        mean = prior._means(vectors[:, t - h : t], h)
+        free, coupling = mean + noise[:, t - known] * prior.std[h], prior.coupling[h]
+        if not coupled:
+            vectors[:, t] = free.clamp(-1, 1)
+            continue
+        now = vectors[:, t]
+        now[:, 0] = free[:, 0].clamp(-1, 1)
+        for d in range(1, vectors.shape[2]):
+            now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
 
 
 def _lifted(rest: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuroprior._checks import check_memory, check_sizes
+from neuroprior._compiled import compiled
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.neural.gru import gru_step
@@ -28,6 +29,9 @@ FIRST_SPREAD = 0.1
 
 DEFAULTS = {"window": 64, "learning_rate": 3e-3}
 """Settings of a training, where they are not given."""
+
+COMPILE_TO = 16
+"""Sequences that a compiled loop reads faster than `nn.GRU`, at most, where numba is installed."""
 
 FEWEST, MOST, VECTORS_A_STEP = 300, 4000, 40
 """Steps of a training, where these are not given: one for so many vectors, within these bounds. More steps overfit some
@@ -169,6 +173,32 @@ class VectorNetwork(VectorPrior):
         if context is not None and context.dim() == 3:
             context = context[:, context.shape[1] - entries.shape[1] :]
         return self._after(self._lagged(entries, None, context), None)
+
+    def continuations(
+        self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
+    ) -> Tensor:
+        forecast, state = self.read(past, context)
+        state = state.repeat_interleave(num_plans, 0)
+        # All random numbers at once, so that compiled loops draw the same.
+        chance = torch.rand(len(state), length, generator=generator, device=self.device)
+        noise = torch.randn(len(state), length, self.action_size, generator=generator, device=self.device)
+        return self.draw(forecast, state, chance, noise).view(len(past), num_plans, length, self.action_size)
+
+    def draw(self, forecast: GaussianForecast, state: Tensor, chance: Tensor, noise: Tensor) -> Tensor:
+        """The next vectors `[N, L, D]` that random numbers make; see `GaussianForecast.drawn`.
+
+        Args:
+            forecast: of M rows, each for N / M successive rows of the state.
+            state: `[N, ...]`, as `step` returned it.
+            chance: `[N, L]`, uniform from 0 to 1.
+            noise: `[N, L, D]`, standard normal.
+        """
+        forecast = forecast.repeat_interleave(len(state) // max(len(forecast.mean), 1))
+        vectors = [forecast.drawn(chance[:, 0], noise[:, 0])]
+        for t in range(1, noise.shape[1]):
+            forecast, state = self.step(vectors[-1], state)
+            vectors.append(forecast.drawn(chance[:, t], noise[:, t]))
+        return torch.stack(vectors, 1)
 
     def _after(self, inputs: Tensor, hidden: Tensor | None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""
@@ -328,12 +358,27 @@ class VectorGRU(VectorNetwork):
         if hidden is None:
             hidden = vectors.new_zeros(len(vectors), self.num_layers * self.width)
         layers = hidden.unflatten(1, (self.num_layers, self.width)).transpose(0, 1)
+        fast = self._fast(vectors) if len(vectors) <= COMPILE_TO and not torch.is_grad_enabled() else None
         if vectors.shape[1] == 1 and not (self.training or torch.is_grad_enabled()):
             out, layers = gru_step(self.gru, vectors[:, 0], layers)
             out = out[:, None]
+        elif fast is not None:
+            out, layers = fast.read_recurrent(self.gru, vectors, layers)
         else:
             out, layers = self.gru(vectors, layers.contiguous())
         return out, layers.transpose(0, 1).flatten(1)
+
+    def _fast(self, values: Tensor) -> Any:
+        """Compiled loops over these values, where there are any."""
+        able = not self.training and values.device.type == "cpu" and values.dtype == torch.float32
+        return compiled("neuroprior.priors.vectors.compiled_sampling") if able else None
+
+    def draw(self, forecast: GaussianForecast, state: Tensor, chance: Tensor, noise: Tensor) -> Tensor:
+        fast = self._fast(state)
+        if fast is None:
+            return super().draw(forecast, state, chance, noise)
+        plans: Tensor = fast.draw_recurrent(self, 2 * LEAST_STD, state, chance, noise)
+        return plans
 
 
 class VectorTransformer(VectorNetwork):

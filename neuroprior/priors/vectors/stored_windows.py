@@ -148,11 +148,14 @@ class StoredWindows(VectorPrior):
         return self._forecast(torch.cat([head, past, weights], 1), place + 1)
 
     def read(self, past: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        head = torch.tensor([min(past.shape[1], self.match), 0], device=self.device).expand(len(past), 2)
+        return self._begin(torch.cat([head, self._last(past)], 1))
+
+    def _last(self, past: Tensor) -> Tensor:
+        """The end of `past [N, T, D]` by which segments are found, scaled: `[N, match * D]`, 0 where there is none."""
         known = min(past.shape[1], self.match)
         last = self.scaled(past[:, past.shape[1] - known :])
-        padded = torch.nn.functional.pad(last, (0, 0, self.match - known, 0)).flatten(1)
-        head = torch.tensor([known, 0], device=self.device).expand(len(past), 2)
-        return self._begin(torch.cat([head, padded], 1))
+        return torch.nn.functional.pad(last, (0, 0, self.match - known, 0)).flatten(1)
 
     def _begin(self, state: Tensor) -> tuple[GaussianForecast, Tensor]:
         """A new segment, after the past in `state [N, 2 + match * D]`."""
@@ -177,10 +180,8 @@ class StoredWindows(VectorPrior):
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
         """Whole segments at once: which is followed is drawn at its beginning, and not known afterwards."""
-        _, state = self.read(past)
-        size, batch = self.match * self.action_size, len(past)
-        known = min(past.shape[1], self.match)
-        last, weights = state[:, 2 : 2 + size], state[:, 2 + size :]
+        batch, known, last = len(past), min(past.shape[1], self.match), self._last(past)
+        weights = self._matches(last, known)
         parts: list[Tensor] = []
         for at in range(0, length, self.horizon):
             times = num_plans if not parts else 1

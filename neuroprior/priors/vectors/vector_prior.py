@@ -70,17 +70,30 @@ class GaussianForecast(NamedTuple):
         return (each + self.log_weights.log_softmax(-1)).logsumexp(-1)
 
     def sample(self, generator: torch.Generator) -> Tensor:
+        mean = self.mean
+        several = mean.shape[1] > 1
+        chance = torch.rand(len(mean), generator=generator, device=mean.device) if several else None
+        noise = torch.randn(mean[:, 0].shape, generator=generator, device=mean.device, dtype=mean.dtype)
+        return self.drawn(chance, noise)
+
+    def drawn(self, chance: Tensor | None, noise: Tensor) -> Tensor:
+        """The vectors `[N, D]` that random numbers make.
+
+        Args:
+            chance: `[N]`, uniform from 0 to 1: choose the component; None: there is one.
+            noise: `[N, D]`, standard normal.
+        """
         mean, std, coupling = self.mean, self.std.expand(self.mean.shape), self.coupling
         row = torch.arange(len(mean), device=mean.device)
-        if mean.shape[1] > 1:
-            if self.log_weights is None:
-                chosen = torch.randint(mean.shape[1], (len(mean),), generator=generator, device=mean.device)
-            else:
-                chosen = torch.multinomial(self.log_weights.softmax(-1), 1, generator=generator)[:, 0]
-        else:
+        if chance is None:
             chosen = torch.zeros_like(row)
-        mean, std = mean[row, chosen], std[row, chosen]
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype) * std
+        elif self.log_weights is None:
+            chosen = (chance * mean.shape[1]).long().clamp(max=mean.shape[1] - 1)
+        else:
+            up_to = self.log_weights.softmax(-1).cumsum(-1)
+            chosen = torch.searchsorted(up_to, chance[:, None] * up_to[:, -1:])[:, 0].clamp(max=mean.shape[1] - 1)
+        mean = mean[row, chosen]
+        noise = noise * std[row, chosen]
         if coupling is None:
             return (mean + noise).clamp(self.low, self.high)
         if coupling.dim() == 4:

@@ -9,6 +9,7 @@ import torch
 
 from eval.__main__ import main
 from eval.bench import limits, peers, sizes
+from eval.bench.against import compared
 from eval.bench.command import tables
 from eval.bench.jobs import (
     JOBS,
@@ -25,7 +26,7 @@ from eval.bench.jobs import (
 from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
 from neuroprior.plans import all_plans
 from neuroprior.worlds import maze
-from tests.support.sources import FALSE_ALARM, p_value, seeded
+from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 SMALL = 1e-3
 
@@ -175,6 +176,52 @@ def test_a_simulation_adds_a_node_and_follows_the_plan_to_its_end():
     pytest.importorskip("numba")
     world = TabularWorld(torch.tensor([[1], [0]]), torch.tensor([0.0, 1.0]))
     assert simulations(MCTSPlanner(UniformPrior(1), 3, 9), world, torch.zeros(2, dtype=torch.long)) == 3
+
+
+def results(ours: float, peer: float, spread: float = 0.01, **settings) -> dict:
+    """Of a run in which a job takes us so many seconds, and the peer so many."""
+    ratio = peer / ours
+    row = {"job": "sample", "peer": "numpy", "seconds": ours, "ratio": ratio}
+    rows = [row | {"low": ratio * (1 - spread), "high": ratio * (1 + spread)}]
+    work = {"work": "copy", "seconds": ours}
+    imports = [{"seconds": ours, "ratio": ours / peer, "low": 0.99 * ours / peer, "high": 1.01 * ours / peer}]
+    return {"settings": {"scale": 1.0, "threads": 2} | settings, "rows": rows, "limits": [work], "imports": imports}
+
+
+def test_regressions_are_relative_to_the_peer():
+    """A machine half as fast makes no difference where a peer was timed."""
+    rows = compared(results(1, 10), results(2, 20)).set_index("name")
+    assert rows.factor.to_dict() == {"sample: numpy": 1, "copy": 2, "import neuroprior": 1}
+    assert rows.verdict.to_dict() == {
+        "sample: numpy": "no difference",
+        "copy": "",
+        "import neuroprior": "no difference",
+    }
+    rows = compared(results(1, 10), results(2, 10)).set_index("name")
+    assert rows.factor.to_dict() == pytest.approx({"sample: numpy": 2, "copy": 2, "import neuroprior": 2})
+    assert list(rows.verdict) == ["slower", "slower", ""]
+    assert list(compared(results(2, 10), results(1, 10)).verdict) == ["faster", "faster", ""]
+    assert compared(results(1, 10, 0.5), results(1.3, 10)).verdict[0] == "no difference"
+    assert compared(results(1, 10), results(1.05, 10)).verdict[0] == "no difference"
+
+
+def test_what_cannot_be_compared():
+    with refuses("scale", "0.5"):
+        compared(results(1, 10), results(1, 10, scale=0.5))
+    with refuses("in common"):
+        compared(results(1, 10), {"settings": {"scale": 1.0, "threads": 2}, "sizes": []})
+
+
+def test_two_results_are_compared(tmp_path, capsys):
+    for name, seconds in (("old", 1), ("new", 2)):
+        (tmp_path / f"{name}.json").write_text(json.dumps(results(seconds, 10)))
+    files = ["--against", str(tmp_path / "old.json"), "--measured", str(tmp_path / "new.json")]
+    assert main(["bench", *files]) == 0
+    assert "slower" in capsys.readouterr().out
+    assert main(["bench", "--measured", "x"]) == 2
+    (tmp_path / "old.json").write_text("{}")
+    assert main(["bench", *files]) == 2
+    assert "results.json is expected" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 from math import inf, log
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -10,9 +11,27 @@ import torch
 
 from eval.__main__ import main
 from eval.control.animation import pictures
+from eval.control.comparison import (
+    against_simple,
+    candidates_needed,
+    differences,
+    interpolated,
+    matches,
+    savings,
+    synergies,
+)
 from eval.control.priors import check_prior_name, fitted, shuffled
-from eval.control.report import candidates_needed, differences, interpolated, savings
-from eval.control.run import NOISES, PROPOSALS, Choice, ControlSettings, chosen, planner_of
+from eval.control.run import (
+    EXPONENTS,
+    PROPOSALS,
+    STDS,
+    Choice,
+    ControlSettings,
+    Tuning,
+    drawing,
+    planner_of,
+    tuning_run,
+)
 from eval.control.tasks import CONDITIONS, TASKS
 from neuroprior.plans import VectorPlans
 from neuroprior.worlds import PlanarArm
@@ -51,11 +70,32 @@ def test_a_small_run(tmp_path, capsys):
         assert row["difference"] == pytest.approx(at[place]["return"] - plain["return"], abs=1e-6)
     assert {row["prior"] for row in results["likelihoods"]} == {"autoregressive", "synergies-2"}
     assert (out / "double_integrator-shooting.png").read_bytes().startswith(b"\x89PNG")
-    kept = {path: path.stat().st_mtime_ns for path in out.rglob("double_integrator-*.json")}
-    assert len(kept) == 3
-    assert main([*SMALL, "--planners", "shooting", "--out", str(out)]) == 0  # finished runs are not done again
-    assert kept == {path: path.stat().st_mtime_ns for path in kept}
+    kept = {path: path.stat().st_mtime_ns for path in out.glob("*/*/double*")}
+    # Settings of iCEM, of the planner, and of the planner with each prior; plans to learn from and others; runs.
+    assert len(list(out.glob("tuning/*/double*.json"))) == 4
+    assert len(list(out.glob("plans/*/double*.npz"))) == 2 * 2
+    assert len(list(out.glob("planning/*/double*.json"))) == 2 * 3 * 3
+    assert len(list(out.glob("scoring/*/double*.json"))) == 2 * 2
+    assert main([*SMALL, "--planners", "shooting", "--out", str(out)]) == 0
     assert capsys.readouterr().out == printed
+    # A prior and a condition less, and a prior that is only scored: what is finished is not done again.
+    less = [name for name in SMALL if name != "synergies-2"] + ["--planners", "shooting", "--out", str(out)]
+    assert main([*less, "--scored", "stored", "--conditions", "masses", "goal"]) == 0
+    results = json.loads((out / "results.json").read_text())
+    assert {row["prior"] for row in results["likelihoods"]} == {"autoregressive", "stored"}
+    assert {row["condition"] for row in results["rows"]} == {"masses", "goal"}
+    assert {row["prior"] for row in results["rows"]} == {"none", "autoregressive"}
+    assert all(path.stat().st_mtime_ns == time for path, time in kept.items())
+    assert len(list(out.glob("scoring/*/double*-stored-*.json"))) == 2
+
+
+def test_nothing_is_called_significant_with_fewer_than_five_seeds():
+    rng = np.random.default_rng(0)
+    for seeds in (4, 5):
+        frame = made_up(seeds).assign(**{"return": lambda rows: rows["return"] + 1e-3 * rng.random(len(rows))})
+        verdicts = differences(frame)["p_holm"]
+        assert verdicts.isna().all() if seeds == 4 else (verdicts < 0.05).all()
+        assert matches(frame)["close"].isna().all() == (seeds == 4)
 
 
 @pytest.mark.parametrize(
@@ -64,6 +104,9 @@ def test_a_small_run(tmp_path, capsys):
         (["--priors", "none", "wizard"], "wizard"),
         (["--priors", "none", "gru-4"], "gru-4"),
         (["--priors", "stored"], "none"),
+        (["--scored", "none"], "scored"),
+        (["--scored", "wizard"], "wizard"),
+        (["--conditions", "validation"], "validation"),
         (["--budgets", "8", "8"], "budgets"),
         (["--tasks", "chess"], "chess"),
         (["--planners", "astar"], "astar"),
@@ -129,25 +172,92 @@ def test_a_moving_picture_without_its_simulator_is_refused_before_anything_is_do
     assert not (tmp_path / "out").exists()
 
 
-def test_settings_are_chosen_by_their_mean_over_validation_seeds():
-    settings = ControlSettings(("shooting",), ("none", "stored"), (8,), (), 10, 1, 8, 8, 0)
-    first, second = [0.0] * len(NOISES), [0.0] * len(NOISES)
-    first[1], second[1], second[4] = 3.0, 1.0, 3.5  # means 2 and 1.75
-    shares = [{"stored": [0.0, 1.0, 5.0, 0.0, 0.0]}, {"stored": [0.0, 6.0, 1.0, 0.0, 0.0]}]
-    results = [
-        {"plain": {"icem": [*first[1:], 0.0], "shooting": plain}, "with_prior": {"shooting": some}}
-        for plain, some in ((first, shares[0]), (second, shares[1]))
-    ]
-    found = chosen(results, settings)
-    assert found["shooting"]["none"] == Choice(*NOISES[1])
-    assert found["shooting"]["stored"] == Choice(*NOISES[1])._replace(**PROPOSALS[1])
-    assert found["icem"]["none"] == Choice(*NOISES[0])
+def test_budgets_that_match_the_plain_planner():
+    """`good` has the return of 100 with 50, `bad` never; a return that varies is near from a smaller budget on."""
+    found = matches(made_up()).set_index("prior")
+    assert found.loc["good", ["reference", "equal", "close"]].tolist() == [100, 50, 50]
+    assert found.loc["bad", ["equal", "close"]].tolist() == [inf, inf]
+    assert found.loc["none", ["equal", "close"]].tolist() == [inf, inf]
+    swing = np.where(made_up()["seed"] % 2, 2.0, -2.0) * (made_up()["prior"] == "good")
+    assert matches(made_up().assign(**{"return": made_up()["return"] + swing})).set_index("prior").loc[
+        "good", ["equal", "close"]
+    ].tolist() == [50, 25]
+
+
+def test_networks_are_compared_with_the_best_prior_that_is_none():
+    values = {"noise": 3.0, "stored": 1.0, "shuffled": 9.0, "gru": 5.0, "transformer": 2.0}
+    frame = pd.DataFrame(
+        [
+            {"world": world, "seed": seed, "prior": prior, "nats": value + seed + 0.1 * (seed % 2) * (prior == "gru")}
+            for world in "ab"
+            for seed in range(6)
+            for prior, value in values.items()
+        ]
+    )
+    found = against_simple(frame, ["world"], "nats").set_index(["world", "prior"])
+    assert set(found["baseline"]) == {"noise"}
+    assert found.loc[("b", "gru"), "difference"] == pytest.approx(2.05)
+    assert found.loc[("b", "gru"), "p_holm"] < 0.05
+    assert found.loc[("a", "transformer"), "difference"] == pytest.approx(-1)
+    assert len(against_simple(frame[frame["prior"] == "noise"], ["world"], "nats")) == 0
+
+
+def test_synergies_are_compared_at_equal_numbers_of_components():
+    values = {"none": 0.0, "synergies-2": 5.0, "step-synergies-2": 3.0, "synergies-4": 9.0, "step-synergies": 1.0}
+    frame = pd.DataFrame(
+        [
+            {"world": "w", "condition": "goal", "planner": "icem", "prior": prior, "budget": budget, "seed": seed}
+            | {"return": value + budget + seed}
+            for prior, value in values.items()
+            for budget in (8, 16, *([100] if prior == "none" else []))
+            for seed in range(5)
+        ]
+    )
+    (row,) = synergies(frame).to_dict("records")
+    assert (row["components"], row["difference"]) == ("2", 2)
+
+
+def test_settings_are_chosen_by_their_returns_over_both_worlds(monkeypatch):
+    """Returns of both worlds count alike, although those of one are a hundred times as large."""
+    settings = ControlSettings((8,), (), 10, 1, 8, 8, 2, 0)
+    worlds, asked = {}, []
+    for name in ("same", "validation"):
+        worlds[TASKS["double_integrator"].make(name).mass] = name
+
+    def returned(planner, world, settings, seed, starts):
+        asked.append((planner.std, planner.noise_beta, planner.prior_share, planner.prior_as))
+        value = {0.12: (100, 1), 0.3: (99, 5)}.get(planner.std, (50, 0.5))[worlds[world.mass] == "validation"]
+        more = 1 + (planner.noise_beta == EXPONENTS[2]) + (planner.prior_as == "noise")
+        return SimpleNamespace(rewards=torch.full((starts, 1), float(value * more)))
+
+    monkeypatch.setattr("eval.control.run.controlled", returned)
+    alone = tuning_run(Tuning("double_integrator", "icem"), settings)
+    assert alone == Choice(0.3, EXPONENTS[2])
+    assert {std for std, *_ in asked} == set(STDS)
+    monkeypatch.setattr("eval.control.run.collecting_run", lambda *_: _plans())
+    found = tuning_run(Tuning("double_integrator", "icem", "autoregressive", (alone, alone)), settings)
+    assert found == alone._replace(**PROPOSALS[2])
+
+
+def test_planners_have_the_settings_that_were_chosen():
     choice = Choice(0.4, 2.0, 0.25, 0, "noise")
     planner = planner_of("icem", 5, 30, choice, fitted("noise", _plans(), 5, seeded(0)))
     assert (planner.std, planner.noise_beta, planner.prior_share, planner.prior_as) == (0.4, 2.0, 0.25, "noise")
     assert planner.prior_iterations == len(planner.populations)
     assert planner_of("icem", 5, 30, Choice(0.4, 2.0, 0.25, 1), planner.prior).prior_iterations == 1
     assert planner_of("shooting", 5, 30, Choice(0.4, 2.0, 0.25, 1), None).prior_share == 0
+
+
+def test_the_time_of_drawing_is_all_that_is_timed():
+    prior = fitted("noise", _plans(), 5, seeded(0))
+    with drawing(prior) as spent:
+        assert spent == [0]
+        prior.sample(200, 20, generator=seeded(0))
+        once = spent[0]
+        prior.log_prob(_plans().without_context())
+        assert spent[0] == once > 0
+    prior.sample(200, 20, generator=seeded(0))
+    assert spent[0] == once
 
 
 def _plans(num=4, length=30):

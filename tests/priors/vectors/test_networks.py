@@ -35,6 +35,17 @@ def kind(request: pytest.FixtureRequest) -> type[VectorGRU] | type[VectorTransfo
     return request.param
 
 
+def test_features_beyond_the_ends_of_plans_are_not_learned_from(kind):
+    """Plans that are padded further have the same mean features, and so the same forecasts."""
+    data = plans(context_size=2)
+    assert data.context is not None
+    padded = VectorPlans(
+        torch.cat([data.actions, data.actions], 1), LOW, HIGH, data.lengths, torch.cat([data.context, data.context], 1)
+    )
+    one, two = (kind(LOW, HIGH, 2, width=8).fit(some, generator=rng(), **HOW) for some in (data, padded))
+    torch.testing.assert_close(one.action_log_probs(data), two.action_log_probs(data), atol=1e-4, rtol=1e-4)
+
+
 @pytest.mark.parametrize(("context_size", "per_step"), [(None, True), (3, True), (3, False)])
 @pytest.mark.parametrize("lags", [1, 3])
 @torch.no_grad()

@@ -10,7 +10,7 @@ from eval.compare.curriculum import curriculum_document
 from eval.compare.planners import planner_document
 from eval.compare.report import FRAMES, document
 from eval.compare.results import Results, best_difference, chosen, needed
-from eval.control.report import candidates_needed, differences, savings
+from eval.control.comparison import candidates_needed, differences, savings
 from eval.live.report import live_document, live_frame, live_pairs
 from eval.live.run import PARTS, conditions
 from eval.options.report import options_document

@@ -1,0 +1,28 @@
+"""Extra cli: the commands of the README's "Your own data", with little training."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+PROGRAM = str(Path(sys.executable).with_name("neuroprior"))
+STUDY = ["study.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
+for words in (
+    ["example", "study.csv"],
+    [
+        "fit",
+        "--config",
+        "gru",
+        "--data.file",
+        *STUDY,
+        "--out",
+        "mine",
+        "--trainer.max_steps",
+        "20",
+        "--data.folds",
+        "1",
+    ],
+    ["score", "mine", *STUDY],
+    ["sample", "mine", "--num-plans", "5", "--length", "4"],
+    ["report", *STUDY, "--models", "counts", "--out", "report"],
+):
+    subprocess.run([PROGRAM, *words], check=True, stdout=subprocess.DEVNULL)

@@ -1,0 +1,11 @@
+"""Extra report: a table of events, and the report on it."""
+
+from pathlib import Path
+
+from neuroprior import Plans
+from neuroprior.report import report
+from neuroprior.testing.study import simulated_study
+
+names = {"action": "behaviour", "plan": "session", "group": "animal"}
+report(Plans.from_dataframe(simulated_study(0), **names), models=["counts"], processes=1, out="report")
+assert "<svg" in Path("report/report.html").read_text(encoding="utf-8")

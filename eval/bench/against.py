@@ -1,0 +1,97 @@
+"""Regressions: the results of two runs of `python -m eval bench`, such as of two commits, compared."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from neuroprior._files import read_json
+from neuroprior.report.document import table
+from neuroprior.report.page import Table
+
+KEYS = {
+    "rows": ("job", "peer"),
+    "imports": (),
+    "sizes": ("growing", "size"),
+    "limits": ("work",),
+    "gpu": ("job", "device"),
+}
+"""By part of the results: what names a row."""
+
+LEAST = 1.1
+"""A smaller factor is no verdict, whatever the spread of the repetitions."""
+
+
+def read_results(path: str) -> dict[str, Any]:
+    """What the bench wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is none of the bench's.
+    """
+    found = read_json(Path(path))
+    if not isinstance(found, dict) or "settings" not in found or not any(isinstance(found.get(k), list) for k in KEYS):
+        raise ValueError(f"{path}: no results of the bench; its results.json is expected")
+    return found
+
+
+def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame:
+    """A row for each measurement that both results have: its `name`, seconds `before` and `now`, `factor`, `verdict`.
+
+    `factor` is how many times as long the library takes now. Where it was timed in turn with a peer (or torch's
+    import), both times are in units of the peer's, so that another machine or a busier one matters less; only there,
+    where the repetitions of one run all lie above those of the other and the factor is at least `LEAST`, is there a
+    verdict.
+
+    Raises:
+        ValueError: the two were not measured with the same scale and threads, or have nothing in common.
+    """
+    for name in ("scale", "threads"):
+        if before["settings"].get(name) != now["settings"].get(name):
+            raise ValueError(
+                f"against: measured with {name} {before['settings'].get(name)}, not {now['settings'].get(name)};"
+                " the same is expected"
+            )
+    rows = []
+    for part, names in KEYS.items():
+        earlier = {tuple(row[name] for name in names): row for row in before.get(part, [])}
+        for row in now.get(part, []):
+            key = tuple(row[name] for name in names)
+            if key in earlier:
+                rows.append(_row(": ".join(map(str, key)) or "import neuroprior", part, earlier[key], row))
+    if not rows:
+        raise ValueError("against: the two results have no measurement in common")
+    return pd.DataFrame(rows)
+
+
+def _row(name: str, part: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    factor, verdict = new["seconds"] / old["seconds"], ""
+    if "ratio" in new:
+        # of peers: the peer's time in units of ours; of the import: ours in units of torch's
+        (old_low, old_high), (new_low, new_high) = (_spread(part, one) for one in (old, new))
+        factor = _relative(part, new["ratio"]) / _relative(part, old["ratio"])
+        slower, faster = new_low > old_high and factor >= LEAST, new_high < old_low and factor <= 1 / LEAST
+        verdict = "slower" if slower else "faster" if faster else "no difference"
+    return {"name": name, "before": old["seconds"], "now": new["seconds"], "factor": factor, "verdict": verdict}
+
+
+def _relative(part: str, ratio: float) -> float:
+    """Our time in units of the peer's."""
+    return ratio if part == "imports" else 1 / ratio
+
+
+def _spread(part: str, row: Mapping[str, Any]) -> tuple[float, float]:
+    ends = sorted(_relative(part, row[end]) for end in ("low", "high"))
+    return ends[0], ends[1]
+
+
+def regression_table(rows: pd.DataFrame, path: str) -> Table:
+    """The table of these rows."""
+    columns = {"measurement": "name", "before, s": "before:.3g", "now, s": "now:.3g"}
+    columns |= {"factor": "factor:.2f", "verdict": "verdict"}
+    caption = (
+        "factor: how many times as long it takes now; with a peer, in units of the peer's time. A verdict where all"
+        f" repetitions of one run lie beyond those of the other, by a factor of at least {LEAST:g}."
+    )
+    return table(rows, columns, caption, f"Against {path}")

@@ -1,0 +1,1 @@
+"""What the pages of results show, run again from the commands that they name."""

@@ -1,0 +1,221 @@
+"""Compiled loops that draw plans of vectors, for `LinearGaussianPrior` and `VectorGRU`; importing this loads numba."""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from torch import Tensor, contiguous_format
+from torch.nn.functional import linear
+
+from neuroprior.priors.neural.compiled_gru import sigmoid, tanh
+
+Array = np.ndarray[Any, Any]
+
+
+def draw_linear(prior: Any, vectors: Tensor, known: int, noise: Tensor) -> None:
+    """As `neuroprior.priors.vectors.linear_gaussian.draw_linear`, of float32 on the CPU."""
+    weights, offset, std, coupling = (each.numpy() for each in (prior.weights, prior.offset, prior.std, prior.coupling))
+    _linear(vectors.numpy(), known, prior.memory, weights, offset, std, coupling, noise.numpy())
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _linear(
+    vectors: Array,
+    known: int,
+    depth: int,
+    weights: Array,
+    offset: Array,
+    std: Array,
+    coupling: Array,
+    noise: Array,
+) -> None:
+    size = vectors.shape[2]
+    mean = np.empty(size, np.float32)
+    for n in range(len(vectors)):
+        plan = vectors[n]
+        for t in range(known, len(plan)):
+            h = min(t, depth)
+            mean[:] = offset[h]
+            for back in range(h):
+                row = (depth - h + back) * size
+                for j in range(size):
+                    value = plan[t - h + back, j]
+                    for d in range(size):
+                        mean[d] += value * weights[h, row + j, d]
+            for d in range(size):
+                centre = mean[d] + noise[n, t - known, d] * std[h, d]
+                for j in range(d):
+                    centre += coupling[h, d, j] * (plan[t, j] - mean[j])
+                plan[t, d] = min(max(centre, np.float32(-1)), np.float32(1))
+
+
+def read_recurrent(gru: Any, vectors: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
+    """As `gru(vectors [N, T, width], layers [num_layers, N, width])`, of float32 on the CPU; no gradients."""
+    layers = layers.clone(memory_format=contiguous_format)
+    for layer, (w_in, w_hidden, b_in, b_hidden) in enumerate(gru.all_weights):
+        given = linear(vectors, w_in, b_in)
+        vectors = vectors.new_empty(vectors.shape)
+        own = np.ascontiguousarray(w_hidden.detach().numpy().T)
+        _read(given.detach().numpy(), layers[layer].numpy(), own, b_hidden.detach().numpy(), vectors.numpy())
+    return vectors, layers
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _gated(into: Array, from_own: Array, state: Array) -> None:
+    """Move on the `state` of a layer, by what its input and its own state give to the gates."""
+    width = len(state)
+    for k in range(width):
+        reset = sigmoid(into[k] + from_own[k])
+        update = sigmoid(into[width + k] + from_own[width + k])
+        fresh = tanh(into[2 * width + k] + reset * from_own[2 * width + k])
+        state[k] = fresh + update * (state[k] - fresh)
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _read(given: Array, states: Array, own: Array, own_bias: Array, out: Array) -> None:
+    from_own = np.empty(len(own_bias), np.float32)
+    for n in range(given.shape[0]):
+        for t in range(given.shape[1]):
+            from_own[:] = own_bias
+            _add_product(from_own, states[n], own)
+            _gated(given[n, t], from_own, states[n])
+            out[n, t] = states[n]
+
+
+def draw_recurrent(prior: Any, least_std: float, state: Tensor, chance: Tensor, noise: Tensor) -> Tensor:
+    """As `VectorNetwork.draw`, for a `VectorGRU` of float32 on the CPU; `least_std` in units of half the range."""
+    layers = prior.gru.all_weights
+    hidden = state[:, : state.shape[1] - prior.input_size].reshape(len(state), len(layers), prior.width).clone()
+    inputs = state[:, state.shape[1] - prior.input_size :].clone()
+    # What the first layer is given is linear in the inputs: two matrices in one.
+    given = (layers[0][0] @ prior.inputs.weight).T
+    given_bias = layers[0][0] @ prior.inputs.bias + layers[0][2]
+    # Gates of higher layers are given what the layer below has found; the first layer's place is not read.
+    above, own, above_bias, own_bias = (
+        np.array([layer[i].detach().numpy().T for layer in layers], order="C") for i in range(4)
+    )
+    size = prior.action_size
+    coupling = noise.new_zeros(size, size)
+    if prior.coupling is not None:
+        coupling = prior.coupling.tril(-1) * (prior._half[:, None] / prior._half)
+    vectors = noise.new_empty(noise.shape)
+    first, first_bias, head, head_bias, direct, coupled = (
+        np.ascontiguousarray(each.detach().numpy())
+        for each in (given, given_bias, prior.head.weight, prior.head.bias, prior.linear.weight, coupling)
+    )
+    _recurrent(
+        vectors.numpy(),
+        hidden.numpy(),
+        inputs.numpy(),
+        chance.numpy(),
+        noise.numpy(),
+        above,
+        above_bias,
+        own,
+        own_bias,
+        first,
+        first_bias,
+        head,
+        head_bias,
+        direct,
+        coupled,
+        np.stack([each.numpy() for each in (prior._centre, prior._half, prior.action_low, prior.action_high)]),
+        prior.num_components,
+        prior.entry_size * prior.lags,
+        np.float32(least_std),
+    )
+    return vectors
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _add_product(total: Array, vector: Array, matrix: Array) -> None:
+    """Add `vector @ matrix`, four rows at a time."""
+    whole = len(vector) // 4 * 4
+    for k in range(0, whole, 4):
+        v0, v1, v2, v3 = vector[k], vector[k + 1], vector[k + 2], vector[k + 3]
+        for j in range(len(total)):
+            total[j] += v0 * matrix[k, j] + v1 * matrix[k + 1, j] + v2 * matrix[k + 2, j] + v3 * matrix[k + 3, j]
+    for k in range(whole, len(vector)):
+        value = vector[k]
+        for j in range(len(total)):
+            total[j] += value * matrix[k, j]
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _dot(start: Any, one: Array, other: Array) -> Any:
+    total = np.float32(0)
+    for k in range(len(one)):
+        total += one[k] * other[k]
+    return start + total
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _recurrent(
+    vectors: Array,
+    hidden: Array,
+    inputs: Array,
+    chance: Array,
+    noise: Array,
+    above: Array,
+    above_bias: Array,
+    own: Array,
+    own_bias: Array,
+    given: Array,
+    given_bias: Array,
+    head: Array,
+    head_bias: Array,
+    direct: Array,
+    coupling: Array,
+    bounds: Array,
+    num: int,
+    recent: int,
+    least_std: Any,
+) -> None:
+    """`inputs [N, E]` begin with `recent` numbers of the last vectors; `bounds`: centre, half the range, low, high."""
+    length, size = vectors.shape[1], vectors.shape[2]
+    width, entry, one = hidden.shape[2], size + 1, np.float32(1)
+    into, from_own = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
+    weights, mean = np.empty(num, np.float32), np.empty(size, np.float32)
+    centre, half, low, high = bounds[0], bounds[1], bounds[2], bounds[3]
+    for n in range(len(vectors)):
+        for t in range(length):
+            if t:
+                for j in range(recent - entry):
+                    inputs[n, j] = inputs[n, j + entry]
+                for d in range(size):
+                    inputs[n, recent - entry + d] = (vectors[n, t - 1, d] - centre[d]) / half[d]
+                inputs[n, recent - 1] = one
+                for layer in range(hidden.shape[1]):
+                    before = hidden[n, layer]
+                    from_own[:] = own_bias[layer]
+                    _add_product(from_own, before, own[layer])
+                    if layer:
+                        into[:] = above_bias[layer]
+                        _add_product(into, hidden[n, layer - 1], above[layer])
+                    else:
+                        into[:] = given_bias
+                        _add_product(into, inputs[n], given)
+                    _gated(into, from_own, before)
+            top = hidden[n, hidden.shape[1] - 1]
+            highest, total = np.float32(-np.inf), np.float32(0)
+            for c in range(num):
+                weights[c] = _dot(head_bias[c], head[c], top)
+                highest = max(highest, weights[c])
+            for c in range(num):
+                weights[c] = np.exp(weights[c] - highest)
+                total += weights[c]
+            chosen, so_far = 0, weights[0]
+            while chosen < num - 1 and chance[n, t] * total > so_far:
+                chosen += 1
+                so_far += weights[chosen]
+            for d in range(size):
+                row = num + chosen * size + d
+                value = _dot(_dot(head_bias[row], head[row], top), direct[d], inputs[n])
+                mean[d] = centre[d] + half[d] * value
+                row += num * size
+                log_std = _dot(head_bias[row], head[row], top)
+                std = np.exp(min(max(log_std, np.float32(-9)), np.float32(3))) + least_std
+                value = mean[d] + half[d] * std * noise[n, t, d]
+                for j in range(d):
+                    value += coupling[d, j] * (vectors[n, t, j] - mean[j])
+                vectors[n, t, d] = min(max(value, low[d]), high[d])

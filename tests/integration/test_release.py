@@ -1,0 +1,76 @@
+"""What a release promises: one version everywhere, versions of packages, extras, types, and the time of an import."""
+
+import re
+import runpy
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import neuroprior
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def test_one_version() -> None:
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert cited is not None
+    assert newest is not None
+    assert {cited[1], newest[1]} == {neuroprior.__version__}
+
+
+def pinned(name: str) -> dict[str, str]:
+    lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+    pairs = (line.split("==") for line in lines if "==" in line)
+    return {package.lower(): version for package, version in pairs}
+
+
+def test_lowest_versions_are_those_that_are_promised() -> None:
+    """Of the library's own extras; the others compare, build pages or test."""
+    extras = PROJECT["optional-dependencies"]
+    own = ("report", "cli", "dask", "gym", "mujoco", "fast")
+    asked = [*PROJECT["dependencies"], *(need for name in own for need in extras[name])]
+    least = dict(re.match(r"([\w-]+)(?:\[\w+\])?>=(.+)", need).groups() for need in asked if ">=" in need)
+    lowest = pinned("constraints-lowest.txt")
+    assert set(lowest) == set(least)
+    for package, version in lowest.items():
+        assert re.fullmatch(re.escape(least[package]) + r"(\.0)*", version), package
+    assert set(lowest) <= set(pinned("constraints.txt"))
+
+
+def test_each_extra_is_tried() -> None:
+    tried = {path.stem.removeprefix("extra_") for path in (ROOT / ".ci/smoke").glob("extra_*.py")}
+    assert tried == set(PROJECT["optional-dependencies"]) - {"all"}
+
+
+def test_code_of_a_user_runs(tmp_path: Path) -> None:
+    """`make check` reads its types."""
+    runpy.run_path(str(ROOT / "tests/typing/user_code.py"))["main"](tmp_path)
+
+
+HEAVY = {"gymnasium", "jinja2", "joblib", "jsonargparse", "lightning", "matplotlib", "numba", "pandas", "rich", "scipy"}
+"""What an import of the library leaves for when it is needed."""
+
+BUDGET = 0.5
+"""Most that an import of the library may take beyond that of torch, as a share of that of torch."""
+
+
+def imported() -> tuple[float, set[str]]:
+    """How much longer than torch an import of the library takes, as a share of torch's time; and what is imported."""
+    command = [sys.executable, "-X", "importtime", "-c", "import torch, neuroprior"]
+    said = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True).stderr
+    lines = re.findall(r"\| +(\d+) \| ( *)(\S+)$", said, re.MULTILINE)
+    seconds = {name: float(cumulative) for cumulative, _, name in lines}
+    return seconds["neuroprior"] / seconds["torch"], {name.partition(".")[0] for name in seconds}
+
+
+def test_import_is_light() -> None:
+    """The least of three times counts: on a machine at work one may take long."""
+    share, packages = imported()
+    assert "torch" in packages
+    assert not packages & HEAVY
+    if share > BUDGET:
+        share = min(imported()[0] for _ in range(2))
+    assert share <= BUDGET
