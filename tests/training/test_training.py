@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import lightning
 import numpy as np
@@ -65,10 +66,12 @@ def test_the_best_weights_are_kept_not_the_last() -> None:
     assert bits == pytest.approx(best, abs=1e-5)
 
 
-def trained(prior: GRUPrior, plans: Plans, held_out: Plans, how: Settings, folder: Path) -> PriorModule:
+def trained(
+    prior: GRUPrior, plans: Plans, held_out: Plans, how: Settings, folder: Path, logs: bool = False
+) -> PriorModule:
     """The module after a training on these plans, with its learning curve."""
     data = PlansModule(plans, held_out, how, seed=0)
-    progress = {"enable_progress_bar": False, "logs": False}
+    progress = {"enable_progress_bar": False, "logs": logs}
     trainer = make_trainer(str(folder), how.max_steps, how.patience, data.steps, "cpu", **progress)
     module = PriorModule(prior, how.learning_rate, how.weight_decay)
     run_training(trainer, module, data)
@@ -109,9 +112,14 @@ def test_in_training_each_action_counts_the_same(equal: int, tmp_path: Path) -> 
     seen: list[tuple[float, list[float]]] = []
 
     class Watch(lightning.Callback):
+        def on_before_backward(
+            self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, loss: Any
+        ) -> None:
+            self.loss = float(loss)
+
         def on_after_backward(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
             assert isinstance(prior.logits.grad, torch.Tensor)
-            seen.append((float(trainer.callback_metrics["train_bits"]), prior.logits.grad.tolist()))
+            seen.append((self.loss, prior.logits.grad.tolist()))
 
     plans, prior = Plans(actions.repeat(equal, 1), 3, lengths.repeat(equal)), Constant()
     data = PlansModule(plans, plans, Settings(1, window=9, check_every=1), seed=0)
@@ -191,12 +199,18 @@ def test_the_last_checkpoint_is_written_after_each_validation(tmp_path: Path) ->
     """Where noise is learned by heart the best one is the first; a training is resumed from the last."""
     plans = Plans(torch.randint(3, (40, 8), generator=generator()), 3)
     how = Settings(30, learning_rate=0.05, check_every=10, patience=1000)
-    module = trained(GRUPrior(3, 16), plans[:28], plans[28:], how, tmp_path)
+    module = trained(GRUPrior(3, 16), plans[:28], plans[28:], how, tmp_path, logs=True)
     bits = [entry["validation_bits"] for entry in module.curve]
     assert bits == sorted(bits)
     saved = {path.stem: torch.load(path, weights_only=True) for path in (tmp_path / "checkpoints").iterdir()}
     assert {name: one["global_step"] for name, one in saved.items()} == {"best": 10, "last": 30}
     assert len(saved["last"]["curve"]) == 3
+    # Without logs the same weights are kept in memory, and nothing is written.
+    unlogged = trained(GRUPrior(3, 16), plans[:28], plans[28:], how, tmp_path / "none")
+    for name, weights in saved["best"]["state_dict"].items():
+        assert unlogged.state_dict()[name].equal(weights)
+        assert module.state_dict()[name].equal(weights)
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_training_that_diverges_is_said(recwarn: pytest.WarningsRecorder) -> None:

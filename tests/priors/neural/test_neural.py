@@ -204,6 +204,30 @@ def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes
         torch.testing.assert_close(third.float(), one, atol=0.05, rtol=0.05)
 
 
+@pytest.mark.parametrize("num_layers", [1, 2])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_compiled_sequence_of_a_gru_is_that_of_torch(num_layers, begun, monkeypatch):
+    """Its output, its last states, and the gradients of weights, inputs and first states."""
+    if compiled("neuroprior.priors.neural.compiled_gru") is None:
+        pytest.skip("numba is not installed")
+    network = torch.nn.GRU(8, 8, num_layers, batch_first=True)
+    inputs = torch.randn(5, 7, 8, generator=seeded(0), requires_grad=True)
+    first = torch.randn(num_layers, 5, 8, generator=seeded(1), requires_grad=True)
+    learned = [*network.parameters(), inputs, *([first] if begun else [])]
+    found = []
+    for compile_from in (None, 0):
+        monkeypatch.setattr(gru, "COMPILE_FROM", compile_from)
+        for values in learned:
+            values.grad = None
+        out, last = gru.gru_sequence(network, inputs, first if begun else None)
+        (out.sin().sum() + (last**2).sum()).backward()
+        found.append([out.detach(), last.detach(), *(values.grad for values in learned)])
+    for plain, fast in zip(*found, strict=True):
+        torch.testing.assert_close(fast, plain, atol=1e-5, rtol=1e-4)
+    with torch.no_grad():
+        assert torch.allclose(gru.gru_sequence(network, inputs, first if begun else None)[0], found[0][0], atol=1e-6)
+
+
 def test_compiled_gates_are_those_of_torch():
     """Over the whole range of activations, of states that have other numbers beside them."""
     module = compiled("neuroprior.priors.neural.compiled_gru")
