@@ -26,17 +26,21 @@ smartquotes = False  # "lower" is a value
 
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "myst_nb", "sphinx_design"]
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "_templates", "**/runs"]
+exclude_patterns = ["_build", "_templates", "_static", "**/runs"]
 html_theme = "pydata_sphinx_theme"
 html_title = "neuroprior"
 html_theme_options = {
     "show_prev_next": False,
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 5,
 }
 html_sidebars = {"index": []}
 html_show_sourcelink = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+toc_object_entries_show_parents = "hide"
+maximum_signature_line_length = 60  # on a phone a line has about 40 characters
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
