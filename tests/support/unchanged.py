@@ -111,10 +111,10 @@ def _summary(values: np.ndarray) -> dict[str, Any]:
 
 def figure_data(figure: Figure) -> list[dict[str, Any]]:
     """What each axes of a figure show: the data behind their lines, dots, patches and pictures, and all texts."""
-    found = []
+    found: list[dict[str, Any]] = [{"size": [*map(float, figure.get_size_inches())]}]
     for axes in figure.axes:
         own: dict[str, Any] = {
-            "title": axes.get_title(),
+            "titles": [axes.get_title(loc=where) for where in ("left", "center", "right")],
             "labels": [axes.get_xlabel(), axes.get_ylabel()],
             "scales": [axes.get_xscale(), axes.get_yscale()],
             "limits": [*map(float, axes.get_xlim()), *map(float, axes.get_ylim())],
@@ -152,7 +152,8 @@ def _label(artist: Any) -> str:
 
 
 def _style(line: Any) -> list[str]:
-    return [str(line.get_color()), str(line.get_linestyle()), str(line.get_marker())]
+    sizes = f"{line.get_linewidth():g} {line.get_markersize():g} {line.get_alpha()}"
+    return [str(line.get_color()), str(line.get_linestyle()), str(line.get_marker()), sizes]
 
 
 def differences(pinned: Any, found: Any, relative: float = RELATIVE, path: str = "") -> list[str]:

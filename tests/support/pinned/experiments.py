@@ -38,7 +38,7 @@ def comparison_of_priors():
 
 @case
 def figures_of_a_comparison():
-    runs = worlds(["maze"], 4, context=("none", "initial"), rounds=1)
+    runs = worlds(["maze"], 6, {**TIMES, "combined": 3.0}, context=("none", "initial"), rounds=1)
     made = document(Results(runs, (16, 4096)), {}, "")
     return {section.title: [box.figure for box in section.figures] for section in made.sections}
 

@@ -95,6 +95,20 @@ def exports():
 
 
 @case
+def constants():
+    """Numbers that modules of the library name: what is tried, bounds, tolerances."""
+    found: dict[str, Any] = {}
+    for _, name, _ in pkgutil.walk_packages(neuroprior.__path__, "neuroprior."):
+        if name.endswith("__main__"):
+            continue
+        own = {key: value for key, value in vars(importlib.import_module(name)).items() if key.lstrip("_").isupper()}
+        kept = {key: value for key, value in own.items() if isinstance(value, int | float | tuple | range)}
+        if kept:
+            found[name] = {key: list(value) if isinstance(value, range) else value for key, value in kept.items()}
+    return found
+
+
+@case
 def commands():
     """The options of each command with their defaults, and the recipes."""
     found: dict[str, Any] = {}

@@ -19,7 +19,7 @@ from neuroprior.report import (
     table,
     transition_figure,
 )
-from neuroprior.report.document import results_of
+from neuroprior.report.document import printed, results_of, write_figures
 from tests.support.pinned.data import behaviour, timed
 from tests.support.reports import QUICK
 from tests.support.studies import between, study
@@ -33,6 +33,7 @@ def of_document(document: Document, figures: bool = True) -> dict[str, Any]:
     for number, section in enumerate(document.sections):
         found[f"{number} {section.title}"] = {
             "text": section.text,
+            "beside": section.beside,
             "tables": [vars(one) for one in section.tables],
             "figures": [{"name": box.name, "caption": box.caption, "alt": box.alt} for box in section.figures],
         }
@@ -56,7 +57,7 @@ def report_on_plans():
 
 @case(relative=2e-3)
 def report_on_modes():
-    made = report(behaviour(8, 8), **QUICK, folds=2, modes=[2], sections=["modes"])
+    made = report(behaviour(12, 10, context="step"), **QUICK, folds=2, modes=[2], sections=["modes"])
     return of_document(made) | {"frames": made.frames}
 
 
@@ -118,6 +119,11 @@ def pages():
     with TemporaryDirectory() as folder:
         with open(Path(folder) / "out.txt", "w") as out:
             publish(document, Path(folder) / "page", Console(file=out, width=80))
+        write_figures(Path(folder) / "page", {"alone": box.figure})
+        with open(Path(folder) / "narrow.txt", "w") as out:
+            names = pd.DataFrame({"name": ["a name that is far too long for it"], "bits": [12345.678]})
+            narrow = table(names, {"a heading": "name", "bits": "bits:.3f"}, "A caption.", "Two")
+            Console(file=out, width=24).print(printed("Two", narrow))
         files = sorted(path.name for path in (Path(folder) / "page").iterdir())
         page = (Path(folder) / "page" / "report.html").read_text()
         body = page[page.index("<body") :]
@@ -126,6 +132,7 @@ def pages():
         return {
             "printed": (Path(folder) / "out.txt").read_text().replace(folder, "").splitlines()[:-1],
             "files": files,
+            "narrow": (Path(folder) / "narrow.txt").read_text().splitlines(),
             "page": [line for part in parts for line in part.splitlines() if line.strip() and "version" not in line],
             "results": {key: value for key, value in results.items() if key != "versions"},
             "table": (Path(folder) / "page" / "rows.csv").read_text(),
