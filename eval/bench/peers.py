@@ -117,7 +117,7 @@ class ObservingGRU(PlainGRU):
         return plans, state
 
 
-def plain_training(plans: Tensor, num_actions: int, steps: int, batch_size: int, learning_rate: float) -> PlainGRU:
+def plain_training(plans: Tensor, num_actions: int, batch_size: int, learning_rate: float, steps: int) -> PlainGRU:
     """A GRU trained on `plans [N, L]` by the loop of every tutorial: DataLoader, Adam, cross entropy."""
     torch.manual_seed(0)
     model = PlainGRU(num_actions)

@@ -110,6 +110,13 @@ def test_the_plain_gru_beside_a_world():
     assert final.equal(world.rollout(state, plans.view(4, 3, 6)).final_state.flatten())
 
 
+def test_the_plain_training_is_one_as_it_is_called():
+    """With the batch size, the learning rate and the number of steps in the order in which settings are tried."""
+    plans = torch.zeros(50, 4, dtype=torch.uint8)
+    model = peers.plain_training(plans, 4, 16, 0.05, 20)
+    assert excess(model, source(), plans) < 0.5 * excess(peers.PlainGRU(4), source(), plans)
+
+
 def test_a_star_in_python_solves_what_ours_does():
     world = sliding_tiles(shape=(3, 3), scramble=12)
     boards = world.reset(5, seeded(0))
