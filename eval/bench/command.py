@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import pandas as pd
 import torch
-from jsonargparse.typing import PositiveInt
+from jsonargparse.typing import NonNegativeInt, PositiveInt
 from rich.console import Console
 
 from eval.bench import limits, sizes
@@ -20,6 +20,9 @@ from neuroprior._jobs import Progress
 from neuroprior.report.document import Column, printed, table, write_figures, write_frames
 from neuroprior.report.page import Table
 
+LEFT = 0.5
+"""Share of a ratio that should be left beside busy processes."""
+
 Part = Literal["peers", "sizes", "limits", "imports", "gpu"]
 
 
@@ -28,6 +31,7 @@ def bench(
     jobs: Sequence[str] = tuple(JOBS),
     repetitions: PositiveInt = 5,
     scale: float = 1.0,
+    busy: Sequence[NonNegativeInt] = (0,),
     against: str | None = None,
     measured: str | None = None,
     out: str = "runs/bench",
@@ -41,6 +45,8 @@ def bench(
         jobs: what to measure against peers.
         repetitions: how often each job is timed, in turn with its peers.
         scale: share of each job that is done, and of the largest size; the goals are for 1.
+        busy: beside how many other processes, which compute without end, jobs are measured against peers: 0 1 2 for a
+            table of how much of the lead is left on a machine with other work.
         against: results.json of another run, such as of another commit: how many times as long everything takes now.
         measured: results.json of a run that is compared with it; nothing is measured then.
         out: folder to write to.
@@ -60,7 +66,9 @@ def bench(
     settings = {"repetitions": repetitions, "scale": scale, "threads": torch.get_num_threads()}
     works: list[tuple[str, str, Callable[[], Iterable[dict[str, Any]]]]] = []
     if "peers" in parts:
-        works += [("peers", name, partial(against_peers, name, scale, repetitions, console.print)) for name in jobs]
+        works += [
+            ("peers", name, partial(against_peers, name, scale, repetitions, console.print, busy=busy)) for name in jobs
+        ]
     if "sizes" in parts:
         works += [
             ("sizes", f"by {name}", partial(sizes.measured, name, sweep, scale * sweep.sizes[-1]))
@@ -105,7 +113,12 @@ def _regressions(earlier: dict[str, Any], later: dict[str, Any], path: str) -> A
 def tables(found: dict[str, Rows], settings: dict[str, Any]) -> list[Table]:
     """The tables of what was measured: rows by part."""
     shown: dict[str, Callable[[pd.DataFrame], Table]]
-    shown = {"peers": partial(_peers, settings), "sizes": _sizes, "limits": _limits, "gpu": _gpu, "imports": _imports}
+    if "peers" in found:
+        rows = pd.DataFrame(found["peers"])
+        several = {"busy": found["peers"]} if rows.busy.nunique() > 1 else {}
+        found = found | {"peers": [row for row in found["peers"] if row["busy"] == rows.busy.min()]} | several
+    shown = {"peers": partial(_peers, settings), "busy": _busy, "sizes": _sizes}
+    shown |= {"limits": _limits, "gpu": _gpu, "imports": _imports}
     return [make(pd.DataFrame(found[part])) for part, make in shown.items() if part in found]
 
 
@@ -115,6 +128,19 @@ def _peers(settings: dict[str, Any], rows: pd.DataFrame) -> Table:
     columns |= {"min": _short("low"), "max": _short("high"), "goal": _short("goal"), "met": "met"}
     title = f"Speed with {settings['threads']} threads of torch (ratio: peer's time / ours)"
     return table(rows.assign(name=rows.job + ": " + rows.peer, met=met), columns, "Medians; least and most.", title)
+
+
+def _busy(rows: pd.DataFrame) -> Table:
+    """The ratios beside each number of busy processes."""
+    ratios = rows.assign(name=rows.job + ": " + rows.peer).pivot_table("ratio", "name", "busy", sort=False)
+    first, last = ratios.columns.min(), ratios.columns.max()
+    shown = ratios.rename(columns=str).assign(left=ratios[last] / ratios[first]).reset_index()
+    columns: dict[str, Column] = {"job: peer": "name"}
+    for number in ratios.columns:
+        columns[str(number)] = _short(str(number))
+    columns |= {"left": "left:.2f", "met": lambda row: "yes" if row["left"] >= LEFT else "no"}
+    caption = f"left: the last as a share of the first; the goal is {LEFT}."
+    return table(shown, columns, caption, "Ratios beside busy processes, by their number")
 
 
 def _imports(rows: pd.DataFrame) -> Table:

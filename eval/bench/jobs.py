@@ -1,7 +1,10 @@
 """The jobs of `python -m eval bench`: what the library does in each, its peers, and how far ahead it should be."""
 
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -30,8 +33,9 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
+from neuroprior.planners import AStarPlanner, MPPIPlanner
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import GridWorld, maze
+from neuroprior.worlds import DoubleIntegrator, GridWorld, maze, sliding_tiles
 
 FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 
@@ -62,16 +66,29 @@ def missing(package: str | None) -> bool:
     return package is not None and find_spec(package) is None
 
 
+@contextmanager
+def beside(number: int) -> Iterator[None]:
+    """So many other processes that compute without end, as on a machine with other work."""
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
 def against_peers(
     name: str,
     scale: float,
     repetitions: int,
     say: Callable[[str], Any],
     missing: Callable[[str | None], bool] = missing,
+    busy: Sequence[int] = (0,),
 ) -> Iterator[dict[str, Any]]:
-    """A row for each peer of a job: how many times as long it takes, timed in turn with it.
+    """A row for each peer of a job, beside each number of `busy` processes: how many times as long it takes.
 
-    `say` is called with what is left out, because a package is missing.
+    The two are timed in turn. `say` is called with what is left out, because a package is missing.
     """
     job = JOBS[name](scale)
     if missing(job.needs):
@@ -87,11 +104,13 @@ def against_peers(
         theirs = peer.make()
         ours(), theirs()  # the first run is slow
         torch.set_num_threads(threads)  # packages change it when they are loaded
-        times = [(seconds(ours), seconds(theirs) / peer.share) for _ in range(repetitions)]
-        own, other = map(list, zip(*times, strict=True))
-        row = {"job": name, "about": job.about, "setup_seconds": setup, "seconds": median(own)}
-        row |= {"peer": peer.name, "peer_seconds": median(other), "share": peer.share}
-        yield row | compared(own, other) | {"goal": peer.goal}
+        for number in busy:
+            with beside(number):
+                times = [(seconds(ours), seconds(theirs) / peer.share) for _ in range(repetitions)]
+            own, other = map(list, zip(*times, strict=True))
+            row = {"job": name, "about": job.about, "setup_seconds": setup, "seconds": median(own), "busy": number}
+            row |= {"peer": peer.name, "peer_seconds": median(other), "share": peer.share}
+            yield row | compared(own, other) | {"goal": peer.goal}
 
 
 def on_device(name: str, device: torch.device, scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
@@ -341,6 +360,31 @@ def shoot(scale: float) -> Job:
     )
 
 
+def search_tiles(scale: float) -> Job:
+    """A*, which no solution stops, so that expansions are compared."""
+    world, most = sliding_tiles(shape=(5, 5), scramble=2000), scaled(10_000, scale)
+    boards = world.reset(100, torch.Generator().manual_seed(0))
+    few = boards[:5].flatten(1)
+    return Job(
+        f"A*, {most:,} expansions of each of 100 24-puzzles",
+        lambda device: partial(AStarPlanner(world.lower_bound, max_nodes=most).search, world, boards),
+        (Peer("plain Python, heapq", partial(peers.python_a_star, few, 5, most), 20, len(few) / len(boards)),),
+        "numba",
+    )
+
+
+def control(scale: float) -> Job:
+    """One decision over vectors from several starts."""
+    world, length, plans = DoubleIntegrator(), 30, scaled(1000, scale)
+    state = world.reset(16, torch.Generator().manual_seed(0))
+    own = partial(peers.plain_mppi, world, state, length, plans, 0.5)
+    return Job(
+        f"MPPI, {plans:,} plans of {length} steps from each of 16 starts, double integrator",
+        lambda device: partial(MPPIPlanner(length, plans).plan, world, state, torch.Generator().manual_seed(0)),
+        (Peer("plain PyTorch, one start after the other", lambda: own, 1),),
+    )
+
+
 def decide(scale: float) -> Job:
     """One decision from many starts."""
     starts = scaled(4096, scale)
@@ -389,7 +433,7 @@ JOBS: dict[str, Callable[[float], Job]] = {
     make.__name__: make
     for make in (
         *(sample_short, sample_long, sample_gru, sample_beside, sample_markov, fit_markov, fit_tree),
-        *(evaluate, table_1, train, shoot, decide),
+        *(evaluate, table_1, train, shoot, decide, search_tiles, control),
     )
 }
 """By name; each makes its job at a scale: 1 is the size of the goals."""

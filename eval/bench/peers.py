@@ -4,6 +4,7 @@ First plain numpy and PyTorch; then other packages, each imported only where it 
 job and return what is timed.
 """
 
+import heapq
 from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
@@ -16,6 +17,7 @@ from torch.utils.data import DataLoader, TensorDataset
 
 from eval.bench.timing import Run
 from neuroprior import GRUPrior, MarkovPrior, Prior, TabularWorld, World
+from neuroprior.worlds import ContinuousWorld
 
 Array = NDArray[Any]
 
@@ -115,7 +117,7 @@ class ObservingGRU(PlainGRU):
         return plans, state
 
 
-def plain_training(plans: Tensor, num_actions: int, steps: int, batch_size: int, learning_rate: float) -> PlainGRU:
+def plain_training(plans: Tensor, num_actions: int, batch_size: int, learning_rate: float, steps: int) -> PlainGRU:
     """A GRU trained on `plans [N, L]` by the loop of every tutorial: DataLoader, Adam, cross entropy."""
     torch.manual_seed(0)
     model = PlainGRU(num_actions)
@@ -401,3 +403,59 @@ def mctx_search(world: TabularWorld, state: Tensor, prior: Prior, simulations: i
 
     key = jax.random.PRNGKey(0)
     return lambda: search(key).block_until_ready()
+
+
+def python_a_star(boards: Tensor, width: int, most: int) -> Run:
+    """A* in plain Python, as in textbooks, on sliding tiles `boards [B, H * W]`; gives the expansions and the steps.
+
+    The goal is 0, 1, 2, ...; at most `most` nodes are expanded for each board; steps None: it was not solved.
+    """
+
+    def distance(board: tuple[int, ...]) -> int:
+        return sum(abs(k // width - t // width) + abs(k % width - t % width) for k, t in enumerate(board) if t)
+
+    def solve(start: tuple[int, ...]) -> tuple[int, int | None]:
+        goal, size, number, expanded = tuple(range(len(start))), len(start), 0, 0
+        heap, steps = [(distance(start), 0, start)], {start: 0}
+        done: set[tuple[int, ...]] = set()
+        while heap and expanded < most:
+            _, _, board = heapq.heappop(heap)
+            if board in done:
+                continue
+            if board == goal:
+                return expanded, steps[board]
+            done.add(board)
+            expanded += 1
+            blank = board.index(0)
+            for move, able in (
+                (-width, blank >= width),
+                (width, blank < size - width),
+                (-1, blank % width > 0),
+                (1, blank % width < width - 1),
+            ):
+                if able:
+                    after = list(board)
+                    after[blank], after[blank + move] = after[blank + move], 0
+                    child, taken = tuple(after), steps[board] + 1
+                    if taken < steps.get(child, taken + 1):
+                        steps[child], number = taken, number + 1
+                        heapq.heappush(heap, (taken + distance(child), -number, child))
+        return expanded, None
+
+    lines = [tuple(board) for board in boards.tolist()]
+    return lambda: [solve(line) for line in lines]
+
+
+@torch.no_grad()
+def plain_mppi(world: ContinuousWorld, state: Tensor, length: int, num_plans: int, std: float) -> Tensor:
+    """Plans `[B, L, D]` by model predictive path integral control, one start after the other, as controllers do it."""
+    low, high, plans = world.action_low, world.action_high, []
+    for start in state:
+        tried = (std * (high - low) / 2 * torch.randn(num_plans, length, len(low)) + (high + low) / 2).clamp(low, high)
+        now, score = start.expand(num_plans, -1), torch.zeros(num_plans)
+        for t in range(length):
+            now, reward = world.step(now, tried[:, t])
+            score += reward
+        weight = ((score - score.max()) / score.std() / 0.1).softmax(0)
+        plans.append((weight[:, None, None] * tried).sum(0))
+    return torch.stack(plans)

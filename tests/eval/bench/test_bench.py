@@ -24,8 +24,9 @@ from eval.bench.jobs import (
     source,
 )
 from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
+from neuroprior.planners import AStarPlanner
 from neuroprior.plans import all_plans
-from neuroprior.worlds import maze
+from neuroprior.worlds import DoubleIntegrator, maze, sliding_tiles
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 SMALL = 1e-3
@@ -107,6 +108,36 @@ def test_the_plain_gru_beside_a_world():
     state = world.reset(4, seeded(0))
     plans, final = peers.ObservingGRU(3, 8).eval().sample_in_world(world, state, 3, 6)
     assert final.equal(world.rollout(state, plans.view(4, 3, 6)).final_state.flatten())
+
+
+def test_the_plain_training_is_one_as_it_is_called():
+    """With the batch size, the learning rate and the number of steps in the order in which settings are tried."""
+    plans = torch.zeros(50, 4, dtype=torch.uint8)
+    model = peers.plain_training(plans, 4, 16, 0.05, 20)
+    assert excess(model, source(), plans) < 0.5 * excess(peers.PlainGRU(4), source(), plans)
+
+
+def test_a_star_in_python_solves_what_ours_does():
+    world = sliding_tiles(shape=(3, 3), scramble=12)
+    boards = world.reset(5, seeded(0))
+    want = AStarPlanner(world.lower_bound, max_nodes=5000).search(world, boards)
+    assert [steps for _, steps in peers.python_a_star(boards.flatten(1), 3, 5000)()] == want.lengths.tolist()
+    assert [expanded for expanded, _ in peers.python_a_star(boards.flatten(1), 3, 1)()] == (want.lengths > 0).tolist()
+
+
+def test_a_plain_controller_moves_to_the_goal():
+    world = DoubleIntegrator()
+    plans = peers.plain_mppi(world, torch.tensor([[0.9, -0.9, 0, 0]]), 10, 500, 0.5)
+    assert plans.shape == (1, 10, 2)
+    assert float(plans[0, :, 0].mean()) < 0 < float(plans[0, :, 1].mean())
+
+
+def test_ratios_beside_busy_processes(capsys, tmp_path):
+    arguments = ["--parts", "peers", "--jobs", "sample_markov", "--scale", "0.001", "--repetitions", "1"]
+    assert main(["bench", *arguments, "--busy", "0", "1", "--out", str(tmp_path)]) == 0
+    rows = pd.read_csv(tmp_path / "peers.csv")
+    assert sorted(rows.busy.unique()) == [0, 1]
+    assert "busy processes" in capsys.readouterr().out
 
 
 def test_the_quickest_training_that_is_close_enough_is_timed():
