@@ -188,8 +188,9 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
         sys.stderr.close()
         return 0
     except OSError as error:
-        named = error.filename is not None and error.strerror is not None
-        return _fail(f"error: {error.filename}: {error.strerror.lower()}" if named else f"error: {error}", 2)
+        if error.filename is None or error.strerror is None:
+            return _fail(f"error: {error}", 2)
+        return _fail(f"error: {error.filename}: {error.strerror.lower()}", 2)
     except (ValueError, MemoryError, OverflowError, ImportError) as error:
         return _fail(f"error: {error}", 2)
     except RuntimeError as error:
