@@ -1,6 +1,6 @@
 """Wheel and sdist, built, checked, and tried in fresh environments: each extra alone, and each constraints file.
 
-    python .ci/extras.py                       # everything: about an hour on two cores, 7 GB of disk at a time
+    python .ci/extras.py                       # everything; needs 6 GB of disk at a time
     python .ci/extras.py --only core lowest
 
 Needs Python and a package index; nothing else. An environment is removed when it was tried. The table of results is

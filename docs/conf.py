@@ -35,7 +35,7 @@ html_theme_options = {
     "secondary_sidebar_items": ["page-toc"],
     "header_links_before_dropdown": 5,
 }
-html_sidebars = {"index": []}
+html_sidebars = {page: [] for page in ("index", "contributing", "changelog", "glossary", "search")}  # no sections
 html_show_sourcelink = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]

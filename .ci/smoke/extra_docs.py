@@ -9,6 +9,9 @@ Path("conf.py").write_text(
     'html_theme = "pydata_sphinx_theme"\nnb_execution_mode = "force"\nnb_execution_raise_on_error = True\n'
 )
 Path("index.md").write_text("""---
+jupytext:
+  text_representation:
+    format_name: myst
 kernelspec:
   name: python3
 ---

@@ -187,7 +187,11 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
         # The reader of our output, such as `head`, has enough.
         sys.stderr.close()
         return 0
-    except (ValueError, OSError, MemoryError, OverflowError, ImportError) as error:
+    except OSError as error:
+        if error.filename is None or error.strerror is None:
+            return _fail(f"error: {error}", 2)
+        return _fail(f"error: {error.filename}: {error.strerror.lower()}", 2)
+    except (ValueError, MemoryError, OverflowError, ImportError) as error:
         return _fail(f"error: {error}", 2)
     except RuntimeError as error:
         # torch has no exception of its own for memory that it could not get.

@@ -21,7 +21,8 @@ from train.__main__ import main as train_main
     ("error", "code", "line"),
     [
         (ValueError("what\n  was"), 2, "error: what was"),
-        (FileNotFoundError(2, "No such file", "x"), 2, "error: [Errno 2] No such file: 'x'"),
+        (FileNotFoundError(2, "No such file", "x"), 2, "error: x: no such file"),
+        (OSError("disk"), 2, "error: disk"),
         (ImportError("no module"), 2, "error: no module"),
         (MemoryError("too much"), 2, "error: too much"),
         (OverflowError("too large"), 2, "error: too large"),
