@@ -62,6 +62,11 @@ def q_learning(
 
     Raises:
         ValueError: an argument is out of range, or the goal is the only cell.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> q_learning(world, goal=24, steps=1000, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([1, 25, 4])
     """
     goal = _check_goal(world, goal)
     _require(world.num_states > 1, "world", "a cell that is not the goal", "the goal alone")
@@ -136,6 +141,11 @@ def value_iteration(
 
     Raises:
         ValueError: an argument is out of range, or the reward of a legal action is infinite.
+
+    Example:
+        >>> world = TabularWorld(torch.tensor([[0, 1], [1, 1]]), torch.tensor([0.0, 1.0]))
+        >>> value_iteration(world, discount=0.5).round(decimals=2).tolist()
+        [[2.0, 2.0]]
     """
     _require(sweeps is None or (is_number(sweeps) and sweeps >= 0), "sweeps", "a number that is not negative", sweeps)
     _require(is_number(tolerance) and tolerance > 0, "tolerance", "a positive number", tolerance)
@@ -185,6 +195,10 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
 
     Raises:
         ValueError: an argument is out of range, or the world is stochastic.
+
+    Example:
+        >>> can_reach(gridworld(5, 5, seed=0), torch.tensor([0, 23]), goal=24, length=1).tolist()
+        [False, True]
     """
     world.check_state(state)
     goal = _check_goal(world, goal)
@@ -214,6 +228,11 @@ def tile_approximation(values: Tensor, coordinates: Tensor, tile_size: float, nu
 
     Raises:
         ValueError: a shape, dtype or number is wrong.
+
+    Example:
+        >>> values, coordinates = torch.arange(4.0)[None], torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]])
+        >>> tile_approximation(values, coordinates, tile_size=2.0).tolist()
+        [[1.5, 1.5, 1.5, 1.5]]
     """
     _check_fit(values, coordinates)
     _require(is_number(tile_size) and 0 < tile_size < math.inf, "tile_size", "a positive, finite number", tile_size)
@@ -252,6 +271,11 @@ def network_approximation(
 
     Raises:
         ValueError: a shape, dtype or number is wrong.
+
+    Example:
+        >>> values, coordinates = torch.arange(4.0)[None], torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]])
+        >>> network_approximation(values, coordinates, steps=10, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([1, 4])
     """
     _check_fit(values, coordinates)
     for name, number in (("hidden_size", hidden_size), ("steps", steps), ("learning_rate", learning_rate)):

@@ -49,6 +49,13 @@ class Agent:
 
     Raises:
         ValueError: an argument is out of range, or prior and world do not fit one another.
+
+    Example:
+        >>> world, prior = gridworld(5, 5, seed=0), MarkovPrior(4, 1)
+        >>> start = world.reset(8, torch.Generator().manual_seed(0))
+        >>> agent = Agent(world, SamplingPlanner(prior, length=4, num_plans=16), prior, start)
+        >>> agent.run(10).rewards.shape
+        torch.Size([8, 10])
     """
 
     def __init__(

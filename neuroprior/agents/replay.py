@@ -22,6 +22,9 @@ class Replay:
 
     Raises:
         ValueError: `retention` is out of range.
+
+    Example:
+        >>> replay = Replay(retention=0.5)
     """
 
     def __init__(self, retention: float) -> None:

@@ -79,6 +79,14 @@ def mutual_information(
 
     Raises:
         ValueError: a lag below 1, a negative `skip`, or plans without two pairs of successive actions.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1] * 20]).repeat(4, 1), 2)
+        >>> [
+        ...     round(found.bits, 2)
+        ...     for found in mutual_information(plans, max_lag=2, generator=torch.Generator().manual_seed(0))
+        ... ]
+        [1.0, 1.0]
     """
     check_sizes(max_lag=max_lag)
     check_count("skip", skip, 0)
@@ -180,6 +188,11 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
 
     Raises:
         ValueError: no plan has that many actions, or `length` or `most` is below 1.
+
+    Example:
+        >>> plans = Plans(torch.arange(40)[None] % 4, 4)
+        >>> pieces(plans, length=5, most=3, generator=torch.Generator().manual_seed(0)).actions.shape
+        torch.Size([3, 5])
     """
     check_sizes(length=length, most=most)
     start_here = torch.zeros_like(plans.mask())
@@ -231,6 +244,11 @@ def bits_by_position(prior: Prior, plans: Plans) -> list[Score]:
 
     Raises:
         ValueError: plans of unequal lengths, fewer than two, or that the prior cannot score.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
+        >>> [round(found.bits_per_action().mean, 2) for found in bits_by_position(UniformPrior(3), plans)]
+        [1.58, 1.58, 1.58]
     """
     mask = plans.mask().cpu()
     if len(plans) < 2 or plans.max_length == 0 or not bool(mask.all()):

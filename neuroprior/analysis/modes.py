@@ -107,6 +107,12 @@ def choose_modes(
 
     Raises:
         ValueError: an argument is out of range, or the plans cannot be divided.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1] * 10 + [2, 3] * 10]).repeat(12, 1), 4)
+        >>> how = {"order": 0, "restarts": 1, "folds": 2, "generator": torch.Generator().manual_seed(0)}
+        >>> choose_modes(plans, [1, 2], number_of_folds=2, **how).chosen
+        2
     """
     numbers = sorted(set(num_modes))
     if not numbers:
@@ -163,6 +169,11 @@ def match_modes(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
     Args:
         one, other: `[N, L, K]`: posteriors of the modes behind the same actions.
         mask: `[N, L]` bool: the actions that count.
+
+    Example:
+        >>> one = torch.tensor([[0.9, 0.1], [0.2, 0.8]])[None]
+        >>> match_modes(one, one.flip(-1), torch.ones(1, 2, dtype=torch.bool)).shape
+        torch.Size([2])
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -203,8 +214,21 @@ def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
 
     What there is for plans is so there for modes: `transitions`, `compare_conditions`, the ethogram.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> mode_plans(prior, plans).num_actions
+        2
     """
     given = _scored(prior, plans)
     path = prior.posterior(given).path.cpu()
@@ -214,8 +238,21 @@ def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
 def mode_transitions(prior: SwitchingPrior, plans: Plans) -> Tensor:
     """How often each mode took each action after each, in expectation: `[K, A, A]`, float64, last by next action.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> mode_transitions(prior, plans).shape
+        torch.Size([2, 4, 4])
     """
     given, size = _scored(prior, plans), plans.num_actions
     both, actions = plans.mask()[:, 1:], plans.actions.long()
@@ -232,8 +269,21 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
     is an index; `action`; `mode`, the most probable path's, from 1; and for each mode k `filtered_k`, its probability
     given the actions so far, and `smoothed_k`, given the whole plan.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> len(mode_frame(prior, plans))
+        120
     """
     given = _scored(prior, plans)
     found, mask = prior.posterior(given), plans.mask()
@@ -263,8 +313,21 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     commonest), with their shares in the mode; `enters`
     and `leaves`, the three contexts in which the path most often changes to it and from it, where contexts are indices.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> len(mode_table(prior, plans))
+        2
     """
     import pandas as pd
 

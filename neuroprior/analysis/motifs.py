@@ -105,6 +105,11 @@ def motifs(
     Raises:
         ValueError: a length below 2, or of 2 with `collapse_repeats`, as successive actions are then never
             independent; a repeated length or none; `top` below 1.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 3, 1, 0, 3, 2, 0, 1, 2, 1]]).repeat(5, 1), 4)
+        >>> [found.actions for found in motifs(plans, lengths=[3], top=1)]
+        [(3, 1, 0)]
     """
     check_sizes(chunk_size=chunk_size)
     least = 3 if collapse_repeats else 2

@@ -53,6 +53,12 @@ def order_selection(plans: Plans, max_order: int = 6, num_contexts: int | None =
     Raises:
         ValueError: `max_order` is negative or no plan is longer, or the plans have no context indices that are all
             below `num_contexts`.
+
+    Example:
+        >>> plans = Plans(torch.randint(2, (50, 20), generator=torch.Generator().manual_seed(0)), 2)
+        >>> fits = order_selection(plans, max_order=2)
+        >>> min(fits, key=lambda fit: fit.bic).order
+        0
     """
     check_count("max_order", max_order, 0)
     flat = FlatPlans.of(plans)

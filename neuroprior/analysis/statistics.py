@@ -60,6 +60,10 @@ def best_of(scores: Tensor, baselines: Sequence[int] | None = None) -> Tensor:
 
     Raises:
         ValueError: a baseline that is not there or none, or a score that is NaN.
+
+    Example:
+        >>> best_of(torch.tensor([[0.9, 0.5], [0.8, 0.7]])).tolist()
+        [[True, False], [False, True]]
     """
     numbers = range(len(scores)) if baselines is None else list(baselines)
     if not len(numbers) or not all(0 <= number < len(scores) for number in numbers):
@@ -78,6 +82,10 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
 
     Raises:
         ValueError: a level that is not between 0 and 1, or fewer than two values.
+
+    Example:
+        >>> mean_interval([1.0, 2.0, 3.0, 4.0]).mean
+        2.5
     """
     check_level(level)
     values = _vector("values", values)
@@ -101,6 +109,12 @@ def mean_intervals(frame: Any, by: str | Sequence[str], value: str, level: float
 
     Raises:
         ValueError: a level that is not between 0 and 1, or a column that is not there.
+
+    Example:
+        >>> import pandas as pd
+        >>> frame = pd.DataFrame({"model": ["a", "a", "b", "b"], "bits": [1.0, 1.2, 0.8, 0.9]})
+        >>> list(mean_intervals(frame, "model", "bits")["mean"].round(2))
+        [1.1, 0.85]
     """
     check_level(level)
     by = [by] if isinstance(by, str) else list(by)
@@ -130,6 +144,10 @@ def interquartile_mean(values: ArrayLike, level: float = 0.95) -> Interval:
     Raises:
         ValueError: a level that is not between 0 and 1, another shape, fewer than two seeds, or values that are not
             finite.
+
+    Example:
+        >>> interquartile_mean([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0], [90.0, 90.0]])
+        Interval(mean=1.5, low=1.5, high=1.5)
     """
     return mean_interval(stats.trim_mean(_matrix("values", values), 0.25, axis=0), level)
 
@@ -145,6 +163,10 @@ def interquartile_gap(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     Raises:
         ValueError: a level that is not between 0 and 1, unequal shapes, fewer than two seeds, or values that are not
             finite.
+
+    Example:
+        >>> interquartile_gap([[1.0, 2.0, 3.0, 4.0]], [[0.0, 1.0, 2.0, 3.0]])
+        Interval(mean=1.0, low=1.0, high=1.0)
     """
     a, b = _alike(first, second)
     gap = stats.trim_mean(a, 0.25, axis=0) - stats.trim_mean(b, 0.25, axis=0)
@@ -166,6 +188,10 @@ def probability_of_improvement(first: ArrayLike, second: ArrayLike, level: float
     Raises:
         ValueError: a level that is not between 0 and 1, unequal shapes, fewer than two seeds, or values that are not
             finite.
+
+    Example:
+        >>> probability_of_improvement([[3.0, 4.0]], [[1.0, 2.0]])
+        Interval(mean=1.0, low=1.0, high=1.0)
     """
     a, b = _alike(first, second)
     mean, low, high = mean_interval(((a > b) + (a == b) / 2).mean(0), level)
@@ -178,8 +204,17 @@ def share_interval(successes: int, trials: int, level: float = 0.95) -> Interval
     Only for single trials that are each a success or not. Trials that share a world, a seed or a subject are not
     independent: take the `mean_interval` of their shares.
 
+    Args:
+        successes: how many of the trials succeeded.
+        trials: how many there were, at least 1.
+        level: of confidence.
+
     Raises:
         ValueError: a level that is not between 0 and 1, no trials, or more successes than trials.
+
+    Example:
+        >>> share_interval(9, 10).mean
+        0.9
     """
     check_count("successes", successes, 0)
     check_sizes(trials=trials)
@@ -193,8 +228,15 @@ def share_interval(successes: int, trials: int, level: float = 0.95) -> Interval
 def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) -> Difference:
     """The mean of `first - second`, values `[G]` of the same G worlds (subjects, folds), with Student's paired test.
 
+    Args:
+        first, second: `[G]` each, G >= 2, in the same order.
+        level: of confidence.
+
     Raises:
         ValueError: a level that is not between 0 and 1, different numbers of values, or fewer than two.
+
+    Example:
+        >>> found = paired_difference([0.7, 0.8, 0.9, 0.8], [0.6, 0.6, 0.8, 0.7])
     """
     a, b = _vector("first", first), _vector("second", second)
     if len(a) != len(b):
@@ -221,6 +263,9 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
     Raises:
         ValueError: a level that is not between 0 and 1, fewer than two units, unequal numbers of totals and sizes, or
             sizes that sum to 0.
+
+    Example:
+        >>> found = ratio_difference([-2.0, -3.0], [10.0, 10.0])
     """
     check_level(level)
     above, below = _vector("totals", totals), _vector("sizes", sizes)
@@ -251,6 +296,10 @@ def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
     Raises:
         ValueError: another shape, or a value that is no probability.
+
+    Example:
+        >>> holm([0.01, 0.04, 0.03]).tolist()
+        [0.03, 0.06, 0.06]
     """
     values = np.asarray(p_values.cpu().numpy() if isinstance(p_values, torch.Tensor) else p_values, dtype=np.float64)
     if values.ndim != 1:

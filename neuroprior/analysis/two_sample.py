@@ -109,6 +109,14 @@ def two_sample_tests(
 
     Raises:
         ValueError: different numbers of actions, plans without any action, or no permutations.
+
+    Example:
+        >>> plans = Plans(torch.randint(2, (30, 6), generator=torch.Generator().manual_seed(0)), 2)
+        >>> found = two_sample_tests(
+        ...     plans[:15], plans[15:], permutations=99, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> [one.statistic for one in found]
+        ['1-grams', '2-grams', '3-grams', '4-grams', 'run lengths', 'return times']
     """
     check_sizes(
         permutations=permutations,

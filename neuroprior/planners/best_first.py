@@ -221,6 +221,12 @@ class LevinPlanner(BestFirstPlanner):
 
     Raises:
         ValueError: see `BestFirstPlanner`; and `search` raises it where `reroot` finds no `world.lower_bound`.
+
+    Example:
+        >>> world = sliding_tiles(shape=(2, 2), scramble=6)
+        >>> found = LevinPlanner(UniformPrior(4)).search(world, world.reset(5, torch.Generator().manual_seed(0)))
+        >>> found.solved.all().item()
+        True
     """
 
     def __init__(
@@ -250,7 +256,13 @@ class AStarPlanner(BestFirstPlanner):
         heuristic: the steps that are left; None: breadth-first search.
         weight: of the heuristic: 1: A*, whose plans are shortest where the heuristic is consistent; above 1: weighted
             A*; inf: greedy best-first search.
-        max_nodes, nodes_at_once: see `BestFirstPlanner`.
+        max_nodes, nodes_at_once, compile: see `BestFirstPlanner`.
+
+    Example:
+        >>> world = sliding_tiles(shape=(2, 2), scramble=6)
+        >>> found = AStarPlanner(world.lower_bound).search(world, world.reset(5, torch.Generator().manual_seed(0)))
+        >>> found.solved.all().item()
+        True
     """
 
     def __init__(

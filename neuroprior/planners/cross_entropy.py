@@ -41,6 +41,11 @@ class CrossEntropyPlanner(SamplingPlanner):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> CrossEntropyPlanner(UniformPrior(4), length=4, num_plans=64).plan(world, torch.tensor([0, 12])).plan.shape
+        torch.Size([2, 4])
     """
 
     def __init__(

@@ -51,6 +51,11 @@ class HorizonPlanner(SamplingPlanner):
 
     Warns:
         UserWarning: of `plan`, where each further action of all plans that were tried first only cost.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> HorizonPlanner(UniformPrior(4), length=8, num_plans=64).plan(world, torch.tensor([0, 12])).score.shape
+        torch.Size([2])
     """
 
     def __init__(

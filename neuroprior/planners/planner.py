@@ -209,6 +209,10 @@ def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | Non
 
     Raises:
         ValueError: a score is NaN.
+
+    Example:
+        >>> random_best(torch.tensor([[0.0, 2.0, 1.0]]), torch.Generator().manual_seed(0)).tolist()
+        [1]
     """
     # Scores are often one column of many, which is slow to read more than once.
     score = score.contiguous() if allowed is None else score.masked_fill(~allowed, -torch.inf)

@@ -16,7 +16,12 @@ BLOCKS = 40
 
 
 def divisible(plans: Plans) -> Plans:
-    """The same plans, without their group if they have fewer than two groups, so that they can be split."""
+    """The same plans, without their group if they have fewer than two groups, so that they can be split.
+
+    Example:
+        >>> divisible(Plans(torch.zeros(1, 1000, dtype=torch.long), 2)).actions.shape
+        torch.Size([1, 1000])
+    """
     few = plans.group is None or len(plans.group.unique()) < FEWEST_UNITS
     return replace(plans, group=None, group_names=None) if few else plans
 
@@ -37,6 +42,11 @@ def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor
 
     Raises:
         ValueError: fewer than two folds, or fewer units than folds.
+
+    Example:
+        >>> plans = Plans(torch.zeros(6, 2, dtype=torch.long), 2, group=torch.tensor([0, 0, 1, 1, 2, 2]))
+        >>> [(len(training), len(held_out)) for training, held_out in folds(plans, 3)]
+        [(4, 2), (4, 2), (4, 2)]
     """
     check_are_plans(plans)
     grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
@@ -54,8 +64,16 @@ def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor
 def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
     """A single plan cut into `number` consecutive plans of about the same length, for cross-validation in time.
 
+    Args:
+        plans: a single plan.
+        number: how many parts.
+
     Raises:
         ValueError: not a single plan, fewer actions than parts, or no parts.
+
+    Example:
+        >>> in_parts(Plans(torch.arange(12)[None] % 3, 3), number=4).actions.tolist()
+        [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
     """
     check_sizes(number=number)
     length = int(plans.mask().sum())

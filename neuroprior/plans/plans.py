@@ -50,6 +50,16 @@ class Plans(Sequences):
 
     Raises:
         ValueError: a shape, dtype or value is wrong; the message says which and where.
+
+    Example:
+        >>> steps = torch.tensor([[0, 1, 1], [2, 0, 0]])
+        >>> plans = Plans(steps, 3, lengths=torch.tensor([3, 1]), action_names=("eat", "rest", "walk"))
+        >>> len(plans), plans.max_length
+        (2, 3)
+        >>> plans.mask().tolist()
+        [[True, True, True], [True, False, False]]
+        >>> plans[1:].actions.tolist()
+        [[2, 0, 0]]
     """
 
     actions: Tensor
@@ -356,7 +366,16 @@ def check_are_plans(plans: object) -> None:
 
 
 def all_plans(num_actions: int, length: int) -> Tensor:
-    """All A**L plans `[A**L, L]`, int64; row n is n written in base A."""
+    """All A**L plans `[A**L, L]`, int64; row n is n written in base A.
+
+    Args:
+        num_actions: A.
+        length: L.
+
+    Example:
+        >>> all_plans(2, 2).tolist()
+        [[0, 0], [0, 1], [1, 0], [1, 1]]
+    """
     check_sizes(num_actions=num_actions)
     check_count("length", length)
     if length * log2(num_actions) > MOST_BITS:
@@ -367,12 +386,21 @@ def all_plans(num_actions: int, length: int) -> Tensor:
 
 
 def action_dtype(num_actions: int) -> torch.dtype:
-    """How actions are stored: uint8 where it suffices, else int64."""
+    """How actions are stored: uint8 where it suffices, else int64.
+
+    Example:
+        >>> action_dtype(256), action_dtype(257)
+        (torch.uint8, torch.int64)
+    """
     return torch.uint8 if num_actions <= 256 else torch.int64
 
 
 def check_context(context: Tensor, num_plans: int, length: int) -> None:
-    """Raise ValueError unless `context` is what `Plans.context` may be for `num_plans` plans of `length` actions."""
+    """Raise ValueError unless `context` is what `Plans.context` may be for `num_plans` plans of `length` actions.
+
+    Example:
+        >>> check_context(torch.zeros(5, 3, dtype=torch.long), num_plans=5, length=3)
+    """
     shape = tuple(context.shape)
     if has_patterns(context):
         if shape[:2] != (num_plans, length):
@@ -410,17 +438,34 @@ def is_per_step(context: Tensor | None) -> bool:
     """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
 
     The patterns `[N, F]` of one state each look like indices per step: who expects patterns asks before this.
+
+    Example:
+        >>> (
+        ...     is_per_step(torch.zeros(4, 5, dtype=torch.long)),
+        ...     is_per_step(torch.zeros(4, dtype=torch.long)),
+        ...     is_per_step(None),
+        ... )
+        (True, False, False)
     """
     return context is not None and (context.dim() == 3 or (is_integer(context) and context.dim() == 2))
 
 
 def has_patterns(context: Tensor | None) -> bool:
-    """True for the context of plans that is several indices per step, `[N, L, F]`."""
+    """True for the context of plans that is several indices per step, `[N, L, F]`.
+
+    Example:
+        >>> has_patterns(torch.zeros(4, 5, 7, dtype=torch.int32)), has_patterns(torch.zeros(4, 5, dtype=torch.long))
+        (True, False)
+    """
     return context is not None and context.dim() == 3 and is_integer(context)
 
 
 def check_patterns(patterns: Tensor) -> None:
-    """Raise ValueError unless these are integers from 0 to 2**31 - 1."""
+    """Raise ValueError unless these are integers from 0 to 2**31 - 1.
+
+    Example:
+        >>> check_patterns(torch.tensor([[0, 7, 2**31 - 1]]))
+    """
     check_range("context", patterns, 2**31, "patterns")
 
 

@@ -71,6 +71,10 @@ class Columns:
         duration: how long it took, in place of `stop`.
         event_type: START, STOP or POINT, where the start and the stop of an action are rows of their own, as in the
             tabular export of BORIS; `start` is the time of each row then.
+
+    Example:
+        >>> Columns(action="behaviour", plan="session", group="animal").group
+        'animal'
     """
 
     action: str | None = None

@@ -47,6 +47,11 @@ def fit(
 
     Raises:
         ValueError: an unknown name, plans that the prior cannot learn from, or a setting that it does not have.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
+        >>> fit(plans, "markov").order
+        1
     """
     if isinstance(prior, Prior):
         raise ValueError(

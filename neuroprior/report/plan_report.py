@@ -99,6 +99,12 @@ def report(
     Raises:
         ValueError: an argument is out of range, or the plans cannot be learned from or scored.
         OSError: a file cannot be read or written.
+
+    Example:
+        >>> plans = Plans(torch.randint(3, (20, 30), generator=torch.Generator().manual_seed(0)).sort(1).values, 3)
+        >>> found = report(plans, models=["counts"], sections=["transitions"], folds=2, processes=1)
+        >>> list(found.figures)
+        ['transitions']
     """
     for name, given, known in (
         ("models", models, MODELS),

@@ -58,7 +58,10 @@ class PriorModule(lightning.LightningModule):
         if self.trainer.world_size > 1:
             loss = total * self.trainer.world_size / self._over_processes(weight).clamp(min=1)
         self._totals += torch.stack([total.detach(), weight])
-        self.log("train_bits", loss, prog_bar=True, batch_size=1)
+        if (
+            self.trainer.loggers or self.trainer.progress_bar_callback is not None
+        ):  # to log takes a tenth of a small step
+            self.log("train_bits", loss, prog_bar=True, batch_size=1)
         return loss
 
     def on_validation_epoch_start(self) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from math import ceil
 
 from neuroprior._checks import is_number
-from neuroprior.plans.sequences import Sequences
+from neuroprior.plans.sequences import Sequences, check_validation
 
 FEWEST_STEPS, MOST_STEPS = 10, 100
 """The least and the most steps between two validations, where these are not given."""
@@ -44,6 +44,10 @@ class Settings:
 
     Raises:
         ValueError: a value out of range.
+
+    Example:
+        >>> Settings(max_steps=500, patience=3).max_steps
+        500
     """
 
     max_steps: int | None = None
@@ -69,9 +73,8 @@ class Settings:
                 )
         if not is_number(self.weight_decay) or not 0 <= self.weight_decay < float("inf"):
             raise ValueError(f"weight_decay: a finite number of at least 0 is expected, not {self.weight_decay!r}")
-        share = self.validation
-        if not isinstance(share, Sequences) and (not is_number(share) or not 0 < share < 1):
-            raise ValueError(f"validation: a share above 0 and below 1, or plans, is expected, not {share!r}")
+        if not isinstance(self.validation, Sequences):
+            check_validation(self.validation)
 
     def batches_of(self, longest: int) -> int:
         """The size of batches of plans of which the longest has so many actions."""

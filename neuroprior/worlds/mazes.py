@@ -38,6 +38,11 @@ def four_rooms(
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = four_rooms(7, 7, seed=0)
+        >>> world.num_actions, len(world.next_state)
+        (4, 49)
     """
     check_sizes(height=height, width=width)
     if height < 5 or width < 5:
@@ -85,6 +90,11 @@ def maze(
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = maze(9, 9, num_layouts=2, reward="goal", seed=0)
+        >>> world.num_layouts
+        2
     """
     check_sizes(height=height, width=width)
     if min(height, width) < 3 or height % 2 == 0 or width % 2 == 0:

@@ -44,10 +44,18 @@ class TabularWorld(World):
 
     Raises:
         ValueError: a shape, dtype or value is wrong.
+
+    Example:
+        >>> world = TabularWorld(next_state=torch.tensor([[0, 1], [0, 1]]), reward=torch.tensor([0.0, 1.0]))
+        >>> state, reward = world.step(torch.tensor([0, 0]), torch.tensor([0, 1]))
+        >>> state.tolist(), reward.tolist()
+        ([0, 1], [0.0, 1.0])
     """
 
     num_layouts: int = 1
     compile_from: int = 2**20
+
+    shares_steps = True
 
     def __init__(
         self,

@@ -29,6 +29,10 @@ def coloured_noise(shape: tuple[int, ...], beta: float, generator: torch.Generat
         shape: `[..., L, D]`.
         beta: at least 0: 0 white noise, 1 pink, 2 red.
         generator: source of randomness; the noise is on its device.
+
+    Example:
+        >>> coloured_noise((4, 20), beta=2.0, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([4, 20])
     """
     white = torch.randn(shape, generator=generator, device=generator.device)
     length = shape[-2]

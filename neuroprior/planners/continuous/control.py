@@ -57,6 +57,14 @@ def control(
 
     Raises:
         ValueError: an argument is out of range, plans are too short, or a method of the world returns what it must not.
+
+    Example:
+        >>> world, generator = DoubleIntegrator(), torch.Generator().manual_seed(0)
+        >>> done = control(
+        ...     ICEMPlanner(length=5, num_plans=16), world, world.reset(2, generator), num_steps=3, generator=generator
+        ... )
+        >>> done.plans.actions.shape
+        torch.Size([2, 3, 2])
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
     check_memory(8 * num_steps, num_steps=num_steps)

@@ -65,6 +65,12 @@ class ICEMPlanner(VectorPlanner):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = DoubleIntegrator()
+        >>> decision = ICEMPlanner(length=5, num_plans=16).plan(world, world.reset(2, torch.Generator().manual_seed(0)))
+        >>> decision.plan.shape
+        torch.Size([2, 5, 2])
     """
 
     def __init__(

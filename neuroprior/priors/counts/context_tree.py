@@ -73,6 +73,11 @@ class ContextTreePrior(HistoryPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = ContextTreePrior(2, depth=2).fit(torch.tensor([[0, 0, 1, 0, 0, 1, 0, 0, 1]]))
+        >>> prior(torch.tensor([[0, 0, 1]])).argmax(-1).tolist()
+        [[0, 0, 1]]
     """
 
     bounds: Tensor

@@ -43,6 +43,14 @@ class MixturePrior(Prior):
 
     Raises:
         ValueError: no experts, or experts that differ in their actions or contexts.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(40, 1), 3)
+        >>> prior = MixturePrior(3, [UniformPrior(3), MarkovPrior(3, 1)]).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> prior.log_prob(plans[:1]).item() > UniformPrior(3).log_prob(plans[:1]).item()
+        True
     """
 
     first: Tensor

@@ -56,6 +56,11 @@ def learn_macros(plans: Plans, num_macros: int, by: Criterion = "count") -> tupl
 
     Raises:
         ValueError: an argument is out of range, or the plans have an end symbol.
+
+    Example:
+        >>> macros, shorter = learn_macros(Plans(torch.tensor([[0, 1, 2, 0, 1, 2, 0, 1, 2]]).repeat(5, 1), 3), 2)
+        >>> [macro.actions for macro in macros], shorter.max_length
+        ([(0, 1), (0, 1, 2)], 3)
     """
     macros, (recoded,) = macros_of(plans, num_macros, by)
     return macros, recoded

@@ -36,6 +36,11 @@ class BoardNetwork(Prior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = BoardNetwork(4, board=(6, 6, 5), channels=8, depth=1)
+        >>> prior.num_actions
+        4
     """
 
     def __init__(self, num_actions: int, board: Sequence[int], channels: int = 32, depth: int = 4) -> None:

@@ -32,6 +32,12 @@ class PatternCounts(PatternPrior):
     Attributes:
         weights: of a product, see `PatternPrior`; for back-off the counts, float32 `[V + 1, A]`; the last row is 0.
         marginal: float32 `[A]`: how common each action is; what back-off begins with.
+
+    Example:
+        >>> patterns = torch.randint(5, (40, 3, 2), generator=torch.Generator().manual_seed(0), dtype=torch.int32)
+        >>> prior = PatternCounts(2, num_patterns=2).fit(Plans(patterns[..., 0] % 2, 2, context=patterns))
+        >>> prior.start(1, torch.tensor([[3, 0]]))[0].argmax(-1).tolist()
+        [0]
     """
 
     marginal: Tensor

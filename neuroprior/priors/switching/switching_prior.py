@@ -99,6 +99,15 @@ class SwitchingPrior(HistoryPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1] * 10 + [2, 3] * 10]).repeat(12, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> modes = prior.posterior(plans[:1]).path[0]
+        >>> modes[0].item() == modes[19].item() != modes[20].item()
+        True
     """
 
     first: Tensor

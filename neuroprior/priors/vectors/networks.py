@@ -333,6 +333,11 @@ class VectorGRU(VectorNetwork):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = VectorGRU([-1.0], [1.0], width=4)  # prior.fit(plans) trains it
+        >>> prior.sample(3, 5).shape
+        torch.Size([1, 3, 5, 1])
     """
 
     def __init__(
@@ -395,6 +400,11 @@ class VectorTransformer(VectorNetwork):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = VectorTransformer([-1.0], [1.0], width=8)  # prior.fit(plans) trains it
+        >>> prior.sample(3, 5).shape
+        torch.Size([1, 3, 5, 1])
     """
 
     def __init__(
