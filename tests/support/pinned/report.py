@@ -22,7 +22,7 @@ from neuroprior.report import (
 from neuroprior.report.document import printed, results_of, write_figures
 from tests.support.pinned.data import behaviour, timed
 from tests.support.reports import QUICK
-from tests.support.studies import between, study
+from tests.support.studies import between, study, within
 from tests.support.unchanged import case
 
 
@@ -59,6 +59,13 @@ def report_on_plans():
 def report_on_modes():
     made = report(behaviour(12, 10, context="step"), **QUICK, folds=2, modes=[2], sections=["modes"])
     return of_document(made) | {"frames": made.frames}
+
+
+@case(relative=2e-3)
+def report_on_paired_conditions():
+    """Each animal under both."""
+    plans = study(7, within(6, 2), 20, 3, slower={1: 2.0})
+    return of_document(report(plans, **QUICK, folds=2, sections=["conditions", "durations"]))
 
 
 @case(relative=2e-3)
