@@ -29,11 +29,12 @@ EXPONENTS = (1.0, 0.0, 2.5)
 and the exponents, tried with the best of these."""
 
 PROPOSALS: tuple[dict[str, Any], ...] = (
+    {"share": 0.0},
     {"share": 0.25},
     {"share": 0.6, "iterations": 1},
     {"share": 0.5, "proposes": "noise"},
 )
-"""What validation tries of a prior, as parts of a `Choice`."""
+"""What validation tries of a prior, as parts of a `Choice`; first the planner alone, to fall back to."""
 
 VALIDATION_WORLDS: tuple[Condition, ...] = ("same", "validation")
 """Where settings are validated: in the world of the plans, and in one that changed in another way than those of the

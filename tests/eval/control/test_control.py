@@ -23,7 +23,6 @@ from eval.control.comparison import (
 from eval.control.priors import check_prior_name, fitted, shuffled
 from eval.control.run import (
     EXPONENTS,
-    PROPOSALS,
     STDS,
     Choice,
     ControlSettings,
@@ -236,7 +235,13 @@ def test_settings_are_chosen_by_their_returns_over_both_worlds(monkeypatch):
     assert {std for std, *_ in asked} == set(STDS)
     monkeypatch.setattr("eval.control.run.collecting_run", lambda *_: _plans())
     found = tuning_run(Tuning("double_integrator", "icem", "autoregressive", (alone, alone)), settings)
-    assert found == alone._replace(**PROPOSALS[2])
+    assert found == alone._replace(share=0.5, proposes="noise")
+    # Where all proposals are worse, the planner is left alone.
+    monkeypatch.setattr(
+        "eval.control.run.controlled",
+        lambda planner, *_: SimpleNamespace(rewards=torch.full((1, 1), 1.0 - planner.prior_share)),
+    )
+    assert tuning_run(Tuning("double_integrator", "icem", "autoregressive", (alone, alone)), settings) == alone
 
 
 def test_planners_have_the_settings_that_were_chosen():
