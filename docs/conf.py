@@ -26,17 +26,21 @@ smartquotes = False  # "lower" is a value
 
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "myst_nb", "sphinx_design"]
 templates_path = ["_templates"]
-exclude_patterns = ["_build", "_templates", "**/runs"]
+exclude_patterns = ["_build", "_templates", "_static", "**/runs"]
 html_theme = "pydata_sphinx_theme"
 html_title = "neuroprior"
 html_theme_options = {
     "show_prev_next": False,
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 5,
 }
 html_sidebars = {"index": []}
 html_show_sourcelink = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+toc_object_entries_show_parents = "hide"
+maximum_signature_line_length = 60  # on a phone a line has about 40 characters
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
@@ -70,6 +74,7 @@ ROOMS = {
     "neuroprior.priors.macros": "Macro-actions",
     "neuroprior.priors.neural": "Neural priors",
     "neuroprior.priors.patterns": "Priors of boards",
+    "neuroprior.priors.switching": "Priors with hidden modes",
     "neuroprior.priors.vectors": "Priors over vectors",
     "neuroprior.sampling": "Sampling",
     "neuroprior.worlds": "Worlds",
@@ -79,6 +84,7 @@ ROOMS = {
     "neuroprior.planners": "Planners",
     "neuroprior.planners.continuous": "Planners of vectors",
     "neuroprior.agents": "Agents",
+    "neuroprior": "The top level",
     "neuroprior.analysis": "Analysis",
     "neuroprior.report": "Reports",
     "neuroprior.training": "Training",
@@ -112,7 +118,7 @@ REFERENCE = re.compile(r"(?<![`:\w])`([^`]+)`(?![`_])")
 def target(written: str) -> str | None:
     """The full public name that a docstring means by `MarkovPrior`, `Plans.with_end` or `neuroprior.analysis.score`."""
     written = written.removesuffix("()")
-    if written in NAMES:
+    if written in NAMES or written in HOMES.values():
         return written
     for room in ("neuroprior", *NAMES):
         written = written.removeprefix(f"{room}.") if written.removeprefix(f"{room}.") in BY_NAME else written

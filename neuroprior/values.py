@@ -19,6 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld, check_tabular
 
@@ -61,15 +62,25 @@ def q_learning(
 
     Raises:
         ValueError: an argument is out of range, or the goal is the only cell.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> q_learning(world, goal=24, steps=1000, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([1, 25, 4])
     """
     goal = _check_goal(world, goal)
     _require(world.num_states > 1, "world", "a cell that is not the goal", "the goal alone")
-    _require(num_agents >= 1, "num_agents", "at least 1", num_agents)
-    _require(steps >= 0, "steps", "a number that is not negative", steps)
-    _require(0 < step_size <= 1, "step_size", "a number above 0 and at most 1", step_size)
-    _require(0 < discount < 1, "discount", "a number above 0 and below 1", discount)
-    _require(0 <= initial_scale < math.inf, "initial_scale", "a finite number, at least 0,", initial_scale)
-    _require(0 <= epsilon <= 1, "epsilon", "a share between 0 and 1", epsilon)
+    _require(is_number(num_agents) and num_agents >= 1, "num_agents", "at least 1", num_agents)
+    _require(is_number(steps) and steps >= 0, "steps", "a number that is not negative", steps)
+    _require(is_number(step_size) and 0 < step_size <= 1, "step_size", "a number above 0 and at most 1", step_size)
+    _require(is_number(discount) and 0 < discount < 1, "discount", "a number above 0 and below 1", discount)
+    _require(
+        is_number(initial_scale) and 0 <= initial_scale < math.inf,
+        "initial_scale",
+        "a finite number, at least 0,",
+        initial_scale,
+    )
+    _require(is_number(epsilon) and 0 <= epsilon <= 1, "epsilon", "a share between 0 and 1", epsilon)
     generator = generator_on(generator, world.device)
     device, size = world.device, (num_agents, world.num_states, world.num_actions)
     values = torch.rand(size, generator=generator, device=device, dtype=torch.float64) * initial_scale
@@ -130,10 +141,15 @@ def value_iteration(
 
     Raises:
         ValueError: an argument is out of range, or the reward of a legal action is infinite.
+
+    Example:
+        >>> world = TabularWorld(torch.tensor([[0, 1], [1, 1]]), torch.tensor([0.0, 1.0]))
+        >>> value_iteration(world, discount=0.5).round(decimals=2).tolist()
+        [[2.0, 2.0]]
     """
-    _require(sweeps is None or sweeps >= 0, "sweeps", "a number that is not negative", sweeps)
-    _require(tolerance > 0, "tolerance", "a positive number", tolerance)
-    _require(0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
+    _require(sweeps is None or (is_number(sweeps) and sweeps >= 0), "sweeps", "a number that is not negative", sweeps)
+    _require(is_number(tolerance) and tolerance > 0, "tolerance", "a positive number", tolerance)
+    _require(is_number(discount) and 0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
     if goal is not None:
         _require(discount > 0, "discount", "with a goal, a number above 0", discount)
         goal, tolerance = _check_goal(world, goal), tolerance if world.stochastic else 0.0
@@ -179,6 +195,10 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
 
     Raises:
         ValueError: an argument is out of range, or the world is stochastic.
+
+    Example:
+        >>> can_reach(gridworld(5, 5, seed=0), torch.tensor([0, 23]), goal=24, length=1).tolist()
+        [False, True]
     """
     world.check_state(state)
     goal = _check_goal(world, goal)
@@ -208,9 +228,14 @@ def tile_approximation(values: Tensor, coordinates: Tensor, tile_size: float, nu
 
     Raises:
         ValueError: a shape, dtype or number is wrong.
+
+    Example:
+        >>> values, coordinates = torch.arange(4.0)[None], torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]])
+        >>> tile_approximation(values, coordinates, tile_size=2.0).tolist()
+        [[1.5, 1.5, 1.5, 1.5]]
     """
     _check_fit(values, coordinates)
-    _require(0 < tile_size < math.inf, "tile_size", "a positive, finite number", tile_size)
+    _require(is_number(tile_size) and 0 < tile_size < math.inf, "tile_size", "a positive, finite number", tile_size)
     _require(num_tilings >= 1, "num_tilings", "at least 1", num_tilings)
     place = (coordinates - coordinates.amin(0)).double().cpu() / tile_size
     tilings = [(place + tiling / num_tilings).floor() for tiling in range(num_tilings)]
@@ -246,10 +271,15 @@ def network_approximation(
 
     Raises:
         ValueError: a shape, dtype or number is wrong.
+
+    Example:
+        >>> values, coordinates = torch.arange(4.0)[None], torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]])
+        >>> network_approximation(values, coordinates, steps=10, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([1, 4])
     """
     _check_fit(values, coordinates)
     for name, number in (("hidden_size", hidden_size), ("steps", steps), ("learning_rate", learning_rate)):
-        _require(0 < number < math.inf, name, "a positive, finite number", number)
+        _require(is_number(number) and 0 < number < math.inf, name, "a positive, finite number", number)
     generator = generator_on(generator, values.device)
     target, mean, scale = _standardised(values.detach())
     inputs = _standardised(coordinates.to(values.device).T)[0].T.expand(len(values), -1, -1)
@@ -283,7 +313,7 @@ def _standardised(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _require(holds: bool, name: str, wanted: str, given: object) -> None:
     if not holds:
-        raise ValueError(f"{name}: {wanted} is expected, not {given}")
+        raise ValueError(f"{name}: {wanted} is expected, not {given!r}")
 
 
 def _check_goal(world: TabularWorld, goal: int) -> int:

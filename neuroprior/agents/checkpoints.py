@@ -33,9 +33,22 @@ def save_agent(agent: Agent, folder: str | os.PathLike[str]) -> Path:
     the last complete checkpoint at all times. The files of the checkpoint before are then removed, and nothing else.
     World and planner are not saved.
 
+    Args:
+        agent: whose generator is its own.
+        folder: where.
+
+    Returns:
+        The folder.
+
     Raises:
         OSError: the folder cannot be written.
         ValueError: the folder's `agent.json` is not of an agent.
+
+    Example:
+        >>> world, prior = gridworld(5, 5, seed=0), MarkovPrior(4, 1)
+        >>> start = world.reset(8, torch.Generator().manual_seed(0))
+        >>> agent = Agent(world, SamplingPlanner(prior, length=4, num_plans=16), prior, start)
+        >>> folder = save_agent(agent, "runs/agent")
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -73,6 +86,13 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
     Raises:
         FileNotFoundError: there is no checkpoint.
         ValueError: a file is damaged, or the agent has other arguments. The agent is then unchanged.
+
+    Example:
+        >>> world, prior = gridworld(5, 5, seed=0), MarkovPrior(4, 1)
+        >>> start = world.reset(8, torch.Generator().manual_seed(0))
+        >>> agent = Agent(world, SamplingPlanner(prior, length=4, num_plans=16), prior, start)
+        >>> folder = save_agent(agent, "runs/agent")
+        >>> again = restore_agent(agent, folder)
     """
     folder = Path(folder)
     document = _read(folder / "agent.json")

@@ -96,6 +96,11 @@ def reliability(
 
     Raises:
         ValueError: no places, a wrong shape or dtype, or probabilities that do not sum to 1.
+
+    Example:
+        >>> plans = Plans(torch.randint(2, (20, 5), generator=torch.Generator().manual_seed(0)), 2)
+        >>> log_probs = UniformPrior(2)(plans.actions).log_softmax(-1).flatten(0, 1)
+        >>> found = reliability(log_probs, plans.actions.flatten(), unit=torch.arange(100) // 5)
     """
     check_sizes(bins=bins, chunk_size=chunk_size)
     if log_probs.dim() != 2 or not log_probs.is_floating_point() or log_probs.numel() == 0:

@@ -11,6 +11,7 @@ from neuroprior.analysis.statistics import ENOUGH_UNITS, Difference, ratio_diffe
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import never_occur
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
 from neuroprior.priors.counts import TooLargeError, chains
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS
@@ -57,7 +58,15 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
 
     Raises:
         ValueError: plans that the prior cannot score, or fewer than two actions.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
+        >>> round(score("uniform", UniformPrior(3), plans).bits_per_action().mean, 3)
+        1.585
     """
+    if not isinstance(prior, Prior):
+        raise ValueError(f"prior: a fitted prior is expected, not {type(prior).__name__}")
+    check_are_plans(plans)
     inputs = "actions and context" if prior.takes_context else "actions"
     return score_bits(model, inputs, action_bits(prior, plans), plans)
 
@@ -73,9 +82,16 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
         mask: `[N, L]` bool: the actions that count; None: all.
 
     Raises:
-        ValueError: fewer than two actions count.
+        ValueError: fewer than two actions count, or bits of another shape or that are NaN.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
+        >>> score_bits("uniform", "past actions", action_bits(UniformPrior(3), plans), plans).actions.tolist()
+        [3.0, 3.0]
     """
     mask = (plans.mask() if mask is None else mask).cpu()
+    if bits.shape != mask.shape or bool(bits[mask].isnan().any()):
+        raise ValueError(f"bits: numbers of shape {list(mask.shape)} are expected, not NaN, and not {list(bits.shape)}")
     unit = units(plans, mask)[mask].unique(return_inverse=True)[1]
     size = int(unit.max()) + 1 if len(unit) else 0
     if size < FEWEST_UNITS:
@@ -89,8 +105,17 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
 
     It is 0 beyond a plan's end. The context of the plans is only used by a prior that takes one.
 
+    Args:
+        prior: fitted.
+        plans: N of them.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2]]), 3)
+        >>> action_bits(UniformPrior(3), plans).round(decimals=2).tolist()
+        [[1.58, 1.58, 1.58]]
     """
     given = plans if prior.takes_context else plans.without_context()
     with torch.no_grad():
@@ -113,6 +138,10 @@ def unit_name(plans: Plans, mask: Tensor | None = None) -> str:
     Args:
         plans: the plans.
         mask: `[N, L]` bool: the actions that count; None: all.
+
+    Example:
+        >>> unit_name(Plans(torch.zeros(4, 3, dtype=torch.long), 2, group=torch.tensor([0, 0, 1, 1])))
+        'groups'
     """
     taken = (plans.mask() if mask is None else mask).any(1)
     if plans.group is not None and len(plans.group.to(taken.device)[taken].unique()) >= FEWEST_UNITS:
@@ -180,6 +209,11 @@ def baselines(
 
     Yields:
         One baseline after the other.
+
+    Example:
+        >>> plans = Plans(torch.randint(2, (40, 6), generator=torch.Generator().manual_seed(0)), 2)
+        >>> [found.model for found in baselines(plans[:30], plans[30:])][:3]
+        ['uniform', 'markov-0', 'markov-1']
     """
     contexts: list[int | None] = [num_contexts] if num_contexts is None or always_context else [None, num_contexts]
     if num_contexts is None or not always_context:
@@ -229,6 +263,11 @@ def units(plans: Plans, mask: Tensor) -> Tensor:
     Returns:
         `[N, L]` int64, on the device of `mask`: numbers from 0, ascending with the number of the group, of the plan or
         of the part. They are arbitrary outside `mask`, and the number of a group without actions is not used.
+
+    Example:
+        >>> plans = Plans(torch.zeros(4, 3, dtype=torch.long), 2, group=torch.tensor([0, 0, 1, 1]))
+        >>> units(plans, plans.mask()).shape
+        torch.Size([4, 3])
     """
     what = unit_name(plans, mask)
     if what == "groups":

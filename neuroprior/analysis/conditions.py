@@ -178,6 +178,13 @@ def compare_conditions(
 
     Raises:
         ValueError: the plans have no condition, or `permutations` or `max_work` is below 1.
+
+    Example:
+        >>> first, second = torch.tensor([[0, 1] * 10]).repeat(8, 1), torch.tensor([[0, 0, 1, 1] * 5]).repeat(8, 1)
+        >>> plans = Plans(torch.cat([first, second]), 2, group=torch.arange(16), condition=torch.arange(16) // 8)
+        >>> found = compare_conditions(plans, permutations=199, generator=torch.Generator().manual_seed(0))
+        >>> found.p_value < 0.05
+        True
     """
     check_are_plans(plans)
     check_sizes(permutations=permutations, max_work=max_work)

@@ -133,6 +133,11 @@ def by_position(plans: Plans, bits: Tensor, mask: Tensor, parts: int = 10) -> Po
     Raises:
         ValueError: a wrong shape or dtype, bits that are not finite, fewer than two units with actions, no plan with
             two actions that count, or no parts.
+
+    Example:
+        >>> plans = Plans(torch.randint(2, (6, 20), generator=torch.Generator().manual_seed(0)), 2)
+        >>> len(by_position(plans, action_bits(UniformPrior(2), plans), plans.mask(), parts=4).parts)
+        4
     """
     check_sizes(parts=parts)
     counted = _counted(plans, bits, mask)
@@ -157,6 +162,10 @@ def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
 
     Raises:
         ValueError: as for `by_position`, except that one action per plan is enough.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1], [0, 0], [1, 1], [1, 0]]), 2)
+        >>> found = by_plan(plans, action_bits(UniformPrior(2), plans), plans.mask())
     """
     item, index, group, totals, actions = _items(plans, _counted(plans, bits, mask))
     numbers, inverse = group.unique(return_inverse=True)
@@ -184,6 +193,10 @@ def by_group(plans: Plans, bits: Tensor, mask: Tensor) -> GroupDrift:
 
     Raises:
         ValueError: as for `by_position`, except that one action per plan is enough.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1], [0, 0], [1, 1], [1, 0]]), 2, group=torch.tensor([0, 0, 1, 1]))
+        >>> found = by_group(plans, action_bits(UniformPrior(2), plans), plans.mask())
     """
     _, _, group, totals, actions = _items(plans, _counted(plans, bits, mask))
     order = group.argsort(stable=True)
@@ -213,6 +226,11 @@ def action_drift(plans: Plans) -> list[ActionDrift]:
 
     Raises:
         ValueError: fewer than two units: no two plans of at least two actions, and no single one of at least four.
+
+    Example:
+        >>> plans = Plans(torch.randint(2, (8, 20), generator=torch.Generator().manual_seed(0)), 2)
+        >>> [found.action for found in action_drift(plans)]
+        [0, 1]
     """
     length, step = plans.mask().sum(1)[:, None], torch.arange(plans.max_length, device=plans.actions.device)
     half = length // 2

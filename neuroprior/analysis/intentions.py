@@ -80,6 +80,13 @@ def infer(
     Raises:
         ValueError: an argument is out of range, a prior cannot score the plans, or an action is impossible under every
             intention.
+
+    Example:
+        >>> left = MarkovPrior(2, 0).fit(torch.tensor([[0, 0, 0, 1]]))
+        >>> right = MarkovPrior(2, 0).fit(torch.tensor([[1, 1, 1, 0]]))
+        >>> posterior = infer({"left": left, "right": right}, torch.tensor([[0, 0, 0]]))
+        >>> posterior.names[posterior.log_probs[0, -1].argmax()]
+        'left'
     """
     named = _named(priors)
     observed = _observed(plans, context, next(iter(named.values())))
@@ -151,6 +158,15 @@ def forecast(
 
     Raises:
         ValueError: an argument is out of range, or shapes do not fit one another.
+
+    Example:
+        >>> world, priors = (
+        ...     gridworld(5, 5, edges="torus", seed=0),
+        ...     {"a chain": MarkovPrior(4, 1), "anywhere": UniformPrior(4)},
+        ... )
+        >>> goals = torch.tensor([1, 5])
+        >>> forecast(priors, world, torch.tensor([0]), torch.tensor([[0.5, 0.5]]), 2, 50, targets=goals).shape
+        torch.Size([1, 2])
     """
     named = _named(priors)
     check_sizes(length=length, num_plans=num_plans)

@@ -7,7 +7,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_count, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.analysis.comparison import Score, action_bits, unit_name, units
 from neuroprior.plans import Plans, is_per_step
@@ -79,10 +79,17 @@ def mutual_information(
 
     Raises:
         ValueError: a lag below 1, a negative `skip`, or plans without two pairs of successive actions.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1] * 20]).repeat(4, 1), 2)
+        >>> [
+        ...     round(found.bits, 2)
+        ...     for found in mutual_information(plans, max_lag=2, generator=torch.Generator().manual_seed(0))
+        ... ]
+        [1.0, 1.0]
     """
     check_sizes(max_lag=max_lag)
-    if not isinstance(skip, int) or skip < 0:
-        raise ValueError(f"skip: an integer of at least 0 is expected, not {skip!r}")
+    check_count("skip", skip, 0)
     found, generator = [], generator_on(generator, plans.actions.device)
     for lag in range(1, min(max_lag, plans.max_length - 1) + 1):
         later = plans.mask()
@@ -181,6 +188,11 @@ def pieces(plans: Plans, length: int, most: int, generator: torch.Generator | No
 
     Raises:
         ValueError: no plan has that many actions, or `length` or `most` is below 1.
+
+    Example:
+        >>> plans = Plans(torch.arange(40)[None] % 4, 4)
+        >>> pieces(plans, length=5, most=3, generator=torch.Generator().manual_seed(0)).actions.shape
+        torch.Size([3, 5])
     """
     check_sizes(length=length, most=most)
     start_here = torch.zeros_like(plans.mask())
@@ -232,6 +244,11 @@ def bits_by_position(prior: Prior, plans: Plans) -> list[Score]:
 
     Raises:
         ValueError: plans of unequal lengths, fewer than two, or that the prior cannot score.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
+        >>> [round(found.bits_per_action().mean, 2) for found in bits_by_position(UniformPrior(3), plans)]
+        [1.58, 1.58, 1.58]
     """
     mask = plans.mask().cpu()
     if len(plans) < 2 or plans.max_length == 0 or not bool(mask.all()):

@@ -15,6 +15,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import divisible, folds
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.fitting import make_prior
 from neuroprior.priors.prior import context_arguments
@@ -106,6 +107,12 @@ def choose_modes(
 
     Raises:
         ValueError: an argument is out of range, or the plans cannot be divided.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1] * 10 + [2, 3] * 10]).repeat(12, 1), 4)
+        >>> how = {"order": 0, "restarts": 1, "folds": 2, "generator": torch.Generator().manual_seed(0)}
+        >>> choose_modes(plans, [1, 2], number_of_folds=2, **how).chosen
+        2
     """
     numbers = sorted(set(num_modes))
     if not numbers:
@@ -162,6 +169,11 @@ def match_modes(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
     Args:
         one, other: `[N, L, K]`: posteriors of the modes behind the same actions.
         mask: `[N, L]` bool: the actions that count.
+
+    Example:
+        >>> one = torch.tensor([[0.9, 0.1], [0.2, 0.8]])[None]
+        >>> match_modes(one, one.flip(-1), torch.ones(1, 2, dtype=torch.bool)).shape
+        torch.Size([2])
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -189,15 +201,36 @@ def mode_names(number: int) -> tuple[str, ...]:
     return tuple(f"mode {k + 1}" for k in range(number))
 
 
+def _scored(prior: SwitchingPrior, plans: Plans) -> Plans:
+    """The plans as the prior takes them."""
+    if not isinstance(prior, SwitchingPrior):
+        raise ValueError(f"prior: a SwitchingPrior is expected, not {type(prior).__name__}")
+    check_are_plans(plans)
+    return plans if prior.takes_context else plans.without_context()
+
+
 def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
     """The most probable modes behind plans, as plans whose actions are modes.
 
     What there is for plans is so there for modes: `transitions`, `compare_conditions`, the ethogram.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> mode_plans(prior, plans).num_actions
+        2
     """
-    given = plans if prior.takes_context else plans.without_context()
+    given = _scored(prior, plans)
     path = prior.posterior(given).path.cpu()
     return replace(plans, actions=path, num_actions=prior.num_modes, action_names=mode_names(prior.num_modes), end=None)
 
@@ -205,10 +238,23 @@ def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
 def mode_transitions(prior: SwitchingPrior, plans: Plans) -> Tensor:
     """How often each mode took each action after each, in expectation: `[K, A, A]`, float64, last by next action.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> mode_transitions(prior, plans).shape
+        torch.Size([2, 4, 4])
     """
-    given, size = plans if prior.takes_context else plans.without_context(), plans.num_actions
+    given, size = _scored(prior, plans), plans.num_actions
     both, actions = plans.mask()[:, 1:], plans.actions.long()
     pair = (actions[:, :-1] * size + actions[:, 1:])[both]
     weights = prior.posterior(given).smoothed.cpu()[:, 1:][both]
@@ -223,10 +269,23 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
     is an index; `action`; `mode`, the most probable path's, from 1; and for each mode k `filtered_k`, its probability
     given the actions so far, and `smoothed_k`, given the whole plan.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> len(mode_frame(prior, plans))
+        120
     """
-    given = plans if prior.takes_context else plans.without_context()
+    given = _scored(prior, plans)
     found, mask = prior.posterior(given), plans.mask()
     which, step = (index.numpy() for index in mask.nonzero(as_tuple=True))
 
@@ -254,12 +313,25 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     commonest), with their shares in the mode; `enters`
     and `leaves`, the three contexts in which the path most often changes to it and from it, where contexts are indices.
 
+    Args:
+        prior: fitted.
+        plans: N of them, such as it was fitted to.
+
     Raises:
         ValueError: plans that the prior cannot score.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0, 1] * 5 + [2, 3] * 5]).repeat(6, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> len(mode_table(prior, plans))
+        2
     """
     import pandas as pd
 
-    given = plans if prior.takes_context else plans.without_context()
+    given = _scored(prior, plans)
     found, mask = prior.posterior(given), plans.mask()
     weights, actions = found.smoothed.cpu()[mask], plans.actions[mask].long()
     path = found.path.cpu()

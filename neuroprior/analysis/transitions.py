@@ -98,6 +98,10 @@ def transitions(
 
     Raises:
         ValueError: `permutations`, `max_work` or `chunk_size` is below 1.
+
+    Example:
+        >>> transitions(Plans(torch.tensor([[0, 1, 0, 1, 1]]), 2)).counts.tolist()
+        [[0, 2], [1, 1]]
     """
     check_sizes(permutations=permutations, max_work=max_work, chunk_size=chunk_size)
     flat, size = FlatPlans.of(plans), plans.num_actions

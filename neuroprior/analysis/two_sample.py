@@ -15,6 +15,7 @@ from neuroprior._random import generator_on
 from neuroprior.analysis.statistics import holm
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS
+from neuroprior.plans.plans import check_are_plans
 
 ORDERS = range(1, 5)
 """Lengths of the n-grams that are compared."""
@@ -108,6 +109,14 @@ def two_sample_tests(
 
     Raises:
         ValueError: different numbers of actions, plans without any action, or no permutations.
+
+    Example:
+        >>> plans = Plans(torch.randint(2, (30, 6), generator=torch.Generator().manual_seed(0)), 2)
+        >>> found = two_sample_tests(
+        ...     plans[:15], plans[15:], permutations=99, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> [one.statistic for one in found]
+        ['1-grams', '2-grams', '3-grams', '4-grams', 'run lengths', 'return times']
     """
     check_sizes(
         permutations=permutations,
@@ -116,6 +125,8 @@ def two_sample_tests(
         max_work=max_work,
         chunk_size=chunk_size,
     )
+    for plans in (real, generated):
+        check_are_plans(plans)
     if real.num_actions != generated.num_actions:
         raise ValueError(f"real plans have {real.num_actions} actions, generated ones {generated.num_actions}")
     draw = generator_on(generator, "cpu")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._compiled import compiled
 from neuroprior._hashing import row_hashes
 from neuroprior.planners.planner import Decision, Planner, value_of
@@ -221,6 +221,12 @@ class LevinPlanner(BestFirstPlanner):
 
     Raises:
         ValueError: see `BestFirstPlanner`; and `search` raises it where `reroot` finds no `world.lower_bound`.
+
+    Example:
+        >>> world = sliding_tiles(shape=(2, 2), scramble=6)
+        >>> found = LevinPlanner(UniformPrior(4)).search(world, world.reset(5, torch.Generator().manual_seed(0)))
+        >>> found.solved.all().item()
+        True
     """
 
     def __init__(
@@ -250,7 +256,13 @@ class AStarPlanner(BestFirstPlanner):
         heuristic: the steps that are left; None: breadth-first search.
         weight: of the heuristic: 1: A*, whose plans are shortest where the heuristic is consistent; above 1: weighted
             A*; inf: greedy best-first search.
-        max_nodes, nodes_at_once: see `BestFirstPlanner`.
+        max_nodes, nodes_at_once, compile: see `BestFirstPlanner`.
+
+    Example:
+        >>> world = sliding_tiles(shape=(2, 2), scramble=6)
+        >>> found = AStarPlanner(world.lower_bound).search(world, world.reset(5, torch.Generator().manual_seed(0)))
+        >>> found.solved.all().item()
+        True
     """
 
     def __init__(
@@ -263,8 +275,8 @@ class AStarPlanner(BestFirstPlanner):
         compile: bool = True,
     ) -> None:
         super().__init__(None, max_nodes, heuristic=heuristic, nodes_at_once=nodes_at_once, compile=compile)
-        if not weight >= 0:
-            raise ValueError(f"weight: a number of at least 0 is expected, not {weight}")
+        if not is_number(weight) or not weight >= 0:
+            raise ValueError(f"weight: a number of at least 0 is expected, not {weight!r}")
         self.weight, self.order = weight, (1, float(weight))
 
     def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:

@@ -104,6 +104,15 @@ def bootstrap(
     Raises:
         ValueError: an argument is out of range, the prior cannot act in the world, nothing is solved in any sweep, or
             the folder is damaged or of another call.
+
+    Example:
+        >>> world, generator = sliding_tiles(shape=(2, 2), scramble=6), torch.Generator().manual_seed(0)
+        >>> prior = LogLinearPrior(4, num_patterns=len(world.windows.windows))
+        >>> [
+        ...     sweep.solved
+        ...     for sweep in bootstrap(world, prior, world.reset(20, generator), sweeps=1, generator=generator)
+        ... ]
+        [1.0]
     """
     check_sizes(max_nodes=max_nodes, sweeps=sweeps, first=first, max_actions=max_actions)
     world.check_state(problems)

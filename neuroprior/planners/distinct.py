@@ -23,6 +23,12 @@ class DistinctPlanner(PriorPlanner):
 
     Raises:
         ValueError: an argument is out of range. `plan` raises it for a stochastic world.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> decision = DistinctPlanner(UniformPrior(4), length=3, num_plans=64).plan(world, torch.tensor([0, 12]))
+        >>> torch.equal(decision.score, oracle(world, torch.tensor([0, 12]), 3))  # 64 distinct plans are all of them
+        True
     """
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:

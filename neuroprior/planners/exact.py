@@ -38,6 +38,14 @@ def oracle(
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = TabularWorld(torch.tensor([[0, 1], [2, 0], [2, 2]]), torch.tensor([0.0, 0.5, 1.0]))
+        >>> (
+        ...     oracle(world, torch.tensor([0, 1]), length=1).tolist(),
+        ...     oracle(world, torch.tensor([0, 1]), length=2).tolist(),
+        ... )
+        ([0.5, 1.0], [1.0, 1.0])
     """
     check_sizes(length=length)
     check_objective(objective, discount)
@@ -92,6 +100,11 @@ def expected_score(
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world, start, plans = gridworld(5, 5, seed=0), torch.tensor([0, 12]), torch.tensor([[[0, 1]], [[2, 3]]])
+        >>> torch.equal(expected_score(world, start, plans), world.rollout(start, plans).rewards[..., -1])
+        True
     """
     check_objective(objective, discount)
     check_tabular(world)

@@ -55,8 +55,14 @@ def execute(
 
     Raises:
         ValueError: an argument is out of range, or a plan is too short.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> execute(ExhaustivePlanner(depth=3), world, torch.tensor([0, 12]), num_steps=4).rewards.shape
+        torch.Size([2, 4])
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
+    check_memory(8 * num_steps, num_steps=num_steps)
     generator = generator_on(generator, state.device)
     parts = []
     for at in range(0, num_steps, replan_every):
@@ -96,6 +102,16 @@ def collect(
     Raises:
         ValueError: neither or both of `num_plans` and `state` are given, an argument is out of range, or no plan scored
             more than `min_score`.
+
+    Example:
+        >>> plans = collect(
+        ...     ExhaustivePlanner(depth=3),
+        ...     gridworld(5, 5, seed=0),
+        ...     num_plans=10,
+        ...     generator=torch.Generator().manual_seed(0),
+        ... )
+        >>> plans.actions.shape
+        torch.Size([10, 3])
     """
     if (num_plans is None) == (state is None):
         raise ValueError("collect: give either num_plans or state")

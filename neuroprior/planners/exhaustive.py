@@ -28,6 +28,12 @@ class ExhaustivePlanner(Planner):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> decision = ExhaustivePlanner(depth=3).plan(world, torch.tensor([0, 12]))
+        >>> decision.plan.shape, decision.model_steps
+        (torch.Size([2, 3]), 84)
     """
 
     def __init__(self, depth: int, *, num_rollouts: int = 1, **goal: Unpack[Objective]) -> None:

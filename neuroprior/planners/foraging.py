@@ -27,6 +27,14 @@ class ForagingOracle(Planner):
     Raises:
         ValueError: an argument is out of range. `plan` raises it for another kind of world, a stochastic one, or one
             with more than 12 items.
+
+    Example:
+        >>> table = gridworld(5, 5, seed=0)
+        >>> world = ForagingWorld(
+        ...     table, patches(table, num_seasons=1, radius=1, generator=torch.Generator().manual_seed(0)), period=20
+        ... )
+        >>> ForagingOracle(length=3).plan(world, world.reset(2, torch.Generator().manual_seed(0))).plan.shape
+        torch.Size([2, 3])
     """
 
     def __init__(self, length: int, discount: float = 1.0) -> None:

@@ -38,6 +38,11 @@ class FrontierPlanner(PriorPlanner):
 
     Raises:
         ValueError: an argument is out of range. `plan` raises it for a stochastic world.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> FrontierPlanner(UniformPrior(4), length=4, num_plans=32).plan(world, torch.tensor([0, 12])).plan.shape
+        torch.Size([2, 4])
     """
 
     def __init__(

@@ -76,6 +76,15 @@ def extend_horizon(
 
     Raises:
         ValueError: an argument is out of range, or no plan of a round scored more than `min_score`.
+
+    Example:
+        >>> world, generator = gridworld(5, 5, seed=0), torch.Generator().manual_seed(0)
+        >>> short = collect(ExhaustivePlanner(depth=2), world, 50, generator=generator)
+        >>> rounds = extend_horizon(
+        ...     MarkovPrior(4, 1), short, world, [3, 4], num_starts=20, num_plans=16, generator=generator
+        ... )
+        >>> [one.plans.max_length for one in rounds]
+        [2, 3, 4]
     """
     if any(length < 1 for length in lengths):
         raise ValueError(f"lengths: at least 1 is expected each, not {list(lengths)}")

@@ -5,6 +5,7 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior._compiled import compiled
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions, random_best
 from neuroprior.sampling.draws import Draw
@@ -43,6 +44,11 @@ class MCTSPlanner(PriorPlanner):
 
     Raises:
         ValueError: an argument is out of range. `plan` raises it for a stochastic world.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> MCTSPlanner(UniformPrior(4), length=4, num_plans=32).plan(world, torch.tensor([0, 12])).plan.shape
+        torch.Size([2, 4])
     """
 
     def __init__(
@@ -57,8 +63,8 @@ class MCTSPlanner(PriorPlanner):
         **goal: Unpack[Objective],
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
-        if not 0 <= exploration < float("inf"):
-            raise ValueError(f"exploration: a finite number of at least 0 is expected, not {exploration}")
+        if not is_number(exploration) or not 0 <= exploration < float("inf"):
+            raise ValueError(f"exploration: a finite number of at least 0 is expected, not {exploration!r}")
         self.exploration, self.compile = exploration, compile
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:

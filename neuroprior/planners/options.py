@@ -28,6 +28,15 @@ class OptionPlanner(SamplingPlanner):
 
     Raises:
         ValueError: an argument is out of range, or this is no switching prior.
+
+    Example:
+        >>> from neuroprior.priors import SwitchingPrior
+        >>> plans = Plans(torch.tensor([[0] * 10 + [1] * 10]).repeat(12, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> OptionPlanner(prior, length=4, num_plans=8).plan(gridworld(5, 5, seed=0), torch.tensor([0, 12])).plan.shape
+        torch.Size([2, 4])
     """
 
     def __init__(

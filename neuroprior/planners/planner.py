@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, check_in_world
@@ -191,8 +191,8 @@ def check_objective(objective: str, discount: float) -> None:
     """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
     if objective not in ("terminal", "return"):
         raise ValueError(f'objective: "terminal" or "return" is expected, not {objective!r}')
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount: a number above 0 and at most 1 is expected, not {discount}")
+    if not is_number(discount) or not 0 < discount <= 1:
+        raise ValueError(f"discount: a number above 0 and at most 1 is expected, not {discount!r}")
     if objective == "terminal" and discount != 1:
         raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')
 
@@ -209,6 +209,10 @@ def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | Non
 
     Raises:
         ValueError: a score is NaN.
+
+    Example:
+        >>> random_best(torch.tensor([[0.0, 2.0, 1.0]]), torch.Generator().manual_seed(0)).tolist()
+        [1]
     """
     # Scores are often one column of many, which is slow to read more than once.
     score = score.contiguous() if allowed is None else score.masked_fill(~allowed, -torch.inf)

@@ -32,6 +32,14 @@ def mean_scores(
     Raises:
         ValueError: the world is stochastic and not all actions are legal everywhere, so that some outcomes could make a
             plan impossible.
+
+    Example:
+        >>> world, plans = gridworld(5, 5, seed=0), torch.tensor([[[0, 1], [2, 3]]])
+        >>> scores, _ = mean_scores(
+        ...     ExhaustivePlanner(2), world, torch.tensor([12]), plans, 3, torch.Generator().manual_seed(0)
+        ... )
+        >>> scores.shape
+        torch.Size([1, 2])
     """
     if not world.stochastic:
         return planner.score_rollout(world.rollout(state, plans, generator, planner.any_prefix))

@@ -38,6 +38,12 @@ class SamplingPlanner(PriorPlanner):
 
     Raises:
         ValueError: an argument is out of range. `plan` raises it for a prior that samples an end symbol, too.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> decision = SamplingPlanner(UniformPrior(4), length=4, num_plans=32).plan(world, torch.tensor([0, 12]))
+        >>> decision.plan.shape, decision.model_steps
+        (torch.Size([2, 4]), 128)
     """
 
     def __init__(

@@ -61,6 +61,10 @@ def proposers(prior: Steppable) -> tuple[Steppable, ...]:
 
     The mixture that predicts plans best need not be the best to search with. An expert that is unsure of what it does
     not know proposes more plans that differ.
+
+    Example:
+        >>> len(proposers(MarkovPrior(4, 1)))
+        1
     """
     experts = tuple(prior.experts) if isinstance(prior, MixturePrior) else ()
     return (prior, *cast(tuple[Prior, ...], experts)) if len(experts) > 1 else (prior,)
@@ -95,6 +99,13 @@ def best_sampling(
 
     Raises:
         ValueError: an argument is out of range, or there is nothing to try.
+
+    Example:
+        >>> world, generator = gridworld(5, 5, seed=0), torch.Generator().manual_seed(0)
+        >>> best_sampling(
+        ...     UniformPrior(4), world, world.reset(50, generator), length=3, num_plans=8, generator=generator
+        ... ).temperature
+        1.0
     """
     check_tried(temperatures, uniform_shares)
     if len(state) == 0:
@@ -195,6 +206,11 @@ def sampling_for(
 
     Raises:
         ValueError: an argument is out of range, there is nothing to try, or plans that the prior does not know.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
+        >>> sampling_for(MarkovPrior(3, 1).fit(plans), plans, num_plans=16)
+        (1.0, 0.0)
     """
     check_tried(temperatures, uniform_shares)
     check_sizes(num_plans=num_plans)
@@ -237,6 +253,10 @@ def search_weights(log_prob: Tensor, num_plans: int) -> Tensor:
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> search_weights(torch.tensor([-1.0, -8.0]), num_plans=16).shape
+        torch.Size([2])
     """
     check_sizes(num_plans=num_plans)
     if not bool((log_prob <= 0).all()):

@@ -28,6 +28,10 @@ class PastDurations:
 
     Raises:
         ValueError: a value is out of range.
+
+    Example:
+        >>> PastDurations(number=2, center=0.5, spread=1.0).number
+        2
     """
 
     number: int

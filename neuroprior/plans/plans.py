@@ -2,17 +2,21 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import log2
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior._checks import check_range, check_sizes, is_integer
+from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.rows import check_readable, rows_of
 from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.tables import Columns, Missing, fields_of
+
+MOST_BITS = 48
+"""Binary digits of the largest number of plans that `all_plans` would list, on any machine."""
 
 MOST_ACTIONS = 2**31
 """Actions beyond which their numbers are something else."""
@@ -46,6 +50,16 @@ class Plans(Sequences):
 
     Raises:
         ValueError: a shape, dtype or value is wrong; the message says which and where.
+
+    Example:
+        >>> steps = torch.tensor([[0, 1, 1], [2, 0, 0]])
+        >>> plans = Plans(steps, 3, lengths=torch.tensor([3, 1]), action_names=("eat", "rest", "walk"))
+        >>> len(plans), plans.max_length
+        (2, 3)
+        >>> plans.mask().tolist()
+        [[True, True, True], [True, False, False]]
+        >>> plans[1:].actions.tolist()
+        [[2, 0, 0]]
     """
 
     actions: Tensor
@@ -81,6 +95,8 @@ class Plans(Sequences):
             actions = actions.masked_fill(~self.mask(), 0) if is_integer(actions) else actions
         check_range("actions", actions, self.num_actions, "actions")
         object.__setattr__(self, "actions", actions.to(action_dtype(self.num_actions)))
+        _check_texts("action_names", self.action_names)
+        _check_texts("notes", self.notes)
         if self.action_names is not None and len(self.action_names) != self.num_actions:
             raise ValueError(f"action_names: {self.num_actions} are expected, not {len(self.action_names)}")
         for what in ("group", "condition"):
@@ -119,7 +135,7 @@ class Plans(Sequences):
 
     def _check_end(self, actions: Tensor) -> None:
         """Check that `end` only closes plans; where lengths are not given, take them from it."""
-        if not isinstance(self.end, int) or not 0 <= self.end < self.num_actions:
+        if not isinstance(self.end, int) or isinstance(self.end, bool) or not 0 <= self.end < self.num_actions:
             raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {self.end!r}")
         position = torch.arange(1, actions.shape[1] + 1, device=actions.device)
         first = torch.where(actions == self.end, position, actions.shape[1]).amin(1) if actions.shape[1] else None
@@ -324,9 +340,10 @@ class Plans(Sequences):
         Raises:
             ValueError: `first` is negative, or `stop` is less than `first`.
         """
+        check_count("first", first, 0)
+        if stop is not None:
+            check_count("stop", stop, 0)
         stop = self.max_length if stop is None else min(stop, self.max_length)
-        if first < 0:
-            raise ValueError(f"first: at least 0 is expected, not {first}")
         if stop < min(first, self.max_length):
             raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
 
@@ -349,18 +366,41 @@ def check_are_plans(plans: object) -> None:
 
 
 def all_plans(num_actions: int, length: int) -> Tensor:
-    """All A**L plans `[A**L, L]`, int64; row n is n written in base A."""
+    """All A**L plans `[A**L, L]`, int64; row n is n written in base A.
+
+    Args:
+        num_actions: A.
+        length: L.
+
+    Example:
+        >>> all_plans(2, 2).tolist()
+        [[0, 0], [0, 1], [1, 0], [1, 1]]
+    """
+    check_sizes(num_actions=num_actions)
+    check_count("length", length)
+    if length * log2(num_actions) > MOST_BITS:
+        raise ValueError(f"length: {num_actions}**{length} plans are too many; list fewer or shorter ones")
+    check_memory(8 * num_actions**length * max(length, 1), num_actions=num_actions, length=length)
     base = num_actions ** torch.arange(length - 1, -1, -1)
     return torch.arange(num_actions**length)[:, None].div(base, rounding_mode="floor") % num_actions
 
 
 def action_dtype(num_actions: int) -> torch.dtype:
-    """How actions are stored: uint8 where it suffices, else int64."""
+    """How actions are stored: uint8 where it suffices, else int64.
+
+    Example:
+        >>> action_dtype(256), action_dtype(257)
+        (torch.uint8, torch.int64)
+    """
     return torch.uint8 if num_actions <= 256 else torch.int64
 
 
 def check_context(context: Tensor, num_plans: int, length: int) -> None:
-    """Raise ValueError unless `context` is what `Plans.context` may be for `num_plans` plans of `length` actions."""
+    """Raise ValueError unless `context` is what `Plans.context` may be for `num_plans` plans of `length` actions.
+
+    Example:
+        >>> check_context(torch.zeros(5, 3, dtype=torch.long), num_plans=5, length=3)
+    """
     shape = tuple(context.shape)
     if has_patterns(context):
         if shape[:2] != (num_plans, length):
@@ -398,17 +438,34 @@ def is_per_step(context: Tensor | None) -> bool:
     """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
 
     The patterns `[N, F]` of one state each look like indices per step: who expects patterns asks before this.
+
+    Example:
+        >>> (
+        ...     is_per_step(torch.zeros(4, 5, dtype=torch.long)),
+        ...     is_per_step(torch.zeros(4, dtype=torch.long)),
+        ...     is_per_step(None),
+        ... )
+        (True, False, False)
     """
     return context is not None and (context.dim() == 3 or (is_integer(context) and context.dim() == 2))
 
 
 def has_patterns(context: Tensor | None) -> bool:
-    """True for the context of plans that is several indices per step, `[N, L, F]`."""
+    """True for the context of plans that is several indices per step, `[N, L, F]`.
+
+    Example:
+        >>> has_patterns(torch.zeros(4, 5, 7, dtype=torch.int32)), has_patterns(torch.zeros(4, 5, dtype=torch.long))
+        (True, False)
+    """
     return context is not None and context.dim() == 3 and is_integer(context)
 
 
 def check_patterns(patterns: Tensor) -> None:
-    """Raise ValueError unless these are integers from 0 to 2**31 - 1."""
+    """Raise ValueError unless these are integers from 0 to 2**31 - 1.
+
+    Example:
+        >>> check_patterns(torch.tensor([[0, 7, 2**31 - 1]]))
+    """
     check_range("context", patterns, 2**31, "patterns")
 
 
@@ -430,7 +487,9 @@ def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
 
 def _check_texts(what: str, names: Sequence[str] | None) -> bool:
     """Whether there are names; ValueError unless they are texts."""
-    if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
+    if names is not None and (
+        not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names)
+    ):
         raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
     return names is not None
 

@@ -29,6 +29,11 @@ class VectorPlans(Sequences):
 
     Raises:
         ValueError: a shape, dtype or value is wrong; the message says which and where.
+
+    Example:
+        >>> plans = VectorPlans(torch.zeros(4, 10, 2), action_low=[-1.0, -1.0], action_high=[1.0, 1.0])
+        >>> len(plans), plans.max_length, plans.action_low.tolist()
+        (4, 10, [-1.0, -1.0])
     """
 
     actions: Tensor

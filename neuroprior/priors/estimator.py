@@ -32,6 +32,14 @@ class PriorEstimator:
 
     Attributes:
         prior_: the fitted prior.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
+        >>> estimator = PriorEstimator("markov", order=1).fit(plans)
+        >>> round(estimator.score(plans), 2)
+        -0.05
+        >>> estimator.set_params(order=2).get_params()["order"]
+        2
     """
 
     prior_: Prior

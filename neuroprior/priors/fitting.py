@@ -47,6 +47,11 @@ def fit(
 
     Raises:
         ValueError: an unknown name, plans that the prior cannot learn from, or a setting that it does not have.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
+        >>> fit(plans, "markov").order
+        1
     """
     if isinstance(prior, Prior):
         raise ValueError(
@@ -60,6 +65,8 @@ def fit(
         if prior not in NAMES:
             raise ValueError(f"prior: one of {', '.join(NAMES)} is expected, not {prior!r}")
         prior = NAMES[prior]
+    if not callable(prior):
+        raise ValueError(f"prior: a class, a function or a name is expected, not {prior!r}")
     if effort is not None:
         if prior is not CombinedPrior:
             raise ValueError("effort: for the combined prior alone; leave it out, or leave prior out")

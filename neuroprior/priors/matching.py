@@ -25,6 +25,11 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
 
     Raises:
         ValueError: the prior does not know one of the actions or contexts, or takes durations that plans do not have.
+
+    Example:
+        >>> prior = MarkovPrior(2, 0).fit(Plans(torch.tensor([[0, 1]]), 2, action_names=("rest", "walk")))
+        >>> match_plans(Plans(torch.tensor([[0, 1]]), 2, action_names=("walk", "rest")), prior).actions.tolist()
+        [[1, 0]]
     """
     check_are_plans(plans)
     known = prior.num_actions - (prior.end is not None)
@@ -50,6 +55,10 @@ def decode(plans: Plans | Tensor, prior: Prior | None = None) -> list[list[str]]
 
     Raises:
         ValueError: integers without a prior, a prior for `Plans`, or integers that are none of its actions.
+
+    Example:
+        >>> decode(Plans(torch.tensor([[0, 2], [1, 0]]), 3, torch.tensor([2, 1]), action_names=("eat", "rest", "walk")))
+        [['eat', 'walk'], ['rest']]
     """
     if isinstance(plans, Plans) != (prior is None):
         raise ValueError("decode: Plans, or samples and the prior that they are from, are expected")

@@ -35,6 +35,11 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
 
     Raises:
         ValueError: the prior does not know the actions or contexts, or plans have no groups or conditions.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3, group=torch.tensor([0, 1]))
+        >>> score(UniformPrior(3), plans, by="group")["bits_per_action"].round(3).tolist()
+        [1.585, 1.585]
     """
     if not isinstance(prior, Prior):
         raise ValueError(

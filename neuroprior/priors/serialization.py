@@ -43,6 +43,10 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
     Raises:
         OSError: the folder cannot be written.
         ValueError: it is no prior.
+
+    Example:
+        >>> sorted(path.name for path in save(MarkovPrior(3, order=2), "runs/markov").iterdir())
+        ['config.json', 'model.safetensors']
     """
     if not isinstance(prior, SavedModule):
         raise ValueError(f"prior: a Prior is expected, not {type(prior).__name__}")
@@ -90,6 +94,11 @@ def load(
         FileNotFoundError: the folder or one of its two files is not there.
         ValueError: a file is damaged or not of this kind, the prior's class is not known (import it first), it is of
             another kind, or there is no such device.
+
+    Example:
+        >>> folder = save(MarkovPrior(3, order=2), "runs/markov")
+        >>> load(folder).order
+        2
     """
     if not isinstance(folder, str | os.PathLike):
         raise ValueError(f"folder: the name of a folder is expected, not {type(folder).__name__}")

@@ -14,6 +14,10 @@ class UniformPrior(Prior):
 
     Args:
         num_actions: A.
+
+    Example:
+        >>> UniformPrior(4).log_prob(torch.zeros(1, 3, dtype=torch.long)).exp().item() == 4**-3
+        True
     """
 
     def __init__(self, num_actions: int) -> None:

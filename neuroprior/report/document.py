@@ -28,17 +28,34 @@ class Document:
 
     Each of `frames`, the tables of results, is written as `NAME.csv`, and as a list of rows in `results.json` under
     `NAME`, or under what `keys` has for it.
+
+    Attributes:
+        title: of the page.
+        lead: the finding in one or two plain sentences.
+        sections: in order; their tables are printed too.
+        frames: tables of results, by name.
+        settings: how the results were made, by name.
+        command: the command line that makes them again.
+        results: further JSON values for `results.json`.
+        keys: the name in `results.json` of a frame, where it is another.
+        former_names: of columns, which files hold under both names.
+
+    Example:
+        >>> Document(
+        ...     "Chains", "Order 1 is best.", [Section("Scores", tables=[Table(["order", "bits"], [["1", "0.92"]])])]
+        ... ).title
+        'Chains'
     """
 
-    title: str  # of the page
-    lead: str  # the finding in one or two plain sentences
-    sections: Sequence[Section]  # in order; their tables are printed too
+    title: str
+    lead: str
+    sections: Sequence[Section]
     frames: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    settings: Mapping[str, Any] = field(default_factory=dict)  # how the results were made, by name
-    command: str = ""  # the command line that makes them again
-    results: Mapping[str, Any] = field(default_factory=dict)  # further JSON values for `results.json`
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    command: str = ""
+    results: Mapping[str, Any] = field(default_factory=dict)
     keys: Mapping[str, str] = field(default_factory=dict)
-    former_names: Mapping[str, str] = field(default_factory=dict)  # of columns, which files hold under both names
+    former_names: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -70,6 +87,11 @@ def publish(document: Document, folder: Path, console: Console | None = None) ->
 
     Raises:
         OSError: the files cannot be written.
+
+    Example:
+        >>> publish(Document("Chains", "Order 1 is best.", [Section("Scores")]), Path("runs/chains"))
+        Order 1 is best.
+        report: runs/chains/report.html
     """
     console = console or Console()
     show(document, console)
@@ -142,6 +164,13 @@ def table(
         caption: what the numbers are, and what their intervals are over.
         title: above it; by default that of its section.
         align: see `Table`.
+
+    Example:
+        >>> import pandas as pd
+        >>> table(
+        ...     pd.DataFrame({"prior": ["uniform"], "bits": [2.0]}), {"prior": "prior", "bits per action": "bits:.2f"}
+        ... ).rows
+        [['uniform', '2.00']]
     """
     rows = [[_cell(row, column) for column in columns.values()] for _, row in frame.iterrows()]
     return Table(list(columns), rows, caption, align, title)

@@ -482,6 +482,11 @@ def ethogram_figure(plans: Plans) -> Figure:
 
     Raises:
         ValueError: no plan has an action.
+
+    Example:
+        >>> ethogram_figure(
+        ...     Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3, action_names=("eat", "rest", "walk"))
+        ... ).savefig("ethogram.png")
     """
     check_are_plans(plans)
     plans = plans if plans.end is None else plans.without_end()

@@ -27,8 +27,8 @@ from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.report.part import SIGNIFICANT, Part, action_names, p_text
 from neuroprior.report.scores import Evaluation
 
-MOST_MOTIFS, SHARE = 3, 0.5
-"""Sequences that are listed of each mode, and the probability from which an action is drawn as one of a mode."""
+MOST_MOTIFS = 3
+"""Sequences that are listed of each mode."""
 
 
 def mode_section(found: Evaluation) -> Part | None:

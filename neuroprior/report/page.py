@@ -67,15 +67,26 @@ def breakable(name: str) -> str:
 class Table:
     """A table of text, with K columns.
 
+    Attributes:
+        headings: K of them.
+        rows: the first cell of each names its row.
+        caption: what the numbers are, and what their intervals go over.
+        align: K letters, "l" or "r" (right, for numbers); None: the first column left, others right.
+        title: above it; by default, in the terminal, that of its section.
+
     Raises:
         ValueError: a row, or `align`, does not have as many columns as there are headings.
+
+    Example:
+        >>> Table(["prior", "bits"], [["uniform", "2.00"]], caption="Bits per action.").rows
+        [['uniform', '2.00']]
     """
 
     headings: Sequence[str]
-    rows: Sequence[Sequence[str]]  # the first cell of each names its row
-    caption: str = ""  # what the numbers are, and what their intervals go over
-    align: str | None = None  # K letters, "l" or "r" (right, for numbers); None: the first column left, others right
-    title: str = ""  # above it; by default, in the terminal, that of its section
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    align: str | None = None
+    title: str = ""
 
     def __post_init__(self) -> None:
         wide = len(self.headings)
@@ -90,12 +101,24 @@ class Table:
 
 @dataclass(frozen=True)
 class FigureBox:
-    """A figure with its words."""
+    """A figure with its words.
 
-    figure: Figure  # made with matplotlib's settings `STYLE`
-    caption: str  # below it: what it shows, in which units, and what intervals go over
-    alt: str  # what it says, for readers who cannot see it
-    name: str = ""  # by which programs find it
+    Attributes:
+        figure: made with matplotlib's settings `STYLE`.
+        caption: below it: what it shows, in which units, and what intervals go over.
+        alt: what it says, for readers who cannot see it.
+        name: by which programs find it.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
+        >>> FigureBox(ethogram_figure(plans), "What was done.", "A row a plan, a colour an action.").caption
+        'What was done.'
+    """
+
+    figure: Figure
+    caption: str
+    alt: str
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -103,6 +126,17 @@ class Section:
     """A part of a page with a line in its contents: paragraphs, then figures, then tables.
 
     Where `beside` is set, figures stand beside one another as far as there is room: small ones, up to 3 inches wide.
+
+    Attributes:
+        title: its line in the contents.
+        text: paragraphs.
+        tables: in order.
+        figures: in order.
+        beside: see above.
+
+    Example:
+        >>> Section("Scores", ["Two priors."], tables=[Table(["prior", "bits"], [["uniform", "2.00"]])]).title
+        'Scores'
     """
 
     title: str

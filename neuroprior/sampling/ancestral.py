@@ -54,6 +54,10 @@ def sample(
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> sample(UniformPrior(4), num_plans=3, length=5, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([3, 5])
     """
     _check(num_plans, length, temperature, batch_size)
     # The plans, and the uniform numbers of those that are drawn together.
@@ -118,6 +122,13 @@ def sample_in_world(
 
     Raises:
         ValueError: an argument is out of range, or prior and world differ in their number of actions.
+
+    Example:
+        >>> plans, rollout = sample_in_world(
+        ...     UniformPrior(4), gridworld(5, 5, seed=0), torch.tensor([0, 12]), num_plans=6, length=3
+        ... )
+        >>> plans.shape, rollout.final_state.shape
+        (torch.Size([2, 6, 3]), torch.Size([2, 6]))
     """
     _check(num_plans, length, temperature, 1)
     # The plans and their rewards.
@@ -199,7 +210,7 @@ def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
     for name, number in (("num_plans", num_plans), ("length", length)):
-        if not isinstance(number, int):
+        if not isinstance(number, int) or isinstance(number, bool):
             raise ValueError(f"{name}: an integer is expected, not {number!r}")
     if num_plans < 0 or length < 0 or batch_size < 1:
         raise ValueError(

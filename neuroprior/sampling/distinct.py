@@ -61,6 +61,11 @@ def sample_distinct(
 
     Raises:
         ValueError: an argument is out of range, or there are not so many plans.
+
+    Example:
+        >>> found = sample_distinct(UniformPrior(2), num_plans=8, length=3, generator=torch.Generator().manual_seed(0))
+        >>> len(found.plans.view(-1, 3).unique(dim=0))
+        8
     """
     _check(prior, num_plans, length, temperature)
     beams = _start(prior, context, num_sets, temperature)
@@ -95,6 +100,14 @@ def sample_distinct_in_world(
     Raises:
         ValueError: an argument is out of range, prior and world differ in their number of actions, or the world is
             stochastic.
+
+    Example:
+        >>> world = gridworld(5, 5, seed=0)
+        >>> found, rollout = sample_distinct_in_world(
+        ...     UniformPrior(4), world, torch.tensor([0, 12]), num_plans=6, length=3
+        ... )
+        >>> found.plans.shape, rollout.rewards.shape
+        (torch.Size([2, 6, 3]), torch.Size([2, 6, 3]))
     """
     _check(prior, num_plans, length, temperature)
     beams = start_beams_in_world(prior, world, state, temperature, generator)
@@ -129,6 +142,12 @@ def most_probable(
     Raises:
         ValueError: an argument is out of range, there are not so many plans, or too many prefixes would have to be
             extended.
+
+    Example:
+        >>> prior = MarkovPrior(3, order=1).fit(torch.tensor([[0, 1, 2, 0, 1, 2]]))
+        >>> plans, log_prob = most_probable(prior, num_plans=2, length=3)
+        >>> plans.tolist()
+        [[[0, 1, 2], [0, 0, 1]]]
     """
     _check(prior, num_plans, length, temperature)
     beams = _start(prior, context, None, temperature)
@@ -297,6 +316,7 @@ def _start(prior: Steppable, context: Tensor | None, num_sets: int | None, tempe
     if context is None:
         number = 1 if num_sets is None else num_sets
         check_sizes(num_sets=number)
+        check_memory(8 * number, num_sets=number)
         stepper.check_context(None)
         return Beams(stepper, *stepper.start(number), temperature)
     if num_sets is not None:

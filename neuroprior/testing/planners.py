@@ -54,6 +54,9 @@ def check_planner(make: Callable[..., Any], enough: int = 512, seed: int = 0, *,
 
     Raises:
         AssertionError: the planner breaks a rule.
+
+    Example:
+        >>> check_planner(SamplingPlanner)
     """
     if vectors:
         check_vector_planner(make, seed)

@@ -35,6 +35,9 @@ def check_prior(prior: Prior | VectorPrior, length: int | None = None, num_plans
 
     Raises:
         AssertionError: the prior breaks a rule.
+
+    Example:
+        >>> check_prior(MarkovPrior(3, order=1).fit(torch.tensor([[0, 1, 2, 0, 1]])))
     """
     if isinstance(prior, VectorPrior):
         check_vector_prior(prior, length or 5, num_plans, seed)

@@ -34,6 +34,9 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
 
     Raises:
         AssertionError: the world breaks a rule.
+
+    Example:
+        >>> check_world(gridworld(5, 5, seed=0))
     """
     generator = torch.Generator().manual_seed(seed)
     state = world.reset(num_states, torch.Generator().manual_seed(seed))

@@ -7,6 +7,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
+from neuroprior._checks import is_number
 from neuroprior.training.batches import Batch
 
 
@@ -32,10 +33,10 @@ class PriorModule(lightning.LightningModule):
         self, prior: nn.Module, learning_rate: float = 5e-3, weight_decay: float = 0.01, seed: int = 0
     ) -> None:
         super().__init__()
-        if not 0 < learning_rate < float("inf"):
-            raise ValueError(f"learning_rate: a positive number is expected, not {learning_rate}")
-        if not 0 <= weight_decay < float("inf"):
-            raise ValueError(f"weight_decay: must not be negative, not {weight_decay}")
+        if not is_number(learning_rate) or not 0 < learning_rate < float("inf"):
+            raise ValueError(f"learning_rate: a positive number is expected, not {learning_rate!r}")
+        if not is_number(weight_decay) or not 0 <= weight_decay < float("inf"):
+            raise ValueError(f"weight_decay: must not be negative, not {weight_decay!r}")
         self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
         self.curve: list[dict[str, float]] = []
         self._hidden: Tensor | None = None

@@ -29,8 +29,10 @@ class PocketCube(World):
     A state is one integer, `permutation * 729 + orientation`, below 3,674,160; 0 is the solved cube. The permutation is
     the lexicographic number of the cubies in the seven places, the orientation the twists of the first six in base 3.
 
+    Args:
+        turns, scramble, reward, absorbing: see `cube`.
+
     Attributes:
-        turns, scramble, absorbing: see `cube`.
         reward_kind: "solved" or "distance".
         action_names: such as ("U", "U2", "U'", ...).
     """
@@ -176,6 +178,11 @@ def cube(
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = cube(scramble=4)
+        >>> world.num_actions, world.solved(world.reset(100, torch.Generator().manual_seed(0))).any().item()
+        (9, True)
     """
     return PocketCube(turns, scramble, reward, absorbing)
 

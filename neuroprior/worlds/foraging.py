@@ -33,6 +33,14 @@ class ForagingWorld(World):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> table = gridworld(5, 5, seed=0)
+        >>> world = ForagingWorld(
+        ...     table, patches(table, num_seasons=2, radius=1, generator=torch.Generator().manual_seed(0)), period=20
+        ... )
+        >>> world.reset(3, torch.Generator().manual_seed(0)).shape[0]
+        3
     """
 
     def __init__(self, table: TabularWorld, growth: Tensor, period: int, num_items: int = 4) -> None:
@@ -124,6 +132,10 @@ def patches(table: TabularWorld, num_seasons: int, radius: int, generator: torch
 
     Raises:
         ValueError: an argument is out of range, or the table is stochastic.
+
+    Example:
+        >>> patches(gridworld(5, 5, seed=0), num_seasons=2, radius=1, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([2, 25])
     """
     check_sizes(num_seasons=num_seasons, radius=radius)
     if table.stochastic:

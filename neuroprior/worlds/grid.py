@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory, check_sizes
+from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 
@@ -43,6 +43,11 @@ class GridWorld(TabularWorld):
 
     Raises:
         ValueError: a shape, dtype or value is wrong.
+
+    Example:
+        >>> world = GridWorld(2, 3, "torus", torch.tensor([[0.0, 0, 1, 0, 0, 0]]))
+        >>> world.next_state[0].tolist()
+        [3, 1, 3, 2]
     """
 
     def __init__(
@@ -138,10 +143,16 @@ def gridworld(
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = gridworld(20, 20, edges="torus", num_worlds=3, seed=0)
+        >>> world.num_actions, world.reward.shape
+        (4, torch.Size([3, 400]))
     """
-    if not 0 < reward_power < float("inf"):
+    if not is_number(reward_power) or not 0 < reward_power < float("inf"):
         raise ValueError(f"gridworld: reward_power must be positive and finite, not {reward_power}")
     check_sizes(height=height, width=width, num_worlds=num_worlds)
+    check_seed(seed)
     check_memory(8 * height * width * num_worlds, height=height, width=width, num_worlds=num_worlds)
     if edges not in ("wall", "torus"):
         raise ValueError(f'gridworld: edges must be "wall" or "torus", not {edges!r}')
@@ -156,6 +167,10 @@ def egocentric(world: GridWorld) -> GridWorld:
 
     Raises:
         ValueError: the agents of `world` have headings already.
+
+    Example:
+        >>> egocentric(gridworld(5, 5, seed=0)).action_names
+        ('left', 'right', 'forward')
     """
     if world.egocentric:
         raise ValueError("egocentric: the world is egocentric already")
@@ -178,6 +193,10 @@ def local_view(world: GridWorld, radius: int = 2) -> Callable[[Tensor], Tensor]:
 
     Raises:
         ValueError: the radius is not at least 1.
+
+    Example:
+        >>> local_view(gridworld(5, 5, seed=0), radius=1)(torch.tensor([0, 12])).shape
+        torch.Size([2, 8])
     """
     _check_view(radius)
     table = _view_table(world.walls, world.edges, radius, world.egocentric)
@@ -197,6 +216,11 @@ def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
 
     Raises:
         ValueError: the grid is a torus, where there are several ways to count.
+
+    Example:
+        >>> world = four_rooms(7, 7, reward="goal", seed=0)
+        >>> goal_direction(world)(world.reset(5, torch.Generator().manual_seed(0))).shape
+        torch.Size([5, 2])
     """
     if world.edges == "torus":
         raise ValueError("goal_direction: a grid whose edges are walls is expected, not a torus")

@@ -23,6 +23,11 @@ def labyrinth(absorbing: bool = False) -> TabularWorld:
 
     Returns:
         A world of 127 states, 4 moves and one reward map.
+
+    Example:
+        >>> world = labyrinth()
+        >>> world.action_names, len(world.next_state)
+        (('in_left', 'in_right', 'out_left', 'out_right'), 127)
     """
     node = torch.arange(2 ** (DEPTH + 1) - 1)
     depth = (node + 1).double().log2().floor().long()

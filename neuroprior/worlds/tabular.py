@@ -44,6 +44,12 @@ class TabularWorld(World):
 
     Raises:
         ValueError: a shape, dtype or value is wrong.
+
+    Example:
+        >>> world = TabularWorld(next_state=torch.tensor([[0, 1], [0, 1]]), reward=torch.tensor([0.0, 1.0]))
+        >>> state, reward = world.step(torch.tensor([0, 0]), torch.tensor([0, 1]))
+        >>> state.tolist(), reward.tolist()
+        ([0, 1], [0.0, 1.0])
     """
 
     num_layouts: int = 1

@@ -7,6 +7,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import yaml
+
 import neuroprior
 
 ROOT = Path(__file__).parents[2]
@@ -74,3 +76,18 @@ def test_import_is_light() -> None:
     if share > BUDGET:
         share = min(imported()[0] for _ in range(2))
     assert share <= BUDGET
+
+
+def test_issue_forms_are_well_formed() -> None:
+    """What GitHub asks of them: a name, a description, and fields with an id and a label."""
+    forms = [
+        yaml.safe_load(path.read_text(encoding="utf-8")) for path in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml")
+    ]
+    assert len({form["name"] for form in forms}) == len(forms) >= 3
+    for form in forms:
+        assert form["description"]
+        assert len({field["id"] for field in form["body"]}) == len(form["body"])
+        for field in form["body"]:
+            assert field["type"] in ("textarea", "input", "dropdown")
+            assert field["attributes"]["label"]
+            assert ("options" in field["attributes"]) == (field["type"] == "dropdown")

@@ -6,12 +6,14 @@ from math import inf, sqrt
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
+
 
 def check_noise(std: float, noise_beta: float, name: str = "std") -> None:
     """Raise ValueError unless these are a standard deviation, and an exponent of a spectrum."""
-    if not 0 < std < inf:
+    if not is_number(std) or not 0 < std < inf:
         raise ValueError(f"{name}: a positive finite number is expected, not {std!r}")
-    if not 0 <= noise_beta < inf:
+    if not is_number(noise_beta) or not 0 <= noise_beta < inf:
         raise ValueError(f"noise_beta: a finite number of at least 0 is expected, not {noise_beta!r}")
 
 
@@ -27,6 +29,10 @@ def coloured_noise(shape: tuple[int, ...], beta: float, generator: torch.Generat
         shape: `[..., L, D]`.
         beta: at least 0: 0 white noise, 1 pink, 2 red.
         generator: source of randomness; the noise is on its device.
+
+    Example:
+        >>> coloured_noise((4, 20), beta=2.0, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([4, 20])
     """
     white = torch.randn(shape, generator=generator, device=generator.device)
     length = shape[-2]

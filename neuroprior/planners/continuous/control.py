@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.continuous.vector_planner import Memory, VectorPlanner
 from neuroprior.plans.vector_plans import VectorPlans
@@ -57,8 +57,17 @@ def control(
 
     Raises:
         ValueError: an argument is out of range, plans are too short, or a method of the world returns what it must not.
+
+    Example:
+        >>> world, generator = DoubleIntegrator(), torch.Generator().manual_seed(0)
+        >>> done = control(
+        ...     ICEMPlanner(length=5, num_plans=16), world, world.reset(2, generator), num_steps=3, generator=generator
+        ... )
+        >>> done.plans.actions.shape
+        torch.Size([2, 3, 2])
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
+    check_memory(8 * num_steps, num_steps=num_steps)
     if replan_every > planner.length:
         raise ValueError(
             f"replan_every: at most the {planner.length} vectors of a plan are expected, not {replan_every}"

@@ -47,6 +47,11 @@ class MPPIPlanner(VectorPlanner):
 
     Raises:
         ValueError: an argument is out of range, or a control cost, which is that of white noise, with another.
+
+    Example:
+        >>> world = DoubleIntegrator()
+        >>> MPPIPlanner(length=5, num_plans=16).plan(world, world.reset(2, torch.Generator().manual_seed(0))).plan.shape
+        torch.Size([2, 5, 2])
     """
 
     averages = True

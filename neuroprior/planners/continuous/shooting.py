@@ -34,6 +34,13 @@ class ShootingPlanner(VectorPlanner):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = DoubleIntegrator()
+        >>> ShootingPlanner(length=5, num_plans=16).plan(
+        ...     world, world.reset(2, torch.Generator().manual_seed(0))
+        ... ).plan.shape
+        torch.Size([2, 5, 2])
     """
 
     def __init__(

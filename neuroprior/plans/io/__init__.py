@@ -80,6 +80,13 @@ def read_plans(
         FileNotFoundError: there is no such file.
         ValueError: an argument or the file is wrong; the message names the file and the line or the array.
         ImportError: a file with one action a row needs pandas, and it is not installed.
+
+    Example:
+        >>> write_plans(
+        ...     Plans(torch.tensor([[0, 1, 1], [2, 0, 0]]), 3, action_names=("eat", "rest", "walk")), "plans.csv"
+        ... )
+        >>> read_plans("plans.csv").action_names
+        ('eat', 'rest', 'walk')
     """
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"path: the name of a file is expected, not {type(path).__name__}")
@@ -117,8 +124,16 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
     Raises:
         ValueError: the file cannot hold these plans; the message says why.
         OSError: the file cannot be written.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 1], [2, 0, 0]]), 3)
+        >>> write_plans(plans, "plans.jsonl")
+        >>> torch.equal(read_plans("plans.jsonl").actions, plans.actions)
+        True
     """
     check_are_plans(plans)
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path: a file is expected, not {type(path).__name__}")
     place = Path(path)
     suffix = _suffix(place)
     if layout is not None and FILES[suffix].read is not read_csv:

@@ -30,6 +30,12 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     Raises:
         ValueError: actions that are not integers, observations that are neither integers nor arrays of one shape, or a
             trajectory with more or fewer of them; the message names the trajectory, counted from 0.
+
+    Example:
+        >>> episodes = [{"actions": [0, 1, 1], "observations": [4, 5, 5]}, {"actions": [2], "observations": [4]}]
+        >>> plans = from_trajectories(episodes, num_actions=3)
+        >>> plans.actions.tolist(), plans.context.tolist()
+        ([[0, 1, 1], [2, 0, 0]], [[4, 5, 5], [4, 0, 0]])
     """
     check_names(num_actions, None)
     if observations not in ("context", None):
@@ -61,6 +67,10 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
     Raises:
         ValueError: another kind; or, for imitation, plans without a context per step, or one without actions.
         ImportError: imitation is asked for, and not installed.
+
+    Example:
+        >>> to_trajectories(Plans(torch.tensor([[0, 1]]), 2, context=torch.tensor([[5, 3]])))
+        [{'actions': array([0, 1]), 'observations': array([5, 3])}]
     """
     if kind not in ("dicts", "imitation"):
         raise ValueError(f"kind: 'dicts' or 'imitation' is expected, not {kind!r}")

@@ -27,10 +27,18 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
     `action_high [D]` are required, and nothing is unpickled. Each episode of a Minari dataset is a plan, and its
     observations are features per step; nothing is downloaded.
 
+    Args:
+        path: the file or dataset.
+
     Raises:
         FileNotFoundError: there is no such file or dataset.
         ValueError: it is damaged or holds no such plans; the message names it and what is wrong.
         ImportError: Minari is not installed.
+
+    Example:
+        >>> write_vector_plans(VectorPlans(torch.zeros(4, 10, 2), [-1.0, -1.0], [1.0, 1.0]), "reaching.npz")
+        >>> read_vector_plans("reaching.npz").actions.shape
+        torch.Size([4, 10, 2])
     """
     if isinstance(path, str) and path.startswith(MINARI):
         return _read_minari(path.removeprefix(MINARI))
@@ -55,9 +63,16 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
 def write_vector_plans(plans: VectorPlans, path: str | os.PathLike[str]) -> None:
     """Write plans to a `.npz` file, which `read_vector_plans` reads. An old file is replaced once it is whole.
 
+    Args:
+        plans: of vectors.
+        path: the file, which ends in `.npz`.
+
     Raises:
         ValueError: these are no plans of vectors, or the file is of another kind.
         OSError: the file cannot be written.
+
+    Example:
+        >>> write_vector_plans(VectorPlans(torch.zeros(4, 10, 2), [-1.0, -1.0], [1.0, 1.0]), "reaching.npz")
     """
     if not isinstance(plans, VectorPlans):
         raise ValueError(f"plans: VectorPlans are expected, not {type(plans).__name__}")
@@ -86,6 +101,11 @@ def vector_plans_from_trajectories(
     Raises:
         ValueError: actions or observations are wrong, or beyond the bounds; the message names the trajectory, where it
             is of one, counted from 0.
+
+    Example:
+        >>> steps = {"actions": torch.zeros(3, 1), "observations": torch.ones(3, 2)}
+        >>> vector_plans_from_trajectories([steps], [-1.0], [1.0]).context.shape
+        torch.Size([1, 3, 2])
     """
     if observations not in ("context", None):
         raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count
+from neuroprior._checks import check_count, is_number
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
@@ -67,6 +67,13 @@ class MarkovPrior(HistoryPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = MarkovPrior(3, order=1).fit(torch.tensor([[0, 1, 2, 0, 1, 2], [1, 2, 0, 1, 2, 0]]))
+        >>> prior.log_prob(torch.tensor([[0, 1, 2], [0, 2, 1]])).double().exp().round(decimals=2).tolist()
+        [0.21, 0.01]
+        >>> prior.sample(2, 4, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([2, 4])
     """
 
     def __init__(
@@ -79,7 +86,7 @@ class MarkovPrior(HistoryPrior):
         backoff: Backoff = "kneser-ney",
     ) -> None:
         check_count("order", order, 0)
-        if not 0 < smoothing < float("inf"):
+        if not is_number(smoothing) or not 0 < smoothing < float("inf"):
             raise ValueError(f"smoothing: a positive finite number is expected, not {smoothing!r}")
         if initial not in ("joint", "lower"):
             raise ValueError(f'initial: "joint" or "lower" is expected, not {initial!r}')
@@ -179,8 +186,18 @@ def kneser_ney_discounts(counts: Tensor) -> Tensor:
 def chains(plans: Plans, order: int, num_contexts: int | None = None) -> Iterator[MarkovPrior]:
     """Markov chains of an order, one for each of `BACKOFFS_TRIED`; what they count is counted once.
 
+    Args:
+        plans: to count.
+        order: of all chains.
+        num_contexts: of priors that take an index as context; None: of priors without.
+
     Raises:
         TooLargeError: their tables would be too large.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
+        >>> [prior.order for prior in chains(plans, 1)]
+        [1, 1, 1, 1, 1, 1]
     """
     counted = None
     for backoff, smoothing in BACKOFFS_TRIED:

@@ -75,6 +75,12 @@ class DurationModel(nn.Module):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> durations = torch.tensor([[1.0, 4.0, 1.2, 3.5]]).repeat(20, 1) * torch.linspace(0.5, 2, 20)[:, None]
+        >>> model = DurationModel(2).fit(Plans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations))
+        >>> model.num_actions
+        2
     """
 
     pair: Tensor  # int64 [T], ascending: action * A + next action, of the laws of transitions

@@ -36,6 +36,13 @@ class SemiMarkovPrior(Prior):
 
     Raises:
         ValueError: an argument is out of range, or the action prior has other actions.
+
+    Example:
+        >>> durations = torch.tensor([[1.0, 4.0, 1.2, 3.5]]).repeat(20, 1) * torch.linspace(0.5, 2, 20)[:, None]
+        >>> plans = Plans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations)
+        >>> prior = SemiMarkovPrior(2).fit(plans)
+        >>> prior.sample(3, 4, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([3, 4])
     """
 
     def __init__(

@@ -70,6 +70,13 @@ class CombinedPrior(MixturePrior):
 
     Raises:
         ValueError: an argument is out of range, or experts that differ in their actions or contexts.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(40, 1), 3)
+        >>> prior = CombinedPrior(3, experts=[UniformPrior(3), MarkovPrior(3, 1)])
+        >>> prior = prior.fit(plans, generator=torch.Generator().manual_seed(0))
+        >>> prior.log_prob(plans[:1]).item() > UniformPrior(3).log_prob(plans[:1]).item()
+        True
     """
 
     powers: Tensor

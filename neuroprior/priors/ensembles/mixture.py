@@ -7,6 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from neuroprior._checks import check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
@@ -42,6 +43,14 @@ class MixturePrior(Prior):
 
     Raises:
         ValueError: no experts, or experts that differ in their actions or contexts.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(40, 1), 3)
+        >>> prior = MixturePrior(3, [UniformPrior(3), MarkovPrior(3, 1)]).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> prior.log_prob(plans[:1]).item() > UniformPrior(3).log_prob(plans[:1]).item()
+        True
     """
 
     first: Tensor
@@ -57,8 +66,7 @@ class MixturePrior(Prior):
     ) -> None:
         if not experts:
             raise ValueError("experts: at least one is expected")
-        if not 0 <= share <= 1:
-            raise ValueError(f"share: a number between 0 and 1 is expected, not {share!r}")
+        check_share("share", share)
         made = [as_prior(e) for e in experts]
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:

@@ -61,6 +61,13 @@ class StackedPrior(Prior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = StackedPrior(
+        ...     3, hidden_size=4
+        ... )  # prior.fit(plans) counts, and trains the network that weighs the counts
+        >>> prior.num_actions
+        3
     """
 
     actions_at_once = 2**18

@@ -35,6 +35,12 @@ class MacroPrior(Prior):
 
     Raises:
         ValueError: an argument is out of range, or the inner prior does not fit.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2, 0, 1, 2]]).repeat(5, 1), 3)
+        >>> prior = MacroPrior(3, MarkovPrior(5, 1)).fit(plans)
+        >>> [macro.actions for macro in prior.macros]
+        [(0, 1), (0, 1, 2)]
     """
 
     MOST = 128

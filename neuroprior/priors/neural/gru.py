@@ -28,6 +28,11 @@ class GRUPrior(NeuralPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = GRUPrior(3, hidden_size=8)  # prior.fit(plans) trains it
+        >>> prior.sample(2, 4).shape
+        torch.Size([2, 4])
     """
 
     def __init__(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_count, check_memory, check_sizes
+from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.prior import Prior
@@ -110,8 +110,9 @@ class NeuralPrior(Prior):
         super().__init__(num_actions, num_contexts, context_size)
         if window is not None:
             check_count("window", window, 0)
-        if dropout is not None and not 0 <= dropout < 1:
+        if dropout is not None and (not is_number(dropout) or not 0 <= dropout < 1):
             raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
+        check_seed(seed)
         self._given_window = self.window = window
         check_sizes(lags=1 if lags is None else lags)
         self._given = (width, lags, dropout)

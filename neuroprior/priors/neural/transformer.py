@@ -35,6 +35,11 @@ class TransformerPrior(NeuralPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = TransformerPrior(3, width=8)  # prior.fit(plans) trains it
+        >>> prior.sample(2, 4).shape
+        torch.Size([2, 4])
     """
 
     def __init__(

@@ -21,7 +21,15 @@ class LogLinearPrior(PatternPrior):
     2023, have such a policy). The log-loss is convex in the weights; they are learned by Adagrad, one step of a plan
     after the other. A fit that follows another continues from its weights.
 
-    Arguments: see `PatternPrior`.
+    Args:
+        num_actions, num_patterns, use_last, min_count: see `PatternPrior`.
+
+    Example:
+        >>> patterns = torch.randint(5, (40, 3, 2), generator=torch.Generator().manual_seed(0), dtype=torch.int32)
+        >>> plans = Plans(patterns[..., 0] % 2, 2, context=patterns)
+        >>> prior = LogLinearPrior(2, num_patterns=2).fit(plans)
+        >>> prior.start(1, torch.tensor([[3, 0]]))[0].argmax(-1).tolist()
+        [0]
     """
 
     @property
@@ -111,6 +119,11 @@ class PatternNetwork(LogLinearPrior):
     Attributes:
         embeddings: float32 `[V + 1, E]`; the last row, of unknown patterns, is 0.
         layers, biases, out: float32 `[D, E, E]`, `[D, E]`, `[A, E]`.
+
+    Example:
+        >>> prior = PatternNetwork(4, num_patterns=2)  # prior.fit(plans) trains it
+        >>> prior.num_patterns
+        2
     """
 
     embeddings: Tensor

@@ -27,6 +27,11 @@ class SwitchingNetwork(GRUPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> prior = SwitchingNetwork(2, num_modes=2, hidden_size=4)  # prior.fit(plans) trains it
+        >>> prior.sample(2, 5).shape
+        torch.Size([2, 5])
     """
 
     def __init__(

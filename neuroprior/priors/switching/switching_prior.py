@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from copy import copy
 from math import inf
-from numbers import Real
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory, check_share, check_sizes
+from neuroprior._checks import check_count, check_memory, check_share, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree
@@ -100,6 +99,15 @@ class SwitchingPrior(HistoryPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> plans = Plans(torch.tensor([[0, 1] * 10 + [2, 3] * 10]).repeat(12, 1), 4)
+        >>> prior = SwitchingPrior(4, num_modes=2, order=0, folds=2, restarts=1).fit(
+        ...     plans, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> modes = prior.posterior(plans[:1]).path[0]
+        >>> modes[0].item() == modes[19].item() != modes[20].item()
+        True
     """
 
     first: Tensor
@@ -128,11 +136,13 @@ class SwitchingPrior(HistoryPrior):
         tolerance: float = 1e-4,
     ) -> None:
         check_sizes(num_modes=num_modes, phases=phases, folds=folds, restarts=restarts)
+        if num_contexts is not None:
+            check_sizes(num_contexts=num_contexts)
         check_count("order", order, 0)
         check_count("max_iterations", max_iterations, 0)
         numbers: dict[str, object] = {"smoothing": smoothing, "stay": stay, "tolerance": tolerance}
         for name, value in numbers.items():
-            if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= float(value) < inf:
+            if not is_number(value) or not 0 <= value < inf:
                 raise ValueError(f"{name}: a finite number of at least 0 is expected, not {value!r}")
         check_share("sharing", sharing)
         if switching not in ("context", "constant"):
@@ -141,7 +151,12 @@ class SwitchingPrior(HistoryPrior):
         self.smoothing, self.sharing, self.stay = float(smoothing), float(sharing), float(stay)
         self.switching: Literal["context", "constant"] = switching
         self.max_iterations, self.tolerance = max_iterations, float(tolerance)
-        check_memory(8 * (num_contexts or 1) * (num_modes * phases) ** 2, num_modes=num_modes, phases=phases)
+        check_memory(
+            8 * (num_contexts or 1) * (num_modes * phases) ** 2,
+            num_contexts=num_contexts,
+            num_modes=num_modes,
+            phases=phases,
+        )
         super().__init__(num_actions, order, num_contexts)
 
     @property

@@ -28,6 +28,13 @@ class AutoregressivePrior(LinearGaussianPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> plans = VectorPlans(torch.linspace(-1, 1, 20).expand(8, 20)[..., None], [-1.0], [1.0])
+        >>> AutoregressivePrior([-1.0], [1.0], order=1).fit(plans).sample(
+        ...     5, 10, generator=torch.Generator().manual_seed(0)
+        ... ).shape
+        torch.Size([1, 5, 10, 1])
     """
 
     orders = (1, 2, 3, 4, 6, 8, 12, 16)

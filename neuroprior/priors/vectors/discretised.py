@@ -33,6 +33,14 @@ class DiscretisedPrior(VectorPrior):
 
     Raises:
         ValueError: an argument is out of range, or the prior over tokens does not fit.
+
+    Example:
+        >>> plans = VectorPlans(torch.linspace(-1, 1, 20).expand(8, 20)[..., None], [-1.0], [1.0])
+        >>> prior = DiscretisedPrior([-1.0], [1.0], num_bins=5, tokens=MarkovPrior(7, 1)).fit(
+        ...     plans
+        ... )  # and a token for each bound
+        >>> prior.sample(3, 4, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([1, 3, 4, 1])
     """
 
     _edges: Tensor

@@ -25,6 +25,11 @@ class NoisePrior(LinearGaussianPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> noise = NoisePrior([-1.0], [1.0], exponent=2.0, scale=0.3)
+        >>> noise.sample(4, 20, generator=torch.Generator().manual_seed(0)).shape
+        torch.Size([1, 4, 20, 1])
     """
 
     exponents = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)

@@ -46,6 +46,13 @@ class StoredWindows(VectorPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> plans = VectorPlans(torch.linspace(-1, 1, 40).expand(8, 40)[..., None], [-1.0], [1.0])
+        >>> StoredWindows([-1.0], [1.0], horizon=10).fit(plans).sample(
+        ...     3, 20, generator=torch.Generator().manual_seed(0)
+        ... ).shape
+        torch.Size([1, 3, 20, 1])
     """
 
     segments: Tensor

@@ -36,6 +36,11 @@ class WindowSynergies(LinearGaussianPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> plans = VectorPlans(torch.sin(torch.linspace(0, 9, 40)).expand(8, 40)[..., None], [-1.0], [1.0])
+        >>> WindowSynergies([-1.0], [1.0], num_components=2, window=5).fit(plans).sample(2, 10).shape
+        torch.Size([1, 2, 10, 1])
     """
 
     def __init__(self, action_low: Any, action_high: Any, num_components: int | None = None, window: int = 20) -> None:
@@ -104,6 +109,16 @@ class StepSynergies(LinearGaussianPrior):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> movement = torch.linspace(-1, 1, 20)[:, None] * torch.rand(
+        ...     8, 1, 3, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> prior = StepSynergies([-1.0] * 3, [1.0] * 3, num_components=1).fit(
+        ...     VectorPlans(movement, [-1.0] * 3, [1.0] * 3)
+        ... )
+        >>> prior.sample(2, 10).shape
+        torch.Size([1, 2, 10, 3])
     """
 
     def __init__(self, action_low: Any, action_high: Any, num_components: int | None = None, order: int = 1) -> None:

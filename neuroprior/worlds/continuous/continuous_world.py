@@ -156,6 +156,13 @@ def check_vectors(name: str, vectors: Tensor, low: Tensor, high: Tensor) -> None
     """Raise ValueError unless `vectors [..., D]` are floating point numbers between `low [D]` and `high [D]`.
 
     A millionth of the range beyond the bounds is taken for rounding.
+
+    Args:
+        name: what messages call them.
+        vectors, low, high: the vectors and their bounds.
+
+    Example:
+        >>> check_vectors("actions", torch.zeros(3, 2), torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 1.0]))
     """
     if not vectors.is_floating_point():
         raise ValueError(

@@ -29,6 +29,12 @@ class DoubleIntegrator(ContinuousWorld):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = DoubleIntegrator(num_dimensions=1)
+        >>> state, reward = world.step(torch.tensor([[1.0, 0.0]]), torch.tensor([[-1.0]]))
+        >>> state.double().round(decimals=3).tolist()
+        [[0.995, -0.1]]
     """
 
     def __init__(

@@ -22,6 +22,13 @@ class MujocoWorld(ContinuousWorld):
     within a rollout the solver starts from the step before, as in `env.step`. States equal those of `env.step` to
     rounding.
 
+    Args:
+        file: the task's model, among Gymnasium's assets.
+        frame_skip: MuJoCo's steps in a step.
+        masses: by which all masses and inertias are multiplied.
+        num_threads: how many threads simulate; None: as many as torch uses.
+        sensors: positions of bodies that are asked for beside the state.
+
     Attributes:
         model: the `mujoco.MjModel`.
         frame_skip: MuJoCo's steps in a step.

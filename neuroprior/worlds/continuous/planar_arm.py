@@ -40,6 +40,11 @@ class PlanarArm(ContinuousWorld):
 
     Raises:
         ValueError: an argument is out of range.
+
+    Example:
+        >>> world = PlanarArm(num_links=2)
+        >>> world.reset(3, torch.Generator().manual_seed(0)).shape, world.action_high.tolist()
+        (torch.Size([3, 4]), [2.0, 0.5])
     """
 
     def __init__(

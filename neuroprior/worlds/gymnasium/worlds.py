@@ -74,6 +74,11 @@ def from_gymnasium(
 
     Warns:
         UserWarning: the method is "step", no `seeds` are given, and the environment starts otherwise with another seed.
+
+    Example:
+        >>> world = from_gymnasium("FrozenLake-v1", progress=False)
+        >>> world.num_actions, world.stochastic
+        (4, True)
     """
     if method not in METHODS:
         raise ValueError(f'method: "auto", "table", "enumerate" or "step" is expected, not {method!r}')

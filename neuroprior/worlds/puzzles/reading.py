@@ -37,6 +37,10 @@ def read_sokoban(path_or_text: str | Path) -> Boards:
         OSError: the file cannot be read.
         ValueError: the text holds no levels, or one of them is none: an unknown symbol, not one player, no box, or not
             as many boxes as goals. The message names file, level (from 0) and line.
+
+    Example:
+        >>> read_sokoban("#####\\n#@$.#\\n#####").shape
+        (1, 3, 5)
     """
     name, text = _text_of(path_or_text)
     levels: list[list[str]] = []
@@ -94,6 +98,12 @@ def format_sokoban(board: npt.ArrayLike) -> str:
 
     Raises:
         ValueError: it is no board.
+
+    Example:
+        >>> print(format_sokoban(read_sokoban("#####\\n#@$.#\\n#####")[0]))
+        #####
+        #@$.#
+        #####
     """
     codes = np.asarray(board)
     if codes.ndim != 2 or codes.dtype.kind not in "iu" or codes.size == 0 or codes.min() < 0 or codes.max() > 6:
@@ -114,6 +124,12 @@ def read_tiles(path: str | Path, shape: tuple[int, int] | None = None) -> Boards
     Raises:
         OSError: the file cannot be read.
         ValueError: the file holds no puzzle, or a line is none; the message names file and line. Or the shape is none.
+
+    Example:
+        >>> with open("tiles.txt", "w") as file:
+        ...     _ = file.write("1 0 2 3 4 5 6 7 8\\n")
+        >>> read_tiles("tiles.txt").tolist()
+        [[[1, 0, 2], [3, 4, 5], [6, 7, 8]]]
     """
     name, text = _text_of(path)
     lines = [(number, line.split()) for number, line in enumerate(text.split("\n"), 1) if line.strip()]

@@ -166,6 +166,13 @@ def tile_windows(height: int, width: int) -> tuple[Window, ...]:
     """All single cells of the board, pairs of neighbours at most two from the blank, and 2 x 2 squares with it.
 
     On boards of 7 x 7 and more, which have too many such squares to be numbered, there are none.
+
+    Args:
+        height, width: of the board.
+
+    Example:
+        >>> len(tile_windows(3, 3))
+        69
     """
     pairs = (*windows_within(1, 2, 2), *windows_within(2, 1, 2))
     squares = windows_within(2, 2, 1)
@@ -203,6 +210,11 @@ def sliding_tiles(
     Raises:
         ValueError: a board is none, or cannot be solved (the message names the first one), or an argument is out of
             range.
+
+    Example:
+        >>> world = sliding_tiles(shape=(3, 3), scramble=20)
+        >>> world.reset(5, torch.Generator().manual_seed(0)).shape
+        torch.Size([5, 3, 3])
     """
     check_count("scramble", scramble)
     if shape is not None:

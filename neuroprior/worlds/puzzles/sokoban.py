@@ -178,6 +178,12 @@ def sokoban(
     Raises:
         ValueError: a level is none, or an argument is out of range; the message says which.
         OSError: the file cannot be read.
+
+    Example:
+        >>> world = sokoban(read_sokoban("#####\\n#@$.#\\n#####"))
+        >>> state, reward = world.step(world.reset(1), torch.tensor([3]))
+        >>> world.solved(state).tolist()
+        [True]
     """
     if isinstance(levels, str | Path):
         boards = torch.from_numpy(read_sokoban(levels))

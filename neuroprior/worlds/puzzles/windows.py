@@ -16,14 +16,31 @@ FURTHEST = 256
 
 
 def windows_within(height: int, width: int, distance: int) -> tuple[Window, ...]:
-    """All windows of a size whose cells are at most `distance` rows and columns from the mover."""
+    """All windows of a size whose cells are at most `distance` rows and columns from the mover.
+
+    Args:
+        height, width: of the windows.
+        distance: in rows and columns.
+
+    Example:
+        >>> windows_within(3, 3, distance=1)
+        ((-1, -1, 3, 3),)
+    """
     rows = range(-distance, distance - height + 2)
     columns = range(-distance, distance - width + 2)
     return tuple((row, column, height, width) for row in rows for column in columns)
 
 
 def windows_with_mover(height: int, width: int) -> tuple[Window, ...]:
-    """All windows of a size that hold the mover's cell."""
+    """All windows of a size that hold the mover's cell.
+
+    Args:
+        height, width: of the windows.
+
+    Example:
+        >>> len(windows_with_mover(2, 2))
+        4
+    """
     return tuple((row, column, height, width) for row in range(1 - height, 1) for column in range(1 - width, 1))
 
 
@@ -45,6 +62,10 @@ class Windows:
 
     Raises:
         ValueError: there are no windows, one of them is none, or they have 2**31 patterns or more together.
+
+    Example:
+        >>> Windows(((0, 0, 2, 2),), base=3, outside=2).windows
+        ((0, 0, 2, 2),)
     """
 
     def __init__(self, windows: Sequence[Window], base: int, outside: int) -> None:

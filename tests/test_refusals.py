@@ -1,0 +1,145 @@
+"""Messages about bad input that no other test reads, and what happens at the edges: no plans, plans without actions."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, StackedPrior, TabularWorld, UniformPrior
+from neuroprior.analysis import forecast, infer
+from neuroprior.cli.__main__ import main
+from neuroprior.plans import VectorPlans, read_vector_plans, vector_plans_from_trajectories, write_vector_plans
+from neuroprior.priors import (
+    BoardNetwork,
+    DurationModel,
+    LogLinearPrior,
+    SemiMarkovPrior,
+    VectorTransformer,
+    load,
+    save,
+)
+from neuroprior.priors.patterns import Steps
+from neuroprior.worlds import DoubleIntegrator, SokobanWorld, cube, gridworld, read_sokoban, sliding_tiles, sokoban
+from tests.support.sources import refuses, seeded
+
+ZEROS = torch.zeros(2, 3, dtype=torch.long)
+VECTORS = torch.zeros(2, 3, 1)
+LEVEL = "#####\n#@$.#\n#####"
+
+
+def vectors(**fields: object) -> VectorPlans:
+    return VectorPlans(**({"actions": VECTORS, "action_low": [-1.0], "action_high": [1.0]} | fields))
+
+
+REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+    "vectors of two dimensions": (lambda: vectors(actions=torch.zeros(2, 3)), "[N, L, D]"),
+    "bounds the wrong way": (lambda: vectors(action_low=[1.0], action_high=[-1.0]), "action_low"),
+    "lengths of others": (lambda: vectors(lengths=torch.tensor([3])), "lengths: shape [2]"),
+    "groups of others": (lambda: vectors(group=torch.tensor([1])), "group"),
+    "a name for names": (lambda: vectors(action_names="torque"), "action_names: a list"),
+    "context of others": (lambda: vectors(context=torch.zeros(5, 2)), "context"),
+    "steps before the first": (lambda: vectors().steps(-1), "0 <= first"),
+    "lengths that are words": (lambda: vectors(lengths=["long", "short"]), "lengths: integers"),
+    "plans that are none": (lambda: write_vector_plans(Plans(ZEROS, 1), "x.npz"), "VectorPlans"),
+    "vectors in CSV": (lambda: write_vector_plans(vectors(), "x.csv"), ".npz"),
+    "no name of a file": (lambda: read_vector_plans(3), "path"),
+    "observations of another kind": (
+        lambda: vector_plans_from_trajectories([], [-1.0], [1.0], observations="all"),
+        "observations",
+    ),
+    "integers observed": (
+        lambda: vector_plans_from_trajectories([{"actions": VECTORS[0], "observations": [1, 2, 3]}], [-1.0], [1.0]),
+        "features are expected",
+    ),
+    "one plan by its number": (lambda: Plans(ZEROS, 1)[0], "plans[0 : 1]"),
+    "patterns of others": (lambda: Plans(ZEROS, 1, context=torch.zeros(2, 4, 5, dtype=torch.int32)), "[2, 3, F]"),
+    "no patterns": (lambda: LogLinearPrior(2, 2).start(1), "context"),
+    "no board": (lambda: BoardNetwork(2, (3, 3, 4)).start(1), "context"),
+    "patterns of other steps": (
+        lambda: LogLinearPrior(2, 2).fit_steps(Steps(ZEROS[:, :1], ZEROS[0], ZEROS[0], ZEROS[0])),
+        "shape",
+    ),
+    "levels of no width": (lambda: SokobanWorld(torch.zeros(0, 3, 3), (), "board"), "levels"),
+    "a prior that is none": (lambda: infer({"a": 3}, ZEROS), "priors['a']"),
+    "what no prior allows": (
+        lambda: forecast(
+            [UniformPrior(4)], gridworld(3, 3), ZEROS[0, :1], torch.ones(1, 1) * 2, 1, 2, targets=ZEROS[0]
+        ),
+        "sum to 1",
+    ),
+    "an odd width": (lambda: VectorTransformer([-1.0], [1.0], width=5), "multiple of"),
+    "a state that is no tensor": (lambda: DoubleIntegrator().rollout(3, VECTORS), "state"),
+    "a state of other shape": (lambda: DoubleIntegrator().rollout(torch.zeros(2, 3), torch.zeros(2, 1, 3, 2)), "state"),
+    "a table that is too large": (
+        lambda: TabularWorld(torch.zeros(2**16, 2**8, dtype=torch.long), torch.zeros(2**8, 1).expand(2**8, 2**16)),
+        "2**31",
+    ),
+}
+
+
+@pytest.mark.parametrize(("call", "says"), REFUSED.values(), ids=REFUSED)
+def test_refused(call: Callable[[], object], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with refuses(says, error=IndexError if "plans[0" in says else ValueError):
+        call()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_sample_needs_the_context_that_the_prior_takes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    plain = str(save(MarkovPrior(2, 0), tmp_path / "plain"))
+    index = str(save(MarkovPrior(2, 0, num_contexts=3), tmp_path / "index"))
+    for words, says in (
+        ([plain, "--context", "day"], "takes none"),
+        ([index], "give --context"),
+        ([index, "--context", "7"], "not known"),
+    ):
+        assert main(["sample", *words]) == 2
+        assert says in capsys.readouterr().err
+    assert main(["sample", index, "--context", "2", "--num-plans", "2", "--length", "3"]) == 0
+
+
+def test_a_device_that_is_not_there(tmp_path: Path) -> None:
+    folder = save(MarkovPrior(2, 0), tmp_path)
+    with refuses("device", "nowhere"):
+        load(folder, "nowhere")
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        CombinedPrior(2, [UniformPrior(2), MarkovPrior(2, 1)]),
+        MixturePrior(2, [UniformPrior(2), MarkovPrior(2, 1)]),
+        StackedPrior(2, hidden_size=4),
+    ],
+    ids=lambda prior: type(prior).__name__,
+)
+def test_no_plans_and_plans_without_actions(prior) -> None:
+    prior.fit(
+        Plans(torch.randint(2, (4, 60), generator=seeded(0)), 2),
+        generator=seeded(0),
+        **({"max_steps": 1} if isinstance(prior, StackedPrior) else {}),
+    )
+    logits, state = prior.start(0)
+    assert prior.step(torch.zeros(0, dtype=torch.long), state)[0].shape == logits.shape == (0, 2)
+    assert prior(torch.zeros(3, 0, dtype=torch.long)).shape == (3, 0, 2)
+
+
+@pytest.mark.parametrize(
+    "world",
+    [cube(), gridworld(3, 3), sliding_tiles(shape=(2, 2)), sokoban(read_sokoban(LEVEL))],
+    ids=lambda w: type(w).__name__,
+)
+def test_worlds_move_to_a_device(world) -> None:
+    assert world.to(torch.device("cpu")) is world
+    state = world.reset(2, seeded(0))
+    assert world.step(state, torch.zeros(2, dtype=torch.long))[0].device.type == "cpu"
+
+
+def test_durations_are_counted_anew() -> None:
+    durations = torch.tensor([[1.0, 4.0, 1.2, 3.5]]).repeat(20, 1) * torch.linspace(0.5, 2, 20)[:, None]
+    plans = Plans(torch.tensor([[0, 1, 0, 1]]).repeat(20, 1), 2, durations=durations)
+    prior = SemiMarkovPrior(2).fit(plans[:4])
+    fewer = prior.log_prob(plans)
+    assert not torch.allclose(prior.recount(plans).log_prob(plans), fewer)
+    assert repr(DurationModel(2, laws=("gamma",))) == "DurationModel(2, laws=['gamma'], transitions=True)"
