@@ -132,6 +132,16 @@ def test_a_plain_controller_moves_to_the_goal():
     assert float(plans[0, :, 0].mean()) < 0 < float(plans[0, :, 1].mean())
 
 
+def test_what_is_left_beside_busy_processes_is_a_table():
+    own = {"job": "j", "about": "a", "peer": "p", "seconds": 1.0, "low": 1.0, "high": 9.0, "goal": 1.0}
+    rows = [own | {"busy": number, "ratio": ratio} for number, ratio in ((0, 8.0), (2, 3.0))]
+    first, busy = tables({"peers": rows}, {"threads": 2, "scale": 1.0})
+    assert len(first.rows) == len(busy.rows) == 1
+    assert busy.rows[0][1:] == ["8", "3", "0.38", "no"]
+    assert len(tables({"peers": rows[:1]}, {"threads": 2, "scale": 1.0})) == 1
+
+
+@pytest.mark.slow
 def test_ratios_beside_busy_processes(capsys, tmp_path):
     arguments = ["--parts", "peers", "--jobs", "sample_markov", "--scale", "0.001", "--repetitions", "1"]
     assert main(["bench", *arguments, "--busy", "0", "1", "--out", str(tmp_path)]) == 0
