@@ -3,6 +3,7 @@
 import os
 from functools import cache
 from numbers import Real
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -51,10 +52,27 @@ def check_count(name: str, count: object, bytes_each: int = 8) -> None:
     check_memory(bytes_each * count, **{name: count})
 
 
+def is_number(value: object) -> TypeGuard[float]:
+    """True for a real number, of numpy, too (bool is none). NaN is one, of which no comparison holds."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def check_seed(seed: object) -> None:
+    """Raise ValueError unless it is an integer that torch takes as a seed."""
+    if not isinstance(seed, int) or isinstance(seed, bool) or not -(2**63) <= seed < 2**63:
+        raise ValueError(f"seed: an integer from -2**63 to 2**63 - 1 is expected, not {seed!r}")
+
+
 def check_share(name: str, share: object) -> None:
     """Raise ValueError, naming the argument, unless it is a number from 0 to 1."""
-    if isinstance(share, bool) or not isinstance(share, Real) or not 0 <= float(share) <= 1:
+    if not is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"{name}: a number from 0 to 1 is expected, not {share!r}")
+
+
+def check_level(level: object) -> None:
+    """Raise ValueError unless it is a level of confidence: a number above 0 and below 1."""
+    if not is_number(level) or not 0 < level < 1:
+        raise ValueError(f"level: a number above 0 and below 1, such as 0.95, is expected, not {level!r}")
 
 
 def check_memory(needed: int, **arguments: object) -> None:

@@ -19,6 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld, check_tabular
 
@@ -69,12 +70,17 @@ def q_learning(
     """
     goal = _check_goal(world, goal)
     _require(world.num_states > 1, "world", "a cell that is not the goal", "the goal alone")
-    _require(num_agents >= 1, "num_agents", "at least 1", num_agents)
-    _require(steps >= 0, "steps", "a number that is not negative", steps)
-    _require(0 < step_size <= 1, "step_size", "a number above 0 and at most 1", step_size)
-    _require(0 < discount < 1, "discount", "a number above 0 and below 1", discount)
-    _require(0 <= initial_scale < math.inf, "initial_scale", "a finite number, at least 0,", initial_scale)
-    _require(0 <= epsilon <= 1, "epsilon", "a share between 0 and 1", epsilon)
+    _require(is_number(num_agents) and num_agents >= 1, "num_agents", "at least 1", num_agents)
+    _require(is_number(steps) and steps >= 0, "steps", "a number that is not negative", steps)
+    _require(is_number(step_size) and 0 < step_size <= 1, "step_size", "a number above 0 and at most 1", step_size)
+    _require(is_number(discount) and 0 < discount < 1, "discount", "a number above 0 and below 1", discount)
+    _require(
+        is_number(initial_scale) and 0 <= initial_scale < math.inf,
+        "initial_scale",
+        "a finite number, at least 0,",
+        initial_scale,
+    )
+    _require(is_number(epsilon) and 0 <= epsilon <= 1, "epsilon", "a share between 0 and 1", epsilon)
     generator = generator_on(generator, world.device)
     device, size = world.device, (num_agents, world.num_states, world.num_actions)
     values = torch.rand(size, generator=generator, device=device, dtype=torch.float64) * initial_scale
@@ -141,9 +147,9 @@ def value_iteration(
         >>> value_iteration(world, discount=0.5).round(decimals=2).tolist()
         [[2.0, 2.0]]
     """
-    _require(sweeps is None or sweeps >= 0, "sweeps", "a number that is not negative", sweeps)
-    _require(tolerance > 0, "tolerance", "a positive number", tolerance)
-    _require(0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
+    _require(sweeps is None or (is_number(sweeps) and sweeps >= 0), "sweeps", "a number that is not negative", sweeps)
+    _require(is_number(tolerance) and tolerance > 0, "tolerance", "a positive number", tolerance)
+    _require(is_number(discount) and 0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
     if goal is not None:
         _require(discount > 0, "discount", "with a goal, a number above 0", discount)
         goal, tolerance = _check_goal(world, goal), tolerance if world.stochastic else 0.0
@@ -229,7 +235,7 @@ def tile_approximation(values: Tensor, coordinates: Tensor, tile_size: float, nu
         [[1.5, 1.5, 1.5, 1.5]]
     """
     _check_fit(values, coordinates)
-    _require(0 < tile_size < math.inf, "tile_size", "a positive, finite number", tile_size)
+    _require(is_number(tile_size) and 0 < tile_size < math.inf, "tile_size", "a positive, finite number", tile_size)
     _require(num_tilings >= 1, "num_tilings", "at least 1", num_tilings)
     place = (coordinates - coordinates.amin(0)).double().cpu() / tile_size
     tilings = [(place + tiling / num_tilings).floor() for tiling in range(num_tilings)]
@@ -273,7 +279,7 @@ def network_approximation(
     """
     _check_fit(values, coordinates)
     for name, number in (("hidden_size", hidden_size), ("steps", steps), ("learning_rate", learning_rate)):
-        _require(0 < number < math.inf, name, "a positive, finite number", number)
+        _require(is_number(number) and 0 < number < math.inf, name, "a positive, finite number", number)
     generator = generator_on(generator, values.device)
     target, mean, scale = _standardised(values.detach())
     inputs = _standardised(coordinates.to(values.device).T)[0].T.expand(len(values), -1, -1)
@@ -307,7 +313,7 @@ def _standardised(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _require(holds: bool, name: str, wanted: str, given: object) -> None:
     if not holds:
-        raise ValueError(f"{name}: {wanted} is expected, not {given}")
+        raise ValueError(f"{name}: {wanted} is expected, not {given!r}")
 
 
 def _check_goal(world: TabularWorld, goal: int) -> int:

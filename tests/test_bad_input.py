@@ -1,6 +1,7 @@
 """What no part of the library takes: one clear line each, where it is given."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -9,9 +10,11 @@ from neuroprior import (
     GRUPrior,
     MarkovPrior,
     MCTSPlanner,
+    MixturePrior,
     Plans,
     SamplingPlanner,
     UniformPrior,
+    analysis,
     fit,
     load,
     oracle,
@@ -22,6 +25,8 @@ from neuroprior import (
 )
 from neuroprior.cli.__main__ import main
 from neuroprior.planners import expected_score
+from neuroprior.plans import folds
+from neuroprior.priors import CombinedPrior, learn_macros
 from neuroprior.report import ethogram_figure, report
 from neuroprior.values import q_learning
 from neuroprior.worlds import cube
@@ -109,6 +114,39 @@ PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
         (lambda: ethogram_figure(PLANS.actions), ["plans", "Tensor"]),
         (lambda: load(None), ["folder", "NoneType"]),
         (lambda: save(3, "prior"), ["prior", "int"]),
+        (lambda: write_plans(PLANS, None), ["path", "NoneType"]),
+        (lambda: Plans(ACTIONS, 2, end=True), ["end", "True"]),
+        (lambda: Plans(ACTIONS, 2, action_names=iter("ab")), ["action_names", "list of texts"]),
+        (lambda: Plans(ACTIONS, 2, notes=3), ["notes", "list of texts"]),
+        (lambda: Plans.from_dataframe(pd.DataFrame({"action": [[1], [2]]})), ["column 'action'", "names or numbers"]),
+        (lambda: Plans.from_dataframe(pd.DataFrame([[1, 2]], columns=["action"] * 2)), ["'action'", "twice"]),
+        (
+            lambda: Plans.from_dataframe(pd.DataFrame({"action": [0], "x": [1.5]}), context=["x", "x"]),
+            ["columns.context", "twice"],
+        ),
+        (lambda: fit(PLANS, 3), ["prior", "a class", "3"]),
+        (lambda: fit(PLANS, None), ["prior", "a class", "None"]),
+        (lambda: CombinedPrior(2, ["gru"]), ["a prior is expected", "'gru'"]),
+        (lambda: MixturePrior(2, [MarkovPrior]), ["a prior is expected", "MarkovPrior"]),
+        (lambda: learn_macros(ACTIONS, 2), ["plans", "Tensor"]),
+        (lambda: folds(None, 2), ["plans", "NoneType"]),
+        (lambda: analysis.transitions(ACTIONS), ["plans", "Tensor"]),
+        (lambda: analysis.motifs([[0, 1]]), ["plans", "list"]),
+        (lambda: analysis.two_sample_tests(PLANS, None), ["plans", "NoneType"]),
+        (lambda: analysis.score("x", None, PLANS), ["prior", "NoneType"]),
+        (lambda: analysis.score_bits("x", "actions", torch.zeros(2, 2), PLANS), ["bits", "[2, 3]", "[2, 2]"]),
+        (lambda: analysis.score_bits("x", "actions", torch.full((2, 3), torch.nan), PLANS), ["bits", "NaN"]),
+        (lambda: analysis.mode_table(MarkovPrior(2), PLANS), ["prior", "SwitchingPrior"]),
+        (lambda: analysis.mean_interval([1.0, np.nan]), ["values[1]", "NaN"]),
+        (lambda: analysis.ratio_difference([1.0, 2.0], [np.nan, 1.0]), ["sizes[0]", "NaN"]),
+        (lambda: analysis.share_interval(1.5, 3), ["successes", "1.5"]),
+        (lambda: analysis.share_interval(4, 3), ["successes", "at most 3"]),
+        (lambda: analysis.share_interval(0, True), ["trials", "True"]),
+        (lambda: analysis.mean_intervals(None, "a", "b"), ["frame", "NoneType"]),
+        (lambda: analysis.mean_intervals(pd.DataFrame({"b": [1.0]}), "a", "b"), ["frame", "no column 'a'"]),
+        (lambda: analysis.best_of(torch.zeros(2, 3), [2]), ["baselines", "[2]"]),
+        (lambda: analysis.best_of(torch.zeros(2, 3), []), ["baselines", "[]"]),
+        (lambda: analysis.best_of(torch.tensor([[0.0, torch.nan]])), ["scores[0, 1]", "NaN"]),
         (lambda: report(PLANS, models="counts"), ["models", "a list", "['counts']"]),
         (lambda: report(PLANS, priors=UniformPrior(2)), ["priors", "a dict"]),
         (lambda: report(PLANS, priors=[UniformPrior(2)]), ["priors", "a dict"]),

@@ -30,7 +30,8 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-from neuroprior.worlds import GridWorld
+from neuroprior.sampling import sample_in_world
+from neuroprior.worlds import GridWorld, maze
 
 FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 
@@ -143,6 +144,37 @@ def sample_gru(scale: float) -> Job:
         f"sample {number:,} plans of length 64, GRU",
         lambda device: partial(GRUPrior(4, lags=1).to(device).sample, number, 64),
         (Peer("plain PyTorch", lambda: partial(peers.PlainGRU(4).eval().sample, number, 64), 3),),
+    )
+
+
+def sample_beside(scale: float) -> Job:
+    """Plans of a GRU that is given each observation, while a world is stepped along."""
+    world = maze(egocentric=True, view=2, num_layouts=20)
+    state = world.reset(scaled(16, scale), torch.Generator().manual_seed(0))
+    size = world.observe(state).shape[1]
+    prior = GRUPrior(3, lags=1, context_size=size)
+    plain = peers.ObservingGRU(3, size).eval()
+    return Job(
+        f"sample 2,048 plans of length 24 beside a maze from {len(state)} starts, GRU",
+        lambda device: partial(sample_in_world, prior, world, state, 2048, 24),
+        (Peer("plain PyTorch", lambda: partial(plain.sample_in_world, world, state, 2048, 24), 3),),
+    )
+
+
+TRAINED = 12
+"""Actions of the plans after which longer ones are sampled."""
+
+
+def horizon(make: type[GRUPrior] | type[TransformerPrior], times: int, scale: float) -> Job:
+    """Plans so many times as long as those that a network was trained on; its peer are plans of that length."""
+    number = scaled(2048, scale)
+    prior = make(4, window=TRAINED - 1)
+    own = partial(prior.sample, number, TRAINED, method="ancestral")
+    name = prior.__class__.__name__.removesuffix("Prior")
+    return Job(
+        f"sample {number:,} plans of length {times * TRAINED}, {name} trained on {TRAINED}",
+        lambda device: partial(prior.to(device).sample, number, times * TRAINED, method="ancestral"),
+        (Peer(f"{times} times plans of length {TRAINED}", lambda: own, round(1 / 1.3, 2), 1 / times),),
     )
 
 
@@ -356,7 +388,7 @@ def simulations(planner: MCTSPlanner, world: TabularWorld, state: Tensor) -> int
 JOBS: dict[str, Callable[[float], Job]] = {
     make.__name__: make
     for make in (
-        *(sample_short, sample_long, sample_gru, sample_markov, fit_markov, fit_tree),
+        *(sample_short, sample_long, sample_gru, sample_beside, sample_markov, fit_markov, fit_tree),
         *(evaluate, table_1, train, shoot, decide),
     )
 }
@@ -366,6 +398,12 @@ JOBS |= {
     f"trees_{policy.split('-')[0].lower()}_{starts}": partial(trees, policy, starts)
     for policy in ("uniform", "Markov-2", "GRU-64")
     for starts in (1, 64, 1024)
+}
+
+JOBS |= {
+    f"horizon_{name}_{times}": partial(horizon, make, times)
+    for name, make in (("gru", GRUPrior), ("transformer", TransformerPrior))
+    for times in (2, 16)
 }
 
 ON_DEVICES = ("sample_short", "sample_long", "sample_gru", "sample_markov", "evaluate", "decide")

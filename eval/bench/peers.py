@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
 from eval.bench.timing import Run
-from neuroprior import GRUPrior, MarkovPrior, Prior, TabularWorld
+from neuroprior import GRUPrior, MarkovPrior, Prior, TabularWorld, World
 
 Array = NDArray[Any]
 
@@ -91,6 +91,28 @@ class PlainGRU(nn.Module):
             action = torch.multinomial(self.head(out[:, 0]).softmax(-1), 1)
             plans[:, t] = action[:, 0]
         return plans
+
+
+class ObservingGRU(PlainGRU):
+    """The same with features of an observation before each action."""
+
+    def __init__(self, num_actions: int, context_size: int, hidden_size: int = 64) -> None:
+        super().__init__(num_actions, hidden_size)
+        self.features = nn.Linear(context_size, hidden_size)
+
+    @torch.no_grad()
+    def sample_in_world(self, world: World, state: Tensor, num_plans: int, length: int) -> tuple[Tensor, Tensor]:
+        """Plans `[B * P, L]` and the states after them; each step is given the observation before it."""
+        state, hidden = state.repeat_interleave(num_plans, 0), None
+        action = torch.full((len(state), 1), self.num_actions)
+        plans = torch.empty(len(state), length, dtype=torch.uint8)
+        for t in range(length):
+            vectors = self.embedding(action) + self.features(world.observe(state))[:, None]
+            out, hidden = self.gru(vectors, hidden)
+            action = torch.multinomial(self.head(out[:, 0]).softmax(-1), 1)
+            plans[:, t] = action[:, 0]
+            state, _ = world.step(state, action[:, 0])
+        return plans, state
 
 
 def plain_training(plans: Tensor, num_actions: int, steps: int, batch_size: int, learning_rate: float) -> PlainGRU:

@@ -36,19 +36,7 @@ MACROS, MACRO_ORDER = 16, 2
 """Number of macro-actions, and the order of the chain over actions and macro-actions."""
 
 
-class UnlimitedGRU(GRUPrior):
-    """A GRU that carries its hidden state on beyond the length of the plans that it was trained on.
-
-    It predicts longer plans as well as a GRU that reads their last actions in a window, and is far quicker.
-    """
-
-    def prepare(self, plans: Plans | Tensor, window: int) -> Plans:
-        plans = super().prepare(plans, window)
-        self.window = None
-        return plans
-
-
-NEURAL: dict[str, Callable[..., Prior]] = {"gru": UnlimitedGRU, "transformer": TransformerPrior}
+NEURAL: dict[str, Callable[..., Prior]] = {"gru": GRUPrior, "transformer": TransformerPrior}
 
 RECIPE: dict[str, dict[str, Any]] = {"gru": {"lags": 1, "dropout": 0.2}, "transformer": {"dropout": 0.2}}
 """Arguments of networks. In plans this short a GRU does not need its last inputs shown again, and is far quicker."""

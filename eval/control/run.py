@@ -246,7 +246,8 @@ def scoring_run(run: Scoring, settings: ControlSettings) -> dict[str, Any]:
     prior = fitted(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
     seconds = process_time() - began
     held_out = run.held_out if sees_state(run.prior) else run.held_out.without_context()
-    nats = float(prior.log_prob(held_out).sum() / held_out.mask().sum())
+    with torch.no_grad():
+        nats = float(prior.log_prob(held_out).sum() / held_out.mask().sum())
     explained = getattr(prior, "explained", ())
     found = {"world": run.world, "seed": run.seed, "prior": run.prior, "nats": nats, "fit_seconds": seconds}
     return found | {f"for_{share}": _components(explained, share / 100) for share in (80, 95)}

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
@@ -109,6 +109,7 @@ class Agent:
             ValueError: another number of steps, plans that are too short, or plans that the prior cannot be fitted to.
         """
         check_sizes(num_steps=num_steps)
+        check_memory(8 * num_steps, num_steps=num_steps)
         if num_steps % self.replan_every:
             raise ValueError(
                 f"num_steps: a multiple of replan_every = {self.replan_every} is expected, not {num_steps}"

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior.plans import Plans
 
 
@@ -27,8 +28,8 @@ class Replay:
     """
 
     def __init__(self, retention: float) -> None:
-        if not 0 < retention <= 1:
-            raise ValueError(f"retention: a probability above 0 and at most 1 is expected, not {retention}")
+        if not is_number(retention) or not 0 < retention <= 1:
+            raise ValueError(f"retention: a probability above 0 and at most 1 is expected, not {retention!r}")
         self.retention = retention
         self.plans: Plans | None = None
 

@@ -11,6 +11,7 @@ from neuroprior.analysis.statistics import ENOUGH_UNITS, Difference, ratio_diffe
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import never_occur
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
 from neuroprior.priors.counts import TooLargeError, chains
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS
@@ -63,6 +64,9 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
         >>> round(score("uniform", UniformPrior(3), plans).bits_per_action().mean, 3)
         1.585
     """
+    if not isinstance(prior, Prior):
+        raise ValueError(f"prior: a fitted prior is expected, not {type(prior).__name__}")
+    check_are_plans(plans)
     inputs = "actions and context" if prior.takes_context else "actions"
     return score_bits(model, inputs, action_bits(prior, plans), plans)
 
@@ -78,7 +82,7 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
         mask: `[N, L]` bool: the actions that count; None: all.
 
     Raises:
-        ValueError: fewer than two actions count.
+        ValueError: fewer than two actions count, or bits of another shape or that are NaN.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
@@ -86,6 +90,8 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
         [3.0, 3.0]
     """
     mask = (plans.mask() if mask is None else mask).cpu()
+    if bits.shape != mask.shape or bool(bits[mask].isnan().any()):
+        raise ValueError(f"bits: numbers of shape {list(mask.shape)} are expected, not NaN, and not {list(bits.shape)}")
     unit = units(plans, mask)[mask].unique(return_inverse=True)[1]
     size = int(unit.max()) + 1 if len(unit) else 0
     if size < FEWEST_UNITS:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,7 @@ class FlatPlans:
     @staticmethod
     def of(plans: Plans) -> "FlatPlans":
         """The actions of `plans`; an end symbol is an action like others."""
+        check_are_plans(plans)
         place = plans.mask().flatten().nonzero()[:, 0]
         plan = place.div(max(plans.max_length, 1), rounding_mode="floor")
         return FlatPlans(plans.actions.flatten()[place].long(), plan, place, plans.num_actions)

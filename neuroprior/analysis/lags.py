@@ -7,7 +7,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_count, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.analysis.comparison import Score, action_bits, unit_name, units
 from neuroprior.plans import Plans, is_per_step
@@ -89,8 +89,7 @@ def mutual_information(
         [1.0, 1.0]
     """
     check_sizes(max_lag=max_lag)
-    if not isinstance(skip, int) or skip < 0:
-        raise ValueError(f"skip: an integer of at least 0 is expected, not {skip!r}")
+    check_count("skip", skip, 0)
     found, generator = [], generator_on(generator, plans.actions.device)
     for lag in range(1, min(max_lag, plans.max_length - 1) + 1):
         later = plans.mask()

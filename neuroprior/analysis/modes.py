@@ -15,6 +15,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import divisible, folds
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.fitting import make_prior
 from neuroprior.priors.prior import context_arguments
@@ -200,6 +201,14 @@ def mode_names(number: int) -> tuple[str, ...]:
     return tuple(f"mode {k + 1}" for k in range(number))
 
 
+def _scored(prior: SwitchingPrior, plans: Plans) -> Plans:
+    """The plans as the prior takes them."""
+    if not isinstance(prior, SwitchingPrior):
+        raise ValueError(f"prior: a SwitchingPrior is expected, not {type(prior).__name__}")
+    check_are_plans(plans)
+    return plans if prior.takes_context else plans.without_context()
+
+
 def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
     """The most probable modes behind plans, as plans whose actions are modes.
 
@@ -221,7 +230,7 @@ def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
         >>> mode_plans(prior, plans).num_actions
         2
     """
-    given = plans if prior.takes_context else plans.without_context()
+    given = _scored(prior, plans)
     path = prior.posterior(given).path.cpu()
     return replace(plans, actions=path, num_actions=prior.num_modes, action_names=mode_names(prior.num_modes), end=None)
 
@@ -245,7 +254,7 @@ def mode_transitions(prior: SwitchingPrior, plans: Plans) -> Tensor:
         >>> mode_transitions(prior, plans).shape
         torch.Size([2, 4, 4])
     """
-    given, size = plans if prior.takes_context else plans.without_context(), plans.num_actions
+    given, size = _scored(prior, plans), plans.num_actions
     both, actions = plans.mask()[:, 1:], plans.actions.long()
     pair = (actions[:, :-1] * size + actions[:, 1:])[both]
     weights = prior.posterior(given).smoothed.cpu()[:, 1:][both]
@@ -276,7 +285,7 @@ def mode_frame(prior: SwitchingPrior, plans: Plans) -> Any:
         >>> len(mode_frame(prior, plans))
         120
     """
-    given = plans if prior.takes_context else plans.without_context()
+    given = _scored(prior, plans)
     found, mask = prior.posterior(given), plans.mask()
     which, step = (index.numpy() for index in mask.nonzero(as_tuple=True))
 
@@ -322,7 +331,7 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
     """
     import pandas as pd
 
-    given = plans if prior.takes_context else plans.without_context()
+    given = _scored(prior, plans)
     found, mask = prior.posterior(given), plans.mask()
     weights, actions = found.smoothed.cpu()[mask], plans.actions[mask].long()
     path = found.path.cpu()

@@ -114,13 +114,13 @@ def motifs(
     check_sizes(chunk_size=chunk_size)
     least = 3 if collapse_repeats else 2
     for n in lengths:
-        if n < least:
+        if not isinstance(n, int) or isinstance(n, bool) or n < least:
             why = " with collapse_repeats" if collapse_repeats else ""
-            raise ValueError(f"lengths: integers of at least {least} are expected{why}, not {n}")
+            raise ValueError(f"lengths: integers of at least {least} are expected{why}, not {n!r}")
     if not lengths or len(set(lengths)) < len(lengths):
         raise ValueError(f"lengths: one or more different integers are expected, not {list(lengths)}")
-    if top is not None and top < 1:
-        raise ValueError(f"top: an integer of at least 1 or None is expected, not {top}")
+    if top is not None:
+        check_sizes(top=top)
     flat = FlatPlans.of(plans)
     flat = flat.without_repeats() if collapse_repeats else flat
     found, tests = [], 0

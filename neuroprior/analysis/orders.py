@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, is_integer
+from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior.analysis.flat import FlatPlans, ranks
 from neuroprior.plans import Plans, is_per_step
 
@@ -60,8 +60,7 @@ def order_selection(plans: Plans, max_order: int = 6, num_contexts: int | None =
         >>> min(fits, key=lambda fit: fit.bic).order
         0
     """
-    if max_order < 0:
-        raise ValueError(f"max_order: an integer of at least 0 is expected, not {max_order}")
+    check_count("max_order", max_order, 0)
     flat = FlatPlans.of(plans)
     scored = flat.starts(max_order + 1) + max_order
     if len(scored) == 0:

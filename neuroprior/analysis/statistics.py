@@ -25,6 +25,8 @@ from numpy.typing import ArrayLike
 from scipy import special, stats
 from torch import Tensor
 
+from neuroprior._checks import check_count, check_level, check_sizes
+
 ENOUGH_UNITS = 5
 """Independent units below which no verdict is drawn: intervals are given, and nothing is called significant."""
 
@@ -56,10 +58,18 @@ def best_of(scores: Tensor, baselines: Sequence[int] | None = None) -> Tensor:
     Returns:
         `[K, ...]` bool.
 
+    Raises:
+        ValueError: a baseline that is not there or none, or a score that is NaN.
+
     Example:
         >>> best_of(torch.tensor([[0.9, 0.5], [0.8, 0.7]])).tolist()
         [[True, False], [False, True]]
     """
+    numbers = range(len(scores)) if baselines is None else list(baselines)
+    if not len(numbers) or not all(0 <= number < len(scores) for number in numbers):
+        raise ValueError(f"baselines: one or more of 0 to {len(scores) - 1} are expected, not {list(numbers)}")
+    if scores.isnan().any():
+        raise ValueError(f"scores{scores.isnan().nonzero()[0].tolist()}: NaN is no score")
     return scores >= (scores if baselines is None else scores[list(baselines)]).amax(0)
 
 
@@ -71,12 +81,13 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
         level: of confidence.
 
     Raises:
-        ValueError: fewer than two values.
+        ValueError: a level that is not between 0 and 1, or fewer than two values.
 
     Example:
         >>> mean_interval([1.0, 2.0, 3.0, 4.0]).mean
         2.5
     """
+    check_level(level)
     values = _vector("values", values)
     mean, error = float(values.mean()), float(stats.sem(values))
     half = float(special.stdtrit(len(values) - 1, (1 + level) / 2)) * error
@@ -96,13 +107,21 @@ def mean_intervals(frame: Any, by: str | Sequence[str], value: str, level: float
         A pandas frame with a row for each group, in order of appearance: the columns `by`, then `mean`, `low`, `high`
         and `n`, the number of units. `low` and `high` are NaN for fewer than two units.
 
+    Raises:
+        ValueError: a level that is not between 0 and 1, or a column that is not there.
+
     Example:
         >>> import pandas as pd
         >>> frame = pd.DataFrame({"model": ["a", "a", "b", "b"], "bits": [1.0, 1.2, 0.8, 0.9]})
         >>> list(mean_intervals(frame, "model", "bits")["mean"].round(2))
         [1.1, 0.85]
     """
+    check_level(level)
     by = [by] if isinstance(by, str) else list(by)
+    if not hasattr(frame, "columns"):
+        raise ValueError(f"frame: a pandas frame is expected, not {type(frame).__name__}")
+    if missing := [name for name in [*by, value] if name not in frame.columns]:
+        raise ValueError(f"frame: no column {missing[0]!r}; there are {', '.join(map(str, frame.columns))}")
     groups = frame.groupby(by, sort=False, dropna=False)[value]
     found = groups.agg(mean="mean", error="sem", n="count")
     half = special.stdtrit(found["n"] - 1, (1 + level) / 2) * found["error"]
@@ -123,7 +142,8 @@ def interquartile_mean(values: ArrayLike, level: float = 0.95) -> Interval:
         level: of confidence.
 
     Raises:
-        ValueError: another shape, fewer than two seeds, or values that are not finite.
+        ValueError: a level that is not between 0 and 1, another shape, fewer than two seeds, or values that are not
+            finite.
 
     Example:
         >>> interquartile_mean([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0], [90.0, 90.0]])
@@ -141,7 +161,8 @@ def interquartile_gap(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
         level: of confidence.
 
     Raises:
-        ValueError: unequal shapes, fewer than two seeds, or values that are not finite.
+        ValueError: a level that is not between 0 and 1, unequal shapes, fewer than two seeds, or values that are not
+            finite.
 
     Example:
         >>> interquartile_gap([[1.0, 2.0, 3.0, 4.0]], [[0.0, 1.0, 2.0, 3.0]])
@@ -165,7 +186,8 @@ def probability_of_improvement(first: ArrayLike, second: ArrayLike, level: float
         level: of confidence.
 
     Raises:
-        ValueError: unequal shapes, fewer than two seeds, or values that are not finite.
+        ValueError: a level that is not between 0 and 1, unequal shapes, fewer than two seeds, or values that are not
+            finite.
 
     Example:
         >>> probability_of_improvement([[3.0, 4.0]], [[1.0, 2.0]])
@@ -188,14 +210,17 @@ def share_interval(successes: int, trials: int, level: float = 0.95) -> Interval
         level: of confidence.
 
     Raises:
-        ValueError: no trials, or more successes than trials.
+        ValueError: a level that is not between 0 and 1, no trials, or more successes than trials.
 
     Example:
         >>> share_interval(9, 10).mean
         0.9
     """
-    if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"share_interval: {successes} successes of {trials} trials")
+    check_count("successes", successes, 0)
+    check_sizes(trials=trials)
+    if successes > trials:
+        raise ValueError(f"successes: at most {trials}, the number of trials, is expected, not {successes}")
+    check_level(level)
     low, high = stats.binomtest(successes, trials).proportion_ci(level, method="wilson")
     return Interval(successes / trials, float(low), float(high))
 
@@ -208,7 +233,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
         level: of confidence.
 
     Raises:
-        ValueError: different numbers of values, or fewer than two.
+        ValueError: a level that is not between 0 and 1, different numbers of values, or fewer than two.
 
     Example:
         >>> found = paired_difference([0.7, 0.8, 0.9, 0.8], [0.6, 0.6, 0.8, 0.7])
@@ -236,11 +261,13 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
         The ratio with its interval, and the p-value of a ratio of 0 (two-sided).
 
     Raises:
-        ValueError: fewer than two units, unequal numbers of totals and sizes, or sizes that sum to 0.
+        ValueError: a level that is not between 0 and 1, fewer than two units, unequal numbers of totals and sizes, or
+            sizes that sum to 0.
 
     Example:
         >>> found = ratio_difference([-2.0, -3.0], [10.0, 10.0])
     """
+    check_level(level)
     above, below = _vector("totals", totals), _vector("sizes", sizes)
     if len(above) != len(below):
         raise ValueError(f"ratio_difference: {len(above)} totals and {len(below)} sizes")
@@ -314,4 +341,7 @@ def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.
     vector = np.asarray(values, dtype=np.float64)
     if vector.ndim != 1 or len(vector) < 2:
         raise ValueError(f"{name}: at least two values, shape [G], are expected, not {list(vector.shape)}")
+    wrong = np.flatnonzero(np.isnan(vector))
+    if len(wrong):
+        raise ValueError(f"{name}[{wrong[0]}]: NaN is no number; leave it out")
     return vector

@@ -15,6 +15,7 @@ from neuroprior._random import generator_on
 from neuroprior.analysis.statistics import holm
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS
+from neuroprior.plans.plans import check_are_plans
 
 ORDERS = range(1, 5)
 """Lengths of the n-grams that are compared."""
@@ -124,6 +125,8 @@ def two_sample_tests(
         max_work=max_work,
         chunk_size=chunk_size,
     )
+    for plans in (real, generated):
+        check_are_plans(plans)
     if real.num_actions != generated.num_actions:
         raise ValueError(f"real plans have {real.num_actions} actions, generated ones {generated.num_actions}")
     draw = generator_on(generator, "cpu")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._compiled import compiled
 from neuroprior._hashing import row_hashes
 from neuroprior.planners.planner import Decision, Planner, value_of
@@ -275,8 +275,8 @@ class AStarPlanner(BestFirstPlanner):
         compile: bool = True,
     ) -> None:
         super().__init__(None, max_nodes, heuristic=heuristic, nodes_at_once=nodes_at_once, compile=compile)
-        if not weight >= 0:
-            raise ValueError(f"weight: a number of at least 0 is expected, not {weight}")
+        if not is_number(weight) or not weight >= 0:
+            raise ValueError(f"weight: a number of at least 0 is expected, not {weight!r}")
         self.weight, self.order = weight, (1, float(weight))
 
     def cost(self, depth: Tensor, log_prob: Tensor, left: Tensor) -> Tensor:

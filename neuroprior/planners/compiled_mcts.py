@@ -447,8 +447,9 @@ def search_all(
     nodes.probs[:, 0] = (logits.double() / planner.temperature).softmax(1).numpy()
     known.state[:, 0] = state.numpy()
     known.code[:, 0] = int(planner.prior.start_node) if isinstance(planner.prior, HistoryPrior) else 0
-    if size:
-        known.hidden[:, 0] = hidden[:, :size].numpy()
+    if isinstance(planner.prior, GRUPrior):
+        first = planner.prior.input_size
+        known.hidden[:, 0] = hidden[:, first : first + size].numpy()
     moves = Moves(
         world.next_state.view(-1).numpy(), world.reward.reshape(-1).numpy(), world.reward.dim() == 2, world.num_states
     )
@@ -505,7 +506,8 @@ def _knows(prior: Steppable, length: int) -> bool:
         return same and own.advance is Prior.advance and prior.log_probs.dtype == torch.float32
     if type(prior) is not GRUPrior or prior.num_layers > 1 or prior.training:
         return False
-    return (prior.window is None or length <= prior.window + 1) and prior.head.weight.dtype == torch.float32
+    within = prior.window is None or length <= prior.window + 1 or prior.lags <= prior.window
+    return within and prior.head.weight.dtype == torch.float32
 
 
 def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:

@@ -5,7 +5,7 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_sizes, is_number
 from neuroprior.planners.planner import Decision, Objective, decide, join_decisions, random_top
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner
@@ -66,10 +66,10 @@ class CrossEntropyPlanner(SamplingPlanner):
             prior, length, num_plans, num_rollouts=num_rollouts, halving=False, temperature=temperature, **goal
         )
         check_sizes(rounds=rounds, **({} if order is None else {"order": order}))
-        if not 0 < elites <= 1:
-            raise ValueError(f"elites: a share above 0 and at most 1 is expected, not {elites}")
-        if not 0 < strength < float("inf"):
-            raise ValueError(f"strength: a positive finite number is expected, not {strength}")
+        if not is_number(elites) or not 0 < elites <= 1:
+            raise ValueError(f"elites: a share above 0 and at most 1 is expected, not {elites!r}")
+        if not is_number(strength) or not 0 < strength < float("inf"):
+            raise ValueError(f"strength: a positive finite number is expected, not {strength!r}")
         self.rounds, self.elites, self.order, self.strength = min(rounds, num_plans), elites, order, strength
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:

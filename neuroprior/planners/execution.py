@@ -62,6 +62,7 @@ def execute(
         torch.Size([2, 4])
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
+    check_memory(8 * num_steps, num_steps=num_steps)
     generator = generator_on(generator, state.device)
     parts = []
     for at in range(0, num_steps, replan_every):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_sizes, is_number
 from neuroprior.planners.planner import Decision, Objective, decide, join_decisions
 from neuroprior.planners.sampling import SamplingPlanner
 from neuroprior.sampling.stepping import Steppable
@@ -76,8 +76,8 @@ class HorizonPlanner(SamplingPlanner):
             prior, length, num_plans, num_rollouts=num_rollouts, halving=False, temperature=temperature, **goal
         )
         check_sizes(rounds=rounds)
-        if not 0 < pilot <= 1:
-            raise ValueError(f"pilot: a share above 0 and at most 1 is expected, not {pilot}")
+        if not is_number(pilot) or not 0 < pilot <= 1:
+            raise ValueError(f"pilot: a share above 0 and at most 1 is expected, not {pilot!r}")
         self.first = max(round(pilot * num_plans), 1)
         self.rounds = min(rounds, num_plans - self.first)
 

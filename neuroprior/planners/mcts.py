@@ -5,6 +5,7 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior._compiled import compiled
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions, random_best
 from neuroprior.sampling.draws import Draw
@@ -62,8 +63,8 @@ class MCTSPlanner(PriorPlanner):
         **goal: Unpack[Objective],
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
-        if not 0 <= exploration < float("inf"):
-            raise ValueError(f"exploration: a finite number of at least 0 is expected, not {exploration}")
+        if not is_number(exploration) or not 0 <= exploration < float("inf"):
+            raise ValueError(f"exploration: a finite number of at least 0 is expected, not {exploration!r}")
         self.exploration, self.compile = exploration, compile
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:

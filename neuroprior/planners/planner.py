@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, check_in_world
@@ -191,8 +191,8 @@ def check_objective(objective: str, discount: float) -> None:
     """Raise ValueError for an unknown `objective`, or a `discount` that is out of range or has no effect."""
     if objective not in ("terminal", "return"):
         raise ValueError(f'objective: "terminal" or "return" is expected, not {objective!r}')
-    if not 0 < discount <= 1:
-        raise ValueError(f"discount: a number above 0 and at most 1 is expected, not {discount}")
+    if not is_number(discount) or not 0 < discount <= 1:
+        raise ValueError(f"discount: a number above 0 and at most 1 is expected, not {discount!r}")
     if objective == "terminal" and discount != 1:
         raise ValueError('discount: it has no effect with objective="terminal"; use objective="return"')
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior._checks import check_seed, check_sizes
+from neuroprior.plans.plans import Plans, check_are_plans, is_per_step
 
 FEWEST_UNITS = 2
 """Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""
@@ -47,13 +48,15 @@ def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor
         >>> [(len(training), len(held_out)) for training, held_out in folds(plans, 3)]
         [(4, 2), (4, 2), (4, 2)]
     """
+    check_are_plans(plans)
     grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
     unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
     unit = torch.arange(len(plans)) if unit is None else unit
     count = int(unit.max()) + 1 if len(unit) else 0
-    if not 2 <= number <= count:
+    if not isinstance(number, int) or isinstance(number, bool) or not 2 <= number <= count:
         kind = "groups" if grouped else "plans"
-        raise ValueError(f"folds: between 2 and the number of {kind}, {count}, are expected, not {number}")
+        raise ValueError(f"folds: between 2 and the number of {kind}, {count}, are expected, not {number!r}")
+    check_seed(seed)
     drawn = torch.randperm(count, generator=torch.Generator().manual_seed(seed)) % number
     return [((drawn[unit] != fold).nonzero()[:, 0], (drawn[unit] == fold).nonzero()[:, 0]) for fold in range(number)]
 
@@ -72,8 +75,7 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
         >>> in_parts(Plans(torch.arange(12)[None] % 3, 3), number=4).actions.tolist()
         [[0, 1, 2], [0, 1, 2], [0, 1, 2], [0, 1, 2]]
     """
-    if number < 1:
-        raise ValueError(f"number: at least 1 is expected, not {number}")
+    check_sizes(number=number)
     length = int(plans.mask().sum())
     if len(plans) != 1 or length < number:
         raise ValueError(f"plans: a single one of at least {number} actions is expected, not {len(plans)} of {length}")

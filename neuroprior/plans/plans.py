@@ -2,17 +2,21 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import log2
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior._checks import check_range, check_sizes, is_integer
+from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.rows import check_readable, rows_of
 from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.tables import Columns, Missing, fields_of
+
+MOST_BITS = 48
+"""Binary digits of the largest number of plans that `all_plans` would list, on any machine."""
 
 MOST_ACTIONS = 2**31
 """Actions beyond which their numbers are something else."""
@@ -91,6 +95,8 @@ class Plans(Sequences):
             actions = actions.masked_fill(~self.mask(), 0) if is_integer(actions) else actions
         check_range("actions", actions, self.num_actions, "actions")
         object.__setattr__(self, "actions", actions.to(action_dtype(self.num_actions)))
+        _check_texts("action_names", self.action_names)
+        _check_texts("notes", self.notes)
         if self.action_names is not None and len(self.action_names) != self.num_actions:
             raise ValueError(f"action_names: {self.num_actions} are expected, not {len(self.action_names)}")
         for what in ("group", "condition"):
@@ -129,7 +135,7 @@ class Plans(Sequences):
 
     def _check_end(self, actions: Tensor) -> None:
         """Check that `end` only closes plans; where lengths are not given, take them from it."""
-        if not isinstance(self.end, int) or not 0 <= self.end < self.num_actions:
+        if not isinstance(self.end, int) or isinstance(self.end, bool) or not 0 <= self.end < self.num_actions:
             raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {self.end!r}")
         position = torch.arange(1, actions.shape[1] + 1, device=actions.device)
         first = torch.where(actions == self.end, position, actions.shape[1]).amin(1) if actions.shape[1] else None
@@ -334,9 +340,10 @@ class Plans(Sequences):
         Raises:
             ValueError: `first` is negative, or `stop` is less than `first`.
         """
+        check_count("first", first, 0)
+        if stop is not None:
+            check_count("stop", stop, 0)
         stop = self.max_length if stop is None else min(stop, self.max_length)
-        if first < 0:
-            raise ValueError(f"first: at least 0 is expected, not {first}")
         if stop < min(first, self.max_length):
             raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
 
@@ -369,6 +376,11 @@ def all_plans(num_actions: int, length: int) -> Tensor:
         >>> all_plans(2, 2).tolist()
         [[0, 0], [0, 1], [1, 0], [1, 1]]
     """
+    check_sizes(num_actions=num_actions)
+    check_count("length", length)
+    if length * log2(num_actions) > MOST_BITS:
+        raise ValueError(f"length: {num_actions}**{length} plans are too many; list fewer or shorter ones")
+    check_memory(8 * num_actions**length * max(length, 1), num_actions=num_actions, length=length)
     base = num_actions ** torch.arange(length - 1, -1, -1)
     return torch.arange(num_actions**length)[:, None].div(base, rounding_mode="floor") % num_actions
 
@@ -475,7 +487,9 @@ def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
 
 def _check_texts(what: str, names: Sequence[str] | None) -> bool:
     """Whether there are names; ValueError unless they are texts."""
-    if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
+    if names is not None and (
+        not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names)
+    ):
         raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
     return names is not None
 

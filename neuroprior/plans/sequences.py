@@ -7,6 +7,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior._random import generator_on
 
 
@@ -60,10 +61,7 @@ class Sequences(ABC):
             ValueError: `validation` is not between 0 and 1, or there are fewer than two plans or groups, and not a
                 single plan of at least two actions.
         """
-        given: object = validation
-        if not isinstance(given, Real) or not 0 < validation < 1:
-            said = given if isinstance(given, Real | str | None) else type(given).__name__
-            raise ValueError(f"validation: a share between 0 and 1 is expected, not {said}")
+        check_validation(validation)
         length = int(self.mask().sum()) if len(self) == 1 else 0
         if length > 1:
             cut = length - min(max(round(length * validation), 1), length - 1)
@@ -78,3 +76,10 @@ class Sequences(ABC):
         chosen[order[:held_out]] = True
         index = chosen[unit].to(self.actions.device)
         return self[~index], self[index]
+
+
+def check_validation(share: object) -> None:
+    """Raise ValueError for what is no share of plans that can be held out."""
+    if not is_number(share) or not 0 < share < 1:
+        said = share if isinstance(share, Real | str | None) else type(share).__name__
+        raise ValueError(f"validation: a share between 0 and 1 is expected, not {said}")

@@ -125,8 +125,14 @@ class Table:
         features = [context] if isinstance(context, str) else list(context or ())
         self.at = {what: self._find(what, name) for what, name in given.items() if name is not None}
         self.context = [self._find("context", name) for name in features]
+        if len(set(self.context)) < len(self.context):
+            raise ValueError(f"columns.context: a column is given twice: {', '.join(map(str, features))}")
         taken = {*self.at.values(), *self.context}
         usual = {str(name).strip().lower(): i for i, name in reversed(list(enumerate(frame.columns))) if i not in taken}
+        named = list(map(str, frame.columns))
+        for what in given:
+            if what not in self.at and what != "event_type" and named.count(what) > 1:
+                raise ValueError(f"{of}: the column {what!r} is there twice")
         self.by_name: list[str] = []  # what was not given, and found by its name
         for what in given:
             # Under the name event_type tables have anything.
@@ -170,7 +176,12 @@ class Table:
         """The entries of a column: for each row the number of its text, -1 where it is missing; and the texts."""
         import pandas as pd
 
-        codes, values = pd.factorize(self.frame.iloc[:, position].astype(object))
+        column = self.frame.iloc[:, position].astype(object)
+        try:
+            codes, values = pd.factorize(column)
+        except TypeError as error:
+            name = self.frame.columns[position]
+            raise ValueError(f"{self.of}: column {name!r}: names or numbers are expected ({error})") from None
         labels = [_text(value).strip() for value in values]
         number = {label: i for i, label in enumerate(dict.fromkeys(labels)) if not is_missing(label)}
         order = {label: i for i, label in enumerate(number)}

@@ -65,6 +65,8 @@ def fit(
         if prior not in NAMES:
             raise ValueError(f"prior: one of {', '.join(NAMES)} is expected, not {prior!r}")
         prior = NAMES[prior]
+    if not callable(prior):
+        raise ValueError(f"prior: a class, a function or a name is expected, not {prior!r}")
     if effort is not None:
         if prior is not CombinedPrior:
             raise ValueError("effort: for the combined prior alone; leave it out, or leave prior out")

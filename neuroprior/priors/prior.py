@@ -61,7 +61,8 @@ class Prior(SavedModule):
         sizes = {"num_actions": num_actions} | contexts
         required = {name: size for name, size in sizes.items() if size is not None or name == "num_actions"}
         check_sizes(**required)
-        check_memory(4 * num_actions, num_actions=num_actions)  # one row of logits
+        for name, size in required.items():
+            check_memory(4 * (size or 0), **{name: size})  # one row of logits, of features, or a number each
         if num_contexts is not None and context_size is not None:
             raise ValueError("num_contexts and context_size: a prior takes an index or features, not both")
         if num_patterns is not None and (num_contexts is not None or context_size is not None):
@@ -374,6 +375,8 @@ def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
     """
     if isinstance(given, Prior):
         return given
+    if not isinstance(given, Mapping):
+        raise ValueError(f"a prior is expected, not {given!r}")
     made = SavedModule.known[given["prior"]](**given["config"])
     if not isinstance(made, Prior):
         raise ValueError(f"{given['prior']}: not a prior over numbered actions")

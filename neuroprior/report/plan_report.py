@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import torch
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_count, check_sizes
 from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
 from neuroprior.plans import Columns, Missing, Plans, read_plans
@@ -273,6 +273,7 @@ def _folds(name: str, plans: Plans, folds: int | None) -> int:
     if units < 2:
         raise ValueError(f"{name}: at least two plans, or a single long one, are needed for cross-validation")
     number = min(FOLDS, units) if folds is None else folds
+    check_count("folds", number, 0)
     if number > units:
         raise ValueError(f"folds: at most {units}, as many as there are groups or plans, are expected, not {number}")
     if number < 2:  # which a `Design` takes for test plans

@@ -139,40 +139,68 @@ def sample_in_world(
     draw = Draw(prior.num_actions, temperature, generator)
     now, root = state, torch.arange(batch, device=state.device)
     counts = torch.full((batch,), num_plans, device=state.device)
-    steps: list[list[Tensor]] = [[], [], []]  # actions, rewards and states of each step
-    split = False  # whether each row has become a single plan
-    for t in range(length):
-        logits = legal_logits(world, now, logits)
-        if not split and (world.stochastic or 2 * logits.numel() > batch * num_plans):
-            split, row = True, shuffled_rows(counts, root, generator)
-            logits, hidden, now = _taken(row, logits, hidden, now)
-            steps = [_taken(row, *column) for column in steps]
-        if split:
-            action = draw.actions(logits)
-        else:
-            children = draw.split(counts, logits)
-            row, action = children.nonzero(as_tuple=True)
-            counts = children[row, action]
-            root, hidden, now = _taken(row, root, hidden, now)
-            steps = [_taken(row, *column) for column in steps]
+    begun: list[list[Tensor]] = [[], [], []]  # actions, rewards and states of each step of the tree
+    depth = 0
+    while depth < length and not world.stochastic and 2 * logits.numel() <= batch * num_plans:
+        children = draw.split(counts, legal_logits(world, now, logits))
+        row, action = children.nonzero(as_tuple=True)
+        counts = children[row, action]
+        root, hidden, now = _taken(row, root, hidden, now)
+        begun = [_taken(row, *column) for column in begun]
         now, reward = world.step(now, action, generator)
-        for column, values in zip(steps, (action.to(draw.dtype), reward, now), strict=True):
+        for column, values in zip(begun, (action.to(draw.dtype), reward, now), strict=True):
             column.append(values)
         if not keep_states:
-            steps[2].clear()
-        if t + 1 < length:
-            logits, hidden = stepper.step_in(world, action, hidden, now, length - t - 2 if split else 0)
-    if not split:
-        row = shuffled_rows(counts, root, generator)
-        (now,), steps = _taken(row, now), [_taken(row, *column) for column in steps]
-    states = join_states(steps[2], state, (batch, num_plans, *state.shape[1:])) if keep_states else None
+            begun[2].clear()
+        depth += 1
+        if depth < length:
+            logits, hidden = stepper.step_in(world, action, hidden, now)
+    row = shuffled_rows(counts, root, generator)
+    steps = range(depth, length)
+    uniform = None if world.stochastic else draw.uniform((len(steps), len(row)), logits)
+    shares = stepper.shares and world.shares_steps and uniform is not None
+    parts = _parts(len(row), logits, hidden, shares) if shares else [slice(0, len(row))]
+    ends: dict[int, tuple[Tensor, list[list[Tensor]]]] = {}  # last states and columns of each part
+
+    def draw_part(number: int) -> None:
+        some = row[parts[number]]
+        (here,), own = _taken(some, now), [_taken(some, *column) for column in begun]
+        after, memory = _taken(some, logits, hidden) if steps else (logits, hidden)
+        for k in range(len(steps)):
+            given = None if uniform is None else uniform[k, parts[number]]
+            action = draw.actions(legal_logits(world, here, after), given)
+            here, reward = world.step(here, action, generator)
+            for column, values in zip(own, (action.to(draw.dtype), reward, here), strict=True):
+                column.append(values)
+            if not keep_states:
+                own[2].clear()
+            if k + 1 < len(steps):
+                after, memory = stepper.step_in(world, action, memory, here, len(steps) - k - 2)
+        ends[number] = here, own
+
+    share(draw_part, range(len(parts)))
+    final = torch.cat([ends[number][0] for number in range(len(parts))])
+    columns = zip(*(ends[number][1] for number in range(len(parts))), strict=True)
+    joined = [[torch.cat(of) for of in zip(*column, strict=True)] for column in columns]
+    states = join_states(joined[2], state, (batch, num_plans, *state.shape[1:])) if keep_states else None
     # There is nothing to stack where there are no steps.
-    empty = (torch.zeros(len(now), 0, dtype=draw.dtype), torch.zeros(len(now), 0))
+    empty = (torch.zeros(len(final), 0, dtype=draw.dtype), torch.zeros(len(final), 0))
     plans, rewards = (
-        torch.stack(column, 1) if column else none.to(now.device) for column, none in zip(steps, empty, strict=False)
+        torch.stack(column, 1) if column else none.to(final.device) for column, none in zip(joined, empty, strict=False)
     )
     shape = (batch, num_plans, length)
-    return plans.view(shape), Rollout(now.view(*shape[:2], *state.shape[1:]), rewards.view(shape), states)
+    return plans.view(shape), Rollout(final.view(*shape[:2], *state.shape[1:]), rewards.view(shape), states)
+
+
+def _parts(number: int, logits: Tensor, state: Tensor, shares: bool) -> list[slice]:
+    """Parts of so many plans that are stepped together: on a CPU, as many as have states that fit a cache."""
+    parts = 1
+    if logits.device.type == "cpu" and len(state):  # states that fit a cache are read several times as fast
+        together = max(CACHED // max(state[0].numel(), logits.shape[1], 1), FEWEST)
+        parts = max(-(-number // together), 1)
+        if shares and number >= 2 * FEWEST:
+            parts = -(-parts // torch.get_num_threads()) * torch.get_num_threads()
+    return [slice(number * part // parts, number * (part + 1) // parts) for part in range(parts)]
 
 
 def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
@@ -182,7 +210,7 @@ def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
     for name, number in (("num_plans", num_plans), ("length", length)):
-        if not isinstance(number, int):
+        if not isinstance(number, int) or isinstance(number, bool):
             raise ValueError(f"{name}: an integer is expected, not {number!r}")
     if num_plans < 0 or length < 0 or batch_size < 1:
         raise ValueError(
@@ -233,15 +261,8 @@ def _sample_one_by_one(
     """The actions `[N, len(steps)]` of N plans at these `steps`; plan i continues row `row[i]` of logits and state."""
     actions = torch.empty(len(row), len(steps), dtype=draw.dtype, device=row.device)
     uniform = draw.uniform((len(steps), len(row)), logits)
-    parts = 1
-    if row.device.type == "cpu":  # states that fit a cache are read several times as fast
-        together = max(CACHED // max(state[0].numel(), logits.shape[1], 1), FEWEST)
-        parts = -(-len(row) // together)
-        if stepper.shares and len(row) >= 2 * FEWEST:
-            parts = -(-parts // torch.get_num_threads()) * torch.get_num_threads()
 
-    def draw_part(number: int) -> None:
-        part = slice(len(row) * number // parts, len(row) * (number + 1) // parts)
+    def draw_part(part: slice) -> None:
         now, hidden = _taken(row[part], logits, state)
         for k, t in enumerate(steps):
             action = draw.actions(now, uniform[k, part])
@@ -250,9 +271,10 @@ def _sample_one_by_one(
                 given = None if context is None else context[row[part], t + 1]
                 now, hidden = stepper.step(action, hidden, given, len(steps) - k - 2)
 
+    parts = _parts(len(row), logits, state, stepper.shares)
     if stepper.shares:
-        share(draw_part, range(parts))
+        share(draw_part, parts)
     else:
-        for number in range(parts):
-            draw_part(number)
+        for part in parts:
+            draw_part(part)
     return actions

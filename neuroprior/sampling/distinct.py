@@ -316,6 +316,7 @@ def _start(prior: Steppable, context: Tensor | None, num_sets: int | None, tempe
     if context is None:
         number = 1 if num_sets is None else num_sets
         check_sizes(num_sets=number)
+        check_memory(8 * number, num_sets=number)
         stepper.check_context(None)
         return Beams(stepper, *stepper.start(number), temperature)
     if num_sets is not None:

@@ -11,7 +11,7 @@ from neuroprior.sampling.rows import rows_of
 
 def check_temperature(temperature: Any) -> None:
     """Raise ValueError unless logits can be divided by it."""
-    if isinstance(temperature, str | None) or not 0 < temperature < float("inf"):
+    if isinstance(temperature, str | bool | None) or not 0 < temperature < float("inf"):
         raise ValueError(f"temperature: a positive finite number is expected, not {temperature!r}")
 
 

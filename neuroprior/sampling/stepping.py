@@ -5,9 +5,13 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_integer
 from neuroprior.plans import is_per_step
 from neuroprior.sampling.draws import after_end
 from neuroprior.worlds.world import World
+
+FEWEST_TO_SHARE = 256
+"""States of which the distinct ones are worth finding, where an observation is given to a prior."""
 
 
 @runtime_checkable
@@ -23,6 +27,8 @@ class Steppable(Protocol):
       a context that does not fit.
     - `end`: the action that ends a plan.
     - `advance(action, state, context, room)`: as `step`, but may overwrite the state; `room` more steps will follow.
+    - `advance_shared(action, state, context, row, room)`: as `advance`, where plans get the same input: `action [K]`
+      and `context [K, ...]` are the distinct ones, `row [N]` says which of them each plan gets.
     - `device`: where the prior computes; a prior that takes a context computes on the CPU without it.
     - `shares_steps`: true where steps of different plans may be taken on several threads at once.
 
@@ -61,6 +67,7 @@ class Stepper:
         self.end: int | None = getattr(prior, "end", None)
         self.shares: bool = getattr(prior, "shares_steps", False)
         self._advance = getattr(prior, "advance", None) if in_place else None
+        self._advance_shared = getattr(prior, "advance_shared", None) if in_place else None
 
     @property
     def device(self) -> torch.device:
@@ -116,8 +123,18 @@ class Stepper:
     def step_in(
         self, world: World, action: Tensor, state: Tensor, reached: Tensor, room: int = 0
     ) -> tuple[Tensor, Tensor]:
-        """As `step`, after `action` led to the world's states `reached [N, ...]`."""
+        """As `step`, after `action` led to the world's states `reached [N, ...]`; each is observed once."""
+        if self.context_per == "step" and self._advance_shared is not None and _numbered(reached):
+            pair, row = (reached * self.num_actions + action).unique(return_inverse=True)
+            context, action = world.observe(pair // self.num_actions), pair % self.num_actions
+            logits, state = self._advance_shared(action, state, context, row, room)
+            return logits, state
         return self.step(action, state, world.observe(reached) if self.context_per == "step" else None, room)
+
+
+def _numbered(reached: Tensor) -> bool:
+    """Whether states are numbers, and so many that it is worth to find the distinct ones."""
+    return reached.dim() == 1 and is_integer(reached) and len(reached) >= FEWEST_TO_SHARE
 
 
 def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:

@@ -7,6 +7,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
+from neuroprior._checks import is_number
 from neuroprior.training.batches import Batch
 
 
@@ -32,10 +33,10 @@ class PriorModule(lightning.LightningModule):
         self, prior: nn.Module, learning_rate: float = 5e-3, weight_decay: float = 0.01, seed: int = 0
     ) -> None:
         super().__init__()
-        if not 0 < learning_rate < float("inf"):
-            raise ValueError(f"learning_rate: a positive number is expected, not {learning_rate}")
-        if not 0 <= weight_decay < float("inf"):
-            raise ValueError(f"weight_decay: must not be negative, not {weight_decay}")
+        if not is_number(learning_rate) or not 0 < learning_rate < float("inf"):
+            raise ValueError(f"learning_rate: a positive number is expected, not {learning_rate!r}")
+        if not is_number(weight_decay) or not 0 <= weight_decay < float("inf"):
+            raise ValueError(f"weight_decay: must not be negative, not {weight_decay!r}")
         self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
         self.curve: list[dict[str, float]] = []
         self._hidden: Tensor | None = None
@@ -57,7 +58,10 @@ class PriorModule(lightning.LightningModule):
         if self.trainer.world_size > 1:
             loss = total * self.trainer.world_size / self._over_processes(weight).clamp(min=1)
         self._totals += torch.stack([total.detach(), weight])
-        self.log("train_bits", loss, prog_bar=True, batch_size=1)
+        if (
+            self.trainer.loggers or self.trainer.progress_bar_callback is not None
+        ):  # to log takes a tenth of a small step
+            self.log("train_bits", loss, prog_bar=True, batch_size=1)
         return loss
 
     def on_validation_epoch_start(self) -> None:

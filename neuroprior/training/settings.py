@@ -3,7 +3,8 @@
 from dataclasses import dataclass, replace
 from math import ceil
 
-from neuroprior.plans.sequences import Sequences
+from neuroprior._checks import is_number
+from neuroprior.plans.sequences import Sequences, check_validation
 
 FEWEST_STEPS, MOST_STEPS = 10, 100
 """The least and the most steps between two validations, where these are not given."""
@@ -70,8 +71,10 @@ class Settings:
                 raise ValueError(
                     f"{name}: a positive {'number' if kind is float else 'integer'} is expected, not {value}"
                 )
-        if self.weight_decay < 0:
-            raise ValueError(f"weight_decay: must not be negative, not {self.weight_decay}")
+        if not is_number(self.weight_decay) or not 0 <= self.weight_decay < float("inf"):
+            raise ValueError(f"weight_decay: a finite number of at least 0 is expected, not {self.weight_decay!r}")
+        if not isinstance(self.validation, Sequences):
+            check_validation(self.validation)
 
     def batches_of(self, longest: int) -> int:
         """The size of batches of plans of which the longest has so many actions."""

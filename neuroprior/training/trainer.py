@@ -2,7 +2,6 @@
 
 import io
 import logging
-import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,10 +62,10 @@ def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> 
     window = settings.window if in_windows else plans.max_length
     data = PlansModule(training, validation, replace(settings, window=window), seed)
     cuda = device.type == "cuda"
-    with quiet(), tempfile.TemporaryDirectory() as folder, torch.random.fork_rng([device] if cuda else []):
+    with quiet(), torch.random.fork_rng([device] if cuda else []):
         torch.manual_seed(seed)
         trainer = make_trainer(
-            folder,
+            "",
             data.settings.max_steps,
             data.settings.patience,
             data.steps,
@@ -115,7 +114,8 @@ def make_trainer(
 ) -> lightning.Trainer:
     """Lightning's trainer for a `PriorModule` and a `PlansModule`.
 
-    An epoch is what lies between two validations. After each of them the best and the last checkpoint are kept.
+    An epoch is what lies between two validations. After each of them the best and the last checkpoint are kept; without
+    logs the best weights, in memory.
 
     Args:
         folder: of checkpoints and logs.
@@ -133,7 +133,7 @@ def make_trainer(
         accumulate_grad_batches: batches for one step of the optimiser.
         max_time: stop after so much time, DD:HH:MM:SS.
         enable_progress_bar: show it.
-        logs: write logs as CSV and for TensorBoard.
+        logs: write checkpoints, and logs as CSV and for TensorBoard.
         callbacks: further callbacks of Lightning's.
 
     Raises:
@@ -146,17 +146,19 @@ def make_trainer(
         if number < 1:
             raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
     stopping = Stopping("validation_bits", patience=ceil(patience / validate_every), min_delta=1e-4)
-    # Two callbacks: with `save_last` Lightning writes the last one only where it writes the best one, too.
-    best, last = (
-        Checkpoints(
-            Path(folder) / CHECKPOINTS,
-            name,
-            monitor=monitor,
-            save_on_train_epoch_end=True,
-            enable_version_counter=False,
-        )
-        for name, monitor in (("best", "validation_bits"), ("last", None))
-    )
+    kept: list[lightning.Callback] = [BestWeights()]
+    if logs:
+        # Two callbacks: with `save_last` Lightning writes the last one only where it writes the best one, too.
+        kept = [
+            Checkpoints(
+                Path(folder) / CHECKPOINTS,
+                name,
+                monitor=monitor,
+                save_on_train_epoch_end=True,
+                enable_version_counter=False,
+            )
+            for name, monitor in (("best", "validation_bits"), ("last", None))
+        ]
     return lightning.Trainer(
         max_epochs=ceil(max_steps / validate_every),
         accelerator=accelerator,
@@ -168,14 +170,15 @@ def make_trainer(
         accumulate_grad_batches=accumulate_grad_batches,
         max_time=max_time,
         enable_progress_bar=enable_progress_bar,
-        callbacks=[stopping, best, last, *(callbacks or [])],
+        callbacks=[stopping, *kept, *(callbacks or [])],
+        enable_checkpointing=logs,
         logger=[CSVLogger(folder, "logs"), TensorBoardLogger(folder, "tensorboard", "")] if logs else False,
         plugins=[WholeCheckpoints()],
         num_sanity_val_steps=0,
         log_every_n_steps=10,
         use_distributed_sampler=False,
         enable_model_summary=False,
-        default_root_dir=folder,
+        default_root_dir=folder or None,
     )
 
 
@@ -206,16 +209,37 @@ def run_training(
         raise KeyboardInterrupt from interrupted
     if not trainer.is_global_zero:
         return float("nan")
-    best = trainer.checkpoint_callback
-    assert isinstance(best, ModelCheckpoint)
-    if best.best_model_score is None:
+    kept = next(one for one in trainer.callbacks if isinstance(one, BestWeights | ModelCheckpoint))  # type: ignore[attr-defined]
+    if kept.best_model_score is None:
         raise ValueError("training ended before the first validation; nothing was learned")
-    if not best.best_model_score.isfinite():
+    if not kept.best_model_score.isfinite():
         raise ValueError(f"training diverged; a learning_rate below {module.learning_rate} may help")
-    saved = torch.load(best.best_model_path, weights_only=True, map_location=module.device)
-    module.load_state_dict(saved["state_dict"])
+    if isinstance(kept, BestWeights):
+        weights = kept.weights
+    else:
+        weights = torch.load(kept.best_model_path, weights_only=True, map_location=module.device)["state_dict"]
+    module.load_state_dict(weights)
     module.eval()
-    return float(best.best_model_score)
+    return float(kept.best_model_score)
+
+
+class BestWeights(lightning.Callback):
+    """Keeps the weights with the lowest validation bits in memory, as `ModelCheckpoint` does in a file.
+
+    Attributes:
+        best_model_score: bits; infinite where the training diverged, None before the first validation.
+        weights: of the module.
+    """
+
+    def __init__(self) -> None:
+        self.best_model_score: torch.Tensor | None = None
+        self.weights: dict[str, torch.Tensor] = {}
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        score = trainer.callback_metrics["validation_bits"].nan_to_num(torch.inf)
+        if self.best_model_score is None or score < self.best_model_score:
+            self.best_model_score = score
+            self.weights = {name: value.clone() for name, value in pl_module.state_dict().items()}
 
 
 class Stopping(EarlyStopping):

@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory, check_sizes
+from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld
 
@@ -149,9 +149,10 @@ def gridworld(
         >>> world.num_actions, world.reward.shape
         (4, torch.Size([3, 400]))
     """
-    if not 0 < reward_power < float("inf"):
+    if not is_number(reward_power) or not 0 < reward_power < float("inf"):
         raise ValueError(f"gridworld: reward_power must be positive and finite, not {reward_power}")
     check_sizes(height=height, width=width, num_worlds=num_worlds)
+    check_seed(seed)
     check_memory(8 * height * width * num_worlds, height=height, width=width, num_worlds=num_worlds)
     if edges not in ("wall", "torus"):
         raise ValueError(f'gridworld: edges must be "wall" or "torus", not {edges!r}')

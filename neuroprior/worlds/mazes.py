@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_seed, check_sizes, is_number
 from neuroprior.worlds.grid import GridWorld
 
 
@@ -48,6 +48,7 @@ def four_rooms(
     if height < 5 or width < 5:
         raise ValueError(f"four_rooms: height and width must be at least 5, not {height} x {width}")
     _check("four_rooms", num_layouts, num_worlds, reward, reward_power)
+    check_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     walls = torch.zeros(num_layouts, height, width, dtype=torch.bool)
     row, column = height // 2, width // 2
@@ -98,9 +99,10 @@ def maze(
     check_sizes(height=height, width=width)
     if min(height, width) < 3 or height % 2 == 0 or width % 2 == 0:
         raise ValueError(f"maze: height and width must be odd and at least 3, not {height} x {width}")
-    if not 0 <= loops <= 1:
+    if not is_number(loops) or not 0 <= loops <= 1:
         raise ValueError(f"maze: loops must be a share from 0 to 1, not {loops}")
     _check("maze", num_layouts, num_worlds, reward, reward_power)
+    check_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     walls = _dig(height, width, num_layouts, generator)
     _open_some(walls, loops, generator)
@@ -163,7 +165,7 @@ def _check(name: str, num_layouts: int, num_worlds: int, reward: str, reward_pow
     check_sizes(num_layouts=num_layouts, num_worlds=num_worlds)
     if reward not in ("random", "goal"):
         raise ValueError(f'{name}: reward must be "random" or "goal", not {reward!r}')
-    if not 0 < reward_power < float("inf"):
+    if not is_number(reward_power) or not 0 < reward_power < float("inf"):
         raise ValueError(f"{name}: reward_power must be positive and finite, not {reward_power}")
     if reward == "goal" and reward_power != 1:
         raise ValueError(f'{name}: reward_power has no effect with reward="goal"; use reward="random"')

@@ -55,6 +55,8 @@ class TabularWorld(World):
     num_layouts: int = 1
     compile_from: int = 2**20
 
+    shares_steps = True
+
     def __init__(
         self,
         next_state: Tensor,

@@ -33,6 +33,7 @@ class World(ABC):
         num_actions: the number of actions, A.
         all_legal: True where every action is legal in every state, so that `legal_actions` need not be called.
         stochastic: True where the outcome of an action is random, so that one rollout of a plan is not enough.
+        shares_steps: True where steps from different states may be taken on several threads at once.
         has_goal: True where `solved` says in which states a goal is reached.
         action_names: names of the actions, where there are any.
     """
@@ -40,6 +41,7 @@ class World(ABC):
     num_actions: int
     all_legal: bool = True
     stochastic: bool = False
+    shares_steps: bool = False
     has_goal: bool = False
     action_names: tuple[str, ...] | None = None
 

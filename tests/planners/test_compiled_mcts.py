@@ -40,6 +40,8 @@ PRIORS = {
     "markov": markov,
     "gru": lambda: wide(GRUPrior(ACTIONS, 8, lags=1)),
     "gru shown the last actions": lambda: wide(GRUPrior(ACTIONS, 8, lags=16)),
+    "gru past its window": lambda: wide(GRUPrior(ACTIONS, 8, lags=2, window=2)),
+    "gru shown more actions than its window": lambda: wide(GRUPrior(ACTIONS, 8, lags=3, window=2)),
     "gru with contexts": lambda: seeing("step"),
     "gru with the start's context": lambda: seeing("plan"),
     "gru of two layers, in windows": lambda: wide(GRUPrior(ACTIONS, 8, num_layers=2, window=2)),

@@ -236,7 +236,7 @@ def test_steps_of_plans() -> None:
     assert plans.steps().actions.equal(plans.actions)
     once = Plans(plans.actions, 4, context=torch.tensor([5, 6, 7])).steps(2)
     assert once.context.tolist() == [5, 6, 7]
-    with pytest.raises(ValueError, match="first: at least 0"):
+    with pytest.raises(ValueError, match="first: an integer of at least 0"):
         plans.steps(-1)
     with pytest.raises(ValueError, match="stop: at least 3"):
         plans.steps(3, 2)

@@ -43,10 +43,10 @@ def draw_context(takes, num, length, seed=0):
     return torch.randn(*shape, 2, generator=seeded(seed))
 
 
-def make(kind, takes, window=None, seed=0):
+def make(kind, takes, window=None, seed=0, **extra):
     """A prior whose predictions depend on all of its input: random weights, or counts of random plans."""
-    extra = {} if window is None else {"window": window}
     if kind in ("gru", "transformer"):
+        extra |= {} if window is None else {"window": window}
         prior = SMALL[kind](**CONTEXTS[takes][0], **extra, seed=seed)
         with torch.no_grad():
             for weight in prior.parameters():
@@ -165,9 +165,17 @@ def test_states_are_reordered_by_indexing(kind, takes, window):
 @pytest.mark.parametrize("window", [0, 1, 3])
 @torch.no_grad()
 def test_window(kind, takes, window):
-    """Past the window a prediction is that after the last `window` actions had opened a plan, and uses all of them."""
-    prior = make(kind, takes, window)
+    """Past the window a prediction is that after the last `window` actions had opened a plan, and uses all of them.
+
+    So it is where nothing else reaches further back: in a GRU that forgets its hidden state, in one block of attention.
+    """
+    prior = make(kind, takes, window, num_layers=1, **({} if kind == "gru" else {"lags": 1}))
+    if kind == "gru":
+        prior.gru.weight_hh_l0.zero_()
+        prior.gru.bias_ih_l0[8:16] = -100  # the update gate keeps nothing
     plans, context, per = torch.randint(A, (20, L), generator=seeded(3)), draw_context(takes, 20, L), CONTEXTS[takes][1]
+    if context is not None and per == "step" and kind == "transformer" and window:
+        context[:] = context[:, :1]  # the start symbol keeps the context that it came with
     forward = prior(plans, context)
     for t in range(window, L):
         last = slice(t - window, t + 1)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, TransformerPrior, UniformPrior, World, sample
-from neuroprior.sampling import sample_in_world
+from neuroprior.sampling import ancestral, sample_in_world, stepping
 from neuroprior.sampling.draws import Draw
 from tests.support.sources import (
     FALSE_ALARM,
@@ -324,6 +324,38 @@ def test_in_world_same_seed_and_sizes():
         assert plans.shape == rollout.rewards.shape == (batch, num_plans, length)
         assert rollout.final_state.shape == (batch, num_plans)
         assert plans.dtype == torch.uint8
+
+
+class WatchedGRU(GRUPrior):
+    """Notes the distinct inputs, and the plans that they are for, of the steps in which inputs are shared."""
+
+    def advance_shared(self, action, state, context, row, room=0):
+        self.shared.append((torch.stack([action, context], 1), row))
+        return super().advance_shared(action, state, context, row, room)
+
+
+@pytest.mark.parametrize(("lags", "window"), [(1, None), (1, 2), (3, None), (1, 0)])
+@pytest.mark.parametrize("legal", [False, True])
+def test_in_world_plans_are_those_of_the_plain_path(lags, window, legal, monkeypatch):
+    """In parts, on a thread each, with each observation made and read once; against all plans together, one by one."""
+    world = random_world(3, "WSA", legal=legal)
+    prior = WatchedGRU(A, 8, lags=lags, window=window, num_contexts=world.num_states, seed=2).eval()
+    prior.shared = []
+    starts, how = torch.tensor([4, 2, 1]), {"keep_states": True}
+    monkeypatch.setattr(stepping, "FEWEST_TO_SHARE", 10**9)
+    plain = sample_in_world(prior, world, starts, 12, 6, generator=seeded(0), **how)
+    assert not prior.shared
+    monkeypatch.setattr(stepping, "FEWEST_TO_SHARE", 2)
+    monkeypatch.setattr(ancestral, "CACHED", 1)
+    monkeypatch.setattr(ancestral, "FEWEST", 8)
+    found = sample_in_world(prior, world, starts, 12, 6, generator=seeded(0), **how)
+    assert found[0].equal(plain[0])
+    for one, other in zip(found[1], plain[1], strict=True):
+        assert one.equal(other)
+    assert len(prior.shared) > 5  # as many parts, and more steps
+    for inputs, row in prior.shared:
+        assert len(inputs.unique(dim=0)) == len(inputs) == len(row.unique())
+    assert sum(len(inputs) for inputs, _ in prior.shared) < 0.9 * sum(len(row) for _, row in prior.shared)
 
 
 def test_steps_of_a_stochastic_world_are_drawn_by_the_generator():

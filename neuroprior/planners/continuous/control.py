@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.continuous.vector_planner import Memory, VectorPlanner
 from neuroprior.plans.vector_plans import VectorPlans
@@ -67,6 +67,7 @@ def control(
         torch.Size([2, 3, 2])
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
+    check_memory(8 * num_steps, num_steps=num_steps)
     if replan_every > planner.length:
         raise ValueError(
             f"replan_every: at most the {planner.length} vectors of a plan are expected, not {replan_every}"

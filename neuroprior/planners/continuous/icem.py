@@ -6,7 +6,7 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_share, check_sizes
+from neuroprior._checks import check_share, check_sizes, is_number
 from neuroprior.planners.continuous.coloured_noise import check_noise, coloured_noise
 from neuroprior.planners.continuous.vector_planner import (
     Memory,
@@ -94,9 +94,9 @@ class ICEMPlanner(VectorPlanner):
             check_sizes(prior_iterations=prior_iterations)
         check_noise(std, noise_beta)
         check_share("keep_elites", keep_elites)
-        if not 1 <= decay < float("inf"):
+        if not is_number(decay) or not 1 <= decay < float("inf"):
             raise ValueError(f"decay: a finite number of at least 1 is expected, not {decay!r}")
-        if not 0 <= momentum < 1:
+        if not is_number(momentum) or not 0 <= momentum < 1:
             raise ValueError(f"momentum: a number from 0 to below 1 is expected, not {momentum!r}")
         self.populations = populations(num_plans, iterations, decay)
         self.num_elites = max(min(elites, self.populations[-1] // 2), 2)

@@ -132,6 +132,8 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
         True
     """
     check_are_plans(plans)
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"path: a file is expected, not {type(path).__name__}")
     place = Path(path)
     suffix = _suffix(place)
     if layout is not None and FILES[suffix].read is not read_csv:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_sizes
+from neuroprior._checks import check_count, check_sizes, is_number
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
 
@@ -100,9 +100,9 @@ class ContextTreePrior(HistoryPrior):
         check_count("depth", depth, 0)
         if depth > MOST_DEPTH:
             raise ValueError(f"depth: at most {MOST_DEPTH} is expected, not {depth}")
-        if beta is not None and not 0 < beta < 1:
+        if beta is not None and (not is_number(beta) or not 0 < beta < 1):
             raise ValueError(f"beta: a number between 0 and 1 is expected, not {beta!r}")
-        if alpha is not None and not 0 < alpha < float("inf"):
+        if alpha is not None and (not is_number(alpha) or not 0 < alpha < float("inf")):
             raise ValueError(f"alpha: a positive finite number is expected, not {alpha!r}")
         if base not in ("frequencies", "uniform"):
             raise ValueError(f'base: "frequencies" or "uniform" is expected, not {base!r}')

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count
+from neuroprior._checks import check_count, is_number
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree, level_bounds, parent_rows, row_blocks
 from neuroprior.priors.counts.history_prior import HistoryPrior
@@ -86,7 +86,7 @@ class MarkovPrior(HistoryPrior):
         backoff: Backoff = "kneser-ney",
     ) -> None:
         check_count("order", order, 0)
-        if not 0 < smoothing < float("inf"):
+        if not is_number(smoothing) or not 0 < smoothing < float("inf"):
             raise ValueError(f"smoothing: a positive finite number is expected, not {smoothing!r}")
         if initial not in ("joint", "lower"):
             raise ValueError(f'initial: "joint" or "lower" is expected, not {initial!r}')

@@ -7,6 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from neuroprior._checks import check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
@@ -65,8 +66,7 @@ class MixturePrior(Prior):
     ) -> None:
         if not experts:
             raise ValueError("experts: at least one is expected")
-        if not 0 <= share <= 1:
-            raise ValueError(f"share: a number between 0 and 1 is expected, not {share!r}")
+        check_share("share", share)
         made = [as_prior(e) for e in experts]
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:

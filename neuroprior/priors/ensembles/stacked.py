@@ -13,6 +13,7 @@ from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
 from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
 from neuroprior.priors.ensembles.packing import pack, unpack
+from neuroprior.priors.neural.gru import gru_sequence
 from neuroprior.priors.neural.neural import NeuralPrior, context_embedding
 from neuroprior.priors.prior import Prior
 
@@ -292,13 +293,10 @@ class Mixer(NeuralPrior):
             vectors, rest = vectors + self.index(rest[..., 0].long()), rest[..., 1:]
         forecasts = rest[..., : self.num_experts * self.num_actions]
         vectors = vectors + self.features(rest / 2)
-        out, last = self.gru(self.drop(vectors), None if hidden is None else hidden[None].contiguous())
+        out, last = gru_sequence(self.gru, self.drop(vectors), None if hidden is None else hidden[None])
         out = self.drop(out)
         mixed = (self.weights(out)[..., None] * forecasts.unflatten(-1, (self.num_experts, -1))).sum(-2)
         return self.head(out) + mixed, last[0]
-
-    def hidden_size_of(self, state_size: int) -> int:
-        return self.width
 
 
 def context_for(expert: Prior, context: Tensor | None) -> Tensor | None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
 
 Criterion = Literal["count", "information", "compression"]
 
@@ -68,6 +69,8 @@ def learn_macros(plans: Plans, num_macros: int, by: Criterion = "count") -> tupl
 def macros_of(plans: Plans, num_macros: int, by: Criterion, *others: Plans) -> tuple[list[Macro], list[Plans]]:
     """As `learn_macros`; other plans, from which no macros are learned, are recoded as well."""
     check_sizes(num_macros=num_macros)
+    for some in (plans, *others):
+        check_are_plans(some)
     if by not in CRITERIA:
         raise ValueError(f"by: one of {', '.join(map(repr, CRITERIA))} is expected, not {by!r}")
     if any(some.end is not None for some in (plans, *others)):

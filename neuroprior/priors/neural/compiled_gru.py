@@ -1,4 +1,4 @@
-"""The gates of a recurrent network in one pass by a compiled loop, for `gru_step`; importing this loads numba."""
+"""The gates of a recurrent network by compiled loops, for `gru_step` and `gru_sequence`; importing this loads numba."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numba import float32, njit
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 Array = np.ndarray[Any, Any]
 
@@ -57,3 +58,73 @@ def _gates(given: Array, rows: Array, hidden: Array, before: Array, stride: int,
             update = sigmoid(mine[width + k] + own[width + k])
             fresh = tanh(mine[2 * width + k] + reset * own[2 * width + k])
             new[k] = fresh + update * (last[k] - fresh)
+
+
+class Sequence(torch.autograd.Function):
+    """The hidden states `[T, N, width]` of one layer over a sequence, from what its inputs add to the gates.
+
+    As `nn.GRU`'s, of float32 on the CPU: matrix products by torch, gates and their gradients by compiled loops.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, given: Tensor, first: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """From `given [T, N, 3 * width]`, the state before `first [N, width]`, and the recurrent weights and biases."""
+        length, num, _ = given.shape
+        states = given.new_empty(length + 1, num, first.shape[1])
+        states[0] = first
+        opened, hidden, turned = torch.empty_like(given), given.new_empty(given.shape), weight.T.contiguous()
+        arrays = given.contiguous().numpy(), hidden.numpy(), states.numpy(), opened.numpy()
+        for t in range(length):
+            torch.addmm(bias, states[t], turned, out=hidden[t])
+            _forward(*arrays, t)
+        ctx.save_for_backward(states, opened, hidden, weight)
+        return states[1:]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, after: Tensor) -> tuple[Tensor | None, ...]:
+        states, opened, hidden, weight = ctx.saved_tensors
+        length, num, width = after.shape
+        to_given, to_hidden = torch.empty_like(opened), torch.empty_like(opened)
+        carried = torch.zeros(num, width)
+        arrays = after.contiguous().numpy(), carried.numpy(), states.numpy(), opened.numpy(), hidden.numpy()
+        gradients = to_given.numpy(), to_hidden.numpy()
+        for t in range(length - 1, -1, -1):
+            _backward(*arrays, *gradients, t)
+            carried.addmm_(to_hidden[t], weight)
+        every = to_hidden.flatten(0, 1)
+        return to_given, carried, every.T @ states[:-1].flatten(0, 1), every.sum(0)
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _forward(given: Array, hidden: Array, states: Array, opened: Array, t: int) -> None:
+    """Step t: the gates and new states `opened [T, N, 3 * width]`, and the hidden states that follow."""
+    width = states.shape[2]
+    for n in range(states.shape[1]):
+        mine, own, gate, last, new = given[t, n], hidden[t, n], opened[t, n], states[t, n], states[t + 1, n]
+        for k in range(2 * width):
+            gate[k] = sigmoid(mine[k] + own[k])
+        for k in range(width):
+            fresh = tanh(mine[2 * width + k] + gate[k] * own[2 * width + k])
+            gate[2 * width + k] = fresh
+            new[k] = fresh + gate[width + k] * (last[k] - fresh)
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _backward(
+    after: Array, carried: Array, states: Array, opened: Array, hidden: Array, to_given: Array, to_hidden: Array, t: int
+) -> None:
+    """Step t: gradients of what the inputs and the hidden states add; `carried` becomes the direct one of the state."""
+    width, one = states.shape[2], float32(1)
+    for n in range(states.shape[1]):
+        gate, own, last, down, back = opened[t, n], hidden[t, n], states[t, n], to_given[t, n], to_hidden[t, n]
+        out, past = after[t, n], carried[n]
+        for k in range(width):
+            reset, update, fresh = gate[k], gate[width + k], gate[2 * width + k]
+            total = out[k] + past[k]
+            new = total * (one - update) * (one - fresh * fresh)
+            opens = new * own[2 * width + k] * reset * (one - reset)
+            keeps = total * (last[k] - fresh) * update * (one - update)
+            down[k], down[width + k], down[2 * width + k] = opens, keeps, new
+            back[k], back[width + k], back[2 * width + k] = opens, keeps, new * reset
+            past[k] = total * update

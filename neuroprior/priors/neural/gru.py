@@ -76,10 +76,30 @@ class GRUPrior(NeuralPrior):
         if layers is not None and recent is not None and self._may_step(inputs):
             out, layers, recent = self._one_step(inputs, layers, recent)
         else:
-            vectors, recent = self.embedding(inputs, recent)
-            out, layers = self.gru(self.drop(vectors), None if layers is None else layers.contiguous())
+            vectors, recent = self.embedding(inputs, recent, self.window)
+            out, layers = gru_sequence(self.gru, self.drop(vectors), layers)
         hidden = layers.transpose(0, 1).flatten(1)
         return self.head(self.drop(out)), hidden if recent.shape[1] == 0 else torch.cat([hidden, recent], 1)
+
+    def advance_shared(
+        self, action: Tensor, state: Tensor, context: Tensor, row: Tensor, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        """As `advance`, where many plans get the same input; its vectors and gates are computed once.
+
+        Args:
+            action: integers `[K]`, the distinct ones.
+            state, room: see `advance`.
+            context: `[K]` or `[K, C]`: that of the next action, with each.
+            row: integers `[N]`: which of the K each plan gets.
+        """
+        own = type(self).encode is GRUPrior.encode and type(self).step is NeuralPrior.step
+        inputs = self._inputs(action, context, None)
+        if not own or self.lags > 1 or self.window == 0 or not self._may_step(inputs[:, None]):
+            return self.advance(action[row], state, context[row], room)
+        layers = state[:, self.input_size :].unflatten(1, (self.num_layers, self.hidden_size)).transpose(0, 1)
+        vectors, _ = self.embedding(inputs[:, None], None, self.window)
+        out, layers = gru_step(self.gru, vectors[:, 0], layers, row.int())
+        return self.head(out), torch.cat([inputs.index_select(0, row), layers.transpose(0, 1).flatten(1)], 1)
 
     def _may_step(self, inputs: Tensor) -> bool:
         """Whether `_one_step` gives the same as `nn.GRU`, and faster."""
@@ -99,15 +119,42 @@ class GRUPrior(NeuralPrior):
         """
         # Input gates that depend on an action alone are looked up, where there are more plans than actions.
         if self.takes_context or self.lags > 1 or len(inputs) <= self.num_actions:
-            vectors, recent = self.embedding(inputs, recent)
+            vectors, recent = self.embedding(inputs, recent, self.window)
             out, layers = gru_step(self.gru, vectors[:, 0], layers)
         else:
             action = inputs[:, 0, 0].int()
             out, layers = gru_step(self.gru, self.embedding.action.weight, layers, rows=action)
         return out[:, None], layers, recent
 
-    def hidden_size_of(self, state_size: int) -> int:
-        return self.num_layers * self.hidden_size + self.lags - 1
+
+def gru_sequence(gru: nn.GRU, inputs: Tensor, layers: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The output of `nn.GRU`, which is slow for small batches, by compiled loops where they are worth it.
+
+    Args:
+        gru: the network, `batch_first`, with weights of one width.
+        inputs: `[N, T, width]`.
+        layers: `[layers, N, width]`, the hidden states before; None: zeros.
+
+    Returns:
+        The output `[N, T, width]`, and the new `layers`.
+    """
+    plain = inputs.device.type == "cpu" and inputs.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
+    able = plain and COMPILE_FROM is not None and inputs.numel() >= COMPILE_FROM
+    fast = compiled("neuroprior.priors.neural.compiled_gru") if able else None
+    if layers is not None and inputs.shape[1] == 1 and plain and not torch.is_grad_enabled():
+        out, layers = gru_step(gru, inputs[:, 0], layers)
+        return out[:, None], layers
+    if fast is None:
+        out, layers = gru(inputs, None if layers is None else layers.contiguous())
+        return out, layers
+    after, below = [], inputs.transpose(0, 1)
+    for layer, (w_in, w_hidden, b_in, b_hidden) in enumerate(gru.all_weights):
+        if layer > 0:
+            below = functional.dropout(below, gru.dropout, gru.training)
+        first = below.new_zeros(below.shape[1], w_hidden.shape[1]) if layers is None else layers[layer]
+        below = fast.Sequence.apply(functional.linear(below, w_in, b_in), first, w_hidden, b_hidden)
+        after.append(below[-1])
+    return below.transpose(0, 1), torch.stack(after)
 
 
 def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:

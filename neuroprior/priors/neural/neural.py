@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_count, check_memory, check_sizes
+from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.prior import Prior
@@ -61,29 +61,29 @@ class Sizes(NamedTuple):
 class NeuralPrior(Prior):
     """A network over (last action, context) inputs; the first input is a start symbol.
 
-    Beyond the training length a network meets positions and hidden states that it was not trained on. Therefore each
-    action is predicted from at most the last `window` actions, read as the beginning of a plan: with plans of length T
-    in training, `window = T - 1`, the most that preceded any action there. Up to length T this changes nothing.
-    Measured on a chain of order 2 (1.288 bits per action) at actions 20 to 32, after training on plans of length 8: the
-    transformer takes 1.291 bits with this window and 2.171 without one, the GRU 1.291 with and without; windows of 5
-    and 3 are no worse there, since they still hold the order
-    (`python -m pytest -m slow -k past_the_training_length -s` prints this).
+    Beyond the training length a network meets positions and hidden states that it was not trained on. What it reads of
+    the past is therefore bounded by `window`: with plans of length T in training, `window = T - 1`, the most actions
+    that preceded any other there. A recurrent network carries its hidden state on, and is shown no lag beyond `window`;
+    a transformer attends to the last `window` inputs and the start symbol, at the distances that it was trained on. Up
+    to length T this changes nothing, and a step past it costs what a step costs. How this predicts, against reading the
+    last `window` actions anew as the beginning of a plan:
+    `python -m pytest -m slow -k past_the_training_length -s`. After training on plans of one action, each action is
+    predicted as the first.
 
     Plans longer than the training window (`Settings.window`) are read in consecutive windows in training, the hidden
     state carried from each to the next (truncated backpropagation through time). A prior trained in this way carries
     its hidden state on in use as well, without limit.
 
     In this class "hidden" is what the network carries along a sequence, `[N, H]`: the hidden state of a recurrent
-    network, the key-value cache of a transformer. The prior's `state` holds, beside it, the inputs that the window may
-    still need: `[N, H + (t + 1) * D]` after t actions, D = 1 + (1 for a context index, C for features); past the window
-    it is these inputs alone, `[N, window + 1, D]`.
+    network, the key-value cache of a transformer. The prior's `state` is the last input, whose context may go on, and
+    it: `[N, D + H]`, D = 1 + (1 for a context index, C for features).
 
-    A subclass writes `build`, `encode` and `hidden_size_of`.
+    A subclass writes `build` and `encode`.
 
     Args:
         num_actions: A.
         width: of the network's vectors, and of its hidden state.
-        window: past actions that are read, at most; None: set by `fit`, and no limit before that.
+        window: past actions up to which it is trained; None: set by `fit`, and no limit before that.
         lags: past actions that each input shows to the network directly; see `Embedding`.
         dropout: share of the network's activations that is set to 0 at random in training.
         num_contexts, context_size: see `Prior`.
@@ -110,8 +110,9 @@ class NeuralPrior(Prior):
         super().__init__(num_actions, num_contexts, context_size)
         if window is not None:
             check_count("window", window, 0)
-        if dropout is not None and not 0 <= dropout < 1:
+        if dropout is not None and (not is_number(dropout) or not 0 <= dropout < 1):
             raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
+        check_seed(seed)
         self._given_window = self.window = window
         check_sizes(lags=1 if lags is None else lags)
         self._given = (width, lags, dropout)
@@ -169,10 +170,6 @@ class NeuralPrior(Prior):
             Logits `[N, T, A]`, and `hidden` `[N, H']` after the last input.
         """
 
-    @abstractmethod
-    def hidden_size_of(self, state_size: int) -> int:
-        """The size H of the hidden part of a state of `state_size` numbers."""
-
     def set_training_window(self, window: int | None) -> None:
         """Prepare for training in windows of so many actions, after which the hidden state is carried on without limit.
 
@@ -186,7 +183,7 @@ class NeuralPrior(Prior):
             return
         if self._given_window is not None:
             raise ValueError(
-                f"window: this prior reads {self._given_window} actions at a time, but plans of more than {window} are"
+                f"window: this prior reads {self._given_window} past actions, but plans of more than {window} are"
                 " trained on with the hidden state carried over; train with a window as long as the plans, or make the"
                 " prior without one"
             )
@@ -196,30 +193,21 @@ class NeuralPrior(Prior):
         previous = torch.full((batch_size,), self.num_actions, device=self.device)
         inputs = self._inputs(previous, context, None)
         logits, hidden = self.encode(inputs[:, None])
-        return logits[:, 0], torch.cat([hidden, inputs], 1)
+        return logits[:, 0], torch.cat([inputs, hidden], 1)
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        hidden, history = self._split(state)
-        new = self._inputs(action, context, history[:, -1])
-        kept = history if self.window is not None else history[:, :0]
-        history = torch.cat([kept, new[:, None]], 1)
-        if self.window is not None and history.shape[1] > self.window + 1:
-            history = history[:, 1:]
-            return self._read_window(history), history
-        logits, hidden = self.encode(new[:, None], hidden)
-        return logits[:, 0], torch.cat([hidden, history.flatten(1)], 1)
+        last, hidden = state[:, : self.input_size], state[:, self.input_size :]
+        new = self._inputs(action, context, last)
+        logits, hidden = self.encode(new[:, None], None if self.window == 0 else hidden)
+        return logits[:, 0], torch.cat([new, hidden], 1)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
-        num, length = plans.shape
-        if length == 0:
-            return torch.zeros(num, 0, self.num_actions, device=self.device)
-        if self.window is None or length <= self.window + 1:
-            return self.forward_from(plans, context)[0]
+        if plans.shape[1] == 0:
+            return torch.zeros(*plans.shape, self.num_actions, device=self.device)
         inputs = self._sequence(plans, context, None)
-        first = self.encode(inputs[:, : self.window + 1])[0]
-        late = inputs[:, 1:].unfold(1, self.window + 1, 1).transpose(2, 3)
-        logits = self._read_window(late.flatten(0, 1))
-        return torch.cat([first, logits.view(num, length - self.window - 1, self.num_actions)], 1)
+        if self.window == 0:  # each action is the first of a plan
+            return self.encode(inputs.flatten(0, 1)[:, None])[0].view(*plans.shape, self.num_actions)
+        return self.encode(inputs)[0]
 
     def forward_from(
         self,
@@ -303,6 +291,8 @@ class NeuralPrior(Prior):
 
     def _inputs(self, previous: Tensor, context: Tensor | None, last: Tensor | None) -> Tensor:
         """Previous actions `[...]` and contexts as inputs `[..., D]`; context None: that of the `last` input."""
+        if self.window == 0:
+            previous = torch.full_like(previous, self.num_actions, dtype=torch.long)
         action = previous[..., None].float()
         if not self.takes_context:
             return action
@@ -312,27 +302,6 @@ class NeuralPrior(Prior):
             return torch.cat([action, last[..., 1:]], -1)
         values = context[..., None] if self.num_contexts is not None else context
         return torch.cat([action, values.to(action)], -1)
-
-    def _split(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """The hidden part `[N, H]` and the inputs `[N, T, D]` of a state; past the window it is the inputs alone."""
-        if state.dim() == 3:
-            return state[:, 0, :0], state
-        size = self.hidden_size_of(state.shape[1])
-        return state[:, :size], state[:, size:].unflatten(1, (-1, self.input_size))
-
-    def _read_window(self, inputs: Tensor) -> Tensor:
-        """The logits `[N, A]` after `inputs [N, window + 1, D]`, read as the beginning of a plan.
-
-        Samples and trees have few different windows; without context each of these is read once.
-        """
-        start = torch.full_like(inputs[:, :1, :1], self.num_actions)
-        inputs = torch.cat([torch.cat([start, inputs[:, :1, 1:]], -1), inputs[:, 1:]], 1)
-        if self.takes_context or self.num_actions ** (inputs.shape[1] - 1) > 2**62:
-            return self.encode(inputs)[0][:, -1]
-        base = self.num_actions ** torch.arange(inputs.shape[1] - 1, device=inputs.device)
-        distinct, which = (inputs[:, 1:, 0].long() * base).sum(1).unique(return_inverse=True)
-        last = torch.empty_like(distinct).scatter_(0, which, torch.arange(len(which), device=inputs.device))
-        return self.encode(inputs[last])[0][:, -1][which]
 
 
 def training_settings() -> tuple[str, ...]:
@@ -372,19 +341,32 @@ class Embedding(nn.Module):
         self.index = None if num_contexts is None else context_embedding(num_contexts, width)
         self.features = None if context_size is None else nn.Linear(context_size, width)
 
-    def forward(self, inputs: Tensor, recent: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The vectors, and the last `lags` - 1 actions; `recent [N, lags - 1]`: those before these inputs."""
+    def forward(self, inputs: Tensor, recent: Tensor | None, window: int | None = None) -> tuple[Tensor, Tensor]:
+        """The vectors, and the last `lags` - 1 actions.
+
+        Args:
+            inputs: see the class.
+            recent: `[N, lags - 1]`: the actions before these inputs; None: there were none.
+            window: past actions that were shown in training, at most. Lags further back have no weight: there the last
+                input of a plan's window is the start symbol, as it was in training.
+        """
         now = inputs[..., 0]
         vectors: Tensor = self.action(now.long())
         if recent is None:
             recent = now.new_full((len(now), self.lags - 1), self.nothing)
         line = torch.cat([recent.to(now), now], 1)
         if self.past is not None and self.mix is not None:
-            past = self.past(line.long()).transpose(1, 2)
+            taps = self.lags if window is None else min(window, self.lags)
+            weight, beyond = self.mix.weight[..., self.lags - taps :], self.lags - taps
+            past = self.past(line[:, beyond:].long()).transpose(1, 2)
             if now.shape[1] == 1:  # one output of a convolution is a product, which is quicker
-                vectors = vectors + nn.functional.linear(past.flatten(1), self.mix.weight.flatten(1))[:, None]
-            else:
-                vectors = vectors + self.mix(past).transpose(1, 2)
+                vectors = vectors + nn.functional.linear(past.flatten(1), weight.flatten(1))[:, None]
+            elif taps:
+                vectors = vectors + nn.functional.conv1d(past, weight).transpose(1, 2)
+            if beyond:
+                start = self.mix.weight[..., beyond - 1] @ self.past.weight[self.nothing - 1]
+                begun = line[:, beyond - 1 : beyond - 1 + now.shape[1]] != self.nothing
+                vectors = vectors + begun[..., None] * start
         if self.index is not None:
             vectors = vectors + self.index(inputs[..., 1].long())
         if self.features is not None:

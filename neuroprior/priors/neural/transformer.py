@@ -1,6 +1,5 @@
 """The transformer prior: attention over the actions so far, with a key-value cache for stepping."""
 
-import sys
 from typing import Any
 
 import torch
@@ -12,13 +11,18 @@ from neuroprior.plans import Plans
 from neuroprior.priors.neural.neural import FEW, Embedding, NeuralPrior, Sizes
 from neuroprior.sampling.rows import extended, states_with_room
 
+FEWEST_AT_ONCE = 32
+"""Inputs of a sequence that are read at once, at least, past the training length."""
+
 
 class TransformerPrior(NeuralPrior):
     """A pre-norm transformer (Vaswani et al. 2017) with rotary positions (Su et al. 2021) as a prior.
 
-    Its state holds the key-value cache: `num_layers * 2 * width` numbers for each input so far. Trained in windows (see
-    `NeuralPrior`), each layer attends to at most `span` inputs before its own, `span` being the training window, and
-    the cache keeps no more; several layers together still reach further back.
+    Its state holds the key-value cache: `num_layers * 2 * width` numbers for each input that is attended to. Past the
+    training length each layer attends to the start symbol and the last `window` inputs, its own among them, at the
+    distances of the last action of a plan in training (as the attention sink of Xiao et al. 2023). Trained in windows
+    (see `NeuralPrior`), it attends to its own input and at most `span` before it, `span` being the training window.
+    The cache keeps no more: new keys and values replace the oldest. Several layers together still reach further back.
 
     Args:
         num_actions: A.
@@ -90,100 +94,116 @@ class TransformerPrior(NeuralPrior):
         self.head = nn.Linear(self.width, self.num_actions)
 
     def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if self.span is not None and inputs.shape[1] > 2 * self.span:
-            return self._encode_in_parts(inputs, hidden)
-        past, recent, kept = None, None, self.lags - 1
-        if hidden is not None:
-            past = hidden[:, kept:].view(len(hidden), -1, self.num_layers, 2 * self.width)
-            recent = hidden[:, :kept]
-        x, recent = self.embedding(inputs, recent)
+        most = self.most_kept
+        if most is not None and inputs.shape[1] > max(most, FEWEST_AT_ONCE):
+            return self._encode_in_parts(inputs, hidden, max(most, FEWEST_AT_ONCE))
+        recent, past = (None, None) if hidden is None else self._unpacked(hidden)
+        x, recent = self.embedding(inputs, recent, self.window)
         x = self.drop(x)
         caches = []
         for layer, block in enumerate(self.blocks):
-            x, cache = block(x, None if past is None else past[:, :, layer], self.span)
+            x, cache = block(x, None if past is None else past[:, :, layer], self.span, self.window)
             caches.append(cache)
-        return self.head(self.norm(x)), torch.cat([recent, torch.stack(caches, 2).flatten(1)], 1)
+        cache = torch.stack(caches, 2)
+        number = recent.new_full((len(cache), 1), cache.shape[1])
+        return self.head(self.norm(x)), torch.cat([recent, number, cache.flatten(1)], 1)
 
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if self.steps_in_place(state) is None:
-            return super().step(action, state, context)
-        return self._step_in_place(action, state, context)
+    def _encode_in_parts(self, inputs: Tensor, hidden: Tensor | None, size: int) -> tuple[Tensor, Tensor]:
+        """As `encode`, part by part, since the cost of attention grows with the square of what is read at once."""
+        logits = []
+        for part in inputs.split(size, 1):
+            out, hidden = self.encode(part, hidden)
+            logits.append(out)
+        assert hidden is not None
+        return torch.cat(logits, 1), hidden
 
-    def advance(
-        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
-        most = self.steps_in_place(state)
-        if most is None or type(self).step is not TransformerPrior.step:
-            return self.step(action, state, context)
-        return self._step_in_place(action, state, context, min(room, most))
+    def _unpacked(self, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        """The actions before, and the key-value cache `[N, S, num_layers, 2 * width]` from the oldest input on.
 
-    def _step_in_place(
-        self, action: Tensor, state: Tensor, context: Tensor | None, room: int | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """A step in which new keys and values are written behind the cache, which is the largest part of the state.
-
-        Args:
-            action, state, context: see `step`.
-            room: None: the cache is copied once, and `state` stays as it is. Otherwise a state that has room is
-                overwritten, and any other is copied to a tensor with room for so many further steps.
+        Its keys are at the positions 0 to S - 1, as those that are read at once.
         """
-        hidden, history = self._split(state)
-        new = self._inputs(action, context, history[:, -1])
-        kept = 0 if self.window is None else history.shape[1] * self.input_size
-        recent, past, cached = self.lags - 1, hidden.shape[1], hidden.shape[1] + self.cache_size
-        before = state[:, past : past + kept].clone()  # the cache will be written there
-        size = cached + kept + self.input_size
-        x, line = self.embedding(new[:, None], hidden[:, :recent])
-        after = None if room is None else extended(state, size)
-        if after is None:
-            free = (room or 0) * (self.cache_size + self.input_size)
-            after = state.new_empty(len(state), size) if room is None else states_with_room(state, size, free)
-            after[:, recent:past] = hidden[:, recent:]
-        after[:, :recent] = line
-        places = after[:, recent:cached].unflatten(1, ((cached - recent) // self.cache_size, self.num_layers, -1))
-        for layer, block in enumerate(self.blocks):
-            assert isinstance(block, Block)
-            x = block.step(x, places[:, :, layer])
-        after[:, cached : cached + kept] = before
-        after[:, cached + kept :] = new
-        return self.head(self.norm(x))[:, 0], after
+        cache = hidden[:, self.lags :].unflatten(1, (-1, self.num_layers, 2 * self.width))
+        kept, number = cache.shape[1], self._number(hidden)
+        if number > kept:
+            first = 0 if self.window is None else 1  # the start symbol stays where it is
+            turned = torch.roll(cache[:, first:], -((number - first) % (kept - first)), 1)
+            key, value = torch.cat([cache[:, :first], turned], 1).chunk(2, -1)
+            back = rotation(torch.tensor([kept - number], device=cache.device), self.width // self.num_heads)
+            cache = torch.cat([rotate(key.flatten(1, 2), *back).view(key.shape), value], -1)
+        return hidden[:, : self.lags - 1], cache
 
-    def steps_in_place(self, state: Tensor) -> int | None:
-        """How many steps after the next can be written in place as well; None: not even the next one.
+    def _number(self, hidden: Tensor) -> int:
+        """How many inputs were read before; the position of the next one."""
+        kept = (hidden.shape[1] - self.lags) // self.cache_size
+        full = kept == self.most_kept and len(hidden) > 0
+        return int(hidden[0, self.lags - 1]) if full else kept
 
-        In training, under autocast, where inputs leave the window or span, and in subclasses with an `encode` of their
-        own, steps are not written in place.
-        """
-        plain = type(self).encode is TransformerPrior.encode and not (self.training or torch.is_grad_enabled())
-        if not plain or state.dim() == 3 or torch.is_autocast_enabled(state.device.type):
-            return None
-        hidden, history = self._split(state)
-        read = (hidden.shape[1] - self.lags + 1) // self.cache_size
-        limits = [
-            *([] if self.window is None else [self.window - history.shape[1]]),
-            *([] if self.span is None else [self.span - read - 1]),
-        ]
-        most = min(limits, default=sys.maxsize)
-        return None if most < 0 else most
+    @property
+    def most_kept(self) -> int | None:
+        """Inputs in the key-value cache, at most; None: no limit."""
+        return self.window + 1 if self.window is not None else None if self.span is None else self.span + 1
 
     @property
     def cache_size(self) -> int:
         """Numbers of the key-value cache for each input."""
         return self.num_layers * 2 * self.width
 
-    def _encode_in_parts(self, inputs: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
-        """As `encode`, part by part, since the cost of attention grows with the square of what is read at once."""
-        logits = []
-        for part in inputs.split(self.span or inputs.shape[1], 1):
-            out, hidden = self.encode(part, hidden)
-            logits.append(out)
-        assert hidden is not None
-        return torch.cat(logits, 1), hidden
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        if not self.writes_in_place(state):
+            return super().step(action, state, context)
+        return self._step_in_place(action, state, context)
 
-    def hidden_size_of(self, state_size: int) -> int:
-        if self.window is None:
-            return state_size - self.input_size
-        return (state_size - self.lags + 1) // (self.cache_size + self.input_size) * self.cache_size + self.lags - 1
+    def advance(
+        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        if not self.writes_in_place(state) or type(self).step is not TransformerPrior.step:
+            return self.step(action, state, context)
+        return self._step_in_place(action, state, context, room)
+
+    def _step_in_place(
+        self, action: Tensor, state: Tensor, context: Tensor | None, room: int | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """A step in which new keys and values are written behind the cache, which is the largest part of the state.
+
+        Where the cache is full they are written over the oldest.
+
+        Args:
+            action, state, context: see `step`.
+            room: None: the cache is copied once, and `state` stays as it is. Otherwise a state that has room is
+                overwritten, and any other is copied to a tensor with room for so many further steps.
+        """
+        given, recent, most = self.input_size, self.input_size + self.lags - 1, self.most_kept
+        number, kept = self._number(state[:, given:]), (state.shape[1] - recent - 1) // self.cache_size
+        new = self._inputs(action, context, state[:, :given])
+        x, line = self.embedding(new[:, None], state[:, given:recent], self.window)
+        grown = kept if kept == most else kept + 1
+        size = recent + 1 + grown * self.cache_size
+        after = None if room is None else extended(state, size)
+        if after is None:
+            more = 0 if room is None else room if most is None else min(room, most - grown)
+            after = states_with_room(state, size, more * self.cache_size)
+            after[:, recent + 1 : state.shape[1]] = state[:, recent + 1 :]
+        after[:, :given], after[:, given:recent], after[:, recent] = new, line, number + 1
+        cache = after[:, recent + 1 :].unflatten(1, (grown, self.num_layers, -1))
+        first = 0 if self.window is None else 1
+        place = number if number < grown else first + (number - first) % (grown - first)
+        size = self.width // self.num_heads
+        turns = rotation(torch.tensor([number], device=state.device), size)
+        if self.window is not None and number > self.window:  # keep the distance of the start symbol
+            key = cache[:, 0, :, : self.width]
+            key.copy_(rotate(key, *rotation(torch.tensor([1], device=state.device), size)))
+        for layer, block in enumerate(self.blocks):
+            assert isinstance(block, Block)
+            x = block.step(x, cache[:, :, layer], place, turns)
+        return self.head(self.norm(x))[:, 0], after
+
+    def writes_in_place(self, state: Tensor) -> bool:
+        """Whether the next step may be written in place.
+
+        In training, under autocast, and in subclasses with an `encode` of their own it is not.
+        """
+        plain = type(self).encode is TransformerPrior.encode and not (self.training or torch.is_grad_enabled())
+        return plain and self.window != 0 and not torch.is_autocast_enabled(state.device.type)
 
 
 class Block(nn.Module):
@@ -200,36 +220,53 @@ class Block(nn.Module):
             nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width)
         )
 
-    def forward(self, x: Tensor, past: Tensor | None, span: int | None) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, x: Tensor, past: Tensor | None, span: int | None, window: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """`x [N, T, width]` after `past [N, S, 2 * width]`: the new `x`, and the keys and values to be kept.
 
         Each input attends to itself and those before it, at most `span` back. Positions count from the first input of
         the past; where the oldest ones are dropped, the keys that are kept are rotated back by as many positions.
+
+        With a `window`, each input attends to the first one and to the last `window`, itself among them; the first is
+        never further away than `window`, and is kept.
         """
-        start = 0 if past is None else past.shape[1]
+        start, size = 0 if past is None else past.shape[1], x.shape[-1] // self.num_heads
         place = torch.arange(start, start + x.shape[1], device=x.device)
-        query, key, value = self._project(x, place)
+        turns = rotation(place, size)
+        unturned, key, value = self._project(x)
+        query, key = rotate(unturned, *turns), rotate(key, *turns)
         if past is not None:
             # under autocast new keys and values may be of another dtype than kept ones
             key, value = torch.cat([past.to(key.dtype), torch.cat([key, value], -1)], 1).chunk(2, -1)
-        x = self._add(x, self._attend(query, key, value, span))
-        excess = 0 if span is None else max(key.shape[1] - span, 0)
+        if window is None or key.shape[1] <= window + 1:
+            mixed = self._attend(query, key, value, span)
+        else:
+            near = rotate(unturned, *rotation(place.clamp(max=window), size))
+            mixed = self._attend_to_first(query, near, key, value, window)
+        x = self._add(x, mixed)
+        most = span if window is None else window + 1
+        excess = 0 if most is None else max(key.shape[1] - most, 0)
         if excess:
-            key, value = self._rotate(key[:, excess:], torch.full_like(place[:1], -excess)), value[:, excess:]
+            first, back = (0 if window is None else 1), rotation(place.new_tensor([-excess]), size)
+            key = torch.cat([key[:, :first], rotate(key[:, first + excess :], *back)], 1)
+            value = torch.cat([value[:, :first], value[:, first + excess :]], 1)
         return x, torch.cat([key, value], -1)
 
-    def step(self, x: Tensor, cache: Tensor) -> Tensor:
-        """The new `x [N, 1, width]`; keys and values are written to the last place of `cache [N, S, 2 * width]`."""
-        last = cache.shape[1] - 1
-        query, key, value = self._project(x, torch.arange(last, last + 1, device=x.device))
-        cache[:, last:] = torch.cat([key, value], -1)
-        key, value = cache.chunk(2, -1)
-        return self._add(x, self._attend(query, key, value, None))
+    def step(self, x: Tensor, cache: Tensor, place: int, turns: tuple[Tensor, Tensor]) -> Tensor:
+        """The new `x [N, 1, width]`; keys and values are written to this place of `cache [N, S, 2 * width]`.
 
-    def _project(self, x: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values of `x [N, T, width]`, rotated to their positions `place [T]`."""
+        `turns`: the rotation of the input's position.
+        """
+        query, key, value = self._project(x)
+        cache[:, place] = torch.cat([rotate(key, *turns), value], -1)[:, 0]
+        key, value = cache.chunk(2, -1)
+        return self._add(x, self._attend(rotate(query, *turns), key, value, None))
+
+    def _project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries, keys and values of `x [N, T, width]`."""
         query, key, value = self.query_key_value(self.attention_norm(x)).chunk(3, -1)
-        return self._rotate(query, place), self._rotate(key, place), value
+        return query, key, value
 
     def _add(self, x: Tensor, mixed: Tensor) -> Tensor:
         """`x` plus the output of attention, `mixed`, and then plus that of the two-layer network."""
@@ -240,23 +277,44 @@ class Block(nn.Module):
     def _attend(self, query: Tensor, key: Tensor, value: Tensor, span: int | None) -> Tensor:
         """`[N, T, width]`: attention of each query over keys and values `[N, S + T, width]`."""
         num, total = query.shape[1], key.shape[1]
-        query, key, value = (v.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for v in (query, key, value))
-        plain = num == total and (span is None or num <= span + 1)
-        mask = None
-        if not plain and num > 1:
-            back = torch.arange(total - num, total, device=query.device)[:, None] - torch.arange(
-                total, device=query.device
-            )
-            mask = (back >= 0) & (back <= (total if span is None else span))
-        mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask, is_causal=plain)
+        span = total if span is None else span
+        every = total <= span + 1
+        plain = num == total and every
+        mask = None if plain or (num == 1 and every) else reached(num, total, span, query.device)
+        query, key, value = map(self._heads, (query, key, value))
+        mixed: Tensor = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask, is_causal=plain)
         return mixed.transpose(1, 2).flatten(2)
 
-    def _rotate(self, x: Tensor, place: Tensor) -> Tensor:
-        """Rotate each pair of numbers of each head of `x [N, T, width]` by an angle proportional to `place [T]`."""
-        pairs = x.unflatten(-1, (self.num_heads, 2, -1))
-        half = pairs.shape[-1]
-        rate = 10_000 ** -(torch.arange(half, device=x.device) / half)
-        angle = place[:, None] * rate
-        cos, sin = angle.cos()[:, None], angle.sin()[:, None]
-        first, second = pairs[..., 0, :], pairs[..., 1, :]
-        return torch.stack([first * cos - second * sin, first * sin + second * cos], -2).flatten(-3)
+    def _attend_to_first(self, query: Tensor, near: Tensor, key: Tensor, value: Tensor, window: int) -> Tensor:
+        """As `_attend`, over the last `window` inputs and the first one, which queries `near` it attend to."""
+        mask = reached(query.shape[1], key.shape[1], window - 1, query.device)
+        mask[:, 0] = True
+        query, near, key, value = map(self._heads, (query, near, key, value))
+        scores = torch.cat([near @ key[:, :, :1].mT, query @ key[:, :, 1:].mT], -1) / query.shape[-1] ** 0.5
+        mixed: Tensor = scores.masked_fill(~mask, -torch.inf).softmax(-1) @ value
+        return mixed.transpose(1, 2).flatten(2)
+
+    def _heads(self, x: Tensor) -> Tensor:
+        """`[N, heads, T, size]`."""
+        heads: Tensor = x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+        return heads
+
+
+def reached(num: int, total: int, span: int, device: torch.device) -> Tensor:
+    """`[num, total]`: the inputs that each of the last `num` attends to, itself and those at most `span` back."""
+    back = torch.arange(total - num, total, device=device)[:, None] - torch.arange(total, device=device)
+    return (back >= 0) & (back <= span)
+
+
+def rotation(place: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Cosine and sine `[T, size / 2]` of the angles by which heads of this size are rotated at `place [T]`."""
+    half = size // 2
+    angle = place[:, None] * 10_000 ** -(torch.arange(half, device=place.device) / half)
+    return angle.cos(), angle.sin()
+
+
+def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """Each pair of numbers of each head of `x [N, T, width]` rotated by the angles of its position, see `rotation`."""
+    first, second = x.unflatten(-1, (-1, 2, cos.shape[-1])).unbind(-2)
+    cos, sin = cos[:, None], sin[:, None]
+    return torch.stack([first * cos - second * sin, first * sin + second * cos], -2).flatten(-3)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.patterns.minibatches import train
@@ -111,7 +111,7 @@ class BoardNetwork(Prior):
         epochs, batch_size = settings.get("epochs", 10), settings.get("batch_size", 256)
         check_sizes(epochs=epochs, batch_size=batch_size)
         learning_rate, share = settings.get("learning_rate", 1e-3), settings.get("validation", VALIDATION)
-        if not 0 < learning_rate < inf:
+        if not is_number(learning_rate) or not 0 < learning_rate < inf:
             raise ValueError(f"learning_rate: a finite number above 0 is expected, not {learning_rate}")
         units = len(plans) if plans.group is None else len(plans.group.unique())
         training, held_out = (plans, None) if share is None or units < 2 else plans.split(share, generator)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuroprior._checks import is_number
 from neuroprior.priors.patterns.pattern_prior import PatternPrior, Steps, compiled_fit
 
 HELD_OUT = 10
@@ -53,8 +54,8 @@ class PatternCounts(PatternPrior):
         super().__init__(num_actions, num_patterns, use_last=combine == "product", min_count=min_count)
         if combine not in ("product", "backoff"):
             raise ValueError(f'combine: "product" or "backoff" is expected, not {combine!r}')
-        if not 0 < smoothing < inf:
-            raise ValueError(f"smoothing: a finite number above 0 is expected, not {smoothing}")
+        if not is_number(smoothing) or not 0 < smoothing < inf:
+            raise ValueError(f"smoothing: a finite number above 0 is expected, not {smoothing!r}")
         self.combine, self.smoothing = combine, float(smoothing)
         self.register_buffer("marginal", torch.full((num_actions,), 1 / num_actions))
 

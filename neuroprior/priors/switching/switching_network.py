@@ -87,6 +87,3 @@ class SwitchingNetwork(GRUPrior):
             last = emitted[:, t]
             forecasts.append((before[..., None] + last).logsumexp(1))
         return torch.stack(forecasts, 1), torch.cat([network, before, last.flatten(1)], 1)
-
-    def hidden_size_of(self, state_size: int) -> int:
-        return super().hidden_size_of(state_size) + self.num_modes * (self.num_actions + 1)

@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from copy import copy
 from math import inf
-from numbers import Real
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory, check_share, check_sizes
+from neuroprior._checks import check_count, check_memory, check_share, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts.histories import Counts, Tree
@@ -137,11 +136,13 @@ class SwitchingPrior(HistoryPrior):
         tolerance: float = 1e-4,
     ) -> None:
         check_sizes(num_modes=num_modes, phases=phases, folds=folds, restarts=restarts)
+        if num_contexts is not None:
+            check_sizes(num_contexts=num_contexts)
         check_count("order", order, 0)
         check_count("max_iterations", max_iterations, 0)
         numbers: dict[str, object] = {"smoothing": smoothing, "stay": stay, "tolerance": tolerance}
         for name, value in numbers.items():
-            if isinstance(value, bool) or not isinstance(value, Real) or not 0 <= float(value) < inf:
+            if not is_number(value) or not 0 <= value < inf:
                 raise ValueError(f"{name}: a finite number of at least 0 is expected, not {value!r}")
         check_share("sharing", sharing)
         if switching not in ("context", "constant"):
@@ -150,7 +151,12 @@ class SwitchingPrior(HistoryPrior):
         self.smoothing, self.sharing, self.stay = float(smoothing), float(sharing), float(stay)
         self.switching: Literal["context", "constant"] = switching
         self.max_iterations, self.tolerance = max_iterations, float(tolerance)
-        check_memory(8 * (num_contexts or 1) * (num_modes * phases) ** 2, num_modes=num_modes, phases=phases)
+        check_memory(
+            8 * (num_contexts or 1) * (num_modes * phases) ** 2,
+            num_contexts=num_contexts,
+            num_modes=num_modes,
+            phases=phases,
+        )
         super().__init__(num_actions, order, num_contexts)
 
     @property

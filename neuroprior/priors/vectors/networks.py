@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_seed, check_sizes, is_number
 from neuroprior._compiled import compiled
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans.vector_plans import VectorPlans
@@ -93,8 +93,9 @@ class VectorNetwork(VectorPrior):
         super().__init__(action_low, action_high, context_size)
         check_sizes(width=width, num_layers=num_layers, num_components=num_components, lags=lags)
         check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
-        if not isinstance(dropout, int | float) or not 0 <= dropout < 1:
+        if not is_number(dropout) or not 0 <= dropout < 1:
             raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
+        check_seed(seed)
         self.width, self.num_layers, self.num_components, self.lags = width, num_layers, num_components, lags
         self.coupled, self.dropout = coupled, dropout
         size, features = self.action_size, context_size or 0

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.plans.vector_plans import VectorPlans, as_floats, check_widths, same_bounds
 from neuroprior.priors.saved import SavedModule
@@ -307,6 +307,7 @@ class VectorPrior(SavedModule):
             ValueError: an argument is out of range, or does not fit this prior.
         """
         check_sizes(num_plans=num_plans, length=length)
+        check_memory(4 * num_plans * length * self.action_size, num_plans=num_plans, length=length)
         if context is not None:
             context = as_floats("context", context).to(self.device)
         batch = len(context) if context is not None and context.dim() else 1

@@ -25,6 +25,7 @@ from eval.bench.jobs import (
 )
 from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
 from neuroprior.plans import all_plans
+from neuroprior.worlds import maze
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 SMALL = 1e-3
@@ -99,6 +100,13 @@ def test_the_plain_gru():
     want = model(every).log_softmax(-1).gather(-1, every[..., None].long())[..., 0].sum(1).double().exp()
     drawn = model.sample(20_000, 3).long() @ torch.tensor([9, 3, 1])
     assert p_value(drawn, want.detach()) > FALSE_ALARM
+
+
+def test_the_plain_gru_beside_a_world():
+    world = maze(5, 5, egocentric=True, view=1)
+    state = world.reset(4, seeded(0))
+    plans, final = peers.ObservingGRU(3, 8).eval().sample_in_world(world, state, 3, 6)
+    assert final.equal(world.rollout(state, plans.view(4, 3, 6)).final_state.flatten())
 
 
 def test_the_quickest_training_that_is_close_enough_is_timed():

@@ -10,7 +10,6 @@ from eval.compare.priors import (
     MANY,
     ContextMarkov,
     Renumbered,
-    UnlimitedGRU,
     chain,
     combined,
     context_sizes,
@@ -108,14 +107,14 @@ def test_the_combined_prior_is_made_of_what_it_is_compared_with():
     plans = collect(ExhaustivePlanner(3), world, 60, context="step", generator=seeded(0))
     prior = combined(world, plans, (), 5)
     names = [type(expert).__name__ for expert in prior.experts]
-    assert names == ["ContextMarkov"] * 5 + ["MarkovPrior"] * 5 + ["UnlimitedGRU"]
+    assert names == ["ContextMarkov"] * 5 + ["MarkovPrior"] * 5 + ["GRUPrior"]
     for _ in range(2):  # experts that were left out are fitted again
         prior.fit(plans, generator=seeded(0), max_steps=3, progress=False)
         assert prior.tried == len(names) + 2
     sampled, _ = sample_in_world(prior, world, world.reset(4, seeded(1)), 8, 3, generator=seeded(2))
     assert sampled.shape == (4, 8, 3)
     alone = combined(world, plans.without_context(), (), 5)
-    assert [type(expert).__name__ for expert in alone.experts] == ["MarkovPrior"] * 5 + ["UnlimitedGRU"]
+    assert [type(expert).__name__ for expert in alone.experts] == ["MarkovPrior"] * 5 + ["GRUPrior"]
 
 
 def test_chains_choose_among_sets_of_features():
@@ -145,15 +144,6 @@ def test_networks_with_many_features_are_wide():
     world = small(0)
     assert [network("gru", world, one, 0).hidden_size for one in (plans, few)] == [128, 64]
     assert [network("transformer", world, one, 0).width for one in (plans, few)] == [128, 64]
-
-
-def test_a_gru_of_the_comparison_carries_its_hidden_state_on():
-    prior = UnlimitedGRU(3, 8).fit(torch.randint(3, (40, 4), generator=seeded(0)), max_steps=2, progress=False)
-    assert prior.window is None
-    _, state = prior.start(2)
-    for _ in range(10):
-        _, state = prior.step(torch.zeros(2, dtype=torch.long), state)
-    assert state.dim() == 2
 
 
 def learned(names=NAMES, **more) -> Plans:

@@ -62,6 +62,21 @@ def one_step(world: TabularWorld) -> Task:
     return Task(names, "one step", lambda seed: Worlds(world, world, world), 1, (1,), "return")
 
 
+def test_plans_are_learned_in_training_worlds_and_bits_are_of_held_out_ones():
+    """In each kind of world another action is best."""
+    worlds = []
+    for best_action in range(3):
+        reward = torch.zeros(1, 1, 3)
+        reward[..., best_action] = 1.0
+        worlds.append(TabularWorld(torch.zeros(1, 3, dtype=torch.long), reward))
+    made = Worlds(*worlds)
+    task = replace(one_step(made.training), worlds=lambda seed: made)
+    contest = Contest(Run("three", 0), task, SMALL)
+    found = contest.first, contest.held_out_plans
+    due = [next(k for k, one in enumerate(worlds) if one is world) for world in (made.training, made.held_out)]
+    assert [plans.actions.unique().tolist() for plans in found] == [[action] for action in due]
+
+
 def test_the_curve_of_a_lottery():
     """One of five plans wins: n candidates hold it with 1 - 0.8 ** n. 4,096 draws at each of 50 starts; 6 errors."""
     world = bandit(5)

@@ -6,12 +6,14 @@ from collections import deque
 from dataclasses import replace
 from math import exp, log
 
+import pandas as pd
 import pytest
 import torch
 
 from eval.__main__ import main
 from eval.intentions.grid import STAY, Agents, IntentionSettings, make_scene, policy_prior, progress, walk
 from eval.intentions.mice import log_odds, regression, stretches
+from eval.intentions.report import compared
 from eval.worlds.labyrinth import DATA, arrives_within
 from neuroprior import read_plans
 from neuroprior.analysis import infer
@@ -89,6 +91,19 @@ def test_progress_and_scores():
     assert both["accuracy"] == pytest.approx((1 + 0.5) / 2)  # of two that are equally probable one is drawn
     assert (both["agents"], one["agents"]) == (2, 1)
     assert one["probability"] == pytest.approx(0.7)
+
+
+def test_observers_are_compared_with_as_many_plans_and_exact_ones_with_all():
+    rows = [("exact", None, 1.0), ("blind", 20, 3.0), ("blind", 40, 2.0), ("blind, tempered", 20, 2.5)]
+    scored = pd.DataFrame(rows, columns=["kind", "plans", "loss"]).assign(world="g", measure="moves", at=4, seed=0)
+    found = compared(scored)
+    pairs = {(row.kind, row.minus, row.first, row.second) for row in found.itertuples()}
+    assert pairs == {
+        ("blind", "exact", 3.0, 1.0),
+        ("blind", "exact", 2.0, 1.0),
+        ("blind, tempered", "exact", 2.5, 1.0),
+        ("blind, tempered", "blind", 2.5, 3.0),
+    }
 
 
 def test_stretches_lead_to_the_water():

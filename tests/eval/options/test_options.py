@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from eval.__main__ import main
+from eval.options import run as run_module
 from eval.options.priors import entrants, pairs
 from eval.options.report import compared_pairs
-from eval.options.run import index_of, numbered, observed, scores_reached
+from eval.options.run import OptionSettings, index_of, numbered, observed, scores_reached
 from eval.worlds.labyrinth import DATA, cut_plans
+from eval.worlds.runs import Run
 from eval.worlds.starts import Starts
 from eval.worlds.suite import Task
 from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, TabularWorld, UniformPrior, collect, read_plans
@@ -56,6 +58,15 @@ def test_a_small_run(tmp_path, capsys):
     assert main([*SMALL, "--out", str(out)]) == 0  # finished runs are not done again
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
     assert capsys.readouterr().out == printed
+
+
+def test_priors_learn_from_the_larger_part_of_the_mices_plans(monkeypatch):
+    parts = []
+    monkeypatch.setattr(run_module, "entrants", lambda training, held_out, *_: parts.append((training, held_out)) or ())
+    run_module.options_run(Run("labyrinth", 0), OptionSettings((2,), (8,), (2,), 4, 4, 0))
+    assert len(parts) == 2  # without context and with it
+    for training, held_out in parts:
+        assert len(held_out) / (len(training) + len(held_out)) == pytest.approx(run_module.HELD_OUT, abs=0.05)
 
 
 @pytest.mark.slow

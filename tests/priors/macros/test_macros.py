@@ -163,7 +163,7 @@ def test_it_is_a_prior(inner):
 
 @pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
 def test_networks_inside_predict_plans_longer_than_their_window(kind):
-    """Recoded plans are short, and so is the window that is learned; past it a network's state has another shape."""
+    """Recoded plans are short, and so is the window that is learned."""
     words = torch.tensor([[0, 1, 2, 3], [3, 2, 2, 0], [1, 1, 0, 3]])
     plans = words[torch.randint(3, (200, 4), generator=seeded(0))].flatten(1)
     prior = MacroPrior(4, kind(12)).fit(plans, generator=seeded(3), max_steps=3, progress=False)

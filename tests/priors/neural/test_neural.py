@@ -204,6 +204,30 @@ def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes
         torch.testing.assert_close(third.float(), one, atol=0.05, rtol=0.05)
 
 
+@pytest.mark.parametrize("num_layers", [1, 2])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_compiled_sequence_of_a_gru_is_that_of_torch(num_layers, begun, monkeypatch):
+    """Its output, its last states, and the gradients of weights, inputs and first states."""
+    if compiled("neuroprior.priors.neural.compiled_gru") is None:
+        pytest.skip("numba is not installed")
+    network = torch.nn.GRU(8, 8, num_layers, batch_first=True)
+    inputs = torch.randn(5, 7, 8, generator=seeded(0), requires_grad=True)
+    first = torch.randn(num_layers, 5, 8, generator=seeded(1), requires_grad=True)
+    learned = [*network.parameters(), inputs, *([first] if begun else [])]
+    found = []
+    for compile_from in (None, 0):
+        monkeypatch.setattr(gru, "COMPILE_FROM", compile_from)
+        for values in learned:
+            values.grad = None
+        out, last = gru.gru_sequence(network, inputs, first if begun else None)
+        (out.sin().sum() + (last**2).sum()).backward()
+        found.append([out.detach(), last.detach(), *(values.grad for values in learned)])
+    for plain, fast in zip(*found, strict=True):
+        torch.testing.assert_close(fast, plain, atol=1e-5, rtol=1e-4)
+    with torch.no_grad():
+        assert torch.allclose(gru.gru_sequence(network, inputs, first if begun else None)[0], found[0][0], atol=1e-6)
+
+
 def test_compiled_gates_are_those_of_torch():
     """Over the whole range of activations, of states that have other numbers beside them."""
     module = compiled("neuroprior.priors.neural.compiled_gru")
@@ -217,42 +241,44 @@ def test_compiled_gates_are_those_of_torch():
 
 
 @pytest.mark.parametrize("lags", [1, 3])
-@pytest.mark.parametrize("window", [None, 4, 9])
-@pytest.mark.parametrize("span", [None, 3])
+@pytest.mark.parametrize(("window", "span"), [(None, None), (1, None), (4, None), (9, None), (None, 3), (None, 1)])
 @pytest.mark.parametrize("takes", [{}, {"num_contexts": 3}, {"context_size": 2}])
 def test_single_steps_of_a_transformer_are_those_of_its_blocks(lags, window, span, takes, monkeypatch):
-    """Without gradients a step writes behind a copy of the cache; with them, and past a window or span, it does not."""
+    """Without gradients a step writes to a copy of the cache, over the oldest input past a window or span."""
     prior = TransformerPrior(4, width=8, num_heads=2, window=window, lags=lags, dropout=0.3, seed=1, **takes)
     prior.span, batch = span, 3
-    action = torch.randint(4, (7, batch), generator=seeded(0))
+    action = torch.randint(4, (13, batch), generator=seeded(0))
     context = {"num_contexts": torch.arange(batch), "context_size": torch.rand(batch, 2, generator=seeded(1))}
     current = next((context[name] for name in takes), None)
-    may, answers = prior.steps_in_place, []
-    monkeypatch.setattr(prior, "steps_in_place", lambda state: answers.append(may(state)) or answers[-1])
+    may, answers = prior.writes_in_place, []
+    monkeypatch.setattr(prior, "writes_in_place", lambda state: answers.append(may(state)) or answers[-1])
 
-    def steps(step, learning=False):
-        with torch.set_grad_enabled(learning):
-            logits, state = prior.start(batch, current)
-            predicted = [logits]
-            for one in action:
+    def steps(step, learning=lambda t: False):
+        logits, state = prior.start(batch, current)
+        predicted = [logits]
+        for t, one in enumerate(action):
+            with torch.set_grad_enabled(learning(t)):
                 logits, state = step(one, state)
-                predicted.append(logits)
+            predicted.append(logits)
         return torch.stack(predicted), state
 
-    fast = steps(prior.step)
-    # Of s + 1 inputs the first s are in the cache when the last is read.
-    limits = [min(window or 99, (span or 99) - 1) - s for s in range(1, len(action) + 1)]
-    assert [answer is not None for answer in answers] == [limit >= 0 for limit in limits]
-    if window or span:
-        assert [answer for answer in answers if answer is not None] == [limit for limit in limits if limit >= 0]
-    answers.clear()
-    plain = steps(prior.step, learning=True)
-    assert answers == [None] * len(action)
+    with torch.no_grad():
+        fast = steps(prior.step)
+        assert answers == [True] * len(action)
+        answers.clear()
+        written_over = steps(lambda one, state: prior.advance(one, state, None, len(action)))
+        answers.clear()
+        by_turns = steps(prior.step, lambda t: t % 3 > 0)
+        assert answers == [t % 3 == 0 for t in range(len(action))]
+    plain = steps(prior.step, lambda t: True)
     assert plain[0].requires_grad
-    written_over = steps(lambda one, state: prior.advance(one, state, None, len(action)))
     for one, other, third in zip(fast, plain, written_over, strict=True):
-        torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
         assert torch.equal(one, third)
+        if one is fast[0] or window is span is None:
+            torch.testing.assert_close(one, other.detach(), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(by_turns[0].detach(), fast[0], atol=1e-5, rtol=1e-4)
+    whole = prior(torch.cat([action, action[:1]]).T, current).detach().transpose(0, 1)
+    torch.testing.assert_close(whole, fast[0], atol=1e-5, rtol=1e-4)
 
 
 def test_no_plans_at_all():
@@ -279,18 +305,23 @@ def test_a_transformer_that_advances_allocates_memory_once():
             _, first = prior.advance(torch.tensor([3, 1, 0]), first, None, 0)
             places.add(first.data_ptr())
         assert len(places) == 1
-        _, more = prior.advance(torch.tensor([3, 1, 0]), first, None, 0)
+        _, more = prior.advance(torch.tensor([3, 1, 0]), first, None, 6)
         assert more.data_ptr() not in places
+        sizes = set()
+        for _ in range(9):  # past the window nothing is added
+            _, again = prior.advance(torch.tensor([3, 1, 0]), more, None, 0)
+            sizes.add((more := again).untyped_storage().data_ptr())
+        assert len(sizes) == 1
 
 
 def test_a_transformer_in_training_or_in_rough_numbers_does_not_write_in_place():
     prior = TransformerPrior(4, width=8, num_heads=2)
     with torch.no_grad():
         _, state = prior.start(3)
-        assert prior.steps_in_place(state) is not None
+        assert prior.writes_in_place(state)
         with torch.autocast("cpu", torch.bfloat16):
-            assert prior.steps_in_place(state) is None
-        assert prior.train().steps_in_place(state) is None
+            assert not prior.writes_in_place(state)
+        assert not prior.train().writes_in_place(state)
 
 
 class NeverFirst(TransformerPrior):
@@ -315,7 +346,7 @@ def test_subclasses_that_step_or_read_in_their_own_way_do(kind):
     with torch.no_grad():
         _, state = prior.start(4)
         action = torch.tensor([0, 1, 2, 0])
-        want = kind.encode(prior, action[:, None, None].float(), state[:, :-1])[0][:, 0]
+        want = kind.encode(prior, action[:, None, None].float(), state[:, 1:])[0][:, 0]
         for logits, _ in (prior.step(action, state), prior.advance(action, state, None, 3)):
             assert torch.allclose(logits[:, 1:], want[:, 1:], atol=1e-5)
             assert (logits[:, 0] == -torch.inf).all() == (kind is NeverFirst)
@@ -339,7 +370,7 @@ def test_a_state_that_is_part_of_another_tensor_is_not_written_over(part):
         assert (beside[:, kept.shape[1] :] == 1).all()
 
 
-@pytest.mark.parametrize(("window", "span"), [(5, None), (None, 6), (9, 4)])
+@pytest.mark.parametrize(("window", "span"), [(5, None), (None, 6)])
 def test_no_more_room_is_taken_than_is_used(window, span):
     prior = TransformerPrior(4, width=8, num_heads=2, window=window)
     prior.span = span
