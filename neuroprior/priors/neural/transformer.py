@@ -140,7 +140,7 @@ class TransformerPrior(NeuralPrior):
 
     @property
     def most_kept(self) -> int | None:
-        """Inputs in the key-value cache, at most; None: no limit."""
+        """At most so many inputs are kept in the key-value cache; if None, no limit."""
         return self.window + 1 if self.window is not None else None if self.span is None else self.span + 1
 
     @property
