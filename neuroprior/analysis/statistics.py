@@ -70,7 +70,7 @@ def best_of(scores: Tensor, baselines: Sequence[int] | None = None) -> Tensor:
         raise ValueError(f"baselines: one or more of 0 to {len(scores) - 1} are expected, not {list(numbers)}")
     if scores.isnan().any():
         raise ValueError(f"scores{scores.isnan().nonzero()[0].tolist()}: NaN is no score")
-    return scores >= (scores if baselines is None else scores[list(baselines)]).amax(0)
+    return scores >= scores[list(numbers)].amax(0)
 
 
 def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:

@@ -58,9 +58,8 @@ class PriorModule(lightning.LightningModule):
         if self.trainer.world_size > 1:
             loss = total * self.trainer.world_size / self._over_processes(weight).clamp(min=1)
         self._totals += torch.stack([total.detach(), weight])
-        if (
-            self.trainer.loggers or self.trainer.progress_bar_callback is not None
-        ):  # to log takes a tenth of a small step
+        # To log takes a tenth of a small step: only where somebody reads it.
+        if self.trainer.loggers or self.trainer.progress_bar_callback is not None:
             self.log("train_bits", loss, prog_bar=True, batch_size=1)
         return loss
 
