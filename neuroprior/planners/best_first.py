@@ -23,7 +23,7 @@ Heuristic = Callable[[Tensor], Tensor]
 """The number of steps that are left, `[N]`, from states `[N, ...]`; such as `SokobanWorld.lower_bound`."""
 
 FIRST_NODES = 256
-"""Nodes for which there is room at first; twice as many whenever they are full."""
+"""Nodes for which there is room at first; the room doubles whenever it is full."""
 
 BLOCK = 256
 """Edges in a block of the queue: the minimum of each block is kept, so that few numbers are read to find the least."""
@@ -68,7 +68,7 @@ class BestFirstPlanner(Planner):
     """Searches for a goal: expands the node with the lowest cost, until a goal is reached or the budget is spent.
 
     Each state is expanded once (state cuts): a path that reaches a state again is dropped. Children are made when their
-    turn comes, so that those which never come cost nothing, unless a heuristic has to see them.
+    turn comes, so that those which never come cost nothing, unless a heuristic needs their states.
 
     Args:
         prior: its probabilities are those of the actions at a node; None: uniform.
@@ -257,6 +257,9 @@ class AStarPlanner(BestFirstPlanner):
         weight: of the heuristic: 1: A*, whose plans are shortest where the heuristic is consistent; above 1: weighted
             A*; inf: greedy best-first search.
         max_nodes, nodes_at_once, compile: see `BestFirstPlanner`.
+
+    Raises:
+        ValueError: an argument is out of range.
 
     Example:
         >>> world = sliding_tiles(shape=(2, 2), scramble=6)

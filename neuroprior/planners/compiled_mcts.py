@@ -497,7 +497,7 @@ def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
 
 
 def _knows(prior: Steppable, length: int) -> bool:
-    """Whether `policy_of` can be told the prior, for plans of so many actions."""
+    """Whether `policy_of` can represent the prior, for plans of so many actions."""
     if type(prior) is UniformPrior:
         return True
     if isinstance(prior, HistoryPrior):
