@@ -287,7 +287,7 @@ class AStarPlanner(BestFirstPlanner):
 
 
 class _Trees:
-    """The search trees of B problems, grown together: R of them still, `rows` numbers them among the B.
+    """The search trees of B problems, searched together: R of them still, `rows` numbers them among the B.
 
     A node is numbered in the order of expansion, and its edge by action a is node * A + a. Of each node are kept the
     edge that led to it, its depth and the rewards of its path, its state, and the prior's; since the last root on its
@@ -339,7 +339,7 @@ class _Trees:
         return len(self.rows) > 0
 
     def found(self) -> Search:
-        """The results, once no tree grows any more."""
+        """The results, once every search has ended."""
         plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan[:, :0]
         return self.result._replace(plan=plans.to(action_dtype(self.actions)))
 
