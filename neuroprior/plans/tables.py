@@ -593,7 +593,10 @@ def _context(table: Table, row: Integers, lengths: Integers) -> dict[str, Any]:
         codes, labels = table.texts(table.context[0])
         codes = codes[row]
         if (codes < 0).any():
-            raise ValueError(f"{place(int(row[(codes < 0).argmax()]))}: context: an empty cell; a context is expected")
+            raise ValueError(
+                f"{place(int(row[(codes < 0).argmax()]))}: context: an empty cell ({int((codes < 0).sum())} in all); a"
+                " context is expected, such as a name of its own where it is not known"
+            )
         try:
             numbers, names = _numbered("context", codes, labels, None, None, lambda i: place(int(row[i])))
         except ValueError as error:
@@ -622,14 +625,11 @@ def _of_plans(what: str, codes: Integers, plan: Integers, place: Callable[[int],
 
 
 def _alike(labels: list[str], what: str) -> list[str]:
-    """A note for each set of names that differ in case, spaces, dashes or underscores only."""
+    """A note on names that differ in case, spaces, dashes or underscores only, if there are any."""
     alike: dict[str, list[str]] = {}
     for label in labels:
         if number_in(label) is None:
             plain = unicodedata.normalize("NFC", label.casefold())  # a letter may be written as one character or as two
             alike.setdefault(re.sub(r"[\s_-]", "", plain), []).append(label)
-    return [
-        f"{what}s {' and '.join(map(repr, names))} are nearly the same; rename them if they mean the same"
-        for key, names in alike.items()
-        if key and len(names) > 1
-    ]
+    sets = [" and ".join(map(repr, names)) for key, names in alike.items() if key and len(names) > 1]
+    return [f"{what}s {', '.join(sets)} are nearly the same; rename them if they mean the same"] if sets else []

@@ -292,11 +292,15 @@ class Prior(SavedModule):
         length: int,
         context: Tensor | None = None,
         *,
+        past: Tensor | None = None,
         temperature: float = 1.0,
         generator: torch.Generator | None = None,
         method: Literal["auto", "ancestral", "tree"] = "auto",
     ) -> Tensor:
         """Independent plans `[num_plans, length]`; see `neuroprior.sampling.ancestral.sample`.
+
+        After a `past` of executed actions, `[T]` or `[num_plans, T]`, plans go on from these, as a planner that replans
+        needs them.
 
         `neuroprior.decode(plans, prior)` gives their names.
 
@@ -304,7 +308,14 @@ class Prior(SavedModule):
             ValueError: an argument is out of range, or the context does not fit.
         """
         return sampling.sample(
-            self, num_plans, length, context, temperature=temperature, generator=generator, method=method
+            self,
+            num_plans,
+            length,
+            context,
+            past=past,
+            temperature=temperature,
+            generator=generator,
+            method=method,
         )
 
     def check_context_of(self, plans: Plans | Tensor | None, num_plans: int = 0, length: int = 0) -> None:

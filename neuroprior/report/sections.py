@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 import torch
+from torch import Tensor
 
 from neuroprior.analysis import (
     action_drift,
@@ -19,7 +20,7 @@ from neuroprior.analysis import (
     transitions,
     two_sample_tests,
 )
-from neuroprior.analysis.comparison import never_taken, too_few, unit_name
+from neuroprior.analysis.comparison import never_taken, too_few, unit_name, units
 from neuroprior.analysis.statistics import ENOUGH_UNITS
 from neuroprior.plans import Plans, has_patterns, is_per_step
 from neuroprior.plans.columns import never_occur
@@ -38,6 +39,7 @@ MOST_ORDER, MOST_LAG, MOST_MACROS = 6, 20, 16
 LISTED_LAGS = (1, 2, 3, 4, 6, 8, 12, 16, 20)
 DRAWN = 12  # sequences, real and generated
 MANY_REPEATS = 0.2  # of all actions: beyond, over-represented sequences are also sought with repeats merged
+BEGINNING = 5  # actions of a plan that do not count in drift
 LEAST = 1e-9  # bits: below, a gain is 0 but for rounding
 
 
@@ -447,7 +449,8 @@ def drift_section(found: Evaluation) -> Part | None:
     model = next((one for one in ranked if one.bits.shape == found.scored.actions.shape), None)
     if model is None or int(found.mask.sum(1).max()) < 2:
         return None
-    given = found.scored, model.bits, found.mask
+    mask = _without_beginnings(found)
+    given = found.scored, model.bits, mask
     within, plans, groups = by_position(*given), by_plan(*given), by_group(*given)
     numbers = list(groups.groups)
     names = dict(zip(numbers, group_names(found.scored, torch.tensor(numbers)), strict=True))
@@ -466,6 +469,12 @@ def drift_section(found: Evaluation) -> Part | None:
     tests_frame = pd.DataFrame(tests, columns=["test", "mean", "low", "high", "p_value"])
     text = [
         "Bits per held-out action of the best model: where behaviour changes, plans get harder (or easier) to predict.",
+        (
+            f"The first {BEGINNING} actions of each plan do not count here: little stands before them."
+            if mask is not found.mask
+            else "Plans are too short to leave out their first actions. Little stands before these, so that they cost"
+            " more, which alone is a change over a plan."
+        ),
         *(["The only plan was cut into consecutive parts, which stand for plans."] * bool(found.settings.get("cut"))),
         *([_no_verdict(found.too_few)] if found.too_few else []),
     ]
@@ -499,6 +508,14 @@ def drift_section(found: Evaluation) -> Part | None:
         tables.append(table(most, _without_p(columns, found.too_few), caption))
     frames = {"drift": drift, "drift_tests": tests_frame, "action_drift": actions}
     return Part(Section("Drift", text, tables, [box]), frames)
+
+
+def _without_beginnings(found: Evaluation) -> Tensor:
+    """The held-out actions that have a history, bool `[N, L]`; all of them where these are less than half."""
+    late = found.mask.clone()
+    late[:, :BEGINNING] = False
+    enough = 2 * int(late.sum()) >= int(found.mask.sum())
+    return late if enough and len(units(found.scored, late)[late].unique()) > 1 else found.mask
 
 
 def _action_drift(plans: Plans) -> pd.DataFrame:

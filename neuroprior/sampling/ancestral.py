@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, is_integer
+from neuroprior._checks import check_memory, check_range, is_integer
 from neuroprior._random import generator_on
 from neuroprior._threads import share
 from neuroprior.plans import is_per_step
@@ -28,6 +28,7 @@ def sample(
     length: int,
     context: Tensor | None = None,
     *,
+    past: Tensor | None = None,
     temperature: float = 1.0,
     generator: torch.Generator | None = None,
     method: Literal["auto", "ancestral", "tree"] = "auto",
@@ -44,10 +45,12 @@ def sample(
         num_plans: number of plans, N.
         length: number of actions in a plan, L.
         context: None; one per plan (`[N]` indices or `[N, C]` features; plan i is drawn under context i); or one per
-            step (`[N, L]`, `[N, L, C]`), where it is known beforehand.
+            step (`[N, L]`, `[N, L, C]`; after a past of T actions `[N, T + L, ...]`), where it is known beforehand.
+        past: integers, the actions that were executed before, which the plans go on from: `[T]`, the same for all
+            plans, or `[N, T]`. None: plans begin.
         temperature: divides the logits; below 1 sharper, above 1 flatter.
         generator: the source of randomness; the same seed gives the same plans.
-        method: see above. With a context per step, or features, plans are always drawn plan by plan.
+        method: see above. With a context per step, features, or pasts `[N, T]`, plans are always drawn plan by plan.
         batch_size: number of plans that are drawn together when drawing plan by plan; bounds memory.
 
     Returns:
@@ -72,18 +75,21 @@ def sample(
         raise ValueError(f'method: "auto", "ancestral" or "tree" is expected, not {method!r}')
     if context is not None and context.shape[0] != num_plans:
         raise ValueError(f"context: its first dimension must be num_plans = {num_plans}, not {context.shape[0]}")
-    if context is not None and is_per_step(context) and context.shape[1] < length:
-        raise ValueError(f"context: {length} steps are to be sampled, but it has only {context.shape[1]}")
-    stepper.check_context(context, num_plans, length)
+    past = _checked_past(past, num_plans, prior.num_actions).to(device)
+    steps = past.shape[-1] + length
+    if context is not None and is_per_step(context) and context.shape[1] < steps:
+        what = "to be sampled" if steps == length else "in the past and to be sampled"
+        raise ValueError(f"context: {steps} steps are {what}, but it has only {context.shape[1]}")
+    stepper.check_context(context, num_plans, steps)
     draw = Draw(prior.num_actions, temperature, generator_on(generator, device))
+    if past.dim() == 2 or (context is not None and (is_per_step(context) or not is_integer(context))):
+        one_each = torch.ones(num_plans, dtype=torch.long, device=device)
+        return _sample_from_roots(stepper, one_each, context, past, length, draw, "ancestral", batch_size)
     if context is None:
         roots = torch.full((min(num_plans, 1),), num_plans, device=device)
-        return _sample_from_roots(stepper, roots, None, length, draw, method, batch_size)
-    if is_per_step(context) or not is_integer(context):
-        one_each = torch.ones(num_plans, dtype=torch.long, device=device)
-        return _sample_from_roots(stepper, one_each, context, length, draw, "ancestral", batch_size)
+        return _sample_from_roots(stepper, roots, None, past, length, draw, method, batch_size)
     distinct, which, counts = context.unique(return_inverse=True, return_counts=True)
-    grouped = _sample_from_roots(stepper, counts, distinct, length, draw, method, batch_size)
+    grouped = _sample_from_roots(stepper, counts, distinct, past, length, draw, method, batch_size)
     plans = torch.empty_like(grouped)
     plans[which.argsort(stable=True)] = grouped
     return plans
@@ -222,15 +228,41 @@ def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> 
     check_temperature(temperature)
 
 
+def _checked_past(past: Tensor | None, num_plans: int, num_actions: int) -> Tensor:
+    """The past `[T]` or `[N, T]`, int64; T is 0 where there is none."""
+    if past is None:
+        return torch.zeros(0, dtype=torch.long)
+    past = torch.as_tensor(past)
+    if past.dim() not in (1, 2) or (past.dim() == 2 and len(past) != num_plans):
+        raise ValueError(f"past: actions [T] or [{num_plans}, T] are expected, not {list(past.shape)}")
+    if past.numel():
+        check_range("past", past, num_actions, "actions")
+    return past.long()
+
+
 def _sample_from_roots(
-    stepper: Stepper, counts: Tensor, context: Tensor | None, length: int, draw: Draw, method: str, batch_size: int
+    stepper: Stepper,
+    counts: Tensor,
+    context: Tensor | None,
+    past: Tensor,
+    length: int,
+    draw: Draw,
+    method: str,
+    batch_size: int,
 ) -> Tensor:
-    """`counts[r]` plans under `context[r]` for each root r: `[total, length]`, root by root, shuffled within."""
+    """`counts[r]` plans under `context[r]` for each root r: `[total, length]`, root by root, shuffled within.
+
+    `past [T]` or `[roots, T]` stands before all of them.
+    """
     total = int(counts.sum())
     if total == 0 or length == 0:
         return torch.empty(total, length, dtype=draw.dtype, device=counts.device)
     per_step = is_per_step(context)
     logits, state = stepper.start(len(counts), context[:, 0] if context is not None and per_step else context)
+    behind = past.shape[-1]
+    for t, action in enumerate(past.expand(len(counts), behind).unbind(1)):
+        given = context[:, t + 1] if context is not None and per_step else None
+        logits, state = stepper.step(action, state, given, behind - t - 1)
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
     root = torch.arange(len(counts), device=counts.device)
     always = {"tree": True, "ancestral": False}
@@ -252,7 +284,7 @@ def _sample_from_roots(
     plans[:, :depth] = begun
     for at in range(0, total, batch_size):
         some, here = row[at : at + batch_size], slice(at, at + batch_size)
-        given = context if per_step else None
+        given = context[:, behind:] if context is not None and per_step else None
         plans[here, depth:] = _sample_one_by_one(stepper, some, logits, state, given, range(depth, length), draw)
     return plans
 

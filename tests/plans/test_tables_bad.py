@@ -44,6 +44,10 @@ def test_dates_whose_day_may_be_their_month(dates, tmp_path):
         ("action,start,stop\na,0,10\nb,5,6\na,7,9\n", "1 actions begin before the one before them ended"),
         (",action\n0,a\n1,b\n", "columns that are not used: (without a name, column 1)"),
         ("action\nGr\u00fcn\nGru\u0308n\n", "are nearly the same"),
+        (
+            "action\nRear\nrear\nGroom\ngroom\n",
+            "actions 'Rear' and 'rear', 'Groom' and 'groom' are nearly the same; rename them if they mean the same",
+        ),
         ("action\n1000000000\n1\n", "of which 0, 2, 3, 4, 5, 6, 7, 8 and 999,999,991 more never occur"),
     ],
 )
@@ -63,6 +67,7 @@ def test_nothing_is_noted_of_plain_tables(tmp_path):
     [
         ("plan,action\n1,a\n".encode("utf-16-le"), ["line 1", "UTF-16"]),
         ("<!DOCTYPE html><html><body>Not found</body></html>", ["a web page"]),
+        ("action,context\na,\nb,x\nc,\n", ["line 2", "context: an empty cell (2 in all)", "not known"]),
         ('action,duration\na,"1,5"\n', ["line 2", "'1,5'", "a decimal point"]),
         ("action,start\na,10:05\nb,10:06\n", ["line 2", "'10:05'", "hours and minutes, or minutes and seconds"]),
         ("action,start\na,1:10:05\nb,10:06\n", ["line 3", "'10:06'", "hours and minutes, or minutes and seconds"]),

@@ -281,6 +281,18 @@ def test_drift_within_plans_between_them_and_between_groups(plans, found):
     assert max(index) == 3
 
 
+@pytest.mark.parametrize(("length", "words"), [(20, "first 5 actions of each plan"), (8, "too short to leave out")])
+def test_the_beginnings_of_plans_are_no_drift(length, words):
+    """Actions repeat at probability .9 throughout; only the first, which nothing stands before, costs more."""
+    repeats = torch.rand(200, length, generator=seeded(0)) < 0.9
+    repeats[:, 0] = torch.rand(200, generator=seeded(1)) < 0.5
+    plans = Plans((~repeats).long().cumsum(1) % 2, 2)
+    part = drift_section(evaluate_saved({"chain": MarkovPrior(2, 1).fit(plans)}, plans, 0))
+    change = part.frames["drift_tests"].set_index("test").loc["change over a plan, bits"]
+    assert (change["low"] < 0 < change["high"]) == (length == 20)
+    assert any(words in line for line in part.section.text)
+
+
 def test_the_action_that_changes_most_clearly_comes_first():
     """By the corrected p-value: a small change of a rare action may be clearer than a large one of a common action."""
     rng = np.random.default_rng(0)

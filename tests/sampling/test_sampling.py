@@ -151,6 +151,53 @@ def test_contexts_known_beforehand(kind, per, features):
         assert not fits(plans[which == row], distribution(prior, 3, table[1 - row]), A)
 
 
+def after(prior, past, length, context=None):
+    """`[A**length]`: the probability of each plan, given that the actions `past` came before."""
+    probs = distribution(prior, len(past) + length, context).view(A ** len(past), -1)[plan_number(past[None], A)[0]]
+    return probs / probs.sum()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", PRIORS)
+def test_plans_go_on_from_what_was_executed(method, kind):
+    past = torch.tensor([2, 0])
+    plans = PRIORS[kind].sample(30_000, 2, past=past, generator=seeded(0), method=method)
+    assert fits(plans, after(PRIORS[kind], past, 2), A)
+
+
+@pytest.mark.parametrize("per", ["plan", "step"])
+def test_each_plan_goes_on_from_its_own_past_under_its_own_context(per):
+    """A context per step begins with those of the past."""
+    generator = seeded(0)
+    pasts = torch.tensor([[0, 1], [2, 2]])
+    contexts = torch.tensor([0, 2] if per == "plan" else [[0, 1, 2, 0], [2, 0, 0, 1]])
+    known = torch.randint(3, (90,) if per == "plan" else (90, 4), generator=generator)
+    seen = Plans(torch.randint(A, (90, 4), generator=generator), A, context=known)
+    prior = MarkovPrior(A, 2, num_contexts=3).fit(seen)
+    which = torch.randint(2, (40_000,), generator=generator)
+    plans = prior.sample(40_000, 2, contexts[which], past=pasts[which].to(torch.uint8), generator=generator)
+    for row in range(2):
+        assert fits(plans[which == row], after(prior, pasts[row], 2, contexts[row]), A)
+        assert not fits(plans[which == row], after(prior, pasts[1 - row], 2, contexts[row]), A)
+
+
+@pytest.mark.parametrize(
+    ("past", "words"),
+    [
+        (torch.tensor([0, 3]), "past[1]: 3"),
+        (torch.tensor([0.5]), "past: integers are expected"),
+        (torch.zeros(4, 2, dtype=torch.long), "past: actions [T] or [5, T] are expected, not [4, 2]"),
+        (torch.tensor(1), "past: actions [T] or [5, T] are expected, not []"),
+    ],
+)
+def test_a_past_that_cannot_be(past, words):
+    with refuses(words):
+        sample(PRIORS["markov"], 5, 2, past=past)
+    per_step = MarkovPrior(A, 1, num_contexts=2)
+    with refuses("context: 4 steps are in the past and to be sampled, but it has only 3"):
+        sample(per_step, 5, 2, torch.zeros(5, 3, dtype=torch.long), past=torch.tensor([0, 1]))
+
+
 class Echo:
     """A prior of three actions that does what its context says: an action, `[N]`, or one for each step."""
 

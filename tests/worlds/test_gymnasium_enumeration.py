@@ -3,6 +3,7 @@
 import copy
 import pickle
 import random
+import warnings
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
@@ -154,7 +155,7 @@ def test_observations_of_many_kinds():
     ("name", "limit"), [("MiniGrid-DoorKey-5x5-v0", 250), ("MiniGrid-MultiRoom-N2-S4-v0", 40)], ids=["key", "rooms"]
 )
 def test_minigrid(name, limit):
-    world = from_gymnasium(name, seed=5, observations=True)
+    world = from_gymnasium(name, seeds=[5], observations=True)
     env = gymnasium.make(name).unwrapped
     env.reset(seed=5)
     assert world.num_states == number_of_states(copy.deepcopy(env))
@@ -185,7 +186,7 @@ def test_layouts_side_by_side():
     assert world.num_layouts == 4
     layout = world.layout(torch.arange(world.num_states))
     assert world.layout(world.next_state).equal(layout[:, None].expand(-1, 2))
-    single = [from_gymnasium(environments.Layouts(), seed=seed) for seed in seeds]
+    single = [from_gymnasium(environments.Layouts(), seeds=[seed]) for seed in seeds]
     sizes = [one.num_states for one in single]
     assert layout.bincount().tolist() == sizes
     assert len(set(sizes)) > 1
@@ -204,7 +205,7 @@ def test_layouts_side_by_side():
     ("name", "least"), [("MiniGrid-FourRooms-v0", 1000), ("MiniGrid-DoorKey-8x8-v0", 5000)], ids=["rooms", "key"]
 )
 def test_larger_minigrids(name, least):
-    world = from_gymnasium(name)
+    world = from_gymnasium(name, seeds=[0])
     assert world.num_states > least
     assert float(oracle(world, world.reset(1), 100, any_prefix=True)) > 0.9
     check_world(world)
@@ -253,3 +254,14 @@ def test_a_bar_on_a_terminal(monkeypatch, capsys):
     assert "5 of 5 states" in capsys.readouterr().err
     from_gymnasium(environments.Corridor(), progress=False)
     assert capsys.readouterr().err == ""
+
+
+def test_one_start_for_all_episodes_is_said():
+    """Without seeds this table holds what can be reached from one of many starts, which nothing else would show."""
+    with pytest.warns(UserWarning, match="seed 3 alone.*seeds=range"):
+        world = from_gymnasium(environments.Layouts(), seed=3)
+    assert int((world.starts > 0).sum()) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        from_gymnasium(environments.Layouts(), seeds=[3])
+        from_gymnasium(environments.Corridor())

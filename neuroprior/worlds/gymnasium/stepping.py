@@ -76,11 +76,6 @@ class SteppedWorld(World):
         state[:, _SEED] = torch.randint(len(self.seeds), (batch_size,), generator=generator)
         return state
 
-    def starts_alike(self, seed: int) -> bool:
-        """Whether the first observation after a reset from another seed is that of this world's first seed."""
-        self._at, self._episode.env = (), self._env
-        return np.array_equal(self._episode.reset(seed), self._episode.reset(self.seeds[0]), equal_nan=True)
-
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """See `World.step`. `generator` draws nothing: what is random is determined by the seed.
 

@@ -6,8 +6,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+<<<<<<< HEAD
 from neuroprior._checks import check_sizes
 from neuroprior.worlds.gymnasium.environment import import_gymnasium, open_environment
+=======
+from neuroprior.worlds.episodes import EpisodicWorld
+from neuroprior.worlds.gymnasium.environment import Episode, import_gymnasium, open_environment
+>>>>>>> users
 from neuroprior.worlds.gymnasium.stepping import SteppedWorld
 from neuroprior.worlds.gymnasium.tables import enumerate_states, has_table, read_table
 from neuroprior.worlds.world import World
@@ -42,8 +47,10 @@ def from_gymnasium(
       states and of every tenth), and random walks are compared with the environment.
     - "step": any environment, by stepping copies of it, slowly. A state is the history of actions since the start,
       which is replayed where the environment cannot be copied; the result is a `SteppedWorld`. What is random is
-      determined by the seed: a plan that is executed gives what it gave when it was tried. There are as many starts as
-      `seeds`, so that with one seed every `reset` is the same; where other seeds start otherwise, that is a warning.
+      determined by the seed: a plan that is executed gives what it gave when it was tried.
+
+    "enumerate" and "step" have as many starts as `seeds`, so that with one seed every episode begins in the same state;
+    where other seeds start otherwise, that is a warning.
 
     "auto" takes a table where there is one, steps where observations are real numbers, and enumerates otherwise.
 
@@ -74,7 +81,8 @@ def from_gymnasium(
             (the message says what), or an argument is out of range.
 
     Warns:
-        UserWarning: the method is "step", no `seeds` are given, and the environment starts otherwise with another seed.
+        UserWarning: there is one start, as no `seeds` are given, but the environment starts otherwise with another seed
+                (not for "table").
 
     Example:
         >>> world = from_gymnasium("FrozenLake-v1", progress=False)
@@ -97,21 +105,27 @@ def from_gymnasium(
     if method == "step":
         if starts == "any":
             raise ValueError('starts: "any" needs a table of all states, which method="step" does not have')
-        world = SteppedWorld(opened, chosen, horizon)
-        if seeds is None and not world.starts_alike(seed + 1):
-            warnings.warn(
-                f"env: it starts otherwise with another seed, but this world has seed {seed} alone: every reset is the"
-                " same state; for several starts give, for example, seeds=range(100)",
-                stacklevel=2,
-            )
-        return world
-    if method == "table" and seeds is not None:
+        world: World = SteppedWorld(opened, chosen, horizon)
+    elif method == "enumerate":
+        world = enumerate_states(opened, chosen, max_states, progress, observations)
+    elif seeds is not None:
         raise ValueError('seeds: a table read from P has one layout; use method="enumerate"')
-    if method == "table":
-        table = read_table(opened)
     else:
-        table = enumerate_states(opened, chosen, max_states, progress, observations)
-    return table.start_anywhere() if starts == "any" else table
+        world = read_table(opened)
+    if method != "table" and seeds is None and not _starts_alike(opened, seed, seed + 1):
+        warnings.warn(
+            f"env: it starts otherwise with another seed, but this world has seed {seed} alone: every episode begins in"
+            " the same state; for several starts give, for example, seeds=range(100), for one without this warning"
+            f" seeds=[{seed}]",
+            stacklevel=2,
+        )
+    return world.start_anywhere() if isinstance(world, EpisodicWorld) and starts == "any" else world
+
+
+def _starts_alike(env: Any, *seeds: int) -> bool:
+    """Whether the first observation is the same after a reset from either of two seeds."""
+    first, second = (Episode(env).reset(seed) for seed in seeds)
+    return np.array_equal(first, second, equal_nan=True)
 
 
 def _has_real_numbers(space: Any) -> bool:
