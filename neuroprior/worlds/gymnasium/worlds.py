@@ -6,13 +6,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-<<<<<<< HEAD
 from neuroprior._checks import check_sizes
-from neuroprior.worlds.gymnasium.environment import import_gymnasium, open_environment
-=======
 from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.gymnasium.environment import Episode, import_gymnasium, open_environment
->>>>>>> users
 from neuroprior.worlds.gymnasium.stepping import SteppedWorld
 from neuroprior.worlds.gymnasium.tables import enumerate_states, has_table, read_table
 from neuroprior.worlds.world import World
