@@ -61,7 +61,7 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame:
             if key in earlier:
                 rows.append(_row(": ".join(map(str, key)) or "import neuroprior", part, earlier[key], row))
     if not rows:
-        raise ValueError("against: the two results have no measurement in common")
+        raise ValueError("against: results of the same measurements are expected; the two have none in common")
     return pd.DataFrame(rows)
 
 

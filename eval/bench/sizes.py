@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from eval.bench.timing import Run, seconds
-from neuroprior import MarkovPrior, SamplingPlanner, UniformPrior, gridworld
+from neuroprior import GRUPrior, MarkovPrior, SamplingPlanner, UniformPrior, gridworld
 
 REPETITIONS = 3
 """Of each size; the median counts."""
@@ -71,6 +71,11 @@ def _fit_and_sample(actions: int) -> Run:
     return lambda: MarkovPrior(actions, 1).fit(plans).sample(10_000, 8, generator=_generator())
 
 
+def _train(steps: int) -> Run:
+    plans = torch.randint(4, (1000, 4), generator=_generator())
+    return lambda: GRUPrior(4).fit(plans, max_steps=steps, patience=steps, progress=False, generator=_generator())
+
+
 def _rollouts(height: int, width: int, worlds: int) -> Run:
     world = gridworld(height, width, "torus", num_worlds=worlds)
     state = world.reset(10_000, _generator())
@@ -89,6 +94,7 @@ SWEEPS = {
     "length": Sweep("fit Markov-2 on one plan", decades(2, 7), _fit_long),
     "length sampled": Sweep("sample 100 plans, Markov-2", decades(2, 4), _sample_long),
     "actions": Sweep("fit Markov-1 on 10,000 plans of length 8, and sample as many", decades(1, 4), _fit_and_sample),
+    "steps": Sweep("train a GRU on 1,000 plans of length 4", decades(0, 3), _train),
     "states": Sweep("roll out 64 plans of 8 steps from 10,000 starts, one grid", decades(2, 7), _one_grid),
     "worlds": Sweep("the same in 10 x 10 grids", decades(2, 6), partial(_rollouts, 10, 10)),
 }

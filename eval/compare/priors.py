@@ -197,7 +197,9 @@ def load_for(folder: str, world: str, num_actions: int, action_names: Sequence[s
     if prior.end is not None:
         raise ValueError(f"{folder}: samples an end symbol, which is no action of a world; train without --data.end")
     if prior.num_actions != num_actions:
-        raise ValueError(f"{folder}: knows {prior.num_actions} actions, the world {world} has {num_actions}")
+        raise ValueError(
+            f"{folder}: {num_actions} actions, those of the world {world}, are expected, not {prior.num_actions}"
+        )
     if action_names is None or prior.action_names is None:
         return prior
     of_world = f" of the world {world}; it knows"

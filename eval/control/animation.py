@@ -47,7 +47,7 @@ def pictures(world: ContinuousWorld, states: Tensor) -> list[NDArray[np.uint8]]:
         return [_arm_picture(world, joints) for joints in world.joints(states)]
     render = getattr(world, "render", None)
     if render is None:
-        raise ValueError("animation: there is no picture of this task")
+        raise ValueError("animation: the arm, or a task with a method `render`, is expected")
     return list(render(states).numpy())
 
 

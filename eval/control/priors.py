@@ -46,7 +46,7 @@ NETWORKS: dict[str, Callable[..., VectorPrior]] = {"gru": VectorGRU, "transforme
 """Networks that see past vectors alone."""
 
 CLONING = "cloning"
-"""A network that sees each state, as a proposal; it is also executed alone."""
+"""A network that is given each state's observation, as a proposal; it is also executed alone."""
 
 
 def check_prior_name(name: str) -> None:

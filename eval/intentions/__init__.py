@@ -1,1 +1,1 @@
-"""Do priors learned toward known goals tell what another agent is after?"""
+"""Do priors learned toward known goals predict another agent's goal?"""

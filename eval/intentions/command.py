@@ -1,4 +1,4 @@
-"""`python -m eval intentions`: do priors learned toward known goals tell what another agent is after?"""
+"""`python -m eval intentions`: do priors learned toward known goals predict another agent's goal?"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,10 +33,10 @@ def intentions(
     dask: str | None = None,
     out: str = "runs/intentions",
 ) -> None:
-    """Do priors learned toward known goals tell what another agent is after?
+    """Do priors learned toward known goals predict another agent's goal?
 
-    Observers see agents walk to one of some goals in a grid: one with a prior for each goal, learned from plans toward
-    it, and one who knows how agents act (exact inverse planning). In the labyrinth the goal is the water. Prints
+    Observers watch agents walk to one of some goals in a grid: one has a prior for each goal, learned from plans
+    toward it; one knows how agents act (exact inverse planning). In the labyrinth the goal is the water. Prints
     tables; writes them (CSV), results.json, report.html and a figure. Interrupted, the same command goes on.
 
     Args:

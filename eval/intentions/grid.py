@@ -223,10 +223,10 @@ def grid_entries(world: str, settings: IntentionSettings, generator: torch.Gener
             sums = reliability(now, seen.goal[there], torch.zeros_like(there)).sums.sum(0)
             yield named | {"measure": "calibration", "sums": sums.tolist()}
     yield from _switched(scene, priors, settings, generator)
-    under_way = (seen.length >= FORECAST_AFTER).nonzero()[:FORECASTED, 0]
-    if len(under_way):
-        posteriors = {key: found[key][under_way, FORECAST_AFTER].exp() for key in priors}
-        yield from _forecasts(scene, priors, posteriors, cells[under_way, FORECAST_AFTER:], settings.ahead, generator)
+    mid_plan = (seen.length >= FORECAST_AFTER).nonzero()[:FORECASTED, 0]
+    if len(mid_plan):
+        posteriors = {key: found[key][mid_plan, FORECAST_AFTER].exp() for key in priors}
+        yield from _forecasts(scene, priors, posteriors, cells[mid_plan, FORECAST_AFTER:], settings.ahead, generator)
 
 
 def _switched(

@@ -43,7 +43,7 @@ FEATURES = {
     "node, modes": (0, 3),
     "node, move, modes": (1, 3),
 }
-"""What the chance of arriving is regressed on, by kind: columns of `features_of`."""
+"""What the probability of arriving is regressed on, by kind: columns of `features_of`."""
 
 
 def stretches(plans: Plans, arrives: Tensor) -> tuple[Plans, Plans]:

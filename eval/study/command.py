@@ -145,7 +145,7 @@ def _alarm_table(frame: pd.DataFrame) -> Table:
     cells = (100 * frame["share"]).map("{:.1f}".format) + outside.map({True: "*", False: " "})
     caption = (
         f"Share of studies without an effect with p < {LEVEL}, %. Of {studies} exact tests {100 * low / studies:.1f} to"
-        f" {100 * high / studies:.1f} % are below it with a probability of 95 %; *: not so."
+        f" {100 * high / studies:.1f} % are below it with a probability of 95 %; *: outside of that."
     )
     return _wide(frame.assign(cell=cells), "False alarms", caption)
 

@@ -85,7 +85,9 @@ class Agent:
         if learn_every is not None and learn_every % plan_length:
             raise ValueError(f"learn_every: a multiple of plan_length = {plan_length} is expected, not {learn_every}")
         if prior.num_actions != world.num_actions:
-            raise ValueError(f"prior: it has {prior.num_actions} actions, the world {world.num_actions}")
+            raise ValueError(
+                f"prior: it has {prior.num_actions} actions, and the world {world.num_actions}; as many are expected"
+            )
         self.generator = generator_on(generator, prior.device)
         self.state = world.reset(1, self.generator) if state is None else state
         world.check_state(self.state)

@@ -54,8 +54,8 @@ class Replay:
         before = self.plans
         if (before.num_actions, before.max_length) != (plans.num_actions, plans.max_length):
             raise ValueError(
-                f"plans: {before.max_length} of {before.num_actions} actions are stored,"
-                f" {plans.max_length} of {plans.num_actions} cannot be added"
+                f"plans: {before.max_length} steps of {before.num_actions} actions are expected, as in the stored"
+                f" plans, not {plans.max_length} of {plans.num_actions}"
             )
         kinds = [None if one.context is None else (one.context.dtype, one.context.shape[1:]) for one in (before, plans)]
         if kinds[0] != kinds[1]:

@@ -44,7 +44,7 @@ class Score:
             ValueError: the two were not scored on the same plans.
         """
         if not self.actions.equal(other.actions):
-            raise ValueError(f"{self.model} and {other.model}: not scored on the same plans")
+            raise ValueError(f"{self.model}, {other.model}: scores on the same plans are expected, and these are not")
         return ratio_difference(self.bits - other.bits, self.actions)
 
 

@@ -70,7 +70,7 @@ def infer(
 
     Args:
         priors: one fitted prior for each intention, by name or in order; a prior without context ignores that of plans.
-        plans: B plans without an end symbol, or integers `[B, L]`. An end is not observed: plans may be under way.
+        plans: B plans without an end symbol, or integers `[B, L]`. An end is not observed: plans may go on.
         context: of integers `[B, L]`, see `Plans`; `Plans` have their own.
         weights: how probable each intention is in advance, `[K]` or `[B, K]`, in any unit; None: all the same.
         switch: from 0 to 1.

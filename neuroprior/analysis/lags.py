@@ -252,7 +252,7 @@ def bits_by_position(prior: Prior, plans: Plans) -> list[Score]:
     """
     mask = plans.mask().cpu()
     if len(plans) < 2 or plans.max_length == 0 or not bool(mask.all()):
-        raise ValueError("plans: at least two of the same length are expected; see neuroprior.analysis.lags.pieces")
+        raise ValueError("plans: at least two of the same length are expected; see neuroprior.analysis.pieces")
     bits, unit = action_bits(prior, plans), units(plans, mask)[:, 0]
     actions = unit.bincount().double()
     totals = torch.zeros(len(actions), plans.max_length, dtype=torch.double).index_add_(0, unit, bits)

@@ -22,10 +22,10 @@ from neuroprior.priors.prior import context_arguments
 from neuroprior.priors.scoring import plan_frame
 
 STABLE = 0.7
-"""Correlation of a mode with its like in another fold from which it is said to come back."""
+"""The least correlation at which a mode counts as found again in another fold."""
 
 FOLDS = 5
-"""In which the number of modes is chosen, at most."""
+"""The most folds on which the number of modes is chosen."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ModeChoice:
         chosen: the number of modes that the rule of `choose_modes` chooses.
         priors: of each number of modes, fitted to all plans.
         stability: `[F, K]` for each number of modes K: the correlation of each mode of the prior that was fitted to all
-            plans with its like in the prior of each fold.
+            plans with the corresponding one of each fold's prior.
     """
 
     scores: dict[int, Score]
@@ -116,7 +116,7 @@ def choose_modes(
     """
     numbers = sorted(set(num_modes))
     if not numbers:
-        raise ValueError("num_modes: at least one number is expected")
+        raise ValueError("num_modes: at least one number is expected, not an empty list")
     for number in numbers:
         check_sizes(num_modes=number)
     plans = divisible(plans)
@@ -164,7 +164,7 @@ def _excess(score: Score, best: Score) -> tuple[float, float]:
 
 
 def match_modes(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
-    """Which mode of another prior is the like of each: int64 `[K]`, so that their posteriors correlate most.
+    """The mode of another prior that corresponds to each mode: int64 `[K]`, so that their posteriors correlate most.
 
     Args:
         one, other: `[N, L, K]`: posteriors of the modes behind the same actions.
@@ -181,7 +181,7 @@ def match_modes(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
 
 
 def agreements(one: Tensor, other: Tensor, mask: Tensor) -> Tensor:
-    """`[K]`: the correlation of each mode with its like in another prior; for the arguments see `match_modes`."""
+    """`[K]`: the correlation of each mode with that of another prior; for the arguments see `match_modes`."""
     return _correlations(one, other, mask).gather(1, match_modes(one, other, mask)[:, None])[:, 0]
 
 
@@ -212,7 +212,7 @@ def _scored(prior: SwitchingPrior, plans: Plans) -> Plans:
 def mode_plans(prior: SwitchingPrior, plans: Plans) -> Plans:
     """The most probable modes behind plans, as plans whose actions are modes.
 
-    What there is for plans is so there for modes: `transitions`, `compare_conditions`, the ethogram.
+    So all analyses of plans apply to modes: `transitions`, `compare_conditions`, the ethogram.
 
     Args:
         prior: fitted.
@@ -309,9 +309,9 @@ def mode_table(prior: SwitchingPrior, plans: Plans) -> Any:
 
     `mode`; `share` of the actions, by the smoothed posterior; `dwell`, mean actions from its beginning to its end in
     the most probable path (those that the end of a plan cuts off left out, where there are others); `visits` a plan;
-    `actions`, up to three that it takes oftener than all modes together, those by most first (of a single mode, the
-    commonest), with their shares in the mode; `enters`
-    and `leaves`, the three contexts in which the path most often changes to it and from it, where contexts are indices.
+    `actions`, up to three that it takes more often than all modes together, by the difference (of a single mode, the
+    most frequent), with their shares in the mode; `enters` and `leaves`, the three contexts in which the path most
+    often changes to it and from it, where contexts are indices.
 
     Args:
         prior: fitted.

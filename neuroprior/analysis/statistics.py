@@ -240,7 +240,7 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     """
     a, b = _vector("first", first), _vector("second", second)
     if len(a) != len(b):
-        raise ValueError(f"paired_difference: {len(a)} and {len(b)} values cannot be paired")
+        raise ValueError(f"second: {len(a)} values are expected, as many as in first, not {len(b)}")
     mean, low, high = mean_interval(a - b, level)
     if np.ptp(a - b) == 0:
         return Difference(mean, low, high, 1.0 if mean == 0 else 2.0 ** (1 - len(a)))
@@ -270,7 +270,7 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
     check_level(level)
     above, below = _vector("totals", totals), _vector("sizes", sizes)
     if len(above) != len(below):
-        raise ValueError(f"ratio_difference: {len(above)} totals and {len(below)} sizes")
+        raise ValueError(f"sizes: {len(above)} are expected, as many as totals, not {len(below)}")
     if (below < 0).any() or below.sum() <= 0:
         raise ValueError("sizes: numbers of at least 0 with a positive sum are expected")
     units, ratio = len(above), float(above.sum() / below.sum())

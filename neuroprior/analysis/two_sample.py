@@ -128,7 +128,9 @@ def two_sample_tests(
     for plans in (real, generated):
         check_are_plans(plans)
     if real.num_actions != generated.num_actions:
-        raise ValueError(f"real plans have {real.num_actions} actions, generated ones {generated.num_actions}")
+        raise ValueError(
+            f"generated: {real.num_actions} actions are expected, as in the real plans, not {generated.num_actions}"
+        )
     draw = generator_on(generator, "cpu")
     kinds = [
         _drawn(name, plans, max_plans, max_actions, draw) for name, plans in (("real", real), ("generated", generated))

@@ -55,7 +55,7 @@ OTHERWISE = {
     "-h",
     "--print_config",
 }
-"""Options with which it is not needed."""
+"""Options with which no default recipe is needed."""
 
 OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
 """Options of `--data` that other commands have, too."""
@@ -117,7 +117,12 @@ class FitCLI(LightningCLI):
         parser.add_argument("--seed_everything", type=int, default=0, help="Seed of all random numbers.")
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        parser.add_argument("--out", type=str, default="runs/prior", help="Folder of the run; made, must be new.")
+        parser.add_argument(
+            "--out",
+            type=str,
+            default="runs/prior",
+            help="Folder of the run, which must hold none yet.",
+        )
         parser.add_argument(
             "--resume",
             type=str | None,
@@ -188,7 +193,7 @@ class FitCLI(LightningCLI):
         """Choose the number of modes on the plans that the prior learns from; print and write what speaks for it."""
         prior, plans = model.prior, data.plans if data.folds > 1 else data.learned_from
         if not isinstance(prior, SwitchingPrior):
-            raise ValueError(f"modes: of a SwitchingPrior (--config switching), not of a {type(prior).__name__}")
+            raise ValueError(f"modes: a SwitchingPrior is expected (--config switching), not a {type(prior).__name__}")
         config = {name: value for name, value in prior.config.items() if name not in OF_PLANS}
         choice = choose_modes(
             plans,
@@ -231,8 +236,8 @@ class FitCLI(LightningCLI):
         _check(self.folder / BEST, model)
         if epoch >= data.epochs:
             raise ValueError(
-                f"trainer.max_steps: the run in {self.folder} has made more steps than"
-                f" {data.settings.max_steps} already"
+                f"trainer.max_steps: more steps than the run in {self.folder} has made are expected, not"
+                f" {data.settings.max_steps}"
             )
 
     def _keep(self, data: PlansData) -> None:

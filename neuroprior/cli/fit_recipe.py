@@ -61,8 +61,7 @@ class PlansData(PlansModule):
         num_actions: number of actions, where the file does not say.
         action_names: names of the actions in the order of their numbers, where the file does not say.
         columns: which columns of a CSV file hold what: action, plan, context, group, condition, start, stop, duration,
-            event_type;
-            `--columns.action` is short for `--data.columns.action`, and so on.
+            event_type; `--columns.action` is short for `--data.columns.action`, and so on.
         missing: what rows without a label do: a gap ends the plan; as label they count as an action; or error.
         merge_repeats: take the same label in successive rows for one action, as in files with a row a frame.
         max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.

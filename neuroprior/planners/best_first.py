@@ -23,7 +23,7 @@ Heuristic = Callable[[Tensor], Tensor]
 """The number of steps that are left, `[N]`, from states `[N, ...]`; such as `SokobanWorld.lower_bound`."""
 
 FIRST_NODES = 256
-"""Nodes for which there is room at first; twice as many whenever they are full."""
+"""Nodes for which there is room at first; the room doubles whenever it is full."""
 
 BLOCK = 256
 """Edges in a block of the queue: the minimum of each block is kept, so that few numbers are read to find the least."""
@@ -68,7 +68,7 @@ class BestFirstPlanner(Planner):
     """Searches for a goal: expands the node with the lowest cost, until a goal is reached or the budget is spent.
 
     Each state is expanded once (state cuts): a path that reaches a state again is dropped. Children are made when their
-    turn comes, so that those which never come cost nothing, unless a heuristic has to see them.
+    turn comes, so that those which never come cost nothing, unless a heuristic needs their states.
 
     Args:
         prior: its probabilities are those of the actions at a node; None: uniform.
@@ -258,6 +258,9 @@ class AStarPlanner(BestFirstPlanner):
             A*; inf: greedy best-first search.
         max_nodes, nodes_at_once, compile: see `BestFirstPlanner`.
 
+    Raises:
+        ValueError: an argument is out of range.
+
     Example:
         >>> world = sliding_tiles(shape=(2, 2), scramble=6)
         >>> found = AStarPlanner(world.lower_bound).search(world, world.reset(5, torch.Generator().manual_seed(0)))
@@ -284,7 +287,7 @@ class AStarPlanner(BestFirstPlanner):
 
 
 class _Trees:
-    """The search trees of B problems, grown together: R of them still, `rows` numbers them among the B.
+    """The search trees of B problems, searched together: R of them still, `rows` numbers them among the B.
 
     A node is numbered in the order of expansion, and its edge by action a is node * A + a. Of each node are kept the
     edge that led to it, its depth and the rewards of its path, its state, and the prior's; since the last root on its
@@ -336,7 +339,7 @@ class _Trees:
         return len(self.rows) > 0
 
     def found(self) -> Search:
-        """The results, once no tree grows any more."""
+        """The results, once every search has ended."""
         plans = torch.nn.utils.rnn.pad_sequence(self.paths, batch_first=True) if self.paths else self.result.plan[:, :0]
         return self.result._replace(plan=plans.to(action_dtype(self.actions)))
 

@@ -27,7 +27,7 @@ ENOUGH = 0.75
 """Where this share of the problems tried is solved, more are tried in the next sweep."""
 
 MORE = 4
-"""So many times as many problems, then."""
+"""Factor by which the number of problems rises then."""
 
 NEW = 0.25
 """Where less than this share of the solutions is new, the budget doubles."""

@@ -25,8 +25,8 @@ Array = np.ndarray[Any, Any]
 DRAWS = 2**18
 """Uniform numbers that are drawn at once."""
 
-BLOCK = 64
-"""Rows of a matrix product: their results stay in the cache."""
+BLOCK = 40
+"""Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
 
 
 class Nodes(NamedTuple):
@@ -207,50 +207,6 @@ def _exp(x: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gates(policy: Policy, plan: Array, t: int, seen: int, out: Array) -> None:
-    """Write what the inputs after the action of step `t` add to the gates to `out [3 H]`."""
-    out[:] = policy.action[plan[t]]
-    for lag in range(min(len(policy.past), t + 2)):
-        before = plan[t - lag] if lag <= t else len(policy.action) - 1  # the start symbol
-        for j in range(len(out)):
-            out[j] += policy.past[lag, before, j]
-    if len(policy.context):
-        for j in range(len(out)):
-            out[j] += policy.seen[policy.context[seen], j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _recur(policy: Policy, gates: Array, product: Array, hidden: Array) -> None:
-    """A step of the network: `hidden [H]` is overwritten, from `product [3 H]`, it times `recurrent`."""
-    size, one = len(hidden), np.float32(1)
-    for j in range(2 * size):
-        gates[j] = one / (one + _exp(-(gates[j] + product[j])))
-    for j in range(size):
-        new = gates[2 * size + j] + gates[j] * (product[2 * size + j] + policy.bias[j])
-        new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
-        hidden[j] = new + gates[size + j] * (hidden[j] - new)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _predict(policy: Policy, hidden: Array, weights: Array, probs: Array) -> None:
-    """Write cumulative unnormalised probabilities, float32 `[A]`, and probabilities, float64 `[A]`."""
-    weights[:] = policy.head_bias
-    for j in range(len(hidden)):
-        for a in range(len(weights)):
-            weights[a] += hidden[j] * policy.head[j, a]
-    top = weights.max()
-    total = 0.0
-    for a in range(len(weights)):
-        probs[a] = np.exp((weights[a] - top) / policy.temperature)
-        total += probs[a]
-    cumulative = 0.0
-    for a in range(len(weights)):
-        cumulative += probs[a]
-        weights[a] = cumulative
-        probs[a] /= total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(
     policy: Policy,
     which: Array,
@@ -261,7 +217,7 @@ def _evaluate(
     hidden: Array,
     weights: Array,
     probs: Array,
-    work: tuple[Array, Array, Array],
+    work: tuple[Array, Array, Array, Array],
 ) -> None:
     """Step the prior after the actions of step `t` of the plans `which [n]`, of all K.
 
@@ -272,27 +228,58 @@ def _evaluate(
         t: the step.
         seen: `[K]`: the states whose contexts the prior is given.
         code, hidden: `[K]` and `[K, H]`: its state, which is overwritten.
-        weights, probs: `[K, A]`: get its predictions.
-        work: room for `BLOCK` rows of hidden states, products and gates.
+        weights, probs: `[K, A]`: get its predictions: cumulative unnormalised probabilities, and probabilities.
+        work: room for `BLOCK` rows of hidden states, products, gates and logits.
     """
-    if hidden.shape[1] == 0:
+    size, actions, one = hidden.shape[1], weights.shape[1], np.float32(1)
+    if size == 0:
         for k in which:
             code[k] = policy.after[code[k], plans[k, t]]
             row = policy.row[code[k], policy.context[seen[k]] if len(policy.context) else 0]
-            for a in range(weights.shape[1]):
+            for a in range(actions):
                 weights[k, a], probs[k, a] = policy.weights[row, a], policy.probs[row, a]
         return
-    before, product, gates = work
+    # Single numbers are indexed, not rows: numba counts references to each row, which takes as long as all else here.
+    block, product, gates, logits = work
     for begin in range(0, len(which), BLOCK):
-        some = which[begin : begin + BLOCK]
-        for i in range(len(some)):
-            before[i] = hidden[some[i]]
-        np.dot(before[: len(some)], policy.recurrent, product[: len(some)])
-        for i in range(len(some)):
-            k = some[i]
-            _gates(policy, plans[k], t, seen[k], gates[i])
-            _recur(policy, gates[i], product[i], hidden[k])
-            _predict(policy, hidden[k], weights[k], probs[k])
+        number = min(BLOCK, len(which) - begin)
+        for i in range(number):
+            k = which[begin + i]
+            last = plans[k, t]
+            for j in range(size):
+                block[i, j] = hidden[k, j]
+            for j in range(3 * size):
+                gates[i, j] = policy.action[last, j]
+            for lag in range(min(len(policy.past), t + 2)):
+                before = plans[k, t - lag] if lag <= t else len(policy.action) - 1  # the start symbol
+                for j in range(3 * size):
+                    gates[i, j] += policy.past[lag, before, j]
+            if len(policy.context):
+                now = policy.context[seen[k]]
+                for j in range(3 * size):
+                    gates[i, j] += policy.seen[now, j]
+        np.dot(block[:number], policy.recurrent, product[:number])
+        for i in range(number):
+            k = which[begin + i]
+            for j in range(2 * size):
+                gates[i, j] = one / (one + _exp(-(gates[i, j] + product[i, j])))
+            for j in range(size):
+                new = gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + policy.bias[j])
+                new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
+                hidden[k, j] = block[i, j] = new + gates[i, size + j] * (block[i, j] - new)
+        np.dot(block[:number], policy.head, logits[:number])
+        for i in range(number):
+            k = which[begin + i]
+            top, total = np.float32(-np.inf), 0.0
+            for a in range(actions):
+                logits[i, a] += policy.head_bias[a]
+                top = max(top, logits[i, a])
+            for a in range(actions):
+                probs[k, a] = np.exp((logits[i, a] - top) / policy.temperature)
+                total += probs[k, a]
+                weights[k, a] = total
+            for a in range(actions):
+                probs[k, a] /= total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -338,6 +325,7 @@ def search(
         np.empty((wide, size), np.float32),
         np.empty((wide, 3 * size), np.float32),
         np.empty((wide, 3 * size), np.float32),
+        np.empty((wide, actions), np.float32),
     )
     used = 0
     for simulation in range(len(plans)):
@@ -371,7 +359,8 @@ def search(
                 if depth[k] == t:
                     node = path[k, t]
                     cell[k], code[k] = known.state[b, node], known.code[b, node]
-                    hidden[k] = known.hidden[b, node]
+                    for j in range(size):
+                        hidden[k, j] = known.hidden[b, node, j]
                 else:
                     total, action = weights[k, actions - 1], 0
                     mark = own[first[t] + k] * total
@@ -402,7 +391,9 @@ def search(
                 nodes.child[b, new], nodes.visits[b, new], nodes.total[b, new] = 0, 0, 0
                 nodes.closed[b, new], nodes.probs[b, new] = False, probs[k]
                 known.state[b, new], known.reward[b, new] = cell[k], rewards[simulation, b, t]
-                known.code[b, new], known.hidden[b, new] = code[k], hidden[k]
+                known.code[b, new] = code[k]
+                for j in range(size):
+                    known.hidden[b, new, j] = hidden[k, j]
         going = 0
         for k in range(number):
             if not alive[k]:
@@ -497,7 +488,7 @@ def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
 
 
 def _knows(prior: Steppable, length: int) -> bool:
-    """Whether `policy_of` can be told the prior, for plans of so many actions."""
+    """Whether `policy_of` can represent the prior, for plans of so many actions."""
     if type(prior) is UniformPrior:
         return True
     if isinstance(prior, HistoryPrior):

@@ -114,7 +114,7 @@ def collect(
         torch.Size([10, 3])
     """
     if (num_plans is None) == (state is None):
-        raise ValueError("collect: give either num_plans or state")
+        raise ValueError("num_plans, state: one of the two is expected, not both or neither")
     if context not in (None, "plan", "step"):
         raise ValueError(f'context: "plan", "step" or None is expected, not {context!r}')
     if state is None:

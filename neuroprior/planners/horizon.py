@@ -17,7 +17,7 @@ POOLED = 4.0
 """The scores from all starts together count as so many of each start's own."""
 
 QUANTILES = 16
-"""Of the best of several scores, over which its mean is taken."""
+"""Quantiles over which the mean of the best of several scores is taken."""
 
 
 class HorizonPlanner(SamplingPlanner):

@@ -87,7 +87,7 @@ def extend_horizon(
         [2, 3, 4]
     """
     if any(length < 1 for length in lengths):
-        raise ValueError(f"lengths: at least 1 is expected each, not {list(lengths)}")
+        raise ValueError(f"lengths: integers of at least 1 are expected, not {list(lengths)}")
     check_tried(temperatures, uniform_shares)
     goal: Objective = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
     prior.fit(plans, generator=generator, **settings)

@@ -13,8 +13,9 @@ from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import Rollout, World
 
 PER_ACTION = 64
-"""Numbers of a prior's state at a node that may take as much memory as one action's: states are kept while trees grow,
-and few of the nodes that there is room for are made."""
+"""So many numbers of a prior's state count as one action where memory is planned: states are kept only at nodes that
+are made, and few of the nodes that there is room for are.
+"""
 
 
 class MCTSPlanner(PriorPlanner):

@@ -26,7 +26,7 @@ from neuroprior.sampling.stepping import Steppable
 from neuroprior.worlds.world import World
 
 TEMPERATURES = (1.0, 1.5, 2.0)
-"""At which priors are tried: an overconfident prior tries the same plans again and again."""
+"""Temperatures that are tried: an overconfident prior proposes the same plans again and again."""
 
 UNIFORM_SHARES = (0.0, 0.1, 0.3)
 """Shares of uniform plans that are tried."""
@@ -93,7 +93,7 @@ def best_sampling(
         prior, length, num_plans, num_rollouts: see `SamplingPlanner`.
         **goal: `objective` and `discount`, see `SamplingPlanner`.
         world: a world that the prior did not learn from: where it did, it is overconfident.
-        state: starts `[B, ...]` in it, at least one; with hundreds the best setting is told from the others.
+        state: starts `[B, ...]` in it, at least one; some hundreds suffice to find the best setting.
         temperatures, uniform_shares: what is tried; of settings with equal scores, the first.
         generator: draws the candidates and the steps of a stochastic world.
 
@@ -230,7 +230,7 @@ def sampling_for(
     def worth(setting: tuple[float, float]) -> tuple[float, float]:
         heat, share = setting
         ways = [at[heat] + (log(1 - share) if share < 1 else -inf), even + (log(share) if share else -inf)]
-        found = log_chance(torch.logaddexp(*ways), num_plans)
+        found = log_inclusion(torch.logaddexp(*ways), num_plans)
         groups = [_log_mean(found[members == number]) for number in range(int(members.max()) + 1)]
         return round(min(groups), DIGITS), round(_log_mean(found), DIGITS)
 
@@ -264,11 +264,11 @@ def search_weights(log_prob: Tensor, num_plans: int) -> Tensor:
     log_prob = log_prob.double()
     others = torch.special.xlog1py(torch.tensor(num_plans - 1.0), -log_prob.exp())
     # Where a plan is impossible, the limit.
-    weight: Tensor = (log(num_plans) + log_prob + others - log_chance(log_prob, num_plans)).exp()
+    weight: Tensor = (log(num_plans) + log_prob + others - log_inclusion(log_prob, num_plans)).exp()
     return weight.masked_fill(log_prob == -inf, 1.0).clamp(0, 1)
 
 
-def log_chance(log_prob: Tensor, num_plans: int) -> Tensor:
+def log_inclusion(log_prob: Tensor, num_plans: int) -> Tensor:
     """log(1 - (1 - q)^P), float64, of log q: that one of P samples is a plan of probability q, however small."""
     log_prob = log_prob.double().clamp(max=0)
     never = torch.special.xlog1py(torch.tensor(float(num_plans)), -log_prob.exp())
@@ -284,7 +284,7 @@ def check_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) 
     """Raise ValueError where there are no temperatures or shares to try, or one is out of range."""
     for name, values in (("temperatures", temperatures), ("uniform_shares", uniform_shares)):
         if not len(values):
-            raise ValueError(f"{name}: at least one is expected")
+            raise ValueError(f"{name}: at least one is expected, not an empty list")
     for temperature in temperatures:
         check_temperature(temperature)
     for share in uniform_shares:

@@ -29,9 +29,10 @@ MISSING_LABELS = frozenset(
 )
 """What stands for no label in tables, in lower case."""
 
-
 NAMED = ("group", "condition")
-"""What may be a name beside numbers, or a number that is not whole, such as a dose: all are names then."""
+"""Columns in which names may stand beside numbers, and numbers need not be whole, such as a dose: all are names
+then.
+"""
 
 
 def is_missing(text: str) -> bool:
@@ -187,9 +188,8 @@ class Column(dict[str, int]):
     def _wrong_label(self, labels: list[str], numbers: list[int | float | None]) -> tuple[int, str] | None:
         """The number of the first text that is wrong among names, and what is wrong with it."""
         if self.names is not None:
-            known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
             wrong = next((i for i, label in enumerate(labels) if label not in self.names), None)
-            return None if wrong is None else (wrong, f"{self.what} {labels[wrong]!r} is none of {known}")
+            return None if wrong is None else (wrong, f"{self.what} {labels[wrong]!r} is none of {listed(self.names)}")
         missing = [i for i, label in enumerate(labels) if self.what == "action" and is_missing(label)]
         if missing:
             return missing[0], f"action {labels[missing[0]]!r} means no label; give action_names if it is an action"
@@ -258,9 +258,10 @@ def listed(values: Sequence[Any] | NDArray[Any], number: int | None = None) -> s
 
 
 def check_distinct(what: str, names: Sequence[str] | None) -> None:
-    """Raise ValueError where a name is there twice, so that a text would stand for two numbers."""
+    """Raise ValueError where a name occurs twice, so that a text would stand for two numbers."""
     if names is not None and len(set(names)) < len(names):
-        raise ValueError(f"{what}: {next(n for n in names if list(names).count(n) > 1)!r} is there twice")
+        twice = next(name for name in names if list(names).count(name) > 1)
+        raise ValueError(f"{what}: {twice!r} is there twice; different names are expected")
 
 
 def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> Names | None:
@@ -274,7 +275,7 @@ def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> 
         raise ValueError(f"action_names: a list of names is expected, not {action_names!r}")
     check_distinct("action_names", names)
     if num_actions not in (None, len(names)):
-        raise ValueError(f"action_names: {num_actions} are expected, not {len(names)}")
+        raise ValueError(f"action_names: {num_actions} names are expected, as many as num_actions, not {len(names)}")
     return names
 
 

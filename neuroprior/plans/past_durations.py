@@ -24,7 +24,8 @@ class PastDurations:
 
     Attributes:
         number: k, how many of the last actions.
-        center, spread: of the logarithms of durations above 0; what is known of the plans that a prior learns from.
+        center, spread: median and standard deviation of the logarithms of the durations above 0 in the plans that a
+            prior learns from; `of` computes them.
 
     Raises:
         ValueError: a value is out of range.
@@ -42,7 +43,8 @@ class PastDurations:
         check_sizes(number=self.number)
         if not -1e3 < self.center < 1e3 or not 0 < self.spread < 1e3:
             raise ValueError(
-                f"center and spread: of logarithms of times are expected, not {self.center}, {self.spread}"
+                "center, spread: between -1000 and 1000 and above 0 to 1000 are expected, those of logarithms of times,"
+                f" not {self.center} and {self.spread}"
             )
 
     @classmethod

@@ -16,10 +16,10 @@ from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.tables import Columns, Missing, fields_of
 
 MOST_BITS = 48
-"""Binary digits of the largest number of plans that `all_plans` would list, on any machine."""
+"""The most binary digits of the number of plans that `all_plans` lists, on any machine."""
 
 MOST_ACTIONS = 2**31
-"""Actions beyond which their numbers are something else."""
+"""The most actions; larger numbers are unlikely to be indices of actions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +84,7 @@ class Plans(Sequences):
         actions = _tensor("actions", self.actions)
         if actions.dim() != 2:
             raise ValueError(f"actions: shape [N, L] is expected, not {list(actions.shape)}")
+        object.__setattr__(self, "actions", actions)
         if self.end is not None:
             self._check_end(actions)
         num, length = actions.shape
@@ -98,7 +99,9 @@ class Plans(Sequences):
         _check_texts("action_names", self.action_names)
         _check_texts("notes", self.notes)
         if self.action_names is not None and len(self.action_names) != self.num_actions:
-            raise ValueError(f"action_names: {self.num_actions} are expected, not {len(self.action_names)}")
+            raise ValueError(
+                f"action_names: {self.num_actions} names are expected, one an action, not {len(self.action_names)}"
+            )
         for what in ("group", "condition"):
             if getattr(self, what) is not None:
                 values = _tensor(what, getattr(self, what))
@@ -147,12 +150,8 @@ class Plans(Sequences):
 
     def mask(self, end: bool = True) -> Tensor:
         """`[N, L]` bool: True where a plan has an action; with `end` False, one that is not the end symbol."""
-        if not end and self.end is not None:
-            return self.mask() & (self.actions != self.end)
-        steps = torch.arange(torch.as_tensor(self.actions).shape[1], device=torch.as_tensor(self.actions).device)
-        if self.lengths is None:
-            return torch.ones_like(torch.as_tensor(self.actions), dtype=torch.bool)
-        return steps < self.lengths[:, None]
+        taken = super().mask()
+        return taken if end or self.end is None else taken & (self.actions != self.end)
 
     def __getitem__(self, index: Tensor | slice | int) -> "Plans":
         """The plans at `index` (a slice, integers or a bool mask), as `Plans`."""
@@ -372,6 +371,9 @@ def all_plans(num_actions: int, length: int) -> Tensor:
         num_actions: A.
         length: L.
 
+    Raises:
+        ValueError: an argument is out of range, or there are too many plans.
+
     Example:
         >>> all_plans(2, 2).tolist()
         [[0, 0], [0, 1], [1, 0], [1, 1]]
@@ -396,7 +398,7 @@ def action_dtype(num_actions: int) -> torch.dtype:
 
 
 def check_context(context: Tensor, num_plans: int, length: int) -> None:
-    """Raise ValueError unless `context` is what `Plans.context` may be for `num_plans` plans of `length` actions.
+    """Raise ValueError unless `context` fits `num_plans` plans of `length` actions, as in `Plans.context`.
 
     Example:
         >>> check_context(torch.zeros(5, 3, dtype=torch.long), num_plans=5, length=3)
@@ -437,7 +439,8 @@ def durations_of(plans: Plans) -> Tensor:
 def is_per_step(context: Tensor | None) -> bool:
     """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
 
-    The patterns `[N, F]` of one state each look like indices per step: who expects patterns asks before this.
+    The patterns `[N, F]` of one state each look like indices per step: callers that expect patterns check for these
+    first.
 
     Example:
         >>> (
@@ -498,5 +501,5 @@ def _check_names(what: str, numbers: Tensor | None, names: Sequence[str] | None)
     if names is None:
         return
     if numbers is None or not is_integer(numbers):
-        raise ValueError(f"{what}_names: given without {what} numbers that they could name")
+        raise ValueError(f"{what}_names: integers in {what} are expected with them, which they name")
     check_range(what, numbers, len(names), f"{what} names")

@@ -35,9 +35,11 @@ class Sequences(ABC):
         """The number of columns of `actions`, L."""
         return self.actions.shape[1]
 
-    @abstractmethod
     def mask(self) -> Tensor:
         """`[N, L]` bool: True where a plan has an action."""
+        if self.lengths is None:
+            return torch.ones(self.actions.shape[:2], dtype=torch.bool, device=self.actions.device)
+        return torch.arange(self.max_length, device=self.actions.device) < self.lengths[:, None]
 
     @abstractmethod
     def __getitem__(self, index: Tensor | slice) -> Self:

@@ -32,7 +32,7 @@ Missing = Literal["gap", "label", "error"]
 MISSING: tuple[Missing, ...] = ("gap", "label", "error")
 
 EVENT_TYPES = ("START", "STOP", "POINT")
-"""What a row of a table says of an action: see `Columns.event_type`."""
+"""Values of the column `Columns.event_type`: an action begins, ends, or takes no time."""
 
 UNLABELLED = "missing"
 """The action of rows without a label, where these are to count as one."""
@@ -47,7 +47,7 @@ ZONED = r".*[T ].*(Z|[+-]\d{2}:?\d{2})\s*"
 """A date and time with a time zone."""
 
 DAY = r"\s*\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}([T ].*)?\s*"
-"""A date of which nobody knows whether its day or its month is first."""
+"""A date that ends with the year: whether its day or its month comes first cannot be known."""
 
 COMMA = re.compile(r"^(\s*-?\d+),(\d+\s*)$")
 """A number with a decimal comma."""
@@ -135,7 +135,7 @@ class Table:
                 raise ValueError(f"{of}: the column {what!r} is there twice")
         self.by_name: list[str] = []  # what was not given, and found by its name
         for what in given:
-            # Under the name event_type tables have anything.
+            # A column of the name event_type may hold anything, so it is used only where it is given.
             if what not in self.at and what in usual and what != "event_type":
                 self.at[what] = usual[what]
                 self.by_name += [what] if any(given.values()) else []
@@ -146,7 +146,7 @@ class Table:
             raise ValueError(
                 f"{of}: no column 'action'; say which holds the actions (columns.action) of {self._names()}"
             )
-        # Days, say, may be plans and conditions.
+        # One column may be both, such as days that are plans and conditions.
         once = [
             i
             for what, i in self.at.items()
@@ -370,7 +370,7 @@ def fields_of(
     if merge_repeats:
         first = (np.diff(piece, prepend=-1) != 0) | (np.diff(codes, prepend=-1) != 0)
         runs = np.cumsum(first) - 1
-        # What is known of the time of a run is the sum of its rows; without any times, the number of its rows.
+        # A run lasts as long as its rows do together; without any times, as many rows as it has.
         weight = np.ones(len(row)) if seconds is None else seconds
         seconds = np.bincount(runs, weight).astype(np.float64)
         row, plan, codes, piece = row[first], plan[first], codes[first], piece[first]

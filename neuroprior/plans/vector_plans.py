@@ -116,13 +116,6 @@ class VectorPlans(Sequences):
         """The number of dimensions of an action, D."""
         return int(self.actions.shape[2])
 
-    def mask(self) -> Tensor:
-        """`[N, L]` bool: True where a plan has a vector."""
-        steps = torch.arange(self.actions.shape[1], device=self.actions.device)
-        if self.lengths is None:
-            return torch.ones(self.actions.shape[:2], dtype=torch.bool, device=self.actions.device)
-        return steps < self.lengths[:, None]
-
     def __getitem__(self, index: Tensor | slice) -> "VectorPlans":
         """The plans at `index` (a slice, integers or a bool mask), as `VectorPlans`."""
 
@@ -172,7 +165,7 @@ class VectorPlans(Sequences):
         return every[ends <= self.mask().sum(1)[:, None]]
 
     def at_bounds(self, share: float = 1e-3) -> Tensor:
-        """The share of the vectors' entries, `[D]`, that lie at a bound: within `share` of the range."""
+        """In each dimension the share of vectors at a bound, or within `share` of the range of one: float32 `[D]`."""
         check_share("share", share)
         slack = share * (self.action_high - self.action_low)
         near = (self.actions <= self.action_low + slack) | (self.actions >= self.action_high - slack)
@@ -180,10 +173,10 @@ class VectorPlans(Sequences):
 
 
 COARSEST = 1e-4
-"""The least width of a range, as a share of its bounds: float32 has about a thousand numbers in it."""
+"""The least width of a range, as a share of its bounds: float32 then has about a thousand numbers between them."""
 
 WIDTHS = 1e-30, 1e30
-"""Between which a range's width lies, so that its square can be computed with."""
+"""The least and the greatest width of a range: float32 can hold their squares."""
 
 
 def check_widths(low: Tensor, high: Tensor) -> None:
@@ -215,7 +208,7 @@ def as_floats(name: str, values: object) -> Tensor:
 
 
 def _integers(name: str, values: object) -> Tensor:
-    """As a tensor; ValueError for what can be none. Its type is checked later."""
+    """`values` as a tensor, whose dtype is checked later; ValueError for what cannot be one."""
     try:
         return torch.as_tensor(values)
     except (OverflowError, RuntimeError, TypeError, ValueError):

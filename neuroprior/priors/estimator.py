@@ -57,7 +57,7 @@ class PriorEstimator:
         return {"prior": self.prior, "num_actions": self.num_actions, "seed": self.seed, **self.settings}
 
     def set_params(self, **params: Any) -> Self:
-        """Change arguments, and return the estimator itself. Whether the prior has a setting is found out by `fit`."""
+        """Change arguments, and return the estimator itself. `fit` checks whether the prior has them."""
         for name, value in params.items():
             if name in ("prior", "num_actions", "seed"):
                 setattr(self, name, value)
@@ -70,7 +70,7 @@ class PriorEstimator:
 
         Args:
             X: `Plans`; a list of `Plans` (`list(plans)`); or integers `[N, L]`.
-            y: nothing, as scikit-learn calls it.
+            y: ignored; scikit-learn passes it.
 
         Raises:
             ValueError: a setting that the prior does not have, or plans that it cannot learn from.
@@ -89,7 +89,7 @@ class PriorEstimator:
 
         Args:
             X: as for `fit`; a plan has at least one action.
-            y: nothing.
+            y: ignored.
 
         Raises:
             ValueError: nothing was fitted, or the prior does not know the plans' actions or contexts.

@@ -34,7 +34,9 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
     check_are_plans(plans)
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
-        raise ValueError(f"{name}: knows {known} actions, the file has {plans.num_actions}")
+        raise ValueError(
+            f"{name}: it knows {known} actions, and the plans have {plans.num_actions}; at most as many are expected"
+        )
     plans = renumbered(plans, known, learned_names(prior), prior.context_names, name)
     if not prior.takes_context:
         plans = plans.without_context()
@@ -98,7 +100,7 @@ def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str)
     """The number under which each of the names is known.
 
     Raises:
-        ValueError: a name is not known; it stands between `before` and `after`, and those that are follow.
+        ValueError: a name is not known; the message has it between `before` and `after`, and then all known names.
     """
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(known)}")

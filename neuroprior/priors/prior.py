@@ -39,8 +39,8 @@ class Prior(SavedModule):
         end: the action that ends a plan, as it was in the plans that the prior learned from (see `Plans.with_end`), or
             None. After it, it has probability 1 in `log_prob` and in samples.
         action_names, context_names: names of the actions and contexts, as they were in these plans, or None.
-        past_durations: how the durations of the last actions were made features of its context, or None;
-            `neuroprior.priors.match_plans` does the same to other plans. Whoever trains the prior so sets it.
+        past_durations: how the durations of the last actions became features of the context in training, or None;
+            `neuroprior.priors.match_plans` then adds the same features to other plans. The caller of `fit` sets it.
 
     Raises:
         ValueError: an argument is out of range.
@@ -274,7 +274,9 @@ class Prior(SavedModule):
 
     def _check_scored(self, plans: Plans) -> None:
         if plans.num_actions != self.num_actions:
-            raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
+            raise ValueError(
+                f"plans: {self.num_actions} actions are expected, as this prior has, not {plans.num_actions}"
+            )
         for what in ("action_names", "context_names"):
             own, names = getattr(self, what), getattr(plans, what)
             if None not in (own, names) and tuple(own) != tuple(names):
@@ -355,7 +357,9 @@ class Prior(SavedModule):
         """
         plans = self._as_plans(plans)
         if plans.num_actions != self.num_actions:
-            raise ValueError(f"plans have {plans.num_actions} actions, this prior {self.num_actions}")
+            raise ValueError(
+                f"plans: {self.num_actions} actions are expected, as this prior has, not {plans.num_actions}"
+            )
         self.end = plans.end
         self.action_names = None if plans.action_names is None else tuple(plans.action_names)
         self.context_names = None

@@ -87,7 +87,7 @@ def load(
 
     Args:
         folder: where.
-        device: where the prior shall compute.
+        device: where the prior computes then.
         kind: what it is a prior over: numbered "actions", or "vectors".
 
     Raises:

@@ -15,6 +15,9 @@ class UniformPrior(Prior):
     Args:
         num_actions: A.
 
+    Raises:
+        ValueError: `num_actions` is out of range.
+
     Example:
         >>> UniformPrior(4).log_prob(torch.zeros(1, 3, dtype=torch.long)).exp().item() == 4**-3
         True

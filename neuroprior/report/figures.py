@@ -152,16 +152,16 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
 
     Args:
         lags: the table `lags` of a report: `what` ("mutual information" or "gain"), `model`, `context`, `lag`, `bits`,
-            `low`, `high`, and `chance`, the 95 % quantile of what independent actions would give, or missing.
+            `low`, `high`, and `critical_value`, the 95 % quantile of what independent actions would give, or missing.
     """
     expect_some("lags", lags)
-    expect_columns("lags", lags, "what model context lag bits low high chance")
+    expect_columns("lags", lags, "what model context lag bits low high critical_value")
     figure, (axes,) = panels(1, 1, (WIDTH, 3.7))
     sizes = np.abs(floats(lags["bits"]))
     sizes = sizes[sizes > 0]
-    floor = lags[lags["chance"].notna()]
+    floor = lags[lags["critical_value"].notna()]
     largest = sizes.max(initial=0)
-    small = np.abs(floats(floor["chance"])) if len(floor) else [min(sizes, default=1.0)]
+    small = np.abs(floats(floor["critical_value"])) if len(floor) else [min(sizes, default=1.0)]
     linear = 10 ** np.round(np.log10(np.nanmax([largest / 100, *small, 1e-9])))
     if largest > 30 * linear:
         axes.set_yscale("symlog", linthresh=linear, linscale=0.6)
@@ -170,7 +170,9 @@ def lag_figure(lags: pd.DataFrame) -> Figure:
     for (name, own), (color, line) in zip(curves.items(), lines(list(curves)), strict=True):
         band(axes, own[["lag", "bits", "low", "high"]].to_numpy(), color, short(name, 40), line)
     if len(floor):
-        axes.plot(floor["lag"], floor["chance"], "--", color=INK, alpha=0.7, lw=1.2, label="independent actions")
+        axes.plot(
+            floor["lag"], floor["critical_value"], "--", color=INK, alpha=0.7, lw=1.2, label="independent actions"
+        )
     axes.axhline(0, color=INK, lw=0.8)
     whole_numbers(axes, "steps back", "bits")
     legend(figure, axes.get_legend_handles_labels()[0])

@@ -55,7 +55,7 @@ COUNTED = "markov"
 VALIDATION = 0.1
 """Share of the training plans on which the settings of count-based models are chosen."""
 
-MOST_PIECES, PIECES_A_STEP = 20_000, 512
+MOST_PIECES, PIECES_A_STEP = 20_000, 128
 MOST_GENERATED = 1000
 """Bounds of what is cut into pieces, read in a step, and sampled."""
 

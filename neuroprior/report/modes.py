@@ -68,7 +68,7 @@ def mode_section(found: Evaluation) -> Part | None:
     columns |= {side: side for side in ("enters", "leaves") if side in described}
     caption = (
         "%: of the actions. dwell: mean actions until the mode ends. visits: a plan. actions: those that it takes"
-        " oftener than all modes together, with their shares in the mode."
+        " more often than all modes together, with their shares in the mode."
         + " enters, leaves: the commonest contexts."
         * ("enters" in described)
     )

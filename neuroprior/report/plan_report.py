@@ -34,7 +34,7 @@ CSV = (".csv", ".tsv")
 """Files whose actions may be numbers without names."""
 
 FOLDS = 5
-"""Where they are not given; fewer where there are fewer groups."""
+"""Folds where their number is not given; fewer where there are fewer groups."""
 
 
 def report(

@@ -164,12 +164,10 @@ def lag_section(found: Evaluation) -> Part | None:
     skip = found.settings["skip"]
     lags = found.gains
     if int(found.plans.mask()[:, max(skip, 1) :].sum()) >= 2:
-        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles())).rename(
-            columns={"critical_value": "chance"}
-        )
+        information = pd.DataFrame(mutual_information(found.plans, MOST_LAG, skip, _shuffles()))
         information = information.assign(what="mutual information", model="counts", context=ACTIONS, units=None)
         lags = pd.concat([information, lags], ignore_index=True) if len(lags) else information
-        lags = lags[["what", "model", "context", "lag", "bits", "low", "high", "chance", "units"]]
+        lags = lags[["what", "model", "context", "lag", "bits", "low", "high", "critical_value", "units"]]
     if not len(lags):
         return None
     lags = lags.assign(units=lags["units"].astype("Int64"))
@@ -390,7 +388,7 @@ def likeness_section(found: Evaluation) -> Part | None:
             shown = model, real, results
         rows += [
             {"model": model.name, "context": model.inputs, "statistic": one.statistic}
-            | {"distance": one.distance, "chance": one.null_distance}
+            | {"distance": one.distance, "null_distance": one.null_distance}
             | {"p_value": one.p_value if tested else None, "corrected": one.corrected if tested else None}
             for one in results
         ]

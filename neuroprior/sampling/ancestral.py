@@ -16,7 +16,9 @@ from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import Rollout, World, join_states
 
 CACHED, FEWEST = 2**17, 1024
-"""On a CPU, as many plans are stepped together as have so many numbers in their states, or logits; at least so many."""
+"""On a CPU, plans are stepped in parts of at most `CACHED` numbers in their states (or logits), so that they fit a
+processor's cache, and of at least `FEWEST` plans.
+"""
 
 
 @torch.no_grad()
@@ -63,7 +65,7 @@ def sample(
         torch.Size([3, 5])
     """
     _check(num_plans, length, temperature, batch_size)
-    # The plans, and the uniform numbers of those that are drawn together.
+    # Memory of the plans, and of the uniform numbers with which some are drawn together.
     each = action_dtype(prior.num_actions).itemsize
     check_memory((each * num_plans + 4 * min(num_plans, batch_size)) * length, num_plans=num_plans, length=length)
     stepper = Stepper(prior)
@@ -124,7 +126,7 @@ def sample_in_world(
         keep_states: also return the state after each step, in the rollout.
 
     Returns:
-        Plans `[B, P, L]` and their `Rollout`.
+        Plans `[B, P, L]`, uint8 (int64 for more than 256 actions), and their `Rollout`.
 
     Raises:
         ValueError: an argument is out of range, or prior and world differ in their number of actions.
@@ -137,7 +139,7 @@ def sample_in_world(
         (torch.Size([2, 6, 3]), torch.Size([2, 6]))
     """
     _check(num_plans, length, temperature, 1)
-    # The plans and their rewards.
+    # Memory of the plans and their rewards.
     check_memory(5 * len(state) * num_plans * length, num_plans=num_plans, length=length)
     stepper = Stepper(prior)
     logits, hidden = stepper.start_in(world, state)

@@ -21,11 +21,11 @@ class Distinct(NamedTuple):
 
     Attributes:
         plans: `[B, P, L]`, uint8 (int64 for more than 256 actions).
-        log_prob: `[B, P]` float64: the log-probability of each plan; -inf where there was no further plan, and what
-            stands there is none.
+        log_prob: `[B, P]` float64, nats: the log-probability of each plan; -inf where there are fewer than P plans, and
+            `plans` holds no plan there.
         inclusion: `[B, P]` float64: the probability that a sample contains this plan, given the sample's threshold; 0
-            where there was no further plan. An unbiased estimate of the mean of any f(plan) is the sum of
-            f(plan) * exp(log_prob) / inclusion (Kool, van Hoof and Welling 2019, section 4.2).
+            where there is no plan. An unbiased estimate of the mean of any f(plan) is the sum of f(plan) *
+            exp(log_prob) / inclusion (Kool, van Hoof and Welling 2019, section 4.2).
     """
 
     plans: Tensor
@@ -60,7 +60,7 @@ def sample_distinct(
         generator: the source of randomness.
 
     Raises:
-        ValueError: an argument is out of range, or there are not so many plans.
+        ValueError: an argument is out of range, or there are fewer than `num_plans` plans.
 
     Example:
         >>> found = sample_distinct(UniformPrior(2), num_plans=8, length=3, generator=torch.Generator().manual_seed(0))
@@ -127,8 +127,8 @@ def most_probable(
 ) -> tuple[Tensor, Tensor]:
     """The most probable plans, exactly, the most probable first.
 
-    A beam search gives a lower bound on the probability of the last plan that is sought; then all prefixes at least as
-    probable as this bound are extended. A nearly uniform distribution has very many of them.
+    A beam search gives a lower bound on the probability of the P-th plan; then all prefixes at least as probable as
+    this bound are extended. A nearly uniform distribution has very many of them.
 
     Args:
         prior, length, temperature: see `sample_distinct`.
@@ -137,11 +137,11 @@ def most_probable(
         max_prefixes: the most prefixes, of all distributions together, that may be extended; bounds memory.
 
     Returns:
-        Plans `[B, P, L]` and their log-probabilities `[B, P]`, float64.
+        Plans `[B, P, L]`, uint8 (int64 for more than 256 actions), and their log-probabilities `[B, P]`, float64, nats.
 
     Raises:
-        ValueError: an argument is out of range, there are not so many plans, or too many prefixes would have to be
-            extended.
+        ValueError: an argument is out of range, there are fewer than `num_plans` plans, or more than `max_prefixes`
+            prefixes would have to be extended.
 
     Example:
         >>> prior = MarkovPrior(3, order=1).fit(torch.tensor([[0, 1, 2, 0, 1, 2]]))
@@ -190,7 +190,8 @@ class Beams:
     Attributes:
         plans: `[B * K, t]`.
         log_prob: `[B, K]` float64; -inf: there is no such plan.
-        height: `[B, K]` float64: what the beams with the highest values are kept by.
+        height: `[B, K]` float64: the beams of the greatest height are kept; the log-probability, after `add_noise`
+            perturbed.
     """
 
     def __init__(

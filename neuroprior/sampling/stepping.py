@@ -11,7 +11,7 @@ from neuroprior.sampling.draws import after_end
 from neuroprior.worlds.world import World, check_is_world
 
 FEWEST_TO_SHARE = 256
-"""States of which the distinct ones are worth finding, where an observation is given to a prior."""
+"""The number of states from which the distinct ones are found, so that each is observed once."""
 
 
 @runtime_checkable
@@ -83,7 +83,9 @@ class Stepper:
         if check is not None:
             check(context, num_plans, length)
         elif (context is None) != (self.context_per is None):
-            raise ValueError(f"context: this prior {'takes none' if context is not None else 'needs one'}")
+            raise ValueError(
+                f"context: this prior {'takes none' if context is not None else 'takes one, and none was given'}"
+            )
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Logits `[N, A]` of the first action, and the state `[N, ...]`."""
@@ -133,7 +135,7 @@ class Stepper:
 
 
 def _numbered(reached: Tensor) -> bool:
-    """Whether states are numbers, and so many that it is worth to find the distinct ones."""
+    """Whether states are numbers, and enough of them that finding the distinct ones pays."""
     return reached.dim() == 1 and is_integer(reached) and len(reached) >= FEWEST_TO_SHARE
 
 
@@ -146,7 +148,9 @@ def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
             "prior: it samples an end symbol, which is no action of the world; fit it to plans without one"
         )
     if prior.num_actions != world.num_actions:
-        raise ValueError(f"prior has {prior.num_actions} actions, the world {world.num_actions}")
+        raise ValueError(
+            f"prior: it has {prior.num_actions} actions, and the world {world.num_actions}; as many are expected"
+        )
 
 
 def legal_logits(world: World, state: Tensor, logits: Tensor) -> Tensor:

@@ -74,7 +74,7 @@ def _random_context(prior: Prior, kind: str | None, num: int, length: int, gener
     if prior.num_contexts is not None:
         return torch.randint(prior.num_contexts, shape, generator=generator).to(prior.device)
     if prior.num_patterns is not None:
-        # Low numbers, which a prior may have learned, and ones that it never saw.
+        # Low numbers, which a prior may have learned, and one that no plans have.
         codes = torch.randint(8, (*shape, prior.num_patterns), generator=generator, dtype=torch.int32)
         return torch.where(codes == 7, 2**31 - 1, codes).to(torch.int32).to(prior.device)
     return torch.randn(*shape, prior.context_size or 0, generator=generator).to(prior.device)

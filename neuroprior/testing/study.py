@@ -51,7 +51,7 @@ def simulated_study(
     Args:
         seed: draws the study.
         effect: whether the treatment does anything.
-        within: each animal is under both conditions, in the order that a coin says; else six animals are treated.
+        within: each animal is under both conditions, in an order drawn at random; else six animals are treated.
         animal_effect: standard deviation, over animals, of the logits of all transitions and of the logarithms of all
             median durations; it has nothing to do with the treatment.
         alike: the second session of an animal repeats the first, apart from the treatment's effect.

@@ -17,7 +17,7 @@ MOST_DISTINCT = 1024
 """Distinct plans that one training step takes together, each weighted by its number."""
 
 MOST_VALIDATION = 2**16
-"""Actions in each validation, about."""
+"""About so many actions are scored in each validation."""
 
 LEAST_WINDOWS = 8
 """Windows through which the hidden state is carried in training, for plans as long; twice as many in validation."""

@@ -34,9 +34,9 @@ class PriorModule(lightning.LightningModule):
     ) -> None:
         super().__init__()
         if not is_number(learning_rate) or not 0 < learning_rate < float("inf"):
-            raise ValueError(f"learning_rate: a positive number is expected, not {learning_rate!r}")
+            raise ValueError(f"learning_rate: a positive finite number is expected, not {learning_rate!r}")
         if not is_number(weight_decay) or not 0 <= weight_decay < float("inf"):
-            raise ValueError(f"weight_decay: must not be negative, not {weight_decay!r}")
+            raise ValueError(f"weight_decay: a finite number of at least 0 is expected, not {weight_decay!r}")
         self.prior, self.learning_rate, self.weight_decay, self.seed = prior, learning_rate, weight_decay, seed
         self.curve: list[dict[str, float]] = []
         self._hidden: Tensor | None = None

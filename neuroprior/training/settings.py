@@ -10,8 +10,9 @@ FEWEST_STEPS, MOST_STEPS = 10, 100
 """The least and the most steps between two validations, where these are not given."""
 
 FEWEST, MOST, PASSES, SHORT = 1000, 4000, 50, 32
-"""Steps of a training, where these are not given: so many passes through the plans, within these bounds; the fewest for
-plans of at most so many actions, of which more steps teach hardly more."""
+"""Steps of a training, where these are not given: so many passes through the plans, within these bounds; `FEWEST` for
+plans of at most `SHORT` actions, from which more steps learn hardly more.
+"""
 
 PATIENCE = 0.4
 """Share of the steps without improvement after which training stops."""

@@ -53,14 +53,15 @@ def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> 
     device = next(prior.parameters()).device
     training: Sequences
     validation: Sequences
-    if isinstance(settings.validation, Sequences):
-        training, validation = plans, settings.validation
-        _check_alike(training, validation)
-    else:
-        training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
     in_windows = hasattr(prior, "forward_from") or hasattr(prior, "log_probs_from")
-    window = settings.window if in_windows else plans.max_length
-    data = PlansModule(training, validation, replace(settings, window=window), seed)
+    with one_thread():
+        if isinstance(settings.validation, Sequences):
+            training, validation = plans, settings.validation
+            _check_alike(training, validation)
+        else:
+            training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
+        window = settings.window if in_windows else plans.max_length
+        data = PlansModule(training, validation, replace(settings, window=window), seed)
     cuda = device.type == "cuda"
     with quiet(), torch.random.fork_rng([device] if cuda else []):
         torch.manual_seed(seed)

@@ -8,6 +8,8 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from neuroprior._memory import new_empty
+
 Array = np.ndarray[Any, Any]
 
 
@@ -34,8 +36,8 @@ def rollout(
         cell, offset = cell.repeat_interleave(threads), offset.repeat_interleave(threads)
         batch, num_plans = batch * threads, num_plans // threads
     given = [x.contiguous().numpy() for x in (table, reward.flatten(), cell, offset, actions_of)]
-    last, gained = torch.empty(rows, dtype=torch.int64), torch.empty(rows, length, dtype=reward.dtype)
-    states = torch.empty(rows, length if keep_states else 0, dtype=torch.int64)
+    last, gained = new_empty((rows,), plans, torch.int64), new_empty((rows, length), reward)
+    states = new_empty((rows, length if keep_states else 0), plans, torch.int64)
     written = [x.numpy() for x in (last, gained, states)]
     sizes = num_plans, len(table) // reward.shape[1], reward.dim() == 2
 

@@ -35,6 +35,9 @@ class PocketCube(World):
     Attributes:
         reward_kind: "solved" or "distance".
         action_names: such as ("U", "U2", "U'", ...).
+
+    Raises:
+        ValueError: an argument is out of range.
     """
 
     has_goal = True
@@ -47,11 +50,10 @@ class PocketCube(World):
         absorbing: bool = False,
     ) -> None:
         if turns not in ("half", "quarter"):
-            raise ValueError(f'cube: turns must be "half" or "quarter", not {turns!r}')
+            raise ValueError(f'turns: "half" or "quarter" is expected, not {turns!r}')
         if reward not in ("solved", "distance"):
-            raise ValueError(f'cube: reward must be "solved" or "distance", not {reward!r}')
-        if scramble < 0:
-            raise ValueError(f"cube: scramble must be a number of moves, at least 0, not {scramble}")
+            raise ValueError(f'reward: "solved" or "distance" is expected, not {reward!r}')
+        check_count("scramble", scramble, 0)
         self.turns, self.scramble, self.reward_kind, self.absorbing = turns, scramble, reward, absorbing
         permutations, orientations = _all_permutations(), _all_orientations()
         names, permutation_moves, orientation_moves = [], [], []

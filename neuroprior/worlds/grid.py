@@ -24,7 +24,7 @@ class GridWorld(TabularWorld):
 
     A cell is `layout * height * width + row * width + column`; where the agent has a heading (`egocentric`), it is four
     times that plus the heading. A move into a wall, or off a grid that is no torus, stays where it is; wall squares are
-    cells that nobody enters.
+    cells that no move enters.
 
     Args:
         height, width, edges: see `gridworld`.
@@ -150,12 +150,12 @@ def gridworld(
         (4, torch.Size([3, 400]))
     """
     if not is_number(reward_power) or not 0 < reward_power < float("inf"):
-        raise ValueError(f"gridworld: reward_power must be positive and finite, not {reward_power}")
+        raise ValueError(f"reward_power: a positive finite number is expected, not {reward_power!r}")
     check_sizes(height=height, width=width, num_worlds=num_worlds)
     check_seed(seed)
     check_memory(8 * height * width * num_worlds, height=height, width=width, num_worlds=num_worlds)
     if edges not in ("wall", "torus"):
-        raise ValueError(f'gridworld: edges must be "wall" or "torus", not {edges!r}')
+        raise ValueError(f'edges: "wall" or "torus" is expected, not {edges!r}')
     uniform = torch.rand(num_worlds, height * width, generator=torch.Generator().manual_seed(seed))
     return GridWorld(height, width, edges, uniform.pow(reward_power))
 
@@ -173,7 +173,7 @@ def egocentric(world: GridWorld) -> GridWorld:
         ('left', 'right', 'forward')
     """
     if world.egocentric:
-        raise ValueError("egocentric: the world is egocentric already")
+        raise ValueError("world: its agents have headings already; a grid with four moves is expected")
     return GridWorld(
         world.height, world.width, world.edges, world.reward, walls=world.walls, egocentric=True, view=world.view
     )
@@ -223,7 +223,9 @@ def goal_direction(world: GridWorld) -> Callable[[Tensor], Tensor]:
         torch.Size([5, 2])
     """
     if world.edges == "torus":
-        raise ValueError("goal_direction: a grid whose edges are walls is expected, not a torus")
+        raise ValueError(
+            "world: a grid whose edges are walls is expected, not a torus, where there are several ways to count"
+        )
     area = world.height * world.width
     reward = world.reward[:, ::4] if world.egocentric else world.reward
     goal = reward.view(world.num_maps, world.num_layouts, area).argmax(-1)

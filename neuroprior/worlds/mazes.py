@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_seed, check_sizes, is_number
+from neuroprior._checks import check_seed, check_share, check_sizes, is_number
 from neuroprior.worlds.grid import GridWorld
 
 
@@ -46,8 +46,8 @@ def four_rooms(
     """
     check_sizes(height=height, width=width)
     if height < 5 or width < 5:
-        raise ValueError(f"four_rooms: height and width must be at least 5, not {height} x {width}")
-    _check("four_rooms", num_layouts, num_worlds, reward, reward_power)
+        raise ValueError(f"height, width: at least 5 squares are expected, not {height} x {width}")
+    _check(num_layouts, num_worlds, reward, reward_power)
     check_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     walls = torch.zeros(num_layouts, height, width, dtype=torch.bool)
@@ -98,10 +98,9 @@ def maze(
     """
     check_sizes(height=height, width=width)
     if min(height, width) < 3 or height % 2 == 0 or width % 2 == 0:
-        raise ValueError(f"maze: height and width must be odd and at least 3, not {height} x {width}")
-    if not is_number(loops) or not 0 <= loops <= 1:
-        raise ValueError(f"maze: loops must be a share from 0 to 1, not {loops}")
-    _check("maze", num_layouts, num_worlds, reward, reward_power)
+        raise ValueError(f"height, width: odd numbers of at least 3 are expected, not {height} x {width}")
+    check_share("loops", loops)
+    _check(num_layouts, num_worlds, reward, reward_power)
     check_seed(seed)
     generator = torch.Generator().manual_seed(seed)
     walls = _dig(height, width, num_layouts, generator)
@@ -161,11 +160,11 @@ def _rewards(walls: Tensor, num_worlds: int, kind: str, power: float, generator:
     return torch.zeros_like(uniform).scatter_(-1, goal, 1.0).flatten(1)
 
 
-def _check(name: str, num_layouts: int, num_worlds: int, reward: str, reward_power: float) -> None:
+def _check(num_layouts: int, num_worlds: int, reward: str, reward_power: float) -> None:
     check_sizes(num_layouts=num_layouts, num_worlds=num_worlds)
     if reward not in ("random", "goal"):
-        raise ValueError(f'{name}: reward must be "random" or "goal", not {reward!r}')
+        raise ValueError(f'reward: "random" or "goal" is expected, not {reward!r}')
     if not is_number(reward_power) or not 0 < reward_power < float("inf"):
-        raise ValueError(f"{name}: reward_power must be positive and finite, not {reward_power}")
+        raise ValueError(f"reward_power: a positive finite number is expected, not {reward_power!r}")
     if reward == "goal" and reward_power != 1:
-        raise ValueError(f'{name}: reward_power has no effect with reward="goal"; use reward="random"')
+        raise ValueError('reward_power: it has no effect with reward="goal"; use reward="random"')

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior._compiled import compiled
+from neuroprior._memory import new_empty
 from neuroprior._random import generator_on
 from neuroprior.worlds.outcomes import Outcomes
 from neuroprior.worlds.world import Rollout, World, check_plans, join_states
@@ -170,7 +171,7 @@ class TabularWorld(World):
             return Rollout(*compiled.rollout(table, self.reward, cell, state - cell, plans, keep_states))
         offset = (state - cell).int()[:, None]
         cell = cell.int()[:, None].expand(batch, num_plans)
-        rewards = self.reward.new_empty(length, batch, num_plans)
+        rewards = new_empty((length, batch, num_plans), self.reward)
         cells = []
         uniform = self._uniform(length, batch, generator)
         for t in range(length):

@@ -395,7 +395,7 @@ def test_damaged_checkpoints(tmp_path):
         ({"retention": 0.0}, "retention"),
         ({"learn_every": "12"}, "learn_every"),
         ({"training": {"max_steps": 5}}, "max_steps"),
-        ({"prior": MarkovPrior(3, 1)}, "3 actions, the world 4"),
+        ({"prior": MarkovPrior(3, 1)}, "3 actions, and the world 4"),
     ],
 )
 def test_bad_agents(given, word):

@@ -67,7 +67,7 @@ def test_a_ratio_of_differences_is_paired_and_antisymmetric():
     [
         ([1], [1], "totals"),
         ([1, 2], [1], "sizes"),
-        ([1, 2], [1, 2, 3], "3 sizes"),
+        ([1, 2], [1, 2, 3], "sizes: 2 are expected"),
         ([1, 2], [0, 0], "sizes"),
         ([1, 2], [-1, 2], "sizes"),
         ([[1, 2]], [1, 2], "totals"),
@@ -228,7 +228,7 @@ def test_minus_is_paired():
     assert markov.minus(markov) == (0, 0, 0, 1)
     for other in (held_out()[:9], held_out(group=torch.arange(12) // 4), held_out().with_end()):
         one = score("other", UniformPrior(other.num_actions), other)
-        with refuses("MarkovPrior and UniformPrior", "not scored on the same plans"):
+        with refuses("MarkovPrior, UniformPrior", "scores on the same plans"):
             markov.minus(replace(one, model="UniformPrior"))
 
 

@@ -99,7 +99,7 @@ def test_two_actions_back_and_no_further(second_order):
         else:  # nothing, but for what is lost to thinner counts
             assert -0.1 < row["bits"] < 0.01
     informed = {row["lag"]: row for row in results["lags"] if row["what"] == "mutual information"}
-    assert all(informed[lag]["low"] > informed[lag]["chance"] for lag in (1, 2))
+    assert all(informed[lag]["low"] > informed[lag]["critical_value"] for lag in (1, 2))
     orders = {row["order"]: row["bic"] for row in results["orders"]}
     assert min(orders, key=orders.__getitem__) == 2
 
@@ -113,11 +113,11 @@ def test_plans_of_the_right_order_do_not_differ(second_order):
     assert int(chain.removeprefix("markov-")) >= 2
     for row in rows:
         if row["model"] == chain:
-            assert row["distance"] < 1.5 * row["chance"] + 0.01, row
+            assert row["distance"] < 1.5 * row["null_distance"] + 0.01, row
             assert row["corrected"] > 0.006, row  # that of 1 in 1000 permutations, six statistics
     untrained = [row for row in rows if row["model"] == "gru"]
     assert min(row["corrected"] for row in untrained) == pytest.approx(0.006)
-    assert any(row["distance"] > 3 * row["chance"] for row in untrained)
+    assert any(row["distance"] > 3 * row["null_distance"] for row in untrained)
 
 
 def test_a_planted_difference_of_groups_is_found(tmp_path):

@@ -110,7 +110,7 @@ def test_what_cannot_be_learned_is_refused_before_the_first_search() -> None:
     for prior, settings, message in (
         (prior_for(world), {"epoch": 2}, "epoch: not a setting"),
         (LogLinearPrior(4, 3), {}, "3 patterns"),
-        (LogLinearPrior(3, 3), {}, "prior has 3 actions"),
+        (LogLinearPrior(3, 3), {}, "it has 3 actions"),
     ):
         with pytest.raises(ValueError, match=message):
             next(bootstrap(world, prior, world.boards, teacher=AStarPlanner(unused), **settings))

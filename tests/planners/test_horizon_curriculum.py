@@ -241,7 +241,7 @@ def test_each_layout_and_reward_map_is_a_group():
 
 def test_bad_input():
     world, plans = FromTheMiddle(), collect(ExhaustivePlanner(2), FromTheMiddle(), 10)
-    with refuses("lengths: at least 1"):
+    with refuses("lengths: integers of at least 1"):
         next(extend_horizon(MarkovPrior(2, 1), plans, world, (0,), num_starts=5))
     with refuses("none of 10 plans scored more than 99"):
         collect(ExhaustivePlanner(2), world, 10, min_score=99)

@@ -8,7 +8,7 @@ import torch
 
 from neuroprior import MarkovPrior, MixturePrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
 from neuroprior.planners import best_sampling, proposers, sampling_for, search_weights
-from neuroprior.planners.tuning import choices, log_chance
+from neuroprior.planners.tuning import choices, log_inclusion
 from neuroprior.testing import check_planner
 from neuroprior.worlds import gridworld
 from tests.support.sources import refuses, seeded, stochastic_world
@@ -224,7 +224,7 @@ def test_tiny_probabilities_are_told_apart():
     assert sampling_for(sure_of(0), plans, 16, (1.0, 2.0, 8.0), (0.0,)) == (8.0, 0.0)
     assert sampling_for(sure_of(0), plans, 16, (1.0,), (0.0, 0.3)) == (1.0, 0.3)
     small = torch.tensor([-50.0, -599.0, -601.0, -5000.0], dtype=torch.float64)
-    assert torch.allclose(log_chance(small, 64), small + log(64), rtol=1e-12)
+    assert torch.allclose(log_inclusion(small, 64), small + log(64), rtol=1e-12)
 
 
 def test_plans_of_several_lengths():

@@ -52,7 +52,7 @@ OK = '{"actions": [0, 1]}'
         (["9" * 5000], ["line 1"]),
         (['{"num_actions": 2}', OK, '{"actions": [2]}'], ["line 3", "action 2 is out of range", "0 to 1"]),
         (['{"num_actions": 0}', OK], ["line 1", "num_actions"]),
-        (['{"num_actions": 2, "action_names": ["a"]}', OK], ["line 1", "2 are expected, not 1"]),
+        (['{"num_actions": 2, "action_names": ["a"]}', OK], ["line 1", "2 names are expected"]),
         (['{"action_names": ["a", "a"]}', OK], ["line 1", "'a' is there twice"]),
         (['{"action_names": "ab"}', OK], ["line 1", "a list of names"]),
         (['{"action_names": ["a"]}', '{"actions": ["b"]}'], ["line 2", "action 'b' is none of a"]),
@@ -146,7 +146,7 @@ def test_given_actions(tmp_path):
     for names in ("ab", [], ["a", "a"], [1, 2]):
         with refuses("action_names"):
             read_plans(tmp_path / "a.csv", action_names=names)
-    with refuses("action_names", "3 are expected, not 2"):
+    with refuses("action_names", "3 names are expected"):
         read_plans(tmp_path / "a.csv", num_actions=3, action_names=["a", "b"])
 
 

@@ -98,5 +98,5 @@ def test_what_is_refused():
     index = Plans(ACTIONS, 3, durations=DURATIONS, context=torch.tensor([0, 1]))
     with refuses("an index cannot stand beside past durations"):
         PastDurations(1, 0.0, 1.0).added_to(index)
-    with refuses("center and spread"):
+    with refuses("center, spread"):
         PastDurations(1, nan, 1.0)

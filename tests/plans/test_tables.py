@@ -427,7 +427,7 @@ def test_a_line_that_names_the_separator_is_no_row(tmp_path, first):
     plans = read_plans(tmp_path / "a.csv")
     assert plans.action_names == ("rest", "walk")
     assert plans.durations.tolist() == [[0.5, 1.0]]
-    assert plans.notes[-1] == "line 1 says that ';' parts the columns, and is no plan"
+    assert plans.notes[-1] == "line 1 names the delimiter, ';', and is not read as a plan"
     (tmp_path / "b.csv").write_text(f"{first}\naction_1;action_2\n1;0\n0\n")
     with pytest.raises(ValueError, match=r"b\.csv, line 4: 1 cells, where the header has 2"):
         read_plans(tmp_path / "b.csv")

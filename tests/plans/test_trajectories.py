@@ -132,7 +132,7 @@ def test_what_is_no_trajectory(trajectory, words):
 
 
 def test_arguments():
-    with refuses("none are given"):
+    with refuses("the list is empty"):
         from_trajectories([], 3)
     with refuses("num_actions", "0"):
         from_trajectories([{"actions": [0]}], 0)

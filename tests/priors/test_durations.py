@@ -304,9 +304,9 @@ def test_what_is_refused():
     bare, unknown = Plans(plans.actions, 3), Plans(plans.actions, 3, durations=torch.full((4, 60), nan))
     with refuses("durations: these plans have none"):
         SemiMarkovPrior(3).fit(bare)
-    with refuses("none of these plans is known"):
+    with refuses("all of these plans are unknown"):
         DurationModel(3).fit(unknown)
-    with refuses("3 actions"):
+    with refuses("not 3"):
         DurationModel(2).fit(plans)
     with refuses("max_steps: not a setting"):
         SemiMarkovPrior(3).fit(plans, max_steps=3)

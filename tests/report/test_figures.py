@@ -132,7 +132,7 @@ def test_orders_that_are_left_out():
     ("make", "frames", "words"),
     [
         (score_figure, ["model context low high"], "scores: .*; bits_per_action missing"),
-        (lag_figure, ["model lag bits low high chance"], "lags: .*; what, context missing"),
+        (lag_figure, ["model lag bits low high critical_value"], "lags: .*; what, context missing"),
         (
             order_figure,
             ["order", "model context bits_per_action low high"],

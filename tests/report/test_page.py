@@ -105,7 +105,7 @@ def criteria(*bits: float | None, context: str = "actions") -> pd.DataFrame:
 def lags(curves: dict[str, list[tuple]], floor: dict[int, float] | None = None) -> pd.DataFrame:
     rows = [("gain", model, "actions", *row, None) for model, rows in curves.items() for row in rows]
     rows += [("mutual information", "counts", "actions", lag, None, None, None, b) for lag, b in (floor or {}).items()]
-    return pd.DataFrame(rows, columns=["what", "model", "context", "lag", "bits", "low", "high", "chance"])
+    return pd.DataFrame(rows, columns=["what", "model", "context", "lag", "bits", "low", "high", "critical_value"])
 
 
 def matrix(names: list[str], seed: int = 0) -> np.ndarray:

@@ -137,8 +137,8 @@ def test_mutual_information_is_that_after_what_does_not_count(plans, skip):
     part = lag_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, skip))
     frame = part.frames["lags"]
     want = pd.DataFrame(mutual_information(plans, 20, skip, seeded(0)))
-    for own, name in (("bits", "bits"), ("low", "low"), ("high", "high"), ("chance", "critical_value"), ("lag", "lag")):
-        assert frame[own].tolist() == want[name].tolist()
+    for name in ("bits", "low", "high", "critical_value", "lag"):
+        assert frame[name].tolist() == want[name].tolist()
     assert lag_section(evaluate_saved({"uniform": UniformPrior(3)}, plans[LENGTHS > 5], 3)) is not None
 
 
@@ -240,8 +240,8 @@ def test_generated_plans_are_compared_with_those_in_whose_place_they_stand(plans
         tests = two_sample_tests(*alike, generator=seeded(0))
         own = frame[frame["model"] == model.name]
         assert own["statistic"].tolist() == [one.statistic for one in tests]
-        for name, value in (("distance", "distance"), ("chance", "null_distance")):
-            assert own[name].tolist() == [getattr(one, value) for one in tests]
+        for name in ("distance", "null_distance"):
+            assert own[name].tolist() == [getattr(one, name) for one in tests]
         for name in ("p_value", "corrected"):
             assert own[name].dropna().tolist() == ([] if grouped else [getattr(one, name) for one in tests])
         (row,) = (row for row in cells(part) if row[0] == model.name)

@@ -75,7 +75,7 @@ def test_gains_are_starred_where_their_interval_is_above_0():
     rows = [(1, 0.3, 0.1, 0.5, 5), (2, 0.3, -0.1, 0.7, 5), (3, 0.3, 0.1, 0.5, 4), (4, 1e-9, 1e-10, 1e-8, 9)]
     rows.append((6, 0.2, 0.01, 0.3, 9))
     gains = pd.DataFrame(rows, columns=["lag", "bits", "low", "high", "units"])
-    gains = gains.assign(what="gain", model="markov", context="actions", chance=None)
+    gains = gains.assign(what="gain", model="markov", context="actions", critical_value=None)
     plans = Plans(torch.randint(3, (12, 8), generator=seeded(0)), 3)
     (table,) = lag_section(replace(found_in(plans), gains=gains)).section.tables
     place = [heading.replace("\n", " ") for heading in table.headings].index("gain, markov".replace(", ", " "))

@@ -58,7 +58,7 @@ def test_the_names_kept_are_those_of_the_plans_learned_from():
 @BOTH
 def test_plans_that_are_no_validation_are_refused(name):
     plans = Plans(some(0).actions, A, action_names=("a", "b", "c"))
-    with refuses("7 actions"):
+    with refuses("not 7"):
         fitted(name, plans, Plans(torch.zeros(4, 3, dtype=torch.long), 7))
     with refuses("validation", "action_names"):
         fitted(name, plans, Plans(plans.actions, A, action_names=("b", "a", "c")))

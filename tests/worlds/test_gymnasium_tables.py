@@ -145,7 +145,7 @@ def test_an_end_that_is_also_passed_through_gets_a_state_of_its_own():
         (lambda: from_gymnasium("CartPole-v1", seeds=[]), ["seeds: one or more integers"]),
         (lambda: from_gymnasium("CartPole-v1", seed=-1), ["seeds: one or more integers", "[-1]"]),
         (lambda: from_gymnasium("CartPole-v1", starts="any"), ['starts: "any" needs a table']),
-        (lambda: from_gymnasium("CartPole-v1", horizon=0), ["max_states and horizon: at least 1"]),
+        (lambda: from_gymnasium("CartPole-v1", horizon=0), ["horizon: an integer of at least 1"]),
     ],
 )
 def test_refusals(call, words):

@@ -223,9 +223,9 @@ def test_an_open_grid_is_as_it_was():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: four_rooms(4, 13), ["four_rooms", "at least 5", "4 x 13"]),
-        (lambda: maze(14, 15), ["maze", "odd", "14 x 15"]),
-        (lambda: maze(15, 1), ["maze", "15 x 1"]),
+        (lambda: four_rooms(4, 13), ["height, width", "at least 5", "4 x 13"]),
+        (lambda: maze(14, 15), ["height, width", "odd", "14 x 15"]),
+        (lambda: maze(15, 1), ["height, width", "15 x 1"]),
         (lambda: maze(loops=1.5), ["loops", "1.5"]),
         (lambda: maze(loops=float("nan")), ["loops", "nan"]),
         (lambda: maze(num_layouts=0), ["num_layouts", "0"]),
@@ -236,7 +236,7 @@ def test_an_open_grid_is_as_it_was():
         (lambda: maze(view=0), ["view", "0"]),
         (lambda: maze(view=True), ["view", "True"]),
         (lambda: local_view(maze(), 0), ["view", "0"]),
-        (lambda: egocentric(maze(egocentric=True)), ["egocentric"]),
+        (lambda: egocentric(maze(egocentric=True)), ["world", "headings already"]),
         (lambda: maze().heading(torch.tensor([0])), ["heading", "egocentric"]),
         (lambda: GridWorld(4, 5, "wall", torch.zeros(1, 20), walls=WALLS), ["reward", "[1, 20]"]),
         (lambda: GridWorld(4, 4, "wall", torch.zeros(1, 48), walls=WALLS), ["walls", "[M, 4, 4]", "[3, 4, 5]"]),

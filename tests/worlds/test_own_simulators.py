@@ -53,11 +53,15 @@ WRONG = {
     "NaN in the state": (stepping(lambda after, reward: (after * torch.nan, reward)), "NaN in the next", "NaN"),
     "NaN in the reward": (stepping(lambda after, reward: (after, reward * torch.nan)), "NaN in the reward", "NaN"),
     "infinite bounds": (with_parts(action_high=TWO * torch.inf), "action_high: .*finite", "action_high: .*finite"),
-    "equal bounds": (with_parts(action_low=TWO), "each number below", "each number below"),
+    "equal bounds": (with_parts(action_low=TWO), "each lower bound", "each lower bound"),
     "bounds that are lists": (with_parts(action_low=[-1.0, -1.0]), "action_low: a tensor", "action_low: a tensor"),
     "a number as bound": (with_parts(action_low=-1.0, action_high=1.0), "action_low: a tensor", "action_low: a tensor"),
     "bounds of float64": (with_parts(action_high=TWO.double()), "action_high: .*float32", "action_high: .*float32"),
-    "bounds of unequal number": (with_parts(action_high=torch.ones(3)), "each number below", "each number below"),
+    "bounds of unequal number": (
+        with_parts(action_high=torch.ones(3)),
+        "each lower bound below",
+        "each lower bound below",
+    ),
     "bounds too near": (with_parts(action_low=TWO - 1e-7), "resolves", "resolves"),
     "too few names": (with_parts(action_names=("knee",)), "action_names", "action_names"),
     "ends that are numbers": (

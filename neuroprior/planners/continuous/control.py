@@ -56,7 +56,8 @@ def control(
             open one.
 
     Raises:
-        ValueError: an argument is out of range, plans are too short, or a method of the world returns what it must not.
+        ValueError: an argument is out of range, plans are too short, or a method of the world returns a wrong shape or
+            dtype.
 
     Example:
         >>> world, generator = DoubleIntegrator(), torch.Generator().manual_seed(0)

@@ -1,4 +1,4 @@
-"""iCEM: the cross-entropy method in few samples, with coloured noise and memory of elites."""
+"""iCEM: the cross-entropy method in few samples, with coloured noise and elites kept from one iteration to the next."""
 
 from itertools import pairwise
 from typing import Unpack

@@ -46,7 +46,7 @@ class MPPIPlanner(VectorPlanner):
         **proposal: prior, prior_share, discount, value: see `VectorPlanner`.
 
     Raises:
-        ValueError: an argument is out of range, or a control cost, which is that of white noise, with another.
+        ValueError: an argument is out of range, or `control_cost` is given with a `noise_beta` above 0.
 
     Example:
         >>> world = DoubleIntegrator()
@@ -74,7 +74,7 @@ class MPPIPlanner(VectorPlanner):
         check_noise(std, noise_beta)
         check_temperature(temperature)
         if control_cost and noise_beta:
-            raise ValueError("control_cost: it is that of white noise; leave noise_beta at 0")
+            raise ValueError("control_cost: it is defined for white noise; leave noise_beta at 0")
         self.std, self.temperature, self.normalise, self.control_cost = std, temperature, normalise, control_cost
         self.iterations, self.noise_beta = min(iterations, num_plans), noise_beta
 

@@ -32,15 +32,15 @@ ROWS_AT_ONCE = 2**10
 
 DELIMITERS = (",", ";", "\t")
 SEPARATOR = re.compile(r'"?sep=([,;\t])"?[,;\t]*\s*', re.IGNORECASE)
-"""A first line by which spreadsheets are told what parts the columns."""
+"""A first line that names the delimiter for spreadsheets, such as `sep=;`."""
 
 OUR_WORDS = re.compile(r"plan|action(_1)?|context_1")
 OUR_COLUMNS = re.compile(r"plan|group|condition|start|stop|duration|(action|context)(_\d+)?")
 PARTS = {"plan", "group"}
-"""Columns of which a header with `action` has one."""
+"""A header with `action` has at least one of these."""
 
 MOST_ABOVE = 100
-"""Lines among which the header is looked for."""
+"""Lines at the beginning of a file that may be the header."""
 
 OTHER_WORDS = re.compile(r"session|subject|animal|behaviou?r|group|context|time|frame|event|label|trial|code")
 Row = list[str]
@@ -231,7 +231,7 @@ class _Sheet:
         said, found = SEPARATOR.fullmatch(lines[0]), _find_header(lines, given)
         self.top, self.note = 1, ""
         if said:
-            self.top, self.note = 2, f"line 1 says that {said[1]!r} parts the columns, and is no plan"
+            self.top, self.note = 2, f"line 1 names the delimiter, {said[1]!r}, and is not read as a plan"
         elif found and any(line.strip() for line in lines[: found[0]]):
             self.top, self.note = found[0] + 1, f"the header is line {found[0] + 1}; what is above it is not read"
         self.delimiter = said[1] if said else found[1] if found else _delimiter(sample)
@@ -246,7 +246,7 @@ class _Sheet:
             known = Counter(name for name in names if OUR_COLUMNS.fullmatch(name))
             twice = next((name for name, times in known.items() if times > 1), None)
             if twice is not None:
-                raise ValueError(f"{path}, line {self.top}: the column {twice!r} is there twice")
+                raise ValueError(f"{path}, line {self.top}: the column {twice!r} is there twice; rename or remove one")
         elif other := next((name for name in names if OTHER_WORDS.fullmatch(name)), None):
             raise ValueError(
                 f"{path}, line {self.top}: looks like a header ({other!r}) without a column 'action' (or 'action_1',"

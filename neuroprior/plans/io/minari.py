@@ -88,7 +88,8 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
 
     Raises:
         ImportError: Minari is not installed.
-        ValueError: a plan without actions, or a dataset of this name is there already.
+        ValueError: no plans, or one without actions; durations, conditions or patterns, which Minari cannot hold; or a
+            dataset of this name is there already.
     """
     minari = _module("minari")
     lengths = plans.mask().sum(1).tolist()

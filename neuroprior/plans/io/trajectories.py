@@ -49,7 +49,7 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
         if observations is not None:
             observed.append(None if made is None else observations_of(made, len(actions[-1]), place))
     if not actions:
-        raise ValueError("trajectories: none are given")
+        raise ValueError("trajectories: at least one is expected; the list is empty")
     lengths = np.array([len(part) for part in actions])
     context = joined(observed)
     return assembled("trajectories", lengths, np.concatenate(actions), num_actions, context=context, per_step=True)

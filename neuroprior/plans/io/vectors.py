@@ -129,7 +129,7 @@ def vector_plans_from_trajectories(
                 raise ValueError(f"{place}: observations are integers; arrays of features are expected")
             observed.append(features)
     if not taken:
-        raise ValueError("trajectories: none are given")
+        raise ValueError("trajectories: at least one is expected; the list is empty")
     lengths = np.array([len(vectors) for vectors in taken])
     context = joined(observed)
     try:

@@ -25,13 +25,13 @@ from neuroprior.priors.durations.laws import (
 from neuroprior.priors.prior import as_actions
 
 FEWEST = 10
-"""Known durations above 0 that an action needs for a law of its own."""
+"""The fewest known durations above 0 with which an action has a law of its own."""
 
 FEWEST_OF_TRANSITION = 30
-"""As many for an action with the one that follows it."""
+"""The fewest with which an action has a law of its own before a certain next action."""
 
 NATS_A_PARAMETER = 2.0
-"""Nats of held-out log-likelihood by which a law with a parameter more must be better than one without it.
+"""Nats of held-out log-likelihood that a law must gain for each parameter that it has more than another.
 
 The held-out likelihood of a law that contains the true one is often a little higher by chance. Of 60 sets of 500
 exponential durations, the exponential law was chosen for 45 without this, and for 59 with it.
@@ -134,7 +134,7 @@ class DurationModel(nn.Module):
         self._check(plans)
         known = self._known(plans)
         if not bool(known.any()):
-            raise ValueError("durations: none of these plans is known; at least one is expected")
+            raise ValueError("durations: all of these plans are unknown (NaN); at least one that is known is expected")
         action, after = plans.actions[known].long().cpu(), self._next(plans)[known].cpu()
         time, fold = durations_of(plans)[known].double().cpu(), _parts(plans, known)[known].cpu()
         zeros = time == 0
@@ -317,7 +317,9 @@ class DurationModel(nn.Module):
 
     def _check(self, plans: Plans, durations: bool = True) -> None:
         if plans.num_actions != self.num_actions:
-            raise ValueError(f"plans have {plans.num_actions} actions, this model {self.num_actions}")
+            raise ValueError(
+                f"plans: {self.num_actions} actions are expected, as this model has, not {plans.num_actions}"
+            )
         if durations:
             durations_of(plans)
 

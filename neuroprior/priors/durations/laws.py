@@ -24,7 +24,7 @@ LEAST_SPREAD = 0.01
 NEWTON_STEPS, EM_STEPS = 20, 50
 
 MOST_VALUES = 150
-"""Values of a set from which a mixture is fitted; of more durations, means of neighbours."""
+"""The most values of a set that a mixture is fitted to; of more durations, means of neighbours."""
 
 ROUNDED = 1 / sqrt(12)
 """Standard deviation of what is lost when numbers are rounded to the next multiple of 1."""

@@ -31,7 +31,7 @@ TOLERANCE, IN_ALL = 5e-4, 0.1
 """An expert is left out where the held-out loss rises by less than so many nats per action, or so many in all."""
 
 NUMBERS = 2**22
-"""At most so many forecasts are looked at to learn the powers of the pool."""
+"""The most numbers of forecasts from which the powers of the pool are learned."""
 
 RIDGE = 1.0
 """Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean."""
@@ -101,13 +101,13 @@ class CombinedPrior(MixturePrior):
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
         self.effort: Effort = effort
-        # What `fit` begins with, each time anew; in a list, as those that are left out are no part of the module.
+        # `fit` begins with these each time; in a list, so that experts that it leaves out are no submodules.
         self.given = None if experts is None else [self._experts()]
         self.tried = 0
         self._allocate()
 
     def _allocate(self) -> None:
-        """Even weights, for as many forecasts as there are to mix."""
+        """Allocate the tables for the present experts, with even weights."""
         size, anchor = len(self.experts), self._anchor
         assert isinstance(anchor, Tensor)
         self.register_buffer("powers", anchor.new_full((size,), 1 / size))
@@ -131,7 +131,7 @@ class CombinedPrior(MixturePrior):
             raise ValueError(f"tried: an integer of at least 0 is expected, not {learned['tried']!r}")
         self.tried = learned["tried"]
         if not learned.get("given", True):
-            self.given = None  # they were chosen by `fit`, which will choose again
+            self.given = None  # `fit` chose them, and will choose again
         self._allocate()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -176,7 +176,7 @@ class CombinedPrior(MixturePrior):
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Fit the experts; learn on plans held out from them which are kept, and how they are combined; returns self.
 
-        What counts learns from all plans in the end.
+        In the end the experts that count learn from all plans.
 
         Args:
             plans: `Plans`, or integers `[N, L]` for plans without context.
@@ -241,7 +241,9 @@ class CombinedPrior(MixturePrior):
 
     @property
     def bound(self) -> float:
-        """Nats by which the negative log-likelihood of any sequence is at most above that of the best expert here."""
+        """The most nats by which the negative log-likelihood of any sequence can exceed that of the best expert
+        kept.
+        """
         return -float(self.first.min())
 
 

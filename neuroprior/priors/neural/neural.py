@@ -20,13 +20,13 @@ LAG_WIDTH = 16
 
 
 SHORT = 32
-"""Plans of at most so many actions are short: the last actions are shown to a network directly."""
+"""Plans of at most so many actions are short: each input shows a network the last actions directly."""
 
 FEW = 20_000
-"""Actions up to which a network is small."""
+"""Plans of fewer actions than this, in all, are learned by a small network."""
 
 KINDS = 16
-"""Kinds of actions beyond which a large one finds more."""
+"""With more different actions than this, a large network predicts better."""
 
 
 class Sizes(NamedTuple):
@@ -65,10 +65,9 @@ class NeuralPrior(Prior):
     the past is therefore bounded by `window`: with plans of length T in training, `window = T - 1`, the most actions
     that preceded any other there. A recurrent network carries its hidden state on, and is shown no lag beyond `window`;
     a transformer attends to the last `window` inputs and the start symbol, at the distances that it was trained on. Up
-    to length T this changes nothing, and a step past it costs what a step costs. How this predicts, against reading the
-    last `window` actions anew as the beginning of a plan:
-    `python -m pytest -m slow -k past_the_training_length -s`. After training on plans of one action, each action is
-    predicted as the first.
+    to length T this changes nothing, and a step past it costs no more than one before. (`python -m pytest -m slow -k
+    past_the_training_length -s` compares its predictions with those from reading the last `window` actions anew.) After
+    training on plans of one action, each action is predicted as the first.
 
     Plans longer than the training window (`Settings.window`) are read in consecutive windows in training, the hidden
     state carried from each to the next (truncated backpropagation through time). A prior trained in this way carries

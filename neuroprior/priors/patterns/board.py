@@ -1,4 +1,4 @@
-"""A convolutional network on a board, which needs no memory of past actions."""
+"""A convolutional network on the board in each state, without the past actions."""
 
 from collections.abc import Sequence
 from math import inf, prod
@@ -15,10 +15,10 @@ from neuroprior.priors.patterns.minibatches import train
 from neuroprior.priors.prior import Prior
 
 VALIDATION = 0.1
-"""The share of plans (or groups) that decide when a training stops."""
+"""The share of plans (or groups) that are held out to decide when training stops."""
 
 CHUNK = 2**12
-"""Boards that are looked at together where no gradient is needed."""
+"""Boards that are evaluated together where no gradient is needed."""
 
 
 class BoardNetwork(Prior):
@@ -94,13 +94,13 @@ class BoardNetwork(Prior):
         return functional.linear(values.relu().flatten(1), self.out, self.out_bias)
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
-        """Train on all steps by log-loss, with Adam; goes on from the present weights.
+        """Train on all steps by log-loss, with Adam, from the present weights on; returns self.
 
         Args:
             plans: `Plans` with features.
             generator: draws the first weights, the plans that are held out, and the order of the steps.
             settings: `epochs` (10), `batch_size` (256), `learning_rate` (1e-3), and `validation` (0.1): the share of
-                plans that are held out and stop the training; None: none are.
+                plans that are held out, on which the training is stopped; None: no plans.
 
         Raises:
             ValueError: plans that this prior cannot learn from, or a setting that it does not have.

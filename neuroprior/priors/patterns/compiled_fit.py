@@ -10,9 +10,6 @@ Array = np.ndarray[Any, Any]
 MIXER = 0x9E3779B97F4A7C15
 """An odd number near 2**64 over the golden ratio: multiplied by it, near numbers fall far apart."""
 
-ONE = 1.0
-"""What the sums of squared gradients begin with."""
-
 
 @njit(cache=True, nogil=True)
 def place(codes: Array, code: Any) -> Any:

@@ -11,7 +11,7 @@ from neuroprior._checks import is_number
 from neuroprior.priors.patterns.pattern_prior import PatternPrior, Steps, compiled_fit
 
 HELD_OUT = 10
-"""Of the steps, every block of so many thousandth parts, one in ten, is held out to choose the power on."""
+"""The steps are cut into `HELD_OUT` ** 2 blocks, of which every `HELD_OUT`-th is held out to choose the power on."""
 
 LARGEST_POWER = 2.0
 
@@ -27,11 +27,14 @@ class PatternCounts(PatternPrior):
     Args:
         num_actions, num_patterns, min_count: see `PatternPrior`.
         combine: see above.
-        smoothing: k, or how many counts the marginal probabilities weigh.
+        smoothing: above 0: k, and how many counts the marginal probabilities weigh in a product.
 
     Attributes:
         weights: of a product, see `PatternPrior`; for back-off the counts, float32 `[V + 1, A]`; the last row is 0.
         marginal: float32 `[A]`: how common each action is; what back-off begins with.
+
+    Raises:
+        ValueError: an argument is out of range.
 
     Example:
         >>> patterns = torch.randint(5, (40, 3, 2), generator=torch.Generator().manual_seed(0), dtype=torch.int32)
@@ -71,7 +74,7 @@ class PatternCounts(PatternPrior):
         if self.combine == "backoff":
             return self._count(steps, 1.0)
         every = torch.arange(len(steps.action))
-        held_out = (every * 10 * HELD_OUT // len(every)) % HELD_OUT == HELD_OUT - 1
+        held_out = (every * HELD_OUT**2 // len(every)) % HELD_OUT == HELD_OUT - 1
         if not bool(held_out.any()):
             return self._count(steps, 1.0)
         self._count(Steps(*(x[~held_out] for x in steps)), 1.0)

@@ -11,7 +11,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.priors.patterns.pattern_prior import PatternPrior, Steps, compiled_fit
 
 ADAGRAD = 1.0
-"""What sums of squared gradients begin with."""
+"""The initial value of the sums of squared gradients."""
 
 
 class LogLinearPrior(PatternPrior):
@@ -23,6 +23,9 @@ class LogLinearPrior(PatternPrior):
 
     Args:
         num_actions, num_patterns, use_last, min_count: see `PatternPrior`.
+
+    Raises:
+        ValueError: an argument is out of range.
 
     Example:
         >>> patterns = torch.randint(5, (40, 3, 2), generator=torch.Generator().manual_seed(0), dtype=torch.int32)
@@ -119,6 +122,9 @@ class PatternNetwork(LogLinearPrior):
     Attributes:
         embeddings: float32 `[V + 1, E]`; the last row, of unknown patterns, is 0.
         layers, biases, out: float32 `[D, E, E]`, `[D, E]`, `[A, E]`.
+
+    Raises:
+        ValueError: an argument is out of range.
 
     Example:
         >>> prior = PatternNetwork(4, num_patterns=2)  # prior.fit(plans) trains it

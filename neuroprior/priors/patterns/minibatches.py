@@ -8,7 +8,7 @@ from torch import Tensor
 from neuroprior._random import generator_on
 
 PATIENCE = 2
-"""Epochs without a better loss on what is held out after which training stops."""
+"""Training stops after so many epochs without a lower held-out loss."""
 
 
 @torch.enable_grad()
@@ -29,7 +29,7 @@ def train(
         parameters: what the optimisers change.
         optimisers: step after each batch.
         loss_at: the loss, a scalar with a gradient, of the steps at `index [m]`.
-        held_out_loss: looked at before the first and after each epoch; None: all epochs are trained.
+        held_out_loss: computed before the first and after each epoch; None: training goes through all epochs.
         num_steps: M.
         epochs: at most so many times through all steps.
         batch_size: steps of a batch.

@@ -9,7 +9,7 @@ from torch import Tensor
 from neuroprior.plans import Plans, is_per_step
 
 RARE = 3.0
-"""Standard deviations, in actions, added to those of a row: what was seen a few times decides nothing."""
+"""Added to the standard deviations of a row, in actions: so histories that occurred a few times weigh little."""
 
 MOST_POINTS, TRIES = 20_000, 10
 """Actions whose directions are clustered, and beginnings that clustering tries."""

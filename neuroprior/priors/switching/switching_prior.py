@@ -22,7 +22,7 @@ SEGMENT = 20
 """Mean length of the random segments, a mode each, that a fit starts from."""
 
 SURE = 0.8
-"""Share of the spectral start that is its modes; the rest is even."""
+"""Probability that a spectral start gives to the mode that it found; the rest is spread evenly."""
 
 SHORT_RUN = 8
 """Iterations after which the best of the restarts goes on alone (Biernacki, Celeux and Govaert 2003)."""
@@ -169,7 +169,7 @@ class SwitchingPrior(HistoryPrior):
     def fit_settings(self) -> tuple[str, ...]:
         return ("warm_start",)
 
-    # The machine: filtered modes and the history.
+    # Stepping: the state is the filtered modes and the history.
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         node = self.start_node.long().expand(batch_size)

@@ -82,7 +82,7 @@ def _read(given: Array, states: Array, own: Array, own_bias: Array, out: Array) 
             out[n, t] = states[n]
 
 
-def draw_recurrent(prior: Any, least_std: float, state: Tensor, chance: Tensor, noise: Tensor) -> Tensor:
+def draw_recurrent(prior: Any, least_std: float, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
     """As `VectorNetwork.draw`, for a `VectorGRU` of float32 on the CPU; `least_std` in units of half the range."""
     layers = prior.gru.all_weights
     hidden = state[:, : state.shape[1] - prior.input_size].reshape(len(state), len(layers), prior.width).clone()
@@ -107,7 +107,7 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, chance: Tensor, 
         vectors.numpy(),
         hidden.numpy(),
         inputs.numpy(),
-        chance.numpy(),
+        uniform.numpy(),
         noise.numpy(),
         above,
         above_bias,
@@ -154,7 +154,7 @@ def _recurrent(
     vectors: Array,
     hidden: Array,
     inputs: Array,
-    chance: Array,
+    uniform: Array,
     noise: Array,
     above: Array,
     above_bias: Array,
@@ -205,7 +205,7 @@ def _recurrent(
                 weights[c] = np.exp(weights[c] - highest)
                 total += weights[c]
             chosen, so_far = 0, weights[0]
-            while chosen < num - 1 and chance[n, t] * total > so_far:
+            while chosen < num - 1 and uniform[n, t] * total > so_far:
                 chosen += 1
                 so_far += weights[chosen]
             for d in range(size):

@@ -61,7 +61,8 @@ class VectorNetwork(VectorPrior):
         num_components: K.
         lags: last vectors that each input shows directly.
         coupled: within a component, each dimension depends on those before it, in the same way at all times; otherwise
-            they are independent. Couplings that the network predicts are overfitted by some thousand vectors.
+            they are independent. (With some thousand vectors, couplings that the network itself predicts are
+            overfitted.)
         dropout: share of the network's activations that is set to 0 at random in training.
         seed: draws the initial weights; torch's global generator is left alone.
 
@@ -181,24 +182,24 @@ class VectorNetwork(VectorPrior):
         forecast, state = self.read(past, context)
         state = state.repeat_interleave(num_plans, 0)
         # All random numbers at once, so that compiled loops draw the same.
-        chance = torch.rand(len(state), length, generator=generator, device=self.device)
+        uniform = torch.rand(len(state), length, generator=generator, device=self.device)
         noise = torch.randn(len(state), length, self.action_size, generator=generator, device=self.device)
-        return self.draw(forecast, state, chance, noise).view(len(past), num_plans, length, self.action_size)
+        return self.draw(forecast, state, uniform, noise).view(len(past), num_plans, length, self.action_size)
 
-    def draw(self, forecast: GaussianForecast, state: Tensor, chance: Tensor, noise: Tensor) -> Tensor:
+    def draw(self, forecast: GaussianForecast, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
         """The next vectors `[N, L, D]` that random numbers make; see `GaussianForecast.drawn`.
 
         Args:
             forecast: of M rows, each for N / M successive rows of the state.
             state: `[N, ...]`, as `step` returned it.
-            chance: `[N, L]`, uniform from 0 to 1.
+            uniform: `[N, L]`, uniform from 0 to 1.
             noise: `[N, L, D]`, standard normal.
         """
         forecast = forecast.repeat_interleave(len(state) // max(len(forecast.mean), 1))
-        vectors = [forecast.drawn(chance[:, 0], noise[:, 0])]
+        vectors = [forecast.drawn(uniform[:, 0], noise[:, 0])]
         for t in range(1, noise.shape[1]):
             forecast, state = self.step(vectors[-1], state)
-            vectors.append(forecast.drawn(chance[:, t], noise[:, t]))
+            vectors.append(forecast.drawn(uniform[:, t], noise[:, t]))
         return torch.stack(vectors, 1)
 
     def _after(self, inputs: Tensor, hidden: Tensor | None) -> tuple[GaussianForecast, Tensor]:
@@ -379,11 +380,11 @@ class VectorGRU(VectorNetwork):
         able = not self.training and values.device.type == "cpu" and values.dtype == torch.float32
         return compiled("neuroprior.priors.vectors.compiled_sampling") if able else None
 
-    def draw(self, forecast: GaussianForecast, state: Tensor, chance: Tensor, noise: Tensor) -> Tensor:
+    def draw(self, forecast: GaussianForecast, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
         fast = self._fast(state)
         if fast is None:
-            return super().draw(forecast, state, chance, noise)
-        plans: Tensor = fast.draw_recurrent(self, 2 * LEAST_STD, state, chance, noise)
+            return super().draw(forecast, state, uniform, noise)
+        plans: Tensor = fast.draw_recurrent(self, 2 * LEAST_STD, state, uniform, noise)
         return plans
 
 

@@ -1,4 +1,4 @@
-"""Stored windows: plans go on as they went on before, after the past that was nearest."""
+"""Stored windows: a plan continues as the stored plans did whose past was nearest to its own."""
 
 from typing import Any, Self
 
@@ -12,16 +12,18 @@ from neuroprior.priors.vectors.linear_gaussian import best_of, held_out_split, m
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
 BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""That `fit` tries, of the match of the past."""
+"""Bandwidths of the match of the past that `fit` tries."""
 
 NOISES = (0.02, 0.05, 0.1, 0.2, 0.4)
-"""That `fit` tries, around the stored vectors."""
+"""Standard deviations around the stored vectors that `fit` tries."""
 
 BANDWIDTH, NOISE = 0.2, 0.1
-"""Before `fit`, and where no plans can be held out to choose on."""
+"""The bandwidth and the noise before `fit`, and where no plans can be held out to choose them on."""
 
 MOST_CHOSEN_WITH, MOST_CHOSEN_ON = 1_000, 500
-"""Stored windows with which bandwidths are chosen, and vectors on which, at most; in the end all are stored."""
+"""The most stored windows with which, and the most held-out vectors on which, bandwidths are chosen; in the end all
+windows are stored.
+"""
 
 
 class StoredWindows(VectorPrior):
@@ -30,8 +32,8 @@ class StoredWindows(VectorPrior):
     A segment of `horizon` vectors is one of the stored ones, the more probable the nearer the vectors before it are to
     the present past: with probability proportional to exp(-d / (2 bandwidth ** 2)), d the sum of squared differences
     over the last `match` vectors. It is followed with independent Gaussian noise, and then the next one is chosen. As
-    which segment is being followed is not known, a vector's density is that of a mixture, weighted by what was seen of
-    the segment so far. All distances are in units of half the range.
+    which segment is being followed is not known, a vector's density is that of a mixture, weighted by how well each
+    segment predicted the vectors since it began. All distances are in units of half the range.
 
     `read` begins a new segment after the past. `state` is `[N, 2 + match * D + M]`: vectors known, place in the
     segment, the last vectors, and the log-weights of M stored segments.

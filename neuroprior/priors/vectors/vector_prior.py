@@ -72,26 +72,26 @@ class GaussianForecast(NamedTuple):
     def sample(self, generator: torch.Generator) -> Tensor:
         mean = self.mean
         several = mean.shape[1] > 1
-        chance = torch.rand(len(mean), generator=generator, device=mean.device) if several else None
+        uniform = torch.rand(len(mean), generator=generator, device=mean.device) if several else None
         noise = torch.randn(mean[:, 0].shape, generator=generator, device=mean.device, dtype=mean.dtype)
-        return self.drawn(chance, noise)
+        return self.drawn(uniform, noise)
 
-    def drawn(self, chance: Tensor | None, noise: Tensor) -> Tensor:
+    def drawn(self, uniform: Tensor | None, noise: Tensor) -> Tensor:
         """The vectors `[N, D]` that random numbers make.
 
         Args:
-            chance: `[N]`, uniform from 0 to 1: choose the component; None: there is one.
+            uniform: `[N]`, uniform from 0 to 1: choose the component; None: there is one.
             noise: `[N, D]`, standard normal.
         """
         mean, std, coupling = self.mean, self.std.expand(self.mean.shape), self.coupling
         row = torch.arange(len(mean), device=mean.device)
-        if chance is None:
+        if uniform is None:
             chosen = torch.zeros_like(row)
         elif self.log_weights is None:
-            chosen = (chance * mean.shape[1]).long().clamp(max=mean.shape[1] - 1)
+            chosen = (uniform * mean.shape[1]).long().clamp(max=mean.shape[1] - 1)
         else:
             up_to = self.log_weights.softmax(-1).cumsum(-1)
-            chosen = torch.searchsorted(up_to, chance[:, None] * up_to[:, -1:])[:, 0].clamp(max=mean.shape[1] - 1)
+            chosen = torch.searchsorted(up_to, uniform[:, None] * up_to[:, -1:])[:, 0].clamp(max=mean.shape[1] - 1)
         mean = mean[row, chosen]
         noise = noise * std[row, chosen]
         if coupling is None:

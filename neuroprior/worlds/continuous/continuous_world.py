@@ -103,7 +103,7 @@ class ContinuousWorld(ABC):
         low, high = self.action_low, self.action_high
         if low.shape != high.shape or not (low < high).all():
             raise ValueError(
-                f"action_low, action_high: each number below its fellow is expected, not {low.tolist()} and"
+                f"action_low, action_high: each lower bound below its upper bound is expected, not {low.tolist()} and"
                 f" {high.tolist()}"
             )
         check_widths(low, high)

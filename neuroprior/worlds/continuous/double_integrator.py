@@ -59,7 +59,7 @@ class DoubleIntegrator(ContinuousWorld):
         self.state_shape = (2 * num_dimensions,)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
-        """Positions and velocities between -1 and 1 in each dimension, uniformly."""
+        """Positions (m) and velocities (m/s), float32 `[batch_size, 2 * D]`, each uniform between -1 and 1."""
         draws = generator_on(generator, "cpu")
         return 2 * torch.rand(batch_size, 2 * self.action_size, generator=draws) - 1
 

@@ -30,8 +30,8 @@ def from_mujoco(
         masses: a factor of the mass and inertia of each body; armatures of motors stay.
         goal: of the first four a speed `v*` in m/s: the reward for speed is `-|v - v*|` in place of v, so that a
             negative goal is backwards. Of Reacher-v5 and Pusher-v5 the position `[2]` (x, y) of the target in m, with
-            which `reset` makes states; it is a part of the state, and a state of elsewhere keeps its own. None: the
-            task's.
+            which `reset` makes states; it is part of the state, and a state that was made otherwise keeps its own.
+            None: the task's.
         num_threads: how many threads simulate; None for as many as torch has.
 
     Raises:

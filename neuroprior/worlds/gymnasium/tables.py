@@ -256,7 +256,7 @@ class _Search:
 
 @contextmanager
 def _bar(progress: bool) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar where rich is installed and a terminal is there to see it."""
+    """A progress bar where rich is installed and standard error is a terminal."""
     try:
         rich = import_module("rich.progress") if progress else None
         console = import_module("rich.console").Console(stderr=True) if progress else None

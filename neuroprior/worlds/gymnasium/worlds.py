@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from neuroprior._checks import check_sizes
 from neuroprior.worlds.episodes import EpisodicWorld
 from neuroprior.worlds.gymnasium.environment import Episode, import_gymnasium, open_environment
 from neuroprior.worlds.gymnasium.stepping import SteppedWorld
@@ -88,8 +89,7 @@ def from_gymnasium(
         raise ValueError(f'method: "auto", "table", "enumerate" or "step" is expected, not {method!r}')
     if starts not in ("initial", "any"):
         raise ValueError(f'starts: "initial" or "any" is expected, not {starts!r}')
-    if max_states < 1 or horizon < 1:
-        raise ValueError(f"max_states and horizon: at least 1 is expected, not {max_states} and {horizon}")
+    check_sizes(max_states=max_states, horizon=horizon)
     given = [seed] if seeds is None else list(seeds)
     if not given or any(not isinstance(one, int | np.integer) or one < 0 for one in given):
         raise ValueError(f"seeds: one or more integers that are not negative are expected, not {given}")

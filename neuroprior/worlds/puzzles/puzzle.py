@@ -30,6 +30,9 @@ class PuzzleWorld(World):
     Attributes:
         boards, shape, windows, observation: as given.
         num_planes: C.
+
+    Raises:
+        ValueError: an argument is wrong.
     """
 
     num_actions = 4
@@ -76,7 +79,13 @@ class PuzzleWorld(World):
 
     def transformed_actions(self, number: int) -> Tensor:
         """What each action is under a symmetry, int64 `[4]`: see `transformed`."""
-        return _transformed_actions(number)
+        # Bit 2 of the number transposes, bit 0 then turns rows around, bit 1 columns.
+        action = torch.tensor([2, 3, 0, 1]) if number & 4 else torch.arange(4)
+        if number & 1:
+            action = torch.tensor([1, 0, 2, 3])[action]
+        if number & 2:
+            action = torch.tensor([0, 1, 3, 2])[action]
+        return action
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """Boards `[batch_size, H, W]` drawn uniformly from `boards`."""
@@ -113,18 +122,8 @@ def board_tensor(name: str, boards: Any) -> Tensor:
         ) from None
 
 
-def _transformed_actions(number: int) -> Tensor:
-    """Bit 2 of the number transposes, bit 0 then turns rows around, bit 1 columns."""
-    action = torch.tensor([2, 3, 0, 1]) if number & 4 else torch.arange(4)
-    if number & 1:
-        action = torch.tensor([1, 0, 2, 3])[action]
-    if number & 2:
-        action = torch.tensor([0, 1, 3, 2])[action]
-    return action
-
-
 def reflected(board: Tensor, number: int) -> Tensor:
-    """Boards `[N, H, W]` under a symmetry; see `_transformed_actions`."""
+    """Boards `[N, H, W]` under a symmetry; see `PuzzleWorld.transformed_actions`."""
     if number & 4:
         board = board.transpose(1, 2)
     turned = [dim for bit, dim in ((1, 1), (2, 2)) if number & bit]

@@ -219,7 +219,7 @@ def test_without_names_actions_are_matched_by_number(tmp_path):
 
 def test_a_prior_that_does_not_fit_is_refused(tmp_path):
     folder = saved(tmp_path, MarkovPrior(3, 1), learned())
-    with refuses(folder, "knows 3 actions", "taxi has 6"):
+    with refuses(folder, "6 actions", "world taxi", "not 3"):
         load_for(folder, "taxi", 6, None)
     with refuses(folder, "'on'", "world maze", "up, right, down"):
         load_for(folder, "maze", 3, ("up", "on", "down"))

@@ -310,5 +310,5 @@ def test_pictures_of_an_arm():
     assert len(frames) == 3
     assert frames[0].shape == (240, 240, 3)
     assert frames[0].std() > 0
-    with pytest.raises(ValueError, match="no picture"):
+    with pytest.raises(ValueError, match="a method `render`"):
         pictures(TASKS["double_integrator"].make("same"), torch.zeros(1, 4))

@@ -355,7 +355,7 @@ def test_a_share_is_saved_too(tmp_path):
         (some_plans(), {"effort": "fast", "prior": "gru"}, "effort: for the combined prior alone"),
         (some_plans(1, 1), {}, "cannot be split"),
         (some_plans(), {"validation": 1.5}, "validation"),
-        (some_plans(), {"validation": Plans(torch.zeros(3, 3, dtype=torch.long), 7)}, "7 actions"),
+        (some_plans(), {"validation": Plans(torch.zeros(3, 3, dtype=torch.long), 7)}, "not 7"),
     ],
 )
 def test_what_cannot_be_fitted(plans, how, word):
