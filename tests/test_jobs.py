@@ -201,7 +201,8 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stderr is not None
-    process.stderr.readline()
+    process.stderr.readline()  # that it begins
+    process.stderr.readline()  # that a job is done
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the program and to its workers
     said = process.stderr.read()
     assert process.wait(60) == 1
