@@ -38,6 +38,11 @@ def _extremes(values: Tensor) -> tuple[int, int]:
     return int(low), int(high)
 
 
+def kind_of(value: object) -> str:
+    """The name of its class; of a class that stands where an object should, that it is one."""
+    return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
 def check_sizes(**sizes: object) -> None:
     """Raise ValueError, naming the argument, unless all are integers of at least 1."""
     for name, size in sizes.items():

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neuroprior import (
+    ExhaustivePlanner,
     FrontierPlanner,
     GRUPrior,
     MarkovPrior,
@@ -24,15 +25,16 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.cli.__main__ import main
-from neuroprior.planners import expected_score
+from neuroprior.planners import ICEMPlanner, control, expected_score
 from neuroprior.plans import folds
 from neuroprior.priors import CombinedPrior, learn_macros
 from neuroprior.report import ethogram_figure, report
 from neuroprior.values import q_learning
-from neuroprior.worlds import cube
+from neuroprior.worlds import PlanarArm, cube
 from tests.support.sources import refuses, seeded
 
 ACTIONS = torch.tensor([[0, 1]])
+ARM = PlanarArm()
 
 
 @pytest.mark.parametrize("what", ["action", "context", "group", "condition"])
@@ -150,6 +152,10 @@ PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
         (lambda: report(PLANS, models="counts"), ["models", "a list", "['counts']"]),
         (lambda: report(PLANS, priors=UniformPrior(2)), ["priors", "a dict"]),
         (lambda: report(PLANS, priors=[UniformPrior(2)]), ["priors", "a dict"]),
+        (lambda: SamplingPlanner(UniformPrior(2), 2, 4).plan(ARM, torch.zeros(1, 4)), ["numbered", "not PlanarArm"]),
+        (lambda: ExhaustivePlanner(2).plan(PlanarArm, torch.zeros(1, 4)), ["a World", "not the class PlanarArm"]),
+        (lambda: ICEMPlanner(2, 4).plan(cube(), torch.zeros(1, 4)), ["a ContinuousWorld", "vectors", "not PocketCube"]),
+        (lambda: control(ICEMPlanner(2, 4), None, torch.zeros(1, 4), 2), ["a ContinuousWorld", "not NoneType"]),
         (lambda: report(PLANS, models=["counts"], folds=3), ["folds: at most 2", "not 3"]),
     ],
 )

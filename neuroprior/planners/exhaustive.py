@@ -10,7 +10,7 @@ from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Objective, Planner, decide, join_decisions, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.plans import action_dtype, all_plans
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, check_is_world
 
 MOST_PLANS = 2**24
 
@@ -42,6 +42,7 @@ class ExhaustivePlanner(Planner):
         self.depth, self.num_rollouts = depth, num_rollouts
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
+        check_is_world(world)
         actions = world.num_actions
         if actions**self.depth > MOST_PLANS:
             raise ValueError(f"depth: {actions}**{self.depth} plans are too many; at most {MOST_PLANS} can be tried")

@@ -8,7 +8,7 @@ from torch import Tensor
 from neuroprior._checks import is_integer
 from neuroprior.plans import is_per_step
 from neuroprior.sampling.draws import after_end
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, check_is_world
 
 FEWEST_TO_SHARE = 256
 """The number of states from which the distinct ones are found, so that each is observed once."""
@@ -141,6 +141,7 @@ def _numbered(reached: Tensor) -> bool:
 
 def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
     """Raise ValueError unless a prior can act in a world from `state [B, ...]`."""
+    check_is_world(world)
     world.check_state(state)
     if getattr(prior, "end", None) is not None:
         raise ValueError(

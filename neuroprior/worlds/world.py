@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range
+from neuroprior._checks import check_range, kind_of
 
 
 class Rollout(NamedTuple):
@@ -128,6 +128,12 @@ def join_states(states: list[Tensor], start: Tensor, shape: tuple[int, ...]) -> 
     if not states:
         return start.new_zeros(*shape[:2], 0, *shape[2:])
     return torch.stack([state.view(shape) for state in states], 2)
+
+
+def check_is_world(world: object) -> None:
+    """Raise ValueError unless it is a `World`."""
+    if not isinstance(world, World):
+        raise ValueError(f"world: a World, whose actions are numbered, is expected, not {kind_of(world)}")
 
 
 def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:

@@ -11,7 +11,7 @@ from neuroprior._random import generator_on
 from neuroprior.planners.continuous.vector_planner import Memory, VectorPlanner
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.worlds.continuous import ContinuousWorld
-from neuroprior.worlds.continuous.continuous_world import outcome_of
+from neuroprior.worlds.continuous.continuous_world import check_is_continuous, outcome_of
 
 
 class Control(NamedTuple):
@@ -73,7 +73,7 @@ def control(
         raise ValueError(
             f"replan_every: at most the {planner.length} vectors of a plan are expected, not {replan_every}"
         )
-    world.check_bounds()
+    check_is_continuous(world)
     world.check_state(state)
     generator, batch, seconds = generator_on(generator, state.device), len(state), 0.0
     actions = torch.zeros(batch, num_steps, world.action_size, device=state.device)

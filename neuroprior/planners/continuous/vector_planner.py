@@ -15,6 +15,7 @@ from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.plans.vector_plans import same_bounds
 from neuroprior.priors.vectors import VectorPrior
 from neuroprior.worlds.continuous import ContinuousWorld
+from neuroprior.worlds.continuous.continuous_world import check_is_continuous
 
 
 class Memory(NamedTuple):
@@ -166,7 +167,7 @@ class VectorPlanner(ABC):
         self, world: ContinuousWorld, state: Tensor, generator: torch.Generator | None, memory: Memory | None
     ) -> tuple[torch.Generator, Memory]:
         """Check the arguments of `plan`; the generator to draw with, and the memory, empty where runs begin."""
-        world.check_bounds()
+        check_is_continuous(world)
         world.check_state(state)
         size = world.action_size
         if self.prior is not None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from neuroprior._checks import kind_of
 from neuroprior.plans.vector_plans import check_widths
 from neuroprior.worlds.world import Rollout, join_states
 
@@ -128,6 +129,13 @@ class ContinuousWorld(ABC):
             given = list(plans.shape) if isinstance(plans, Tensor) else type(plans).__name__
             raise ValueError(f"plans: shape [B, P, L, D] with B = {batch_size} starts is expected, not {given}")
         check_vectors("plans", plans, self.action_low, self.action_high)
+
+
+def check_is_continuous(world: object) -> None:
+    """Raise ValueError unless it is a `ContinuousWorld` whose bounds are right."""
+    if not isinstance(world, ContinuousWorld):
+        raise ValueError(f"world: a ContinuousWorld, whose actions are vectors, is expected, not {kind_of(world)}")
+    world.check_bounds()
 
 
 def outcome_of(state: Tensor, outcome: object) -> tuple[Tensor, Tensor]:
