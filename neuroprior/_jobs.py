@@ -219,7 +219,7 @@ def _cluster(address: str | None) -> Iterator[None]:
 
 
 class Progress:
-    """Progress on standard error: a bar in a terminal, elsewhere a line at the start and one for each finished job.
+    """Progress on standard error: a bar in a terminal, elsewhere a line for each finished job.
 
     Args:
         title: what is done.
@@ -243,9 +243,8 @@ class Progress:
         self._begun = time.monotonic()
         if self._bar is not None:
             self._bar.start()
-        else:
-            before = " were finished before" * (self.missing < self.total)
-            print(f"{self.title}: {self.total - self.missing}/{self.total}{before}", file=sys.stderr, flush=True)
+        elif self.missing < self.total:
+            print(f"{self.title}: {self.total - self.missing}/{self.total} were finished before", file=sys.stderr)
         return self
 
     def __exit__(self, *_: object) -> None:
