@@ -25,6 +25,9 @@ Array = np.ndarray[Any, Any]
 DRAWS = 2**18
 """Uniform numbers that are drawn at once."""
 
+ROWS = 2**16
+"""Rows of tables that are made for a decision, however few its steps: still much quicker than one step after another."""
+
 BLOCK = 40
 """Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
 
@@ -473,7 +476,7 @@ def _widened(values: Array) -> Array:
 
 
 def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
-    """Whether `search` knows the world and the prior, and its tables have no more rows than it may have nodes."""
+    """Whether `search` knows the world and the prior, and its tables have at most `ROWS` rows, or one for each step."""
     prior = planner.prior
     if not isinstance(world, TabularWorld) or getattr(world.step, "__func__", None) is not TabularWorld.step:
         return False
@@ -484,7 +487,7 @@ def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
     rows = len(prior.next_node) * (prior.num_contexts or 1) if isinstance(prior, HistoryPrior) else 0
     if getattr(prior, "context_per", None) is not None:
         rows += world.num_maps * world.num_states
-    return rows <= len(state) * planner.num_plans * planner.length
+    return rows <= max(len(state) * planner.num_plans * planner.length, ROWS)
 
 
 def _knows(prior: Steppable, length: int) -> bool:
