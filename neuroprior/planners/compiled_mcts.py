@@ -26,7 +26,7 @@ DRAWS = 2**18
 """Uniform numbers that are drawn at once."""
 
 ROWS = 2**16
-"""Rows of tables that are made for a decision, however few its steps: still much quicker than one step after another."""
+"""Rows of tables that are made for a decision, however few its steps: still quicker than one step after another."""
 
 BLOCK = 40
 """Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
