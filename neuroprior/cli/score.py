@@ -78,8 +78,14 @@ def score(
         caption += (
             f"Training data: {sum(known):,} of {len(known):,} plans are the same as plans that it has learned from."
         )
+    notes = list(plans.notes)
+    if plans.action_names and action_names is None and prior.action_names is None:
+        order = ", ".join(f"{name} = {number}" for number, name in enumerate(plans.action_names))
+        notes.append(
+            f"the prior knows actions by number, so the file's were numbered: {order}; --action_names orders them"
+        )
     console = Console()
-    for note in plans.notes:
+    for note in notes:
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
     console.print(printed(f"{Path(file).name} under {folder}", table(frame.head(MOST_ROWS), first | numbers, caption)))
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"

@@ -99,3 +99,17 @@ def test_how_a_file_is_read_is_passed_on(tmp_path, monkeypatch, capsys):
     files = {**names, "plans.csv": ["b", "a", "c"]}
     assert asked == [((file,), {**options, "action_names": own}) for file, own in files.items()]
     assert capsys.readouterr().out.count("note: something was odd") == 4
+
+
+def test_a_prior_of_numbers_says_how_it_numbers_a_file_of_names(tmp_path, capsys):
+    prior = MarkovPrior(2, 0).fit(torch.tensor([[0, 1, 0]]))
+    save(prior, tmp_path / "prior")
+    file = tmp_path / "plans.csv"
+    file.write_text("plan,action\na,walk\na,rest\na,walk\n")
+    how = ["score", str(tmp_path / "prior"), str(file), "--out", str(tmp_path / "out")]
+    assert main(how) == 0
+    assert "file's were numbered: rest = 0, walk = 1; --action_names" in " ".join(capsys.readouterr().out.split())
+    assert main([*how, "--action_names", "walk", "rest"]) == 0
+    assert "were numbered" not in " ".join(capsys.readouterr().out.split())
+    found = pd.read_csv(tmp_path / "out" / "plans.csv")["log_likelihood"]
+    assert found.item() == pytest.approx(float(prior.log_prob(torch.tensor([[0, 1, 0]]))), abs=1e-4)
