@@ -92,7 +92,7 @@ class Policy(NamedTuple):
         probs: float64 `[R, A]`.
         action: float32 `[A + 1, 3 H]`: what the last action adds to the gates, with their biases.
         past: float32 `[lags, A + 1, 3 H]`: what each of the last actions adds.
-        seen: float32 `[C, 3 H]`: what each context adds.
+        by_context: float32 `[C, 3 H]`: what each context adds.
         recurrent: float32 `[H, 3 H]`, and `bias [H]` of its last part.
         head: float32 `[H, A]`, and `head_bias [A]`.
         temperature: divides logits.
@@ -106,7 +106,7 @@ class Policy(NamedTuple):
     probs: Array
     action: Array
     past: Array
-    seen: Array
+    by_context: Array
     recurrent: Array
     bias: Array
     head: Array
@@ -215,7 +215,7 @@ def _evaluate(
     which: Array,
     plans: Array,
     t: int,
-    seen: Array,
+    observed: Array,
     code: Array,
     hidden: Array,
     weights: Array,
@@ -229,7 +229,7 @@ def _evaluate(
         which: the plans that it is stepped for.
         plans: `[K, L]`.
         t: the step.
-        seen: `[K]`: the states whose contexts the prior is given.
+        observed: `[K]`: the states whose contexts the prior is given.
         code, hidden: `[K]` and `[K, H]`: its state, which is overwritten.
         weights, probs: `[K, A]`: get its predictions: cumulative unnormalised probabilities, and probabilities.
         work: room for `BLOCK` rows of hidden states, products, gates and logits.
@@ -238,7 +238,7 @@ def _evaluate(
     if size == 0:
         for k in which:
             code[k] = policy.after[code[k], plans[k, t]]
-            row = policy.row[code[k], policy.context[seen[k]] if len(policy.context) else 0]
+            row = policy.row[code[k], policy.context[observed[k]] if len(policy.context) else 0]
             for a in range(actions):
                 weights[k, a], probs[k, a] = policy.weights[row, a], policy.probs[row, a]
         return
@@ -258,9 +258,9 @@ def _evaluate(
                 for j in range(3 * size):
                     gates[i, j] += policy.past[lag, before, j]
             if len(policy.context):
-                now = policy.context[seen[k]]
+                now = policy.context[observed[k]]
                 for j in range(3 * size):
-                    gates[i, j] += policy.seen[now, j]
+                    gates[i, j] += policy.by_context[now, j]
         np.dot(block[:number], policy.recurrent, product[:number])
         for i in range(number):
             k = which[begin + i]
@@ -321,7 +321,7 @@ def search(
     path, depth, first = np.empty((batch, length), np.int64), np.empty(batch, np.int64), np.empty(length, np.int64)
     chosen, alive, score = np.empty((batch, length), np.int64), np.empty(batch, np.bool_), np.empty(batch)
     cell, code, hidden = np.empty(batch, np.int64), np.empty(batch, np.int64), np.empty((batch, size), np.float32)
-    seen, which = np.empty(batch, np.int64), np.empty(batch, np.int64)
+    observed, which = np.empty(batch, np.int64), np.empty(batch, np.int64)
     weights, probs = np.empty((batch, actions), np.float32), np.empty((batch, actions))
     wide = BLOCK if size else 0
     work = (
@@ -349,7 +349,7 @@ def search(
             alive[k] = known.left[b] >= length - depth[k]
             known.over[b] |= not alive[k]
             done[simulation, b] = alive[k]
-            seen[k] = known.state[b, 0]
+            observed[k] = known.state[b, 0]
             for t in range(depth[k]):
                 child = path[k, t + 1]
                 states[simulation, b, t], rewards[simulation, b, t] = known.state[b, child], known.reward[b, child]
@@ -378,11 +378,11 @@ def search(
                 states[simulation, b, t], rewards[simulation, b, t] = cell[k], gained
                 known.left[b] -= 1
                 if policy.each_step:
-                    seen[k] = cell[k]
+                    observed[k] = cell[k]
                 which[going] = k
                 going += 1
             if t + 1 < length:
-                _evaluate(policy, which[:going], chosen, t, seen, code, hidden, weights, probs, work)
+                _evaluate(policy, which[:going], chosen, t, observed, code, hidden, weights, probs, work)
             for i in range(going):
                 k = which[i]
                 if depth[k] != t:
@@ -539,13 +539,13 @@ def _network(prior: GRUPrior, observed: Tensor) -> tuple[Tensor, ...]:
     weight, recurrent, bias, recurrent_bias = prior.gru.all_weights[0]
     both = bias + torch.cat([recurrent_bias[: 2 * size], torch.zeros(size)])
     action = embedding.action.weight @ weight.T + both
-    past, seen = torch.empty(0, 0, 3 * size), torch.empty(0, 3 * size)
+    past, by_context = torch.empty(0, 0, 3 * size), torch.empty(0, 3 * size)
     if embedding.past is not None and embedding.mix is not None:
         # The last tap of the convolution is that of the last action.
         past = torch.einsum("av,hvk->kah", embedding.past.weight[:-1], embedding.mix.weight).flip(0) @ weight.T
     if embedding.index is not None:
-        seen = embedding.index(observed.long()) @ weight.T
+        by_context = embedding.index(observed.long()) @ weight.T
     elif embedding.features is not None:
-        seen = embedding.features(observed.float()) @ weight.T
+        by_context = embedding.features(observed.float()) @ weight.T
     head = prior.head
-    return action, past, seen, recurrent.T, recurrent_bias[2 * size :], head.weight.T, head.bias
+    return action, past, by_context, recurrent.T, recurrent_bias[2 * size :], head.weight.T, head.bias

@@ -272,11 +272,14 @@ class Prior(SavedModule):
     def _as_plans(self, plans: Plans | Tensor) -> Plans:
         return plans if isinstance(plans, Plans) else Plans(as_actions(plans), self.num_actions)
 
-    def _check_scored(self, plans: Plans) -> None:
+    def _check_actions(self, plans: Plans) -> None:
         if plans.num_actions != self.num_actions:
             raise ValueError(
                 f"plans: {self.num_actions} actions are expected, as this prior has, not {plans.num_actions}"
             )
+
+    def _check_scored(self, plans: Plans) -> None:
+        self._check_actions(plans)
         for what in ("action_names", "context_names"):
             own, names = getattr(self, what), getattr(plans, what)
             if None not in (own, names) and tuple(own) != tuple(names):
@@ -356,10 +359,7 @@ class Prior(SavedModule):
             ValueError: another number of actions, or a context of another kind than this prior takes.
         """
         plans = self._as_plans(plans)
-        if plans.num_actions != self.num_actions:
-            raise ValueError(
-                f"plans: {self.num_actions} actions are expected, as this prior has, not {plans.num_actions}"
-            )
+        self._check_actions(plans)
         self.end = plans.end
         self.action_names = None if plans.action_names is None else tuple(plans.action_names)
         self.context_names = None

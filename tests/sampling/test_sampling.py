@@ -172,8 +172,8 @@ def test_each_plan_goes_on_from_its_own_past_under_its_own_context(per):
     pasts = torch.tensor([[0, 1], [2, 2]])
     contexts = torch.tensor([0, 2] if per == "plan" else [[0, 1, 2, 0], [2, 0, 0, 1]])
     known = torch.randint(3, (90,) if per == "plan" else (90, 4), generator=generator)
-    seen = Plans(torch.randint(A, (90, 4), generator=generator), A, context=known)
-    prior = MarkovPrior(A, 2, num_contexts=3).fit(seen)
+    learned = Plans(torch.randint(A, (90, 4), generator=generator), A, context=known)
+    prior = MarkovPrior(A, 2, num_contexts=3).fit(learned)
     which = torch.randint(2, (40_000,), generator=generator)
     plans = prior.sample(40_000, 2, contexts[which], past=pasts[which].to(torch.uint8), generator=generator)
     for row in range(2):
