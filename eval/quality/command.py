@@ -1,7 +1,9 @@
 """`python -m eval quality`: how near priors come to sources whose entropy is known; long sequences of many kinds."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import log
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from eval.quality.sequences import CONDITIONS, Sequences, sequences
-from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, fit
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, fit
 from neuroprior._jobs import Progress
 from neuroprior._random import draw_seed
 from neuroprior.priors.ensembles.candidates import best_chain
@@ -23,7 +25,21 @@ LENGTH = 32
 CONTEXTS = 8
 LAG, REPEAT = 12, 0.8
 
-OF_SEQUENCES = ("markov", "context-tree", "gru", "transformer", "stacked", "combined")
+MARKOV = "markov"
+
+OF_SOURCES: dict[str, Callable[..., Prior]] = {
+    MARKOV: MarkovPrior,
+    "gru": GRUPrior,
+    "transformer": TransformerPrior,
+    "combined": CombinedPrior,
+    "combined, full": partial(CombinedPrior, effort="full"),
+}
+"""Priors that learn sources of known entropy: a chain of the source's order, and others by default settings."""
+
+PARTS = (MARKOV, "context-tree", "gru", "stacked")
+"""The experts of the combined prior."""
+
+OF_SEQUENCES = (*PARTS, "transformer", "combined")
 """Priors that learn long sequences, as `neuroprior.fit` knows them, with their default settings."""
 
 
@@ -121,15 +137,15 @@ def quality(
     """
     if num_plans < 100 or held_out < 100:
         raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
-    generator, kinds = torch.Generator().manual_seed(seed), (MarkovPrior, GRUPrior, TransformerPrior)
+    generator = torch.Generator().manual_seed(seed)
     every, long = sources(generator), sequences(num_sequences, torch.Generator().manual_seed(seed))
-    rows, of_long, jobs = [], [], len(every) * len(kinds) + len(long) * len(OF_SEQUENCES)
+    rows, of_long, jobs = [], [], len(every) * len(OF_SOURCES) + len(long) * len(OF_SEQUENCES)
     with Progress("quality", jobs, jobs) as progress:
         for source in every:
             training, _ = source.draw(num_plans, generator)
             test, true = source.draw(held_out, generator)
-            for kind in kinds:
-                rows.append(_fit(source, kind, training, test, true, seed))
+            for name in OF_SOURCES:
+                rows.append(_fit(source, name, training, test, true, seed))
                 progress.advance(f"{source.name}: {rows[-1]['model']} {rows[-1]['excess_percent']:+.2f} %")
         for given in long:
             for name in OF_SEQUENCES:
@@ -141,15 +157,16 @@ def quality(
     frames, keys = {"quality": frame}, {"quality": "rows"}
     if of_long:
         frames["sequences"] = pd.DataFrame(of_long)
-        sections.append(Section("Bits per action of long sequences", tables=[_table_of_long(frames["sequences"])]))
+        frame = frames["sequences"]
+        sections.append(Section("Bits per action of long sequences", [_price(frame)], [_table_of_long(frame)]))
     settings = {"num_plans": num_plans, "held_out": held_out, "num_sequences": num_sequences, "seed": seed}
     publish(Document("Sources of known entropy", lead, sections, frames, settings, keys=keys), Path(out))
 
 
-def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
-    chain, began = kind is MarkovPrior, time.perf_counter()
+def _fit(source: Source, name: str, training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
+    chain, began = name == MARKOV, time.perf_counter()
     how: dict[str, Any] = {"order": source.order} if chain else {}
-    prior = kind(source.num_actions, num_contexts=source.contexts, **how)
+    prior = OF_SOURCES[name](source.num_actions, num_contexts=source.contexts, **how)
     prior.fit(training, generator=torch.Generator().manual_seed(seed), **({} if chain else {"progress": False}))
     seconds = time.perf_counter() - began
     with torch.no_grad():
@@ -161,7 +178,7 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
     free = source.table.numel() // source.num_actions * (source.num_actions - 1)
     return {
         "source": source.name,
-        "model": kind.__name__.removesuffix("Prior").lower(),
+        "model": name,
         "entropy_rate": rate,
         "bits_per_action": rate + excess,
         "excess_percent": 100 * excess / rate,
@@ -175,7 +192,7 @@ def _fit(source: Source, kind: type[Prior], training: Plans, test: Plans, true: 
 
 def _fit_long(given: Sequences, name: str, seed: int) -> dict[str, Any]:
     generator, began = torch.Generator().manual_seed(seed), time.perf_counter()
-    if name == "markov":
+    if name == MARKOV:
         chain = best_chain(*given.training.split(generator=generator), None)
         assert chain is not None
         prior: Prior = chain.fit(given.training)
@@ -194,6 +211,14 @@ def _fit_long(given: Sequences, name: str, seed: int) -> dict[str, Any]:
     }
 
 
+def _price(rows: pd.DataFrame) -> str:
+    """How long the combined prior takes to fit, as a multiple of its parts."""
+    seconds = rows.pivot(index="source", columns="model", values="seconds")
+    ratio = seconds["combined"] / seconds[list(PARTS)].sum(axis=1)
+    each = "; ".join(f"{source}: {value:.2f}" for source, value in ratio.items())
+    return f"Seconds of fitting the combined prior, divided by the sum of those of {', '.join(PARTS)}: {each}."
+
+
 def _table_of_long(rows: pd.DataFrame) -> Table:
     """A row a model: the bits per action of each source, and the seconds of fitting."""
     cells = rows.assign(text=[f"{row.bits_per_action:.4f} ({row.seconds:.0f})" for row in rows.itertuples()])
@@ -209,19 +234,20 @@ def _table_of_long(rows: pd.DataFrame) -> Table:
 
 
 def _table(rows: pd.DataFrame) -> Table:
-    """A row a source: the excess of each prior, and of the neural ones the seconds of training."""
+    """A row a source: the excess of each prior, and of all but the chain the seconds of fitting."""
     trained = rows.assign(text=[f"{row.excess_percent:+.2f} ({row.seconds:.0f})" for row in rows.itertuples()])
-    neural = trained.pivot(index="source", columns="model", values="text")[["gru", "transformer"]]
+    others = [name for name in OF_SOURCES if name != MARKOV]
+    learned = trained.pivot(index="source", columns="model", values="text")[others]
     columns: dict[str, Column] = {
         "source": "source",
         "entropy": "entropy_rate:.4f",
-        "markov": "excess_percent:+.3f",
+        MARKOV: "excess_percent:+.3f",
         "ex-\npected": "expected_percent:+.3f",
-        "gru (s)": "gru",
-        "transformer (s)": "transformer",
+        **{f"{name} (s)": name for name in others},
     }
     caption = (
         "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
-        " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. (s): seconds of training."
+        " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. full: effort=\"full\". (s):"
+        " seconds of fitting."
     )
-    return table(rows[rows.model == "markov"].join(neural, on="source"), columns, caption)
+    return table(rows[rows.model == MARKOV].join(learned, on="source"), columns, caption)

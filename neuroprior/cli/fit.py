@@ -57,8 +57,8 @@ OTHERWISE = {
 }
 """Options with which no default recipe is needed."""
 
-OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
-"""Options of `--data` that other commands have, too."""
+SHORT = dict.fromkeys(("--columns", "--missing", "--merge_repeats", "--max_gap"), "data") | {"--effort": "model.prior"}
+"""Options that need not be written with their section, as in other commands."""
 
 NETWORKS_ALONE = {"devices": 1, "num_nodes": 1, "precision": "32-true", "accumulate_grad_batches": 1, "max_time": None}
 """Options of the trainer, with their defaults, that do not reach the networks inside other priors."""
@@ -302,8 +302,8 @@ def _in_full(arguments: list[str]) -> list[str]:
             argument = recipe_path(argument)
         elif argument.startswith("--config="):
             argument = f"--config={recipe_path(argument.removeprefix('--config='))}"
-        elif argument.startswith(OF_TABLES):
-            argument = f"--data.{argument.removeprefix('--')}"
+        elif section := next((SHORT[option] for option in SHORT if argument.startswith(option)), None):
+            argument = f"--{section}.{argument.removeprefix('--')}"
         out.append(argument)
     return out
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from rich.console import Console
 
 from neuroprior.plans import Columns, Missing
+from neuroprior.priors.ensembles.candidates import Effort
 from neuroprior.report.document import show
-from neuroprior.report.plan_report import INPUTS, MODELS, InputName, ModelName, report
+from neuroprior.report.plan_report import INPUTS, InputName, ModelName, report
 
 
 def plans(
@@ -16,10 +17,11 @@ def plans(
     priors: list[str] | None = None,
     test: str | None = None,
     folds: int | None = None,
-    models: list[ModelName] = list(MODELS),  # noqa: B006
+    models: list[ModelName] | None = None,
     inputs: list[InputName] = list(INPUTS[:2]),  # noqa: B006
     modes: list[int] | None = None,
     skip: int = 0,
+    effort: Effort = "standard",
     max_steps: int | None = None,
     num_actions: int | None = None,
     action_names: list[str] | None = None,

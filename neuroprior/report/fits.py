@@ -17,7 +17,8 @@ from neuroprior.plans import PastDurations, Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.counts import TooLargeError
-from neuroprior.priors.ensembles.candidates import fitted_experts, number_tried
+from neuroprior.priors.ensembles import candidates
+from neuroprior.priors.ensembles.candidates import Effort, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import divided
 from neuroprior.priors.prior import construct, context_arguments
 from neuroprior.sampling.ancestral import sample, sample_in_world
@@ -36,9 +37,6 @@ NETWORKS: dict[str, type[Prior]] = {"gru": GRUPrior, "transformer": TransformerP
 
 COMBINED = "combined"
 """The combined prior."""
-
-EXPERTS = {"gru", "stacked"}
-"""The networks among its experts, which its job scores as well."""
 
 OF_FEATURES = (COMBINED, "transformer", "gru")
 """Jobs whose models can take features, such as past durations."""
@@ -68,6 +66,7 @@ class Design:
     seed: int = 0  # draws the folds, and everything in training
     skip: int = 0  # actions at the beginning of each plan that are left out of the score
     max_steps: int | None = None  # gradient steps of neural priors; None: by the plans
+    effort: Effort = "standard"  # of the combined prior
     reach: int = 16  # the most past actions whose information is measured
     cut: bool = False  # whether the plans are consecutive parts of a single one
     version: str = __version__  # of the library
@@ -76,6 +75,11 @@ class Design:
     def training(self) -> dict[str, Any]:
         """How neural priors are trained."""
         return {"max_steps": self.max_steps, "progress": False}
+
+    @property
+    def experts(self) -> set[str]:
+        """The models among the experts of the combined prior, which its job scores as well."""
+        return {name for name, kind in NETWORKS.items() if kind in candidates.NETWORKS[self.effort]}
 
 
 @dataclass(frozen=True)
@@ -175,7 +179,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
                 yield baseline.model, baseline.how, baseline.prior.fit(learned)
     elif kind == COMBINED:
         training, validation = divided(learned, None, generator)
-        experts = list(fitted_experts(training, validation, sizes, "standard", generator, design.training))
+        experts = list(fitted_experts(training, validation, sizes, design.effort, generator, design.training))
         combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
         assert isinstance(combined, CombinedPrior)
         combined.learn_weights(validation, number_tried(experts))

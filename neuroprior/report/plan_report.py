@@ -14,6 +14,7 @@ from neuroprior._threads import one_thread
 from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
+from neuroprior.priors.ensembles.candidates import NETWORKS, Effort
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.priors.scoring import learned_from
 from neuroprior.report.document import Document, write_document
@@ -25,6 +26,7 @@ ModelName = Literal["counts", "gru", "transformer", "stacked", "combined"]
 InputName = Literal["actions", "context", "durations"]
 
 MODELS: tuple[ModelName, ...] = ("counts", "gru", "transformer", "stacked", "combined")
+QUICK: tuple[ModelName, ...] = ("counts", "gru", "combined")
 INPUTS: tuple[InputName, ...] = ("actions", "context", "durations")
 
 MOST_ACTIONS = 10_000
@@ -44,10 +46,11 @@ def report(
     priors: Mapping[str, Prior] | Sequence[str] | None = None,
     test: Plans | str | Path | None = None,
     folds: int | None = None,
-    models: Sequence[ModelName] = MODELS,
+    models: Sequence[ModelName] | None = None,
     inputs: Sequence[InputName] = INPUTS[:2],
     modes: Sequence[int] | None = None,
     skip: int = 0,
+    effort: Effort = "standard",
     max_steps: int | None = None,
     num_actions: int | None = None,
     action_names: Sequence[str] | None = None,
@@ -71,13 +74,16 @@ def report(
         test: learn from the plans and score on these, or on those of this file, in place of cross-validation.
         folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
         models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
-            weighs the forecasts of counts), combined (of the others but the transformer, which are fitted for it).
+            weighs the forecasts of counts), combined (of what `effort` says, which is fitted for it). By default all;
+            with little effort counts, gru and combined.
         inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, transformer
             and combined, durations: how long the last action took, beside the actions. Each in turn; durations, with
             which these take as long again, are left out by default.
         modes: numbers of hidden modes that are tried, such as `[1, 2, 3]`; None: no section on modes, which takes about
             as long for each number as the counts.
         skip: actions at the beginning of each plan that do not count in scores.
+        effort: how much the combined prior spends on networks: fast (a GRU), standard (and a stacked prior) or full
+            (and a transformer and a switching network).
         max_steps: gradient steps of a neural prior; None: by the plans, see `neuroprior.training.Settings`.
         num_actions: number of actions, where a file does not say.
         action_names: names of the actions in the order of their numbers, where a file does not say.
@@ -106,6 +112,9 @@ def report(
         >>> list(found.figures)
         ['transitions']
     """
+    if effort not in NETWORKS:
+        raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
+    models = (QUICK if effort == "fast" else MODELS) if models is None else models
     for name, given, known in (
         ("models", models, MODELS),
         ("inputs", inputs, INPUTS),
@@ -149,7 +158,7 @@ def report(
         if other is not None:
             other, cut = _in_parts(other)
         number = 1 if other is not None else _folds(file or "plans", learned, folds)
-        design = Design(number, seed, skip, max_steps, cut=cut)
+        design = Design(number, seed, skip, max_steps, effort, cut=cut)
         kinds: list[str] = [*models]
         if "lags" in sections:
             kinds += LAGS if set(models) != {"counts"} else LAGS[:1]

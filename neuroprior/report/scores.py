@@ -29,7 +29,6 @@ from neuroprior.report.fits import (
     CONTEXT,
     COUNTED,
     DURATIONS,
-    EXPERTS,
     KINDS,
     LAGS,
     OF_FEATURES,
@@ -132,7 +131,7 @@ def cross_validation(folder: Path, plans: Plans, test: Plans | None, design: Des
 def jobs(design: Design, kinds: Iterable[str], inputs: Iterable[str]) -> list[Job]:
     """What there is to do: the slowest first, so that no process is left alone with one at the end."""
     kinds, inputs = set(kinds), list(inputs)
-    kinds -= EXPERTS if COMBINED in kinds else set()
+    kinds -= design.experts if COMBINED in kinds else set()
     return [
         Job(fold, kind, each)
         for kind in KINDS

@@ -224,10 +224,11 @@ def test_the_settings_of_a_recipe_reach_the_networks_inside_other_priors(name, p
 
 
 def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
-    quick = ["--trainer.max_steps", "3", "--model.prior.effort", "fast", "--out", str(tmp_path / "run")]
+    quick = ["--trainer.max_steps", "3", "--effort", "fast", "--out", str(tmp_path / "run")]
     assert main(["fit", plans_file, *quick]) == 0
     prior = load(tmp_path / "run")
     assert isinstance(prior, CombinedPrior)
+    assert prior.effort == "fast"
     row = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"][-1]
     assert (row["model"], row["how"]) == ("combined", prior.summary())
     assert main(["fit", "--resume", str(tmp_path / "run")]) == 0
@@ -325,6 +326,8 @@ def test_ctrl_c_says_how_to_resume(tmp_path, capsys, monkeypatch):
         ([*recipe("gru"), "--model.prior", "NoPrior"], "NoPrior"),
         ([*recipe("gru"), "--nonsense", "1"], "nonsense"),
         ([*recipe("gru"), "--trainer.devices", "0"], "devices"),
+        ([*recipe("gru"), "--effort", "fast"], "error: model.prior: it has no option 'effort'"),
+        ([*recipe("combined"), "--effort", "quick"], "error: effort: one of fast, standard, full is expected, not quick"),
         (["fit", "--config", "missing.yaml"], "missing.yaml"),
         (["fit", "--resume", "missing"], "run.yaml"),
         ([*recipe("gru"), "--data.held_out", "0.95"], "held_out"),

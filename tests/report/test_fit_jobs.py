@@ -11,6 +11,7 @@ from neuroprior.plans.folds import folds
 from neuroprior.priors import StackedPrior
 from neuroprior.report import fits
 from neuroprior.report.fits import ACTIONS, COMBINED, CONTEXT, Design, Job, counted, fit_and_score
+from neuroprior.report.scores import jobs
 from tests.support.sources import seeded
 
 
@@ -46,6 +47,23 @@ def test_the_networks_among_experts_are_counted_again_on_all_that_is_learned(mon
     after = -stacked.recount(plans).action_log_probs(test).detach() / math.log(2)
     assert found == pytest.approx(after.numpy(), abs=1e-6)
     assert abs(found + before.detach().numpy() / math.log(2)).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("effort", "apart"),
+    [("fast", {"stacked", "transformer"}), ("standard", {"transformer"}), ("full", set())],
+)
+def test_the_networks_among_experts_are_fitted_once(effort, apart, monkeypatch):
+    """The job of the combined prior trains what its effort says, and scores it as models of their own."""
+    trained = []
+    plans, design = drawn(20, 6), Design(2, max_steps=1, effort=effort)
+    monkeypatch.setattr("neuroprior.training.train", lambda prior, *_: trained.append(type(prior)))
+    networks = {"gru", "stacked", "transformer"}
+    todo = jobs(design, [*networks, COMBINED, "counts"], [ACTIONS])
+    assert {job.kind for job in todo} == {COMBINED, "counts"} | apart
+    found = fit_and_score(plans, None, design, Job(0, COMBINED, ACTIONS))
+    assert {name.removesuffix("/bits") for name in found if name.endswith("/bits")} == {COMBINED} | networks - apart
+    assert len(trained) == {"fast": 1, "standard": 2, "full": 4}[effort]
 
 
 def test_the_reach_of_lags_is_half_of_the_shorter_plans():

@@ -15,7 +15,7 @@ from neuroprior.report import Document, FigureBox, Section, report
 from neuroprior.report.page import write_page
 from tests.support.chains import markov_plans, markov_probs
 from tests.support.reports import QUICK
-from tests.support.sources import seeded
+from tests.support.sources import refuses, seeded
 
 SCORES: dict[str, Any] = QUICK | {"sections": ["scores"]}
 
@@ -91,20 +91,47 @@ def test_a_single_plan_is_cut_for_scores_and_described_whole():
     assert bits(made, "uniform") == pytest.approx(math.log2(3), abs=1e-5)
 
 
-@pytest.mark.parametrize(("models", "kinds"), [(["counts"], "counts, lags"), (["gru"], "gru, lags, gru-lags")])
-def test_information_by_lag_is_that_of_counts_and_of_networks_where_there_are_any(models, kinds, monkeypatch):
+@pytest.fixture
+def asked(monkeypatch) -> dict[str, Any]:
+    """The kinds of models that a report asks for, after which it is interrupted, and its design."""
     from neuroprior.report import plan_report
 
-    asked: dict[str, Any] = {}
+    found: dict[str, Any] = {}
 
-    def stop(design, todo, inputs):
-        asked.update(kinds=", ".join(todo))
+    def stop(design, kinds, inputs):
+        found.update(design=design, kinds=", ".join(kinds))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(plan_report, "jobs", stop)
+    return found
+
+
+@pytest.mark.parametrize(("models", "kinds"), [(["counts"], "counts, lags"), (["gru"], "gru, lags, gru-lags")])
+def test_information_by_lag_is_that_of_counts_and_of_networks_where_there_are_any(models, kinds, asked):
     with pytest.raises(KeyboardInterrupt):
         report(chain(), models=models, max_steps=3, processes=1)
     assert asked["kinds"] == kinds
+
+
+@pytest.mark.parametrize(
+    ("more", "kinds"),
+    [
+        ({}, "counts, gru, transformer, stacked, combined"),
+        ({"effort": "full"}, "counts, gru, transformer, stacked, combined"),
+        ({"effort": "fast"}, "counts, gru, combined"),
+        ({"effort": "fast", "models": ["stacked"]}, "stacked"),
+    ],
+)
+def test_effort_decides_which_models_are_fitted_where_none_are_given(more, kinds, asked):
+    with pytest.raises(KeyboardInterrupt):
+        report(chain(), sections=["scores"], **more)
+    assert asked["kinds"] == kinds
+    assert asked["design"].effort == more.get("effort", "standard")
+
+
+def test_an_unknown_effort_is_said():
+    with refuses("effort", "one of fast, standard, full", "not 'quick'"):
+        report(chain(), effort="quick")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("skip", [0, 3])

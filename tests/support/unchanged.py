@@ -33,6 +33,9 @@ LONGEST = 48
 RELATIVE, ABSOLUTE = 2e-4, 2e-6
 """How far apart numbers may be, on other machines: of sums in another order, and of networks that learned from them."""
 
+SINGLE = 2.0**-22
+"""Relative distance of numbers in texts that are the same in single precision but for the last digits."""
+
 DECIMAL = re.compile(r"[-+]?\d+\.\d+(?:e[-+]?\d+)?|[-+]?\d+e[-+]?\d+")
 """Numbers in texts that may differ in their last digit."""
 
@@ -184,7 +187,8 @@ def _same(pinned: Any, found: Any, relative: float) -> bool:
         ends = [DECIMAL.findall(text) for text in (pinned, found)]
         if DECIMAL.split(pinned) != DECIMAL.split(found) or len(ends[0]) != len(ends[1]):
             return False
-        return all(abs(float(one) - float(other)) <= 1.01 * _last_digit(one) for one, other in zip(*ends, strict=True))
+        pairs = [(one, float(one), float(other)) for one, other in zip(*ends, strict=True)]
+        return all(abs(a - b) <= max(1.01 * _last_digit(one), SINGLE * abs(a)) for one, a, b in pairs)
     return type(pinned) is type(found) and pinned == found
 
 

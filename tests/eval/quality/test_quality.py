@@ -4,14 +4,15 @@ import itertools
 import json
 import math
 
+import pandas as pd
 import pytest
 import torch
 from scipy import stats
 
 from eval.__main__ import main
-from eval.quality.command import LAG, LENGTH, REPEAT, _fit, sources
+from eval.quality.command import LAG, LENGTH, REPEAT, _fit, _price, sources
 from eval.quality.sequences import CHARACTERS, KINDS, SWITCH, draw, sequences, switching_chain, text
-from neuroprior import MarkovPrior, Plans, UniformPrior, save
+from neuroprior import ContextTreePrior, MarkovPrior, Plans, UniformPrior, save
 from neuroprior.plans import write_plans
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
@@ -73,7 +74,7 @@ def test_markov_of_the_right_order_costs_what_estimation_costs(source):
 def test_excess_is_of_actions_that_depend_on_the_past(number):
     source = SOURCES[number]
     (training, _), (test, true) = (source.draw(num, seeded(num)) for num in (500, 200))
-    row = _fit(source, MarkovPrior, training, test, true, 0)
+    row = _fit(source, "markov", training, test, true, 0)
     prior = MarkovPrior(4, source.order, num_contexts=source.contexts).fit(training)
     first = max(source.order, source.lag)
     rate = -float(true[:, first:].mean()) / math.log(2)
@@ -129,21 +130,44 @@ def test_text_is_cut_into_parts_that_are_divided():
 
 
 def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("eval.quality.command.OF_SEQUENCES", ("markov", "context-tree"))
+    fitted = []
+
+    def quickly(plans, name, **_):
+        fitted.append(name)
+        return (ContextTreePrior if name == "context-tree" else MarkovPrior)(plans.num_actions).fit(plans)
+
+    def untrained(prior, *_, **__):
+        fitted.append(getattr(prior, "effort", type(prior).__name__))
+        return prior
+
+    monkeypatch.setattr("eval.quality.command.fit", quickly)
     monkeypatch.setattr("eval.quality.command.sources", lambda generator: SOURCES[:1])
-    monkeypatch.setattr("eval.quality.command.GRUPrior.fit", lambda prior, *_, **__: prior)
-    monkeypatch.setattr("eval.quality.command.TransformerPrior.fit", lambda prior, *_, **__: prior)
+    for kind in ("GRUPrior", "TransformerPrior", "CombinedPrior"):
+        monkeypatch.setattr(f"eval.quality.command.{kind}.fit", untrained)
     assert (
         main(["quality", "--num-plans", "100", "--held-out", "100", "--num-sequences", "4", "--out", str(tmp_path)])
         == 0
     )
-    rows = json.loads((tmp_path / "results.json").read_text())["sequences"]
-    assert [row["model"] for row in rows] == ["markov", "context-tree"] * 2
+    found = json.loads((tmp_path / "results.json").read_text())
+    assert [row["model"] for row in found["rows"]] == ["markov", "gru", "transformer", "combined", "combined, full"]
+    assert fitted[:4] == ["GRUPrior", "TransformerPrior", "standard", "full"]
+    rows = found["sequences"]
+    names = ["markov", "context-tree", "gru", "stacked", "transformer", "combined"]
+    assert [row["model"] for row in rows] == names * 2
+    assert fitted[4:] == names[1:] * 2
     for row in rows:
         assert row["seconds"] > 0
         kinds = KINDS if row["entropy"] else len(CHARACTERS)
         assert (row["entropy"] or 1) < row["bits_per_action"] < math.log2(kinds)
-    assert f"{rows[0]['bits_per_action']:.4f}" in capsys.readouterr().out
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{rows[0]['bits_per_action']:.4f}" in said
+
+
+def test_the_price_of_the_combined_prior_is_that_of_its_parts():
+    """It takes 30 s, and its parts, a chain, a tree, a GRU and a stacked prior, 1, 2, 8 and 9; a transformer is none."""
+    seconds = {"markov": 1, "context-tree": 2, "gru": 8, "stacked": 9, "transformer": 80, "combined": 30}
+    rows = pd.DataFrame([{"source": "text", "model": name, "seconds": value} for name, value in seconds.items()])
+    assert "text: 1.50" in _price(rows)
 
 
 def context_at(source, plans: Plans, t: int) -> torch.Tensor | int:
