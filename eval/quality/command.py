@@ -247,7 +247,7 @@ def _table(rows: pd.DataFrame) -> Table:
     }
     caption = (
         "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
-        " expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. full: effort=\"full\". (s):"
+        ' expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. full: effort="full". (s):'
         " seconds of fitting."
     )
     return table(rows[rows.model == MARKOV].join(learned, on="source"), columns, caption)

@@ -7,7 +7,7 @@ found in a world, `sampling_for` without one, and `search_weights` says which pl
 from collections.abc import Mapping, Sequence
 from itertools import product
 from math import inf, log
-from typing import Any, NamedTuple, Unpack, cast
+from typing import Any, NamedTuple, Unpack
 
 import torch
 from torch import Tensor
@@ -60,14 +60,15 @@ def proposers(prior: Steppable) -> tuple[Steppable, ...]:
     """Who may propose candidates: the prior, and where it is a mixture of several, each of its experts alone.
 
     The mixture that predicts plans best need not be the best to search with. An expert that is unsure of what it does
-    not know proposes more plans that differ.
+    not know proposes more plans that differ. And an expert that a combined prior left out, since the others predict
+    plans of their own world better, may find better plans in other worlds: those that count may propose alone, too.
 
     Example:
         >>> len(proposers(MarkovPrior(4, 1)))
         1
     """
-    experts = tuple(prior.experts) if isinstance(prior, MixturePrior) else ()
-    return (prior, *cast(tuple[Prior, ...], experts)) if len(experts) > 1 else (prior,)
+    alone = prior.alternatives if isinstance(prior, MixturePrior) else ()
+    return (prior, *alone) if len(alone) > 1 else (prior,)
 
 
 def best_sampling(

@@ -327,7 +327,10 @@ def test_ctrl_c_says_how_to_resume(tmp_path, capsys, monkeypatch):
         ([*recipe("gru"), "--nonsense", "1"], "nonsense"),
         ([*recipe("gru"), "--trainer.devices", "0"], "devices"),
         ([*recipe("gru"), "--effort", "fast"], "error: model.prior: it has no option 'effort'"),
-        ([*recipe("combined"), "--effort", "quick"], "error: effort: one of fast, standard, full is expected, not quick"),
+        (
+            [*recipe("combined"), "--effort", "quick"],
+            "error: effort: one of fast, standard, full is expected, not quick",
+        ),
         (["fit", "--config", "missing.yaml"], "missing.yaml"),
         (["fit", "--resume", "missing"], "run.yaml"),
         ([*recipe("gru"), "--data.held_out", "0.95"], "held_out"),

@@ -6,7 +6,7 @@ from math import log
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, MixturePrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
+from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
 from neuroprior.planners import best_sampling, proposers, sampling_for, search_weights
 from neuroprior.planners.tuning import choices, log_inclusion
 from neuroprior.testing import check_planner
@@ -124,6 +124,19 @@ def test_an_expert_proposes_alone_where_the_mixture_is_wrong():
     # Of equals the mixture itself comes first.
     alike = MixturePrior(2, [sure_of(0), sure_of(0)])
     assert best_sampling(alike, world, state, 1, 64, **how).prior is alike
+
+
+def test_an_expert_that_was_left_out_proposes_where_it_is_right():
+    """All plans of this world take action 1; in another world action 0 is rewarded, which an even prior tries."""
+    prior = CombinedPrior(2, [UniformPrior(2), sure_of(1)])
+    prior.learn_weights(Plans(torch.ones(200, 4, dtype=torch.long), 2))
+    sure, even = prior.alternatives
+    assert (list(prior.experts), list(prior.spare)) == ([sure], [even])
+    assert proposers(prior) == (prior, sure, even)
+    how = {"temperatures": (1.0,), "uniform_shares": (0.0,), "generator": seeded(0)}
+    found = best_sampling(prior, bandit(), torch.zeros(200, dtype=torch.long), 1, 4, **how)
+    assert found.prior is even
+    assert found.scores[even, 1.0, 0.0] == pytest.approx(15 / 16, abs=5 * (15 / 16 / 16 / 200) ** 0.5)
 
 
 def test_a_mixture_of_one_proposes_itself():

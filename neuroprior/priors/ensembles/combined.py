@@ -16,6 +16,7 @@ from neuroprior.priors.ensembles.mixture import (
     divided,
     learned_weights,
     mixed,
+    saved_expert,
     weights_before,
 )
 from neuroprior.priors.ensembles.packing import pack, unpack
@@ -58,7 +59,8 @@ class CombinedPrior(MixturePrior):
     Their weights follow Bayes' rule, from initial weights that are learned on held-out plans. None of these is below
     1 / K, where K forecasts were tried: on every sequence whatever, the negative log-likelihood is at most log K above
     that of the best of those that are kept (Cesa-Bianchi and Lugosi 2006, section 9.2). An expert is left out where
-    held-out plans are predicted as well without it.
+    held-out plans are predicted as well without it. In other worlds than those of the plans it may be the better one:
+    so those that count are kept aside, in `spare`, for planners that try (`neuroprior.planners.best_sampling`).
 
     Args:
         num_actions: A.
@@ -103,6 +105,7 @@ class CombinedPrior(MixturePrior):
         self.effort: Effort = effort
         # `fit` begins with these each time; in a list, so that experts that it leaves out are no submodules.
         self.given = None if experts is None else [self._experts()]
+        self.spare = nn.ModuleList()
         self.tried = 0
         self._allocate()
 
@@ -120,7 +123,8 @@ class CombinedPrior(MixturePrior):
 
     @property
     def learned(self) -> dict[str, Any]:
-        return super().learned | {"tried": self.tried, "given": self.given is not None, "kept": self.config["experts"]}
+        own = {"tried": self.tried, "given": self.given is not None, "kept": self.config["experts"]}
+        return super().learned | own | {"spare": [saved_expert(e) | {"learned": e.learned} for e in self._spare()]}
 
     def restore(self, learned: dict[str, Any]) -> None:
         if "kept" in learned:
@@ -132,6 +136,10 @@ class CombinedPrior(MixturePrior):
         self.tried = learned["tried"]
         if not learned.get("given", True):
             self.given = None  # `fit` chose them, and will choose again
+        spare = [(as_prior(e), e["learned"]) for e in learned.get("spare", [])]
+        for e, own in spare:
+            e.restore(own)
+        self.spare = nn.ModuleList([e for e, _ in spare]).to(self.device)
         self._allocate()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -226,13 +234,28 @@ class CombinedPrior(MixturePrior):
             tracked = torch.cat([taken, tracked.masked_fill(~mask[..., None], 0)], 2)
             if held_out.loss(tracked) > held_out.loss(taken) - held_out.tolerance:
                 share = 0.0
-        self.experts = nn.ModuleList([self._experts()[number] for number in kept])
+        experts = self._experts()
+        self.experts = nn.ModuleList([experts[number] for number in kept])
+        left = [e for number, e in enumerate(experts) if number not in kept]
+        self.spare = nn.ModuleList([e for e in left if not any(True for _ in e.parameters())])
         self.share, self.tried = share, held_out.tried
         self._allocate()
         self.powers = powers.float()
         if share:
             self.tracking, taken = tracking, tracked
         self.first = held_out.initial_weights(taken.sum(1)).float()
+
+    def recount(self, plans: Plans) -> Self:
+        for e in self._spare():
+            e.recount(plans)
+        return super().recount(plans)
+
+    @property
+    def alternatives(self) -> tuple[Prior, ...]:
+        return (*super().alternatives, *self._spare())
+
+    def _spare(self) -> list[Prior]:
+        return [e for e in self.spare if isinstance(e, Prior)]
 
     def summary(self) -> str:
         """What is combined, such as "0.3 markov + 0.8 gru": the powers of the experts in the pool."""

@@ -82,8 +82,7 @@ class MixturePrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        experts = [{"prior": type(e).__name__, "config": e.config} for e in self._experts()]
-        return super().config | {"experts": experts}
+        return super().config | {"experts": [saved_expert(e) for e in self._experts()]}
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -162,6 +161,11 @@ class MixturePrior(Prior):
         taken = taken_of(self._forecasts(plans.actions, plans.context), plans.actions)
         self.first, self.share = learned_weights(taken, plans.mask())
 
+    @property
+    def alternatives(self) -> tuple[Prior, ...]:
+        """The priors that may propose better plans alone than mixed, see `neuroprior.planners.proposers`."""
+        return tuple(self._experts())
+
     def _experts(self) -> list[Prior]:
         return [e for e in self.experts if isinstance(e, Prior)]
 
@@ -172,6 +176,11 @@ class MixturePrior(Prior):
     def _mixed(self, weights: Tensor, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
         forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in found], 1)
         return mixed(weights, forecasts), pack([weights, forecasts, *(state for _, state in found)])
+
+
+def saved_expert(expert: Prior) -> dict[str, Any]:
+    """The name of an expert's class, and its arguments, as a saved `config` has them."""
+    return {"prior": type(expert).__name__, "config": expert.config}
 
 
 def after(weights: Tensor, taken: Tensor, first: Tensor, share: float) -> Tensor:

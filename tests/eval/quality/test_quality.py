@@ -164,7 +164,7 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
 
 
 def test_the_price_of_the_combined_prior_is_that_of_its_parts():
-    """It takes 30 s, and its parts, a chain, a tree, a GRU and a stacked prior, 1, 2, 8 and 9; a transformer is none."""
+    """It takes 30 s; its parts, a chain, a tree, a GRU and a stacked prior, 1, 2, 8 and 9 s; a transformer is none."""
     seconds = {"markov": 1, "context-tree": 2, "gru": 8, "stacked": 9, "transformer": 80, "combined": 30}
     rows = pd.DataFrame([{"source": "text", "model": name, "seconds": value} for name, value in seconds.items()])
     assert "text: 1.50" in _price(rows)

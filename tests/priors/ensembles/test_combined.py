@@ -211,10 +211,34 @@ def test_on_few_actions_more_may_be_lost(number, kept):
 def test_experts_that_add_nothing_are_left_out():
     plans = some_plans(400)
     quick, dear = MarkovPrior(A, 1).fit(plans), Dear(A, 1).fit(plans)
-    prior = CombinedPrior(A, [UniformPrior(A), dear, quick, MarkovPrior(A, 0).fit(plans)])
+    even, lower = UniformPrior(A), MarkovPrior(A, 0).fit(plans)
+    prior = CombinedPrior(A, [even, dear, quick, lower])
     prior.learn_weights(some_plans(400, seed=5))
     assert list(prior.experts) == [quick]
     assert prior.tried == 6
+    # What counts may still propose; what was trained may not.
+    assert list(prior.spare) == [even, lower]
+    assert prior.alternatives == (quick, even, lower)
+
+
+def test_experts_that_were_left_out_are_saved_and_count_all_plans(tmp_path):
+    """A chain of order 0, and one of order 2 in a source of order 1: the latter learns from the held-out plans, too."""
+    plans, other = some_plans(200), some_plans(200, seed=7)
+    chains = [MarkovPrior(A, 0), MarkovPrior(A, 1)]
+    prior = CombinedPrior(A, chains).fit(plans, generator=seeded(0))
+    (left,) = prior.spare
+    assert left is chains[0]
+    assert left.log_prob(other).equal(MarkovPrior(A, 0).fit(plans).log_prob(other))
+    again = load(save(prior, tmp_path / "combined"))
+    assert isinstance(again, CombinedPrior)
+    assert [type(e) for e in again.alternatives] == [MarkovPrior, MarkovPrior]
+    for one, same in zip(again.alternatives, prior.alternatives, strict=True):
+        assert one.log_prob(other).equal(same.log_prob(other))
+    # Files of earlier versions have none.
+    learned = prior.learned
+    del learned["spare"]
+    again.restore(learned)
+    assert len(again.spare) == 0
 
 
 @pytest.mark.parametrize(
