@@ -164,13 +164,20 @@ def headlines(results: Results) -> Section:
     ]
     if len(across := results.across):
         unit = f"the normalised score, % of the optimum, with {results.shown:,} candidate plans"
-        names = {"prior": "label", "baseline": "baseline"}
-        tables.append(across_table(_labelled(across), names, "score", "baseline's", unit, 100))
+        tables += over_worlds(across, {"prior": "prior", "baseline": "baseline"}, ("score", "baseline's"), unit)
     if len(combined := results.combined):
         unit = "the normalised score, % of the optimum; most: the last context that each world offers"
-        names = {"other prior": "label", "candidates": "num_plans"}
-        tables.append(across_table(_labelled(combined), names, "combined", "other", unit, 100))
+        tables += over_worlds(combined, {"other": "prior", "candidates": "num_plans"}, ("combined", "other's"), unit)
     return Section("Neural priors against Markov chains", text, tables, boxes)
+
+
+def over_worlds(
+    rows: pd.DataFrame, names: Mapping[str, Column], headings: tuple[str, str], unit: str
+) -> Iterator[Table]:
+    """A table for each context and curriculum; see `across_table`."""
+    for (context, after), own in grouped(rows.assign(after=rows["rounds"] > 0), ["context", "after"]):
+        how = f", {context.replace('none', 'no')} context, {'after' if after else 'before'} the curriculum"
+        yield across_table(own, names, *headings, unit, 100, how)
 
 
 def reasons(results: Results) -> Section:

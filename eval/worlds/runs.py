@@ -227,11 +227,16 @@ def difference_table(
 
 
 def across_table(
-    found: pd.DataFrame, names: Mapping[str, Column], first: str, second: str, unit: str, factor: float
+    found: pd.DataFrame, names: Mapping[str, Column], first: str, second: str, unit: str, factor: float, how: str = ""
 ) -> Table:
-    """`across_worlds` as a table; `names`: the columns that name a row, by heading; `first`, `second`: headings."""
-    columns = dict(names) | {
-        "worlds": "worlds",
+    """`across_worlds` as a table; `names`: the columns that name a row, by heading; `first`, `second`: headings.
+
+    `how` goes into its title. The number of worlds has a column where it differs.
+    """
+    numbers = found["worlds"].unique()
+    title = f"Over {numbers[0]} worlds" if len(numbers) == 1 else "Over worlds"
+    columns = dict(names) | ({"worlds": "worlds"} if len(numbers) > 1 else {})
+    columns |= {
         first: lambda row: plus_minus(row, "first", factor, ends="first_"),
         second: lambda row: plus_minus(row, "second", factor, ends="second_"),
         "difference": lambda row: plus_minus(row, "difference", factor, sign="+", ends="difference_"),
@@ -242,7 +247,7 @@ def across_table(
         " improvement in a world drawn at random;"
         " Student's 95 % intervals over seeds."
     )
-    return table(found, columns, caption, "Over worlds", "l" * len(names) + "rrrrr")
+    return table(found, columns, caption, f"{title}{how}", "l" * len(names) + "r" * (len(columns) - len(names)))
 
 
 def over_seeds(rows: pd.DataFrame) -> str:
