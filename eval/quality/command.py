@@ -37,7 +37,7 @@ OF_SOURCES: dict[str, Callable[..., Prior]] = {
 """Priors that learn sources of known entropy: a chain of the source's order, and others by default settings."""
 
 PARTS = (MARKOV, "context-tree", "gru", "stacked")
-"""The experts of the combined prior."""
+"""The experts of the combined prior, but the uniform prior."""
 
 OF_SEQUENCES = (*PARTS, "transformer", "combined")
 """Priors that learn long sequences, as `neuroprior.fit` knows them, with their default settings."""
@@ -153,12 +153,12 @@ def quality(
                 progress.advance(f"{given.name}: {name} {of_long[-1]['bits_per_action']:.4f} bits")
     frame = pd.DataFrame(rows)
     lead = f"{num_plans:,} plans of {LENGTH} actions to learn from, {held_out:,} held out."
-    sections = [Section("Bits more than the source, %", tables=[_table(frame)])]
+    sections = [Section("Bits more than the source, %", tables=_tables(frame))]
     frames, keys = {"quality": frame}, {"quality": "rows"}
     if of_long:
         frames["sequences"] = pd.DataFrame(of_long)
         frame = frames["sequences"]
-        sections.append(Section("Bits per action of long sequences", [_price(frame)], [_table_of_long(frame)]))
+        sections.append(Section("Bits per action of long sequences", tables=[_table_of_long(frame)]))
     settings = {"num_plans": num_plans, "held_out": held_out, "num_sequences": num_sequences, "seed": seed}
     publish(Document("Sources of known entropy", lead, sections, frames, settings, keys=keys), Path(out))
 
@@ -216,7 +216,7 @@ def _price(rows: pd.DataFrame) -> str:
     seconds = rows.pivot(index="source", columns="model", values="seconds")
     ratio = seconds["combined"] / seconds[list(PARTS)].sum(axis=1)
     each = "; ".join(f"{source}: {value:.2f}" for source, value in ratio.items())
-    return f"Seconds of fitting the combined prior, divided by the sum of those of {', '.join(PARTS)}: {each}."
+    return f"Those of the combined prior divided by the sum of those of {', '.join(PARTS)}: {each}."
 
 
 def _table_of_long(rows: pd.DataFrame) -> Table:
@@ -227,27 +227,36 @@ def _table_of_long(rows: pd.DataFrame) -> Table:
     caption = (
         f"switching: a chain under {CONDITIONS} hidden conditions; {entropy:.4f} bits under the source itself. text:"
         " characters of Python's own documentation. markov: of the order that predicts a tenth of the training"
-        " sequences best. (s): seconds of fitting."
+        " sequences best. (s): seconds of fitting. {_price(rows)}"
     )
     columns: dict[str, Column] = {"prior": "model", **{f"{name} (s)": name for name in rows["source"].unique()}}
     return table(wide, columns, caption)
 
 
-def _table(rows: pd.DataFrame) -> Table:
-    """A row a source: the excess of each prior, and of all but the chain the seconds of fitting."""
-    trained = rows.assign(text=[f"{row.excess_percent:+.2f} ({row.seconds:.0f})" for row in rows.itertuples()])
-    others = [name for name in OF_SOURCES if name != MARKOV]
-    learned = trained.pivot(index="source", columns="model", values="text")[others]
-    columns: dict[str, Column] = {
+def _tables(rows: pd.DataFrame) -> list[Table]:
+    """A row a source: the excess of each prior; and of all but the chain the seconds of fitting."""
+    headings = {"transformer": "trans-\nformer", "combined, full": "combined,\nfull"}
+    learned = {headings.get(name, name): name for name in OF_SOURCES if name != MARKOV}
+    chains = rows[rows.model == MARKOV]
+
+    def wide(name: str, form: str) -> pd.DataFrame:
+        cells = rows.assign(text=[form.format(value) for value in rows[name]])
+        return chains.join(
+            cells.pivot(index="source", columns="model", values="text")[list(learned.values())], on="source"
+        )
+
+    excess: dict[str, Column] = {
         "source": "source",
-        "entropy": "entropy_rate:.4f",
         MARKOV: "excess_percent:+.3f",
         "ex-\npected": "expected_percent:+.3f",
-        **{f"{name} (s)": name for name in others},
     }
     caption = (
-        "entropy: bits per action of the source, where it depends on the past. markov: of the source's order;"
-        ' expected: free probabilities / (2 ln 2 x actions), the cost of estimating them. full: effort="full". (s):'
-        " seconds of fitting."
+        "markov: of the source's order; expected: free probabilities / (2 ln 2 x actions), the cost of estimating them."
+        ' full: effort="full".'
     )
-    return table(rows[rows.model == MARKOV].join(learned, on="source"), columns, caption)
+    times: dict[str, Column] = {"source": "source", "entropy": "entropy_rate:.4f"}
+    above = "entropy: bits per action of the source, where it depends on the past."
+    return [
+        table(wide("excess_percent", "{:+.2f}"), excess | learned, caption),
+        table(wide("seconds", "{:.0f}"), times | learned, above, "Seconds of fitting"),
+    ]

@@ -31,7 +31,8 @@ from neuroprior.report.document import printed, write_frames
 from neuroprior.report.modes import choice_table
 from neuroprior.training import Settings, make_trainer, quiet, run_training
 
-USAGE = """{0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
+USAGE = """{0} fit PLANS [--effort fast|standard|full] [--out FOLDER]
+       {0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        {0} fit --resume FOLDER"""
 CONFIG, PLANS = "run.yaml", "plans.npz"
 LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
@@ -57,8 +58,11 @@ OTHERWISE = {
 }
 """Options with which no default recipe is needed."""
 
-SHORT = dict.fromkeys(("--columns", "--missing", "--merge_repeats", "--max_gap"), "data") | {"--effort": "model.prior"}
-"""Options that need not be written with their section, as in other commands."""
+OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
+"""Options of `--data` that other commands have, too."""
+
+EFFORT, EFFORT_IN_FULL = "--effort", "--model.prior.effort"
+"""The option of the combined prior that other commands have, too."""
 
 NETWORKS_ALONE = {"devices": 1, "num_nodes": 1, "precision": "32-true", "accumulate_grad_batches": 1, "max_time": None}
 """Options of the trainer, with their defaults, that do not reach the networks inside other priors."""
@@ -297,15 +301,23 @@ def _in_full(arguments: list[str]) -> list[str]:
         if "--data.file" in given and not given & OTHERWISE:
             arguments = ["fit", "--config", OF_MODES if "--modes" in given else DEFAULT, *arguments[1:]]
     out: list[str] = []
-    for argument in arguments:
+    effort: list[str] = []  # last: the prior that it belongs to may be given after it
+    for number, argument in enumerate(arguments):
         if out and out[-1] in ("--config", "-c"):
             argument = recipe_path(argument)
         elif argument.startswith("--config="):
             argument = f"--config={recipe_path(argument.removeprefix('--config='))}"
-        elif section := next((SHORT[option] for option in SHORT if argument.startswith(option)), None):
-            argument = f"--{section}.{argument.removeprefix('--')}"
-        out.append(argument)
-    return out
+        elif argument.startswith(OF_TABLES):
+            argument = f"--data.{argument.removeprefix('--')}"
+        if number and arguments[number - 1] == EFFORT and not argument.startswith("--"):
+            effort.append(argument)
+        elif argument == EFFORT or argument.startswith(f"{EFFORT}="):
+            effort.append(argument.replace(EFFORT, EFFORT_IN_FULL, 1))
+        else:
+            out.append(argument)
+    if len(effort) == 1 and "=" not in effort[0]:
+        raise ValueError("effort: fast, standard or full is expected after --effort")
+    return out + effort
 
 
 def _with_saved_config(arguments: list[str], program: str) -> list[str]:
@@ -313,7 +325,8 @@ def _with_saved_config(arguments: list[str], program: str) -> list[str]:
     folder, others = _resumed(arguments)
     if folder is None:
         sources = ("--config", "-c", "--model", "--help", "-h", "--print_config")
-        if arguments[:1] == ["fit"] and not any(argument.startswith(sources) for argument in arguments):
+        others = [argument for argument in arguments if not argument.startswith(EFFORT_IN_FULL)]
+        if arguments[:1] == ["fit"] and not any(argument.startswith(sources) for argument in others):
             raise ValueError(
                 f"{program} fit: give a file of plans, --config and a recipe ({', '.join(recipes())}, or a file), or"
                 " --resume and the folder of a run"

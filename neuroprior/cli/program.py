@@ -142,10 +142,10 @@ def one_line(message: str, hints: Mapping[str, Any]) -> str:
         return f"{unknown[1]}: it has no option {unknown[2]!r}"
     if nested := re.search(r"NestedArg\(key='([^']*)'", line):
         return f"{nested[1]}: there is no such option ({line.partition('NestedArg')[0].strip()})"
-    if inner := re.search(
-        r"""Parser key "(\w+)": Expected a typing\.Literal\[([^]]*)\]\. Got value: (\S+?)\.? """, line + " "
-    ):
-        return f"{inner[1]}: one of {inner[2].replace(chr(39), '')} is expected, not {inner[3]}"
+    choice = r'Parser key "([\w.]+)": Expected a typing\.Literal\[([^]]*)\]\. Got value:(.*?)(?:\. Got value: |$)'
+    if inner := re.search(choice, line):
+        known, typed = inner[2].replace("'", ""), inner[3].strip()
+        return f"{inner[1]}: one of {known} is expected, not {typed or repr(typed)}"
     found = re.match(r'Parser key "([^"]+)"(?: element \d+)?: (.*)', line)
     if found is None or found[1] not in hints:
         return line

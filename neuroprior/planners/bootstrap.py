@@ -216,8 +216,8 @@ class _Bootstrap:
         saved = load(folder / f"prior-{last}")
         if type(saved) is not type(self.prior) or saved.config != self.prior.config:
             raise ValueError(f"{folder}: its prior is {saved}, not {self.prior}; give another folder")
+        self.prior.restore(saved.learned)  # first: it may make the modules that hold the state
         self.prior.load_state_dict(saved.state_dict())
-        self.prior.restore(saved.learned)
         self.plans = read_solutions(folder, last)
         self.generator.set_state(torch.tensor(kept["generator"], dtype=torch.uint8))
 

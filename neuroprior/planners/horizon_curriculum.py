@@ -66,8 +66,8 @@ def extend_horizon(
         num_rollouts: see `SamplingPlanner`.
         temperatures, uniform_shares: candidates are drawn at one of these temperatures, with one of these shares of
             uniform plans: before each round, what finds most from some starts (`best_sampling`, which also chooses
-            whether one expert of a mixture proposes alone). A prior fitted to few plans is often overconfident, and
-            finds longer plans only at a temperature above 1.
+            who proposes, see `proposers`). A prior fitted to few plans is often overconfident, and finds longer plans
+            only at a temperature above 1.
         generator: draws starts and candidates, and is passed on to the prior's `fit`.
         **settings: passed on to the prior's `fit`, such as `max_steps=300` for neural priors.
 

@@ -43,7 +43,7 @@ class Tuned(NamedTuple):
 
     Attributes:
         planner: samples in this way.
-        prior: who proposes: the prior itself, or one of its experts (`proposers`).
+        prior: who proposes: one of `proposers`.
         temperature: divides the logits of `prior`.
         uniform_share: the share of uniform plans.
         scores: of each (prior, temperature, uniform share) that was tried, the mean score of its decisions.
@@ -61,7 +61,7 @@ def proposers(prior: Steppable) -> tuple[Steppable, ...]:
 
     The mixture that predicts plans best need not be the best to search with. An expert that is unsure of what it does
     not know proposes more plans that differ. And an expert that a combined prior left out, since the others predict
-    plans of their own world better, may find better plans in other worlds: those that count may propose alone, too.
+    plans of their own world better, may find better plans in other worlds: those in its `spare` may propose alone, too.
 
     Example:
         >>> len(proposers(MarkovPrior(4, 1)))

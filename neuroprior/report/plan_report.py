@@ -75,7 +75,7 @@ def report(
         folds: of the cross-validation over groups (over plans, where there are no two groups); 5 by default.
         models: which to fit: counts (uniform, Markov chains, context trees), gru, transformer, stacked (a GRU that
             weighs the forecasts of counts), combined (of what `effort` says, which is fitted for it). By default all;
-            with little effort counts, gru and combined.
+            with effort fast counts, gru and combined.
         inputs: of the models: past actions alone; the context as well, where the plans have one; of gru, transformer
             and combined, durations: how long the last action took, beside the actions. Each in turn; durations, with
             which these take as long again, are left out by default.
@@ -112,7 +112,7 @@ def report(
         >>> list(found.figures)
         ['transitions']
     """
-    if effort not in NETWORKS:
+    if effort not in list(NETWORKS):
         raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
     models = (QUICK if effort == "fast" else MODELS) if models is None else models
     for name, given, known in (

@@ -229,6 +229,9 @@ def test_a_file_alone_is_learned_by_the_combined_prior(plans_file, tmp_path):
     prior = load(tmp_path / "run")
     assert isinstance(prior, CombinedPrior)
     assert prior.effort == "fast"
+    first = ["fit", "--effort=fast", *recipe("combined")[1:], "--data.file", plans_file]
+    assert main([*first, "--trainer.max_steps", "3", "--out", str(tmp_path / "other")]) == 0
+    assert load(tmp_path / "other").log_prob(some_plans(60)).equal(prior.log_prob(some_plans(60)))
     row = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"][-1]
     assert (row["model"], row["how"]) == ("combined", prior.summary())
     assert main(["fit", "--resume", str(tmp_path / "run")]) == 0
@@ -331,6 +334,11 @@ def test_ctrl_c_says_how_to_resume(tmp_path, capsys, monkeypatch):
             [*recipe("combined"), "--effort", "quick"],
             "error: effort: one of fast, standard, full is expected, not quick",
         ),
+        ([*recipe("combined"), "--effort", "a b"], "error: effort: one of fast, standard, full is expected, not a b\n"),
+        ([*recipe("combined"), "--effort="], "error: effort: one of fast, standard, full is expected, not ''\n"),
+        ([*recipe("combined"), "--effort", "--seed_everything", "1"], "error: effort: fast, standard or full"),
+        ([*recipe("gru"), "--missing", "foo"], "error: data.missing: one of gap, label, error is expected, not foo\n"),
+        (["fit", "--effort", "fast"], "--config"),
         (["fit", "--config", "missing.yaml"], "missing.yaml"),
         (["fit", "--resume", "missing"], "run.yaml"),
         ([*recipe("gru"), "--data.held_out", "0.95"], "held_out"),

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from neuroprior import MarkovPrior
+from neuroprior import CombinedPrior, MarkovPrior
 from neuroprior.planners import AStarPlanner, LevinPlanner, bootstrap
 from neuroprior.planners.bootstrap import read_solutions, solution_plans, solution_steps, with_symmetries
 from neuroprior.priors import LogLinearPrior
@@ -65,6 +65,16 @@ def test_an_interrupted_call_goes_on(tmp_path: Path) -> None:
     rarer = LogLinearPrior(4, len(world.windows.windows), min_count=3)
     with pytest.raises(ValueError, match="its prior is"):
         list(bootstrap(world, rarer, world.boards, folder=tmp_path, **how))
+
+
+def test_a_combined_prior_goes_on_with_what_it_learned(tmp_path: Path) -> None:
+    """Restored, it has new experts: what they learned is read after that."""
+    world = sliding_tiles(shape=(2, 2), scramble=6)
+    problems, plans = world.reset(60, seeded()), torch.randint(4, (5, 6), generator=seeded(1))
+    first, again = (CombinedPrior(4, [MarkovPrior(4, 1)]) for _ in range(2))
+    for prior in (first, again):
+        list(bootstrap(world, prior, problems, sweeps=1, generator=seeded(), folder=tmp_path))
+    assert again.log_prob(plans).equal(first.log_prob(plans))
 
 
 def test_fewer_sweeps_of_a_folder_are_those_of_a_call_with_fewer(tmp_path: Path) -> None:

@@ -127,8 +127,9 @@ def test_an_expert_proposes_alone_where_the_mixture_is_wrong():
 
 
 def test_an_expert_that_was_left_out_proposes_where_it_is_right():
-    """All plans of this world take action 1; in another world action 0 is rewarded, which an even prior tries."""
-    prior = CombinedPrior(2, [UniformPrior(2), sure_of(1)])
+    """All plans of this world take action 1; in another world action 0 is rewarded, which an even chain tries."""
+    flips = MarkovPrior(2, 0).fit(torch.tensor([[0, 1] * 2] * 500))
+    prior = CombinedPrior(2, [flips, sure_of(1)])
     prior.learn_weights(Plans(torch.ones(200, 4, dtype=torch.long), 2))
     sure, even = prior.alternatives
     assert (list(prior.experts), list(prior.spare)) == ([sure], [even])

@@ -129,9 +129,10 @@ def test_effort_decides_which_models_are_fitted_where_none_are_given(more, kinds
     assert asked["design"].effort == more.get("effort", "standard")
 
 
-def test_an_unknown_effort_is_said():
-    with refuses("effort", "one of fast, standard, full", "not 'quick'"):
-        report(chain(), effort="quick")  # type: ignore[arg-type]
+@pytest.mark.parametrize("effort", ["quick", ["fast"]])
+def test_an_unknown_effort_is_said(effort):
+    with refuses("effort", "one of fast, standard, full", f"not {effort!r}"):
+        report(chain(), effort=effort)
 
 
 @pytest.mark.parametrize("skip", [0, 3])

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
+from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles.candidates import NETWORKS, Effort, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import (
     MixturePrior,
@@ -30,6 +31,9 @@ LEAST = -30.0
 
 TOLERANCE, IN_ALL = 5e-4, 0.1
 """An expert is left out where the held-out loss rises by less than so many nats per action, or so many in all."""
+
+LARGEST_SPARE = 2**22
+"""The most numbers in the tables of an expert that was left out and is kept aside."""
 
 NUMBERS = 2**22
 """The most numbers of forecasts from which the powers of the pool are learned."""
@@ -60,7 +64,8 @@ class CombinedPrior(MixturePrior):
     1 / K, where K forecasts were tried: on every sequence whatever, the negative log-likelihood is at most log K above
     that of the best of those that are kept (Cesa-Bianchi and Lugosi 2006, section 9.2). An expert is left out where
     held-out plans are predicted as well without it. In other worlds than those of the plans it may be the better one:
-    so those that count are kept aside, in `spare`, for planners that try (`neuroprior.planners.best_sampling`).
+    so chains and context trees whose tables are small are kept aside, in `spare`, for planners that try
+    (`neuroprior.planners.best_sampling`).
 
     Args:
         num_actions: A.
@@ -140,6 +145,8 @@ class CombinedPrior(MixturePrior):
         for e, own in spare:
             e.restore(own)
         self.spare = nn.ModuleList([e for e, _ in spare]).to(self.device)
+        if self.given is not None:
+            self.given = [[*self._experts(), *self._spare()]]
         self._allocate()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -237,7 +244,7 @@ class CombinedPrior(MixturePrior):
         experts = self._experts()
         self.experts = nn.ModuleList([experts[number] for number in kept])
         left = [e for number, e in enumerate(experts) if number not in kept]
-        self.spare = nn.ModuleList([e for e in left if not any(True for _ in e.parameters())])
+        self.spare = nn.ModuleList([e for e in left if _can_be_spare(e)])
         self.share, self.tried = share, held_out.tried
         self._allocate()
         self.powers = powers.float()
@@ -246,8 +253,13 @@ class CombinedPrior(MixturePrior):
         self.first = held_out.initial_weights(taken.sum(1)).float()
 
     def recount(self, plans: Plans) -> Self:
+        counted = []
         for e in self._spare():
-            e.recount(plans)
+            try:
+                counted.append(e.recount(plans))
+            except TooLargeError:  # it fitted before only just
+                continue
+        self.spare = nn.ModuleList(counted)
         return super().recount(plans)
 
     @property
@@ -268,6 +280,13 @@ class CombinedPrior(MixturePrior):
         kept.
         """
         return -float(self.first.min())
+
+
+def _can_be_spare(expert: Prior) -> bool:
+    """Whether an expert that was left out may still propose: it counts, in a small table; uniform plans are shared."""
+    numbers = sum(values.numel() for values in expert.buffers())
+    trained = bool(expert.fit_settings) or any(True for _ in expert.parameters())
+    return not trained and numbers <= LARGEST_SPARE and not isinstance(expert, UniformPrior)
 
 
 class HeldOut:

@@ -25,7 +25,7 @@ from neuroprior import (
     save,
 )
 from neuroprior.priors import SwitchingNetwork
-from neuroprior.priors.counts import BACKOFFS_TRIED, chains
+from neuroprior.priors.counts import BACKOFFS_TRIED, TooLargeError, chains
 from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.testing import check_prior
@@ -216,9 +216,9 @@ def test_experts_that_add_nothing_are_left_out():
     prior.learn_weights(some_plans(400, seed=5))
     assert list(prior.experts) == [quick]
     assert prior.tried == 6
-    # What counts may still propose; what was trained may not.
-    assert list(prior.spare) == [even, lower]
-    assert prior.alternatives == (quick, even, lower)
+    # A chain may still propose; neither what was trained nor a uniform prior, of which plans are drawn anyway.
+    assert list(prior.spare) == [lower]
+    assert prior.alternatives == (quick, lower)
 
 
 def test_experts_that_were_left_out_are_saved_and_count_all_plans(tmp_path):
@@ -234,11 +234,31 @@ def test_experts_that_were_left_out_are_saved_and_count_all_plans(tmp_path):
     assert [type(e) for e in again.alternatives] == [MarkovPrior, MarkovPrior]
     for one, same in zip(again.alternatives, prior.alternatives, strict=True):
         assert one.log_prob(other).equal(same.log_prob(other))
+    # It tries them again when it is fitted again.
+    assert [type(e) for e in again.fit(plans, generator=seeded(0)).spare] == [MarkovPrior]
     # Files of earlier versions have none.
     learned = prior.learned
     del learned["spare"]
     again.restore(learned)
     assert len(again.spare) == 0
+
+
+@pytest.mark.parametrize("most", [10, 1000])
+def test_large_tables_are_not_kept_aside(most, monkeypatch):
+    monkeypatch.setattr("neuroprior.priors.ensembles.combined.LARGEST_SPARE", most)
+    prior = CombinedPrior(A, [MarkovPrior(A, 0), MarkovPrior(A, 1)]).fit(some_plans(200), generator=seeded(0))
+    assert len(prior.spare) == (most > 10)
+
+
+def test_an_expert_that_was_left_out_and_grows_too_large_does_not_spoil_the_fit(monkeypatch):
+    left = MarkovPrior(A, 0)
+
+    def too_large(plans):
+        raise TooLargeError("too large")
+
+    monkeypatch.setattr(left, "recount", too_large)
+    prior = CombinedPrior(A, [left, MarkovPrior(A, 1)]).fit(some_plans(200), generator=seeded(0))
+    assert (len(prior.experts), len(prior.spare)) == (1, 0)
 
 
 @pytest.mark.parametrize(
