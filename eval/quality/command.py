@@ -227,7 +227,7 @@ def _table_of_long(rows: pd.DataFrame) -> Table:
     caption = (
         f"switching: a chain under {CONDITIONS} hidden conditions; {entropy:.4f} bits under the source itself. text:"
         " characters of Python's own documentation. markov: of the order that predicts a tenth of the training"
-        " sequences best. (s): seconds of fitting. {_price(rows)}"
+        f" sequences best. (s): seconds of fitting. {_price(rows)}"
     )
     columns: dict[str, Column] = {"prior": "model", **{f"{name} (s)": name for name in rows["source"].unique()}}
     return table(wide, columns, caption)

@@ -161,6 +161,8 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
         assert (row["entropy"] or 1) < row["bits_per_action"] < math.log2(kinds)
     said = " ".join(capsys.readouterr().out.split())
     assert f"{rows[0]['bits_per_action']:.4f}" in said
+    assert "Those of the combined prior divided by" in said
+    assert SOURCES[0].name in said
 
 
 def test_the_price_of_the_combined_prior_is_that_of_its_parts():
