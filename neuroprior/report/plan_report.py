@@ -124,6 +124,8 @@ def report(
             raise ValueError(f"{name}: a list is expected, such as [{given!r}], not a text")
         if not given or set(given) - set(known):
             raise ValueError(f"{name}: some of {', '.join(known)} are expected, not {', '.join(given) or 'none'}")
+    if effort != "standard" and "combined" not in models:
+        raise ValueError("effort: for the combined prior alone; add combined to models, or leave effort out")
     _check(skip, max_steps, seed, processes)
     for number in modes or ():
         check_sizes(modes=number)
@@ -131,8 +133,10 @@ def report(
     reading: dict[str, Any] = {"num_actions": num_actions, "action_names": action_names, "columns": columns}
     reading |= {"missing": missing, "merge_repeats": merge_repeats, "max_gap": max_gap}
     if priors is not None:
-        if test is not None or folds is not None or modes is not None:
-            raise ValueError("priors: they are scored on the plans as they are; leave test, folds and modes out")
+        if test is not None or folds is not None or modes is not None or effort != "standard":
+            raise ValueError(
+                "priors: they are scored on the plans as they are; leave test, folds, modes and effort out"
+            )
         if isinstance(priors, Prior | str) or any(isinstance(one, Prior) for one in priors):
             raise ValueError("priors: a dict of fitted priors by name, or a list of folders, is expected")
         if not priors:

@@ -119,7 +119,7 @@ def test_information_by_lag_is_that_of_counts_and_of_networks_where_there_are_an
         ({}, "counts, gru, transformer, stacked, combined"),
         ({"effort": "full"}, "counts, gru, transformer, stacked, combined"),
         ({"effort": "fast"}, "counts, gru, combined"),
-        ({"effort": "fast", "models": ["stacked"]}, "stacked"),
+        ({"effort": "fast", "models": ["stacked", "combined"]}, "stacked, combined"),
     ],
 )
 def test_effort_decides_which_models_are_fitted_where_none_are_given(more, kinds, asked):
@@ -127,6 +127,12 @@ def test_effort_decides_which_models_are_fitted_where_none_are_given(more, kinds
         report(chain(), sections=["scores"], **more)
     assert asked["kinds"] == kinds
     assert asked["design"].effort == more.get("effort", "standard")
+
+
+@pytest.mark.parametrize("more", [{"models": ["gru"]}, {"priors": {"even": UniformPrior(3)}}])
+def test_effort_without_a_combined_prior_to_fit_is_said(more):
+    with refuses("effort"):
+        report(chain(), effort="full", **more)
 
 
 @pytest.mark.parametrize("effort", ["quick", ["fast"]])
