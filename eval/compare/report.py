@@ -149,8 +149,8 @@ def headlines(results: Results) -> Section:
             of = own.assign(world=labels, rounds=np.where(own["rounds"] == "0", "before", "after"))
             names = {"world": "world", "context": "context", "curriculum": "rounds"}
             tables.append(table_by(of, names, "num_plans", _gaps(own), caption))
-    for (context, after), rows in grouped(words[best].assign(after=words["rounds"] > 0), ["context", "after"]):
-        how = f"{context.replace('none', 'no')} context, {'after' if after else 'before'} the horizon curriculum"
+    for setting, rows in by_setting(words[best]):
+        how = f"{setting} the horizon curriculum"
         caption = f"Best neural minus best Markov prior with {results.shown:,} plans, {how}. Hollow: not significant."
         alt = "; ".join(f"{row['world']} {100 * row['difference']:+.1f}" for _, row in rows.iterrows())
         drawn = figures.gap_figure(rows, ("Markov better", "neural better"))
@@ -174,10 +174,15 @@ def headlines(results: Results) -> Section:
 def over_worlds(
     rows: pd.DataFrame, names: Mapping[str, Column], headings: tuple[str, str], unit: str
 ) -> Iterator[Table]:
-    """A table for each context and curriculum; see `across_table`."""
+    """An `across_table` for each context and curriculum."""
+    for setting, own in by_setting(rows):
+        yield across_table(own, names, *headings, unit, 100, f", {setting} the curriculum")
+
+
+def by_setting(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """The rows of each context and curriculum, and in words, such as "no context, before", which they are."""
     for (context, after), own in grouped(rows.assign(after=rows["rounds"] > 0), ["context", "after"]):
-        how = f", {context.replace('none', 'no')} context, {'after' if after else 'before'} the curriculum"
-        yield across_table(own, names, *headings, unit, 100, how)
+        yield f"{context.replace('none', 'no')} context, {'after' if after else 'before'}", own
 
 
 def reasons(results: Results) -> Section:

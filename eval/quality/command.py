@@ -157,8 +157,7 @@ def quality(
     frames, keys = {"quality": frame}, {"quality": "rows"}
     if of_long:
         frames["sequences"] = pd.DataFrame(of_long)
-        frame = frames["sequences"]
-        sections.append(Section("Bits per action of long sequences", tables=[_table_of_long(frame)]))
+        sections.append(Section("Bits per action of long sequences", tables=[_table_of_long(frames["sequences"])]))
     settings = {"num_plans": num_plans, "held_out": held_out, "num_sequences": num_sequences, "seed": seed}
     publish(Document("Sources of known entropy", lead, sections, frames, settings, keys=keys), Path(out))
 

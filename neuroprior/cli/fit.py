@@ -61,8 +61,8 @@ OTHERWISE = {
 OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
 """Options of `--data` that other commands have, too."""
 
-EFFORT, EFFORT_IN_FULL = "--effort", "--model.prior.effort"
-"""The option of the combined prior that other commands have, too."""
+EFFORT = "--model.prior.effort"
+"""What `--effort` stands for, an option that other commands have, too."""
 
 NETWORKS_ALONE = {"devices": 1, "num_nodes": 1, "precision": "32-true", "accumulate_grad_batches": 1, "max_time": None}
 """Options of the trainer, with their defaults, that do not reach the networks inside other priors."""
@@ -301,23 +301,20 @@ def _in_full(arguments: list[str]) -> list[str]:
         if "--data.file" in given and not given & OTHERWISE:
             arguments = ["fit", "--config", OF_MODES if "--modes" in given else DEFAULT, *arguments[1:]]
     out: list[str] = []
-    effort: list[str] = []  # last: the prior that it belongs to may be given after it
-    for number, argument in enumerate(arguments):
+    for argument in arguments:
         if out and out[-1] in ("--config", "-c"):
             argument = recipe_path(argument)
         elif argument.startswith("--config="):
             argument = f"--config={recipe_path(argument.removeprefix('--config='))}"
         elif argument.startswith(OF_TABLES):
             argument = f"--data.{argument.removeprefix('--')}"
-        if number and arguments[number - 1] == EFFORT and not argument.startswith("--"):
-            effort.append(argument)
-        elif argument == EFFORT or argument.startswith(f"{EFFORT}="):
-            effort.append(argument.replace(EFFORT, EFFORT_IN_FULL, 1))
-        else:
-            out.append(argument)
-    if len(effort) == 1 and "=" not in effort[0]:
+        out.append(argument)
+    effort, out = _taken_out("--effort", out)
+    if effort is None:
+        return out
+    if effort.startswith("--"):
         raise ValueError("effort: fast, standard or full is expected after --effort")
-    return out + effort
+    return [*out, f"{EFFORT}={effort}"]  # last: the prior that it belongs to may be given after it
 
 
 def _with_saved_config(arguments: list[str], program: str) -> list[str]:
@@ -325,8 +322,8 @@ def _with_saved_config(arguments: list[str], program: str) -> list[str]:
     folder, others = _resumed(arguments)
     if folder is None:
         sources = ("--config", "-c", "--model", "--help", "-h", "--print_config")
-        others = [argument for argument in arguments if not argument.startswith(EFFORT_IN_FULL)]
-        if arguments[:1] == ["fit"] and not any(argument.startswith(sources) for argument in others):
+        made = [one for one in arguments if one.startswith(sources) and not one.startswith(EFFORT)]
+        if arguments[:1] == ["fit"] and not made:
             raise ValueError(
                 f"{program} fit: give a file of plans, --config and a recipe ({', '.join(recipes())}, or a file), or"
                 " --resume and the folder of a run"
@@ -353,11 +350,16 @@ def _with_saved_config(arguments: list[str], program: str) -> list[str]:
 
 def _resumed(arguments: list[str]) -> tuple[str | None, list[str]]:
     """The folder after `--resume`, or None, and the other arguments of `fit`."""
+    return _taken_out("--resume", arguments[arguments.index("fit") + 1 :] if "fit" in arguments else [])
+
+
+def _taken_out(option: str, arguments: list[str]) -> tuple[str | None, list[str]]:
+    """The value of an option ("" where none follows it), or None, and the arguments without the two."""
     for number, argument in enumerate(arguments):
         name, equals, value = argument.partition("=")
-        if name == "--resume" and "fit" in arguments[:number]:
+        if name == option:
             rest = arguments[number + 1 :]
             if not equals:
                 value, rest = (rest[0] if rest else ""), rest[1:]
-            return value, [*arguments[:number], *rest][arguments.index("fit") + 1 :]
+            return value, [*arguments[:number], *rest]
     return None, arguments

@@ -398,6 +398,11 @@ def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
     return made
 
 
+def described(prior: Prior) -> dict[str, Any]:
+    """A prior as `as_prior` makes it again, without what it learned: `prior`, the name of its class, and `config`."""
+    return {"prior": type(prior).__name__, "config": prior.config}
+
+
 def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[str, int]) -> Prior:
     """A prior from its class, or a function that makes it.
 

@@ -14,7 +14,7 @@ from neuroprior._threads import one_thread
 from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
-from neuroprior.priors.ensembles.candidates import NETWORKS, Effort
+from neuroprior.priors.ensembles.candidates import Effort, check_effort
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.priors.scoring import learned_from
 from neuroprior.report.document import Document, write_document
@@ -112,8 +112,7 @@ def report(
         >>> list(found.figures)
         ['transitions']
     """
-    if effort not in list(NETWORKS):
-        raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
+    check_effort(effort)
     models = (QUICK if effort == "fast" else MODELS) if models is None else models
     for name, given, known in (
         ("models", models, MODELS),

@@ -12,7 +12,7 @@ from neuroprior.plans import Plans
 from neuroprior.priors.counts import MarkovPrior
 from neuroprior.priors.durations.duration_model import DurationModel
 from neuroprior.priors.durations.laws import LAW_NAMES, LawName
-from neuroprior.priors.prior import Prior, as_prior, construct
+from neuroprior.priors.prior import Prior, as_prior, construct, described
 
 
 class SemiMarkovPrior(Prior):
@@ -67,9 +67,8 @@ class SemiMarkovPrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        actions = {"prior": type(self.actions).__name__, "config": self.actions.config}
         own = {"laws": list(self.durations.laws), "transitions": self.durations.transitions}
-        return {"num_actions": self.num_actions, "actions": actions} | own
+        return {"num_actions": self.num_actions, "actions": described(self.actions)} | own
 
     @property
     def learned(self) -> dict[str, Any]:

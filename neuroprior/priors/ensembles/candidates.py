@@ -34,6 +34,12 @@ DEPTH = 10
 """Depth of the context trees among experts and baselines."""
 
 
+def check_effort(effort: object) -> None:
+    """Raise ValueError for what is no `Effort`."""
+    if effort not in list(NETWORKS):
+        raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
+
+
 def fitted_experts(
     learned: Plans,
     held_out: Plans,

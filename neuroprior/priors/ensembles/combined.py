@@ -10,20 +10,20 @@ from torch import Tensor, nn
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts import TooLargeError
-from neuroprior.priors.ensembles.candidates import NETWORKS, Effort, fitted_experts, number_tried
+from neuroprior.priors.ensembles.candidates import Effort, check_effort, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import (
     MixturePrior,
     after,
     divided,
     learned_weights,
     mixed,
-    saved_expert,
+    priors_in,
     weights_before,
 )
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.neural.neural import training_settings
-from neuroprior.priors.prior import Prior, as_prior, taken_of
+from neuroprior.priors.prior import Prior, as_prior, described, taken_of
 from neuroprior.priors.uniform import UniformPrior
 
 LEAST = -30.0
@@ -103,8 +103,7 @@ class CombinedPrior(MixturePrior):
         num_contexts: int | None = None,
         context_size: int | None = None,
     ) -> None:
-        if effort not in list(NETWORKS):
-            raise ValueError(f"effort: one of {', '.join(NETWORKS)} is expected, not {effort!r}")
+        check_effort(effort)
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
         self.effort: Effort = effort
@@ -129,7 +128,7 @@ class CombinedPrior(MixturePrior):
     @property
     def learned(self) -> dict[str, Any]:
         own = {"tried": self.tried, "given": self.given is not None, "kept": self.config["experts"]}
-        return super().learned | own | {"spare": [saved_expert(e) | {"learned": e.learned} for e in self._spare()]}
+        return super().learned | own | {"spare": [described(e) | {"learned": e.learned} for e in priors_in(self.spare)]}
 
     def restore(self, learned: dict[str, Any]) -> None:
         if "kept" in learned:
@@ -146,7 +145,7 @@ class CombinedPrior(MixturePrior):
             e.restore(own)
         self.spare = nn.ModuleList([e for e, _ in spare]).to(self.device)
         if self.given is not None:
-            self.given = [[*self._experts(), *self._spare()]]
+            self.given = [[*self.alternatives]]
         self._allocate()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -254,7 +253,7 @@ class CombinedPrior(MixturePrior):
 
     def recount(self, plans: Plans) -> Self:
         counted = []
-        for e in self._spare():
+        for e in priors_in(self.spare):
             try:
                 counted.append(e.recount(plans))
             except TooLargeError:  # it fitted before only just
@@ -264,10 +263,7 @@ class CombinedPrior(MixturePrior):
 
     @property
     def alternatives(self) -> tuple[Prior, ...]:
-        return (*super().alternatives, *self._spare())
-
-    def _spare(self) -> list[Prior]:
-        return [e for e in self.spare if isinstance(e, Prior)]
+        return (*super().alternatives, *priors_in(self.spare))
 
     def summary(self) -> str:
         """What is combined, such as "0.3 markov + 0.8 gru": the powers of the experts in the pool."""

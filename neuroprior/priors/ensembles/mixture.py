@@ -12,7 +12,7 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
-from neuroprior.priors.prior import Prior, as_prior, taken_of
+from neuroprior.priors.prior import Prior, as_prior, described, taken_of
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates for the share; `fit` takes the best."""
@@ -82,7 +82,7 @@ class MixturePrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        return super().config | {"experts": [saved_expert(e) for e in self._experts()]}
+        return super().config | {"experts": [described(e) for e in self._experts()]}
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -167,7 +167,7 @@ class MixturePrior(Prior):
         return tuple(self._experts())
 
     def _experts(self) -> list[Prior]:
-        return [e for e in self.experts if isinstance(e, Prior)]
+        return priors_in(self.experts)
 
     def _forecasts(self, plans: Tensor, context: Tensor | None) -> Tensor:
         """`[N, L, E, A]`: the log-probabilities of each expert."""
@@ -178,9 +178,9 @@ class MixturePrior(Prior):
         return mixed(weights, forecasts), pack([weights, forecasts, *(state for _, state in found)])
 
 
-def saved_expert(expert: Prior) -> dict[str, Any]:
-    """The name of an expert's class, and its arguments, as a saved `config` has them."""
-    return {"prior": type(expert).__name__, "config": expert.config}
+def priors_in(modules: nn.ModuleList) -> list[Prior]:
+    """The modules of a list, all of which are priors."""
+    return [one for one in modules if isinstance(one, Prior)]
 
 
 def after(weights: Tensor, taken: Tensor, first: Tensor, share: float) -> Tensor:

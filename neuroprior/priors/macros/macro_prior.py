@@ -11,7 +11,7 @@ from neuroprior._hashing import row_hashes
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.macros.macros import CRITERIA, Criterion, Macro, macros_of
-from neuroprior.priors.prior import Prior, as_prior
+from neuroprior.priors.prior import Prior, as_prior, described
 
 
 class MacroPrior(Prior):
@@ -78,8 +78,7 @@ class MacroPrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        inner = self._inner()
-        return super().config | {"inner": {"prior": type(inner).__name__, "config": inner.config}, "by": self.by}
+        return super().config | {"inner": described(self._inner()), "by": self.by}
 
     @property
     def learned(self) -> dict[str, Any]:

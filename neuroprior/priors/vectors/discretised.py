@@ -10,7 +10,7 @@ from neuroprior._checks import check_sizes
 from neuroprior.plans import Plans
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.counts import MarkovPrior
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, described
 from neuroprior.priors.saved import SavedModule
 from neuroprior.priors.vectors.vector_prior import VectorPrior
 
@@ -71,8 +71,7 @@ class DiscretisedPrior(VectorPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        tokens = {"prior": type(self.tokens).__name__, "config": self.tokens.config}
-        return super().config | {"num_bins": self.num_bins, "tokens": tokens}
+        return super().config | {"num_bins": self.num_bins, "tokens": described(self.tokens)}
 
     @property
     def learned(self) -> dict[str, Any]:

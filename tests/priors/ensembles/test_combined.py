@@ -222,7 +222,7 @@ def test_experts_that_add_nothing_are_left_out():
 
 
 def test_experts_that_were_left_out_are_saved_and_count_all_plans(tmp_path):
-    """A chain of order 0, and one of order 2 in a source of order 1: the latter learns from the held-out plans, too."""
+    """Of chains of order 0 and 1, in a source of order 1, the first is left out; it counts the held-out plans, too."""
     plans, other = some_plans(200), some_plans(200, seed=7)
     chains = [MarkovPrior(A, 0), MarkovPrior(A, 1)]
     prior = CombinedPrior(A, chains).fit(plans, generator=seeded(0))
