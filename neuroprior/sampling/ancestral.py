@@ -1,6 +1,6 @@
 """Sampling plans from any prior: one by one, by prefix tree, or together with a world."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from neuroprior._threads import share
 from neuroprior.plans import is_per_step
 from neuroprior.plans.plans import action_dtype
 from neuroprior.sampling.draws import Draw, check_temperature, levels_worth_splitting, shuffled_rows, worth_splitting
+from neuroprior.sampling.prefixes import Prefixes
 from neuroprior.sampling.rows import rows_of
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import Rollout, World, join_states
@@ -172,19 +173,22 @@ def sample_in_world(
 
     def draw_part(number: int) -> None:
         some = row[parts[number]]
-        (here,), own = _taken(some, now), [_taken(some, *column) for column in begun]
-        after, memory = _taken(some, logits, hidden) if steps else (logits, hidden)
+        own = [_taken(some, *column) for column in begun]
+        plans, here, after, memory = _begun(some, draw, uniform is not None, now, logits, hidden)
         for k in range(len(steps)):
             given = None if uniform is None else uniform[k, parts[number]]
-            action = draw.actions(legal_logits(world, here, after), given)
-            here, reward = world.step(here, action, generator)
-            for column, values in zip(own, (action.to(draw.dtype), reward, here), strict=True):
-                column.append(values)
-            if not keep_states:
-                own[2].clear()
+            action = draw.actions(legal_logits(world, here, after), given, plans.row)
+            parent, last = plans.extend(action)
+            if parent is not None:
+                here, memory = _taken(parent, here, memory)
+            here, reward = world.step(here, last, generator)
+            own[0].append(action.to(draw.dtype))
+            own[1].append(plans.of_each(reward))
+            if keep_states:
+                own[2].append(plans.of_each(here))
             if k + 1 < len(steps):
-                after, memory = stepper.step_in(world, action, memory, here, len(steps) - k - 2)
-        ends[number] = here, own
+                after, memory = stepper.step_in(world, last, memory, here, len(steps) - k - 2)
+        ends[number] = plans.of_each(here), own
 
     share(draw_part, range(len(parts)))
     final = torch.cat([ends[number][0] for number in range(len(parts))])
@@ -214,6 +218,15 @@ def _parts(number: int, logits: Tensor, state: Tensor, shares: bool) -> list[sli
 def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
     """The rows `row` of each tensor."""
     return [rows_of(tensor, row) for tensor in tensors]
+
+
+def _begun(row: Tensor, draw: Draw, shared: bool, *tensors: Tensor) -> tuple[Any, ...]:
+    """Plans that go on from rows `row [N]` of the tensors, and of these the rows from the first to the last."""
+    if len(row) == 0:
+        return Prefixes(row, 0, draw.num_actions), *(tensor[:0] for tensor in tensors)
+    first, last = int(row.min()), int(row.max())
+    plans = Prefixes(row - first, last - first + 1, draw.num_actions, shared)
+    return plans, *(tensor[first : last + 1] for tensor in tensors)
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
@@ -297,13 +310,16 @@ def _sample_one_by_one(
     uniform = draw.uniform((len(steps), len(row)), logits)
 
     def draw_part(part: slice) -> None:
-        now, hidden = _taken(row[part], logits, state)
+        plans, now, hidden = _begun(row[part], draw, context is None, logits, state)
         for k, t in enumerate(steps):
-            action = draw.actions(now, uniform[k, part])
+            action = draw.actions(now, uniform[k, part], plans.row)
             actions[part, k] = action
             if k + 1 < len(steps):
+                parent, last = plans.extend(action)
+                if parent is not None:
+                    hidden = rows_of(hidden, parent)
                 given = None if context is None else context[row[part], t + 1]
-                now, hidden = stepper.step(action, hidden, given, len(steps) - k - 2)
+                now, hidden = stepper.step(last, hidden, given, len(steps) - k - 2)
 
     parts = _parts(len(row), logits, state, stepper.shares)
     if stepper.shares:

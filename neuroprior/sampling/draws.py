@@ -35,21 +35,23 @@ class Draw:
         """Uniform numbers in [0, 1) to draw actions with, of the dtype of their `logits`."""
         return torch.rand(shape, generator=self.generator, device=logits.device, dtype=logits.dtype)
 
-    def actions(self, logits: Tensor, uniform: Tensor | None = None) -> Tensor:
-        """One action for each row of `logits [N, A]`: int64 `[N]`; never one of probability 0.
+    def actions(self, logits: Tensor, uniform: Tensor | None = None, row: Tensor | None = None) -> Tensor:
+        """One action for each plan: int64 `[N]`; never one of probability 0.
 
         Args:
-            logits: `[N, A]`.
+            logits: `[K, A]`.
             uniform: `[N]`: what to draw with; None: new uniform numbers.
+            row: integers `[N]`: which of the K logits each plan has; None: plan i has those of row i.
         """
         if uniform is None:
-            uniform = self.uniform((len(logits),), logits)
+            uniform = self.uniform((len(logits if row is None else row),), logits)
         # Actions first: with few actions and many rows each operation is several times as fast this way round.
         cumulative = self._weights(logits.T.contiguous(), 0).cumsum(0)
-        total = cumulative[-1]
-        action = (cumulative <= uniform * total).sum(0)
         # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
-        return torch.minimum(action, (cumulative < total).sum(0))
+        most = (cumulative < cumulative[-1]).sum(0)
+        if row is not None:
+            cumulative, most = cumulative.index_select(1, row), most.index_select(0, row)
+        return torch.minimum((cumulative <= uniform * cumulative[-1]).sum(0), most)
 
     def _weights(self, logits: Tensor, dim: int) -> Tensor:
         """Unnormalised probabilities along `dim`."""

@@ -334,6 +334,19 @@ def test_in_world(per, legal):
         assert fits(plans[i, :10_000], probs, A)  # in random order, though they grew on one tree
 
 
+def test_in_world_few_plans_from_each_of_many_starts_fit_the_distribution():
+    """So few that they are drawn one by one, and begin alike often."""
+    world, generator = random_world(3), seeded(1)
+    weights = torch.tensor([8.0, 1.0, 0.5])[:A]
+    prior = MarkovPrior(A, 1).fit(Plans(torch.multinomial(weights, 4_000, True, generator=generator).view(1_000, 4), A))
+    starts = torch.full((3_000,), 4)
+    plans, rollout = sample_in_world(prior, world, starts, 16, 3, generator=generator)
+    want = world.rollout(starts, plans)
+    assert torch.equal(rollout.final_state, want.final_state)
+    assert torch.equal(rollout.rewards, want.rewards)
+    assert fits(plans.flatten(0, 1), in_world_distribution(prior, world, 4, 3), A)
+
+
 class CountingSteps(TabularWorld):
     """Counts the steps that are taken in it."""
 
@@ -345,9 +358,9 @@ class CountingSteps(TabularWorld):
 
 
 @pytest.mark.parametrize("stochastic", [False, True])
-@pytest.mark.parametrize(("num_plans", "steps"), [(20_000, 2 * (3 + 9 + 27)), (17, 2 * (3 + 17 + 17))])
-def test_in_world_plans_that_share_a_prefix_are_stepped_once(stochastic, num_plans, steps):
-    """With few plans only the first step is shared; in a stochastic world, none is."""
+@pytest.mark.parametrize("num_plans", [20_000, 17])
+def test_in_world_plans_that_share_a_prefix_are_stepped_once(stochastic, num_plans):
+    """As long as at most half as many prefixes as plans are distinct; in a stochastic world, each plan by itself."""
     known = random_world(3)
     world = CountingSteps(known.next_state, known.reward)
     world.stochastic = stochastic
@@ -355,7 +368,9 @@ def test_in_world_plans_that_share_a_prefix_are_stepped_once(stochastic, num_pla
     plans, rollout = sample_in_world(
         UniformPrior(A), world, states, num_plans, 3, generator=seeded(0), keep_states=True
     )
-    assert world.taken == (2 * num_plans * 3 if stochastic else steps)
+    distinct = [sum(len(own.unique(dim=0)) for own in plans[:, :, :length]) for length in (1, 2, 3)]
+    shared = sum(number if number <= num_plans else 2 * num_plans for number in distinct)
+    assert world.taken == (2 * num_plans * 3 if stochastic else shared)
     want = known.rollout(states, plans, keep_states=True)
     for found, wanted in zip(rollout, want, strict=True):
         assert torch.equal(found, wanted)
