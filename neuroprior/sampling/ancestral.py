@@ -1,6 +1,6 @@
 """Sampling plans from any prior: one by one, by prefix tree, or together with a world."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -39,7 +39,8 @@ def sample(
 
     Plans that share a prefix share its evaluation: the number of plans is split multinomially over the distinct
     prefixes of each length ("tree"), which gives the same distribution as drawing each plan by itself ("ancestral").
-    "auto" splits as long as there are far fewer prefixes than plans, and draws plan by plan from there on.
+    "auto" splits as long as there are far fewer prefixes than plans, and draws plan by plan from there on; plans that
+    still begin alike are stepped once.
 
     Args:
         prior: any prior.
@@ -174,7 +175,7 @@ def sample_in_world(
     def draw_part(number: int) -> None:
         some = row[parts[number]]
         own = [_taken(some, *column) for column in begun]
-        plans, here, after, memory = _begun(some, draw, uniform is not None, now, logits, hidden)
+        plans, (here, after, memory) = _begun(some, draw, uniform is not None, now, logits, hidden)
         for k in range(len(steps)):
             given = None if uniform is None else uniform[k, parts[number]]
             action = draw.actions(legal_logits(world, here, after), given, plans.row)
@@ -220,13 +221,11 @@ def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
     return [rows_of(tensor, row) for tensor in tensors]
 
 
-def _begun(row: Tensor, draw: Draw, shared: bool, *tensors: Tensor) -> tuple[Any, ...]:
+def _begun(row: Tensor, draw: Draw, shared: bool, *tensors: Tensor) -> tuple[Prefixes, list[Tensor]]:
     """Plans that go on from rows `row [N]` of the tensors, and of these the rows from the first to the last."""
-    if len(row) == 0:
-        return Prefixes(row, 0, draw.num_actions), *(tensor[:0] for tensor in tensors)
-    first, last = int(row.min()), int(row.max())
-    plans = Prefixes(row - first, last - first + 1, draw.num_actions, shared)
-    return plans, *(tensor[first : last + 1] for tensor in tensors)
+    first, behind = (int(row.min()), int(row.max()) + 1) if len(row) else (0, 0)
+    plans = Prefixes(row - first, behind - first, draw.num_actions, shared)
+    return plans, [tensor[first:behind] for tensor in tensors]
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
@@ -310,7 +309,7 @@ def _sample_one_by_one(
     uniform = draw.uniform((len(steps), len(row)), logits)
 
     def draw_part(part: slice) -> None:
-        plans, now, hidden = _begun(row[part], draw, context is None, logits, state)
+        plans, (now, hidden) = _begun(row[part], draw, context is None, logits, state)
         for k, t in enumerate(steps):
             action = draw.actions(now, uniform[k, part], plans.row)
             actions[part, k] = action

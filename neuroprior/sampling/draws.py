@@ -77,7 +77,8 @@ class Draw:
 def worth_splitting(children: int, total: int) -> bool:
     """Whether splitting `total` plans is cheaper than drawing them one by one.
 
-    A split costs one evaluation of the prior per child; drawing one by one costs one per plan, and no shuffling.
+    A split costs one evaluation of the prior per child; drawing one by one costs at most one per plan, and no
+    shuffling.
     """
     return 8 * children <= total
 

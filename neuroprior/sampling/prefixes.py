@@ -18,7 +18,7 @@ class Prefixes:
         shared: False: each plan gets a prefix of its own at the first action.
 
     Attributes:
-        row: see above; None: plan i has prefix i.
+        row: `[N]`, which of the present prefixes each plan has; None: plan i has prefix i.
     """
 
     def __init__(self, row: Tensor, num_prefixes: int, num_actions: int, shared: bool = True) -> None:
