@@ -84,42 +84,43 @@ def _read(given: Array, states: Array, own: Array, own_bias: Array, out: Array) 
 
 def draw_recurrent(prior: Any, least_std: float, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
     """As `VectorNetwork.draw`, for a `VectorGRU` of float32 on the CPU; `least_std` in units of half the range."""
-    layers = prior.gru.all_weights
-    hidden = state[:, : state.shape[1] - prior.input_size].reshape(len(state), len(layers), prior.width).clone()
-    inputs = state[:, state.shape[1] - prior.input_size :].clone()
+    # numpy throughout: for these sizes a call of torch takes longer than what it computes.
+    layers = [[each.detach().numpy() for each in layer] for layer in prior.gru.all_weights]
+    inputs_weight, inputs_bias, head, head_bias, direct = (
+        each.detach().numpy()
+        for each in (prior.inputs.weight, prior.inputs.bias, prior.head.weight, prior.head.bias, prior.linear.weight)
+    )
+    bounds = np.stack([each.numpy() for each in (prior.middle, prior.half_range, prior.action_low, prior.action_high)])
+    numbers, start = state.numpy(), state.shape[1] - prior.input_size
+    hidden = np.array(numbers[:, :start], order="C").reshape(len(state), len(layers), prior.width)
+    inputs = np.array(numbers[:, start:], order="C")
     # What the first layer is given is linear in the inputs: two matrices in one.
-    given = (layers[0][0] @ prior.inputs.weight).T
-    given_bias = layers[0][0] @ prior.inputs.bias + layers[0][2]
+    given = inputs_weight.T @ layers[0][0].T
+    given_bias = layers[0][0] @ inputs_bias + layers[0][2]
     # Gates of higher layers are given what the layer below has found; the first layer's place is not read.
-    above, own, above_bias, own_bias = (
-        np.array([layer[i].detach().numpy().T for layer in layers], order="C") for i in range(4)
-    )
+    above, own, above_bias, own_bias = (np.array([layer[i].T for layer in layers], order="C") for i in range(4))
     size = prior.action_size
-    coupling = noise.new_zeros(size, size)
+    coupling = np.zeros((size, size), np.float32)
     if prior.coupling is not None:
-        coupling = prior.coupling.tril(-1) * (prior._half[:, None] / prior._half)
+        coupling = np.tril(prior.coupling.detach().numpy(), -1) * (bounds[1][:, None] / bounds[1])
     vectors = noise.new_empty(noise.shape)
-    first, first_bias, head, head_bias, direct, coupled = (
-        np.ascontiguousarray(each.detach().numpy())
-        for each in (given, given_bias, prior.head.weight, prior.head.bias, prior.linear.weight, coupling)
-    )
     _recurrent(
         vectors.numpy(),
-        hidden.numpy(),
-        inputs.numpy(),
+        hidden,
+        inputs,
         uniform.numpy(),
         noise.numpy(),
         above,
         above_bias,
         own,
         own_bias,
-        first,
-        first_bias,
+        given,
+        given_bias,
         head,
         head_bias,
         direct,
-        coupled,
-        np.stack([each.numpy() for each in (prior._centre, prior._half, prior.action_low, prior.action_high)]),
+        coupling,
+        bounds,
         prior.num_components,
         prior.entry_size * prior.lags,
         np.float32(least_std),

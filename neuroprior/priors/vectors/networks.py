@@ -75,8 +75,6 @@ class VectorNetwork(VectorPrior):
 
     _mean: Tensor
     _std: Tensor
-    _half: Tensor
-    _centre: Tensor
 
     def __init__(
         self,
@@ -105,8 +103,6 @@ class VectorNetwork(VectorPrior):
         check_memory(4 * width * self.input_size, width=width, lags=lags)
         self.register_buffer("_mean", torch.zeros(features))
         self.register_buffer("_std", torch.ones(features))
-        self.register_buffer("_half", (self.action_high - self.action_low) / 2, persistent=False)
-        self.register_buffer("_centre", (self.action_high + self.action_low) / 2, persistent=False)
         self.coupling = nn.Parameter(torch.zeros(size, size)) if coupled else None
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -157,7 +153,7 @@ class VectorNetwork(VectorPrior):
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         none = torch.zeros(batch_size, 1, self.lags * self.entry_size, device=self.device)
         features = self._features(context)
-        return self._after(none if features is None else torch.cat([none, features[:, None]], -1), None)
+        return self._after(none if features is None else torch.cat([none, features[:, None]], -1))
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         size, last = self.lags * self.entry_size, state.shape[1] - self.input_size
@@ -167,6 +163,10 @@ class VectorNetwork(VectorPrior):
         return self._after(torch.cat([kept, self._entries(action), features], 1)[:, None], state[:, :last])
 
     def read(self, past: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
+        return self._after(self._inputs(past, context))
+
+    def _inputs(self, past: Tensor, context: Tensor | None) -> Tensor:
+        """The inputs `[N, T, E]` that `past` and `context` are read as."""
         # A past as long as `memory` may be the end of a longer one, and is read as such.
         whole = self.memory is None or past.shape[1] < self.memory
         entries = self._entries(past if whole else past[:, past.shape[1] - (self.memory or 0) :])
@@ -174,35 +174,38 @@ class VectorNetwork(VectorPrior):
             entries = functional.pad(entries, (0, 0, 1, 0))
         if context is not None and context.dim() == 3:
             context = context[:, context.shape[1] - entries.shape[1] :]
-        return self._after(self._lagged(entries, None, context), None)
+        return self._lagged(entries, None, context)
 
     def continuations(
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
-        forecast, state = self.read(past, context)
-        state = state.repeat_interleave(num_plans, 0)
+        inputs = self._inputs(past, context)
+        out, hidden = self.encode(self.drop(self.inputs(inputs)), None)
+        state = torch.cat([hidden, inputs[:, -1]], 1).repeat_interleave(num_plans, 0)
         # All random numbers at once, so that compiled loops draw the same.
         uniform = torch.rand(len(state), length, generator=generator, device=self.device)
         noise = torch.randn(len(state), length, self.action_size, generator=generator, device=self.device)
-        return self.draw(forecast, state, uniform, noise).view(len(past), num_plans, length, self.action_size)
+        plans = self.draw(out[:, -1], state, uniform, noise)
+        return plans.view(len(past), num_plans, length, self.action_size)
 
-    def draw(self, forecast: GaussianForecast, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+    def draw(self, out: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
         """The next vectors `[N, L, D]` that random numbers make; see `GaussianForecast.drawn`.
 
         Args:
-            forecast: of M rows, each for N / M successive rows of the state.
-            state: `[N, ...]`, as `step` returned it.
+            out: `[M, width]`, what the first forecast is made of, each row for N / M successive rows of the state.
+            state: `[N, ...]`, as `step` returns it.
             uniform: `[N, L]`, uniform from 0 to 1.
             noise: `[N, L, D]`, standard normal.
         """
-        forecast = forecast.repeat_interleave(len(state) // max(len(forecast.mean), 1))
+        each = max(len(state) // max(len(out), 1), 1)
+        forecast = self._forecast(out, state[::each, state.shape[1] - self.input_size :]).repeat_interleave(each)
         vectors = [forecast.drawn(uniform[:, 0], noise[:, 0])]
         for t in range(1, noise.shape[1]):
             forecast, state = self.step(vectors[-1], state)
             vectors.append(forecast.drawn(uniform[:, t], noise[:, t]))
         return torch.stack(vectors, 1)
 
-    def _after(self, inputs: Tensor, hidden: Tensor | None) -> tuple[GaussianForecast, Tensor]:
+    def _after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""
         out, hidden = self.encode(self.drop(self.inputs(inputs)), hidden)
         last = inputs[:, -1]
@@ -221,7 +224,7 @@ class VectorNetwork(VectorPrior):
         """
         first = torch.zeros_like(actions[:, :1, :1]).expand(-1, -1, self.entry_size)
         if previous is not None:
-            first = self._entries(previous)[:, None]
+            first = torch.where(previous[:, :1].isnan(), 0, self._entries(previous))[:, None]
         entries = torch.cat([first, self._entries(actions[:, :-1])], 1)
         inputs = self._lagged(entries, state, context)
         out, hidden = self.encode(
@@ -248,23 +251,18 @@ class VectorNetwork(VectorPrior):
         return None if context is None else (context - self._mean) / self._std
 
     def _entries(self, actions: Tensor) -> Tensor:
-        """`[..., D + 1]`: vectors scaled to -1..1, and a 1; only zeros for a vector of NaN, which stands for none."""
-        scaled = (actions - self._centre) / self._half
-        entries = functional.pad(scaled, (0, 1), value=1.0)
-        return torch.where(actions[..., :1].isnan(), 0, entries)
+        """`[..., D + 1]`: vectors scaled to -1..1, and a 1; only zeros stand for no vector."""
+        return functional.pad((actions - self.middle) / self.half_range, (0, 1), value=1.0)
 
     def _lagged(self, entries: Tensor, state: Tensor | None, context: Tensor | None) -> Tensor:
         """The inputs `[N, T, E]`: the last `lags` of `entries [N, T, D + 1]` and the features before each vector."""
-        size, before = self.lags * self.entry_size, entries.new_zeros(len(entries), self.lags - 1, self.entry_size)
-        if state is not None:
-            last = state.shape[1] - self.input_size
-            before = (
-                state[:, last + self.entry_size : last + size].unflatten(1, (-1, self.entry_size))
-                if self.lags > 1
-                else before
-            )
-        inputs = torch.cat([before, entries], 1).unfold(1, self.lags, 1).transpose(2, 3).flatten(2)
-        features = self._features(context)
+        inputs, features = entries, self._features(context)
+        if self.lags > 1:
+            before = entries.new_zeros(len(entries), self.lags - 1, self.entry_size)
+            if state is not None:
+                last = state.shape[1] - self.input_size
+                before = state[:, last + self.entry_size : last + self.lags * self.entry_size].reshape(before.shape)
+            inputs = torch.cat([before, entries], 1).unfold(1, self.lags, 1).transpose(2, 3).flatten(2)
         if features is None:
             return inputs
         if features.dim() == 2:
@@ -281,8 +279,8 @@ class VectorNetwork(VectorPrior):
     def _forecast(self, out: Tensor, inputs: Tensor) -> GaussianForecast:
         """The mixture for rows of the network's output `[M, width]` and input `[M, E]`."""
         weights, means, stds = self._parts(self.head(self.drop(out)))
-        half = self._half
-        mean = self._centre + half * (means + self.linear(inputs)[:, None])
+        half = self.half_range
+        mean = self.middle + half * (means + self.linear(inputs)[:, None])
         std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
         coupling = None if self.coupling is None else self.coupling.tril(-1) * (half[:, None] / half)
         return GaussianForecast(mean, std, self.action_low, self.action_high, weights, coupling)
@@ -380,10 +378,10 @@ class VectorGRU(VectorNetwork):
         able = not self.training and values.device.type == "cpu" and values.dtype == torch.float32
         return compiled("neuroprior.priors.vectors.compiled_sampling") if able else None
 
-    def draw(self, forecast: GaussianForecast, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+    def draw(self, out: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
         fast = self._fast(state)
         if fast is None:
-            return super().draw(forecast, state, uniform, noise)
+            return super().draw(out, state, uniform, noise)
         plans: Tensor = fast.draw_recurrent(self, 2 * LEAST_STD, state, uniform, noise)
         return plans
 

@@ -155,6 +155,18 @@ class VectorPrior(SavedModule):
     memory: int | None = None
     """How many of the last vectors predictions depend on, at most; None if on all."""
 
+    action_low: Tensor
+    """`[D]`, the lower bounds."""
+
+    action_high: Tensor
+    """`[D]`, the upper bounds."""
+
+    middle: Tensor
+    """`[D]`, the middle of the range."""
+
+    half_range: Tensor
+    """`[D]`, half the range: the unit of standard deviations."""
+
     def __init__(self, action_low: Any, action_high: Any, context_size: int | None = None) -> None:
         super().__init__()
         low, high = as_floats("action_low", action_low).clone(), as_floats("action_high", action_high).clone()
@@ -168,35 +180,15 @@ class VectorPrior(SavedModule):
         if context_size is not None:
             check_sizes(context_size=context_size)
         self.context_size = context_size
-        self.register_buffer("_low", low, persistent=False)
-        self.register_buffer("_high", high, persistent=False)
-
-    @property
-    def action_low(self) -> Tensor:
-        """`[D]`, the lower bounds."""
-        assert isinstance(self._low, Tensor)
-        return self._low
-
-    @property
-    def action_high(self) -> Tensor:
-        """`[D]`, the upper bounds."""
-        assert isinstance(self._high, Tensor)
-        return self._high
+        self.register_buffer("action_low", low, persistent=False)
+        self.register_buffer("action_high", high, persistent=False)
+        self.register_buffer("middle", (low + high) / 2, persistent=False)
+        self.register_buffer("half_range", (high - low) / 2, persistent=False)
 
     @property
     def action_size(self) -> int:
         """D."""
         return len(self.action_low)
-
-    @property
-    def middle(self) -> Tensor:
-        """`[D]`, the middle of the range."""
-        return (self.action_low + self.action_high) / 2
-
-    @property
-    def half_range(self) -> Tensor:
-        """`[D]`, half the range: the unit of standard deviations."""
-        return (self.action_high - self.action_low) / 2
 
     def scaled(self, vectors: Tensor) -> Tensor:
         """`vectors [..., D]` in units of half the range, from its middle: -1 and 1 at the bounds, and there alone.
@@ -313,8 +305,8 @@ class VectorPrior(SavedModule):
         batch = len(context) if context is not None and context.dim() else 1
         past = torch.zeros(batch, 0, self.action_size) if past is None else as_floats("past", past)
         past = past.to(self.device)
-        if past.dim() != 3 or past.shape[2] != self.action_size or not bool(past.isfinite().all()):
-            raise ValueError(f"past: finite vectors [B, T, {self.action_size}] are expected, not {list(past.shape)}")
+        if past.dim() != 3 or past.shape[2] != self.action_size:
+            raise ValueError(f"past: vectors [B, T, {self.action_size}] are expected, not {list(past.shape)}")
         check_vectors("past", past, self.action_low, self.action_high)
         self.check_context(context, len(past))
         if context is not None and context.dim() == 3 and context.shape[1] != past.shape[1] + 1:
