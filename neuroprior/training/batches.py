@@ -16,8 +16,10 @@ from neuroprior.training.settings import Settings
 MOST_DISTINCT = 1024
 """Distinct plans that one training step takes together, each weighted by its number."""
 
-MOST_VALIDATION = 2**16
-"""About so many actions are scored in each validation."""
+ENOUGH_VALIDATION, ENOUGH_PLANS, MOST_VALIDATION = 2**14, 256, 2**16
+"""Each validation scores plans with about so many actions in all, if there are so many plans among them; else more
+plans, with about `MOST_VALIDATION` actions at most.
+"""
 
 LEAST_WINDOWS = 8
 """Windows through which the hidden state is carried in training, for plans as long; twice as many in validation."""
@@ -70,7 +72,7 @@ class PlansModule(lightning.LightningDataModule):
 
     Args:
         training: plans to learn from.
-        validation: plans for early stopping; of more than `MOST_VALIDATION` actions some plans are drawn.
+        validation: plans for early stopping; of many, some are drawn (`ENOUGH_VALIDATION`).
         settings: size of batches and windows, and how often to validate.
         seed: draws the order.
 
@@ -197,14 +199,15 @@ class Walk(Sampler[Step]):
 
 
 def _some(plans: Sequences, seed: int) -> Sequences:
-    """Plans drawn at random, with about `MOST_VALIDATION` actions in all; all of them where they have fewer."""
+    """Plans drawn at random, enough to validate on; all of them where they are fewer."""
     lengths = plans.mask().sum(1).cpu()
     taken = lengths.nonzero()[:, 0]
     if len(taken) == 0:
         raise ValueError("plans: no validation plan has an action")
     order = taken[torch.randperm(len(taken), generator=torch.Generator().manual_seed(seed))]
-    enough = int((lengths[order].cumsum(0) < MOST_VALIDATION).sum()) + 1
-    return plans[order[:enough].sort().values.to(plans.actions.device)]
+    so_far, number = lengths[order].cumsum(0), torch.arange(1, len(order) + 1)
+    too_few = (so_far < ENOUGH_VALIDATION) | ((so_far < MOST_VALIDATION) & (number < ENOUGH_PLANS))
+    return plans[order[: int(too_few.sum()) + 1].sort().values.to(plans.actions.device)]
 
 
 def _piece_size(lengths: Tensor, window: int, batch_size: int, least: int) -> int:

@@ -153,9 +153,19 @@ def test_validation_reads_no_more_than_it_must():
     data = PlansModule(Plans(actions[:, :9], 2), Plans(actions, 2), Settings(), 0)
     assert len(data.validation.plans) == 1
     # one long plan does not crowd out the short ones, and those without actions are ignored
-    lengths = torch.cat([torch.tensor([30_000]), torch.full((2000,), 10), torch.zeros(50, dtype=torch.long)])
-    many = Plans(torch.zeros(2051, 30_000, dtype=torch.uint8), 2, lengths=lengths)
-    assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 2001
+    lengths = torch.cat([torch.tensor([12_000]), torch.full((300,), 10), torch.zeros(50, dtype=torch.long)])
+    many = Plans(torch.zeros(351, 12_000, dtype=torch.uint8), 2, lengths=lengths)
+    assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 301
+
+
+@pytest.mark.parametrize(
+    ("number", "length", "read"), [(2000, 16, 1024), (300, 100, 256), (40, 1000, 40), (90, 1000, 66)]
+)
+def test_validation_reads_enough_actions_of_enough_plans(number, length, read):
+    """2 ** 14 actions, if these are of 256 plans; else 256 plans, or 2 ** 16 actions if these are of fewer plans."""
+    actions = torch.randint(57, (number, length), generator=seeded(0))
+    data = PlansModule(Plans(actions[:, :9], 57), Plans(actions, 57), Settings(), 0)
+    assert len(data.validation.plans) == read
 
 
 @pytest.mark.parametrize(("num_plans", "length"), [(1, 10_000), (20, 1000), (100, 1000), (1, 100_000)])
