@@ -30,12 +30,16 @@ from neuroprior import (
     TabularWorld,
     TransformerPrior,
     UniformPrior,
+    World,
+    collect,
     from_gymnasium,
     gridworld,
 )
 from neuroprior.planners import AStarPlanner, MPPIPlanner
+from neuroprior.priors import CombinedPrior
+from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS, networks
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import DoubleIntegrator, GridWorld, maze, sliding_tiles
+from neuroprior.worlds import DoubleIntegrator, GridWorld, cube, maze, sliding_tiles
 
 FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 
@@ -167,16 +171,29 @@ def sample_gru(scale: float) -> Job:
 
 
 def sample_beside(scale: float) -> Job:
-    """Plans of a GRU that is given each observation, while a world is stepped along."""
+    """Many plans from few starts, of a GRU that is given each observation while a world is stepped along."""
     world = maze(egocentric=True, view=2, num_layouts=20)
     state = world.reset(scaled(16, scale), torch.Generator().manual_seed(0))
-    size = world.observe(state).shape[1]
-    prior = GRUPrior(3, lags=1, context_size=size)
-    plain = peers.ObservingGRU(3, size).eval()
+    prior = GRUPrior(3, lags=1, context_size=world.observe(state).shape[1])
+    return _beside("a maze", world, state, prior, 2048, 24)
+
+
+def sample_beside_cube(scale: float) -> Job:
+    """Few plans from many starts, of a GRU that has learned, as planners sample: most of them begin alike."""
+    world, generator = cube(scramble=4), torch.Generator().manual_seed(0)
+    plans = collect(ExhaustivePlanner(4), world, 2000, context="step", min_score=0, generator=generator)
+    state = world.reset(scaled(2000, scale), generator)
+    prior = GRUPrior(9, lags=1, context_size=world.observe(state).shape[1])
+    prior.fit(plans, generator=generator, max_steps=200, progress=False)
+    return _beside("a cube", world, state, prior, 64, 8)
+
+
+def _beside(name: str, world: World, state: Tensor, prior: Prior, number: int, length: int) -> Job:
+    plain = peers.ObservingGRU(prior.num_actions, world.observe(state).shape[1]).eval()
     return Job(
-        f"sample 2,048 plans of length 24 beside a maze from {len(state)} starts, GRU",
-        lambda device: partial(sample_in_world, prior, world, state, 2048, 24),
-        (Peer("plain PyTorch", lambda: partial(plain.sample_in_world, world, state, 2048, 24), 3),),
+        f"sample {number:,} plans of length {length} beside {name} from {len(state):,} starts, GRU",
+        lambda device: partial(sample_in_world, prior, world, state, number, length),
+        (Peer("plain PyTorch", lambda: partial(plain.sample_in_world, world, state, number, length), 3),),
     )
 
 
@@ -194,6 +211,46 @@ def horizon(make: type[GRUPrior] | type[TransformerPrior], times: int, scale: fl
         f"sample {number:,} plans of length {times * TRAINED}, {name} trained on {TRAINED}",
         lambda device: partial(prior.to(device).sample, number, times * TRAINED, method="ancestral"),
         (Peer(f"{times} times plans of length {TRAINED}", lambda: own, round(1 / 1.3, 2), 1 / times),),
+    )
+
+
+def sample_combined(scale: float) -> Job:
+    """Many short plans of a combined prior that keeps a chain, a context tree and a network; its peer is the dearest
+    of these.
+    """
+    number, plans = scaled(2_560_000, scale), chain_plans(10_000, 16)
+    parts = [MarkovPrior(4, 2).fit(plans), ContextTreePrior(4, 10).fit(plans), GRUPrior(4, 64, lags=1)]
+    prior = CombinedPrior(4, parts)
+
+    def dearest() -> Run:
+        runs = [partial(part.sample, number, 8) for part in parts]
+        for run in runs:
+            run()  # the first run is slow
+        return max(runs, key=seconds)
+
+    return Job(
+        f"sample {number:,} plans of length 8, combined prior of three",
+        lambda device: partial(prior.to(device).sample, number, 8),
+        (Peer("its dearest part", dearest, round(1 / 3, 2)),),
+    )
+
+
+def fit_combined(scale: float) -> Job:
+    """The combined prior; its peer fits what it combines one after the other, each as it is fitted alone."""
+    plans, steps = chain_plans(scaled(10_000, scale), 16), {"max_steps": 200, "progress": False}
+
+    def parts() -> None:
+        generator = torch.Generator().manual_seed(0)
+        for order in ORDERS:
+            MarkovPrior(4, order).fit(plans)
+        ContextTreePrior(4, DEPTH).fit(plans)
+        for prior in networks(4, {}, "standard", 0):
+            prior.fit(plans, generator=generator, **steps)
+
+    return Job(
+        f"fit the combined prior on {len(plans):,} plans of length 16, 200 steps",
+        lambda device: lambda: CombinedPrior(4).fit(plans, generator=torch.Generator().manual_seed(0), **steps),
+        (Peer("its parts, one after the other", lambda: parts, round(1 / 1.5, 2)),),
     )
 
 
@@ -432,7 +489,8 @@ def simulations(planner: MCTSPlanner, world: TabularWorld, state: Tensor) -> int
 JOBS: dict[str, Callable[[float], Job]] = {
     make.__name__: make
     for make in (
-        *(sample_short, sample_long, sample_gru, sample_beside, sample_markov, fit_markov, fit_tree),
+        *(sample_short, sample_long, sample_gru, sample_beside, sample_beside_cube),
+        *(sample_combined, fit_combined, sample_markov, fit_markov, fit_tree),
         *(evaluate, table_1, train, shoot, decide, search_tiles, control),
     )
 }
