@@ -205,6 +205,7 @@ class CombinedPrior(MixturePrior):
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
         learned, held_out = divided(plans, settings.pop("validation", None), generator)
+        self.spare = nn.ModuleList()
         if self.given:
             self.experts = nn.ModuleList(*self.given).to(self.device)
             self.fit_experts(learned, held_out, generator, settings)
@@ -220,17 +221,19 @@ class CombinedPrior(MixturePrior):
     def learn_weights(self, plans: Plans, tried: int | None = None) -> None:
         """Learn from plans that the experts did not learn from which of them are kept, and how they are combined.
 
+        Those that were kept aside before, in `spare`, are tried again.
+
         Args:
             plans: held-out plans.
             tried: how many experts there were, where these are the best of more; None: these.
         """
+        experts = list(self.alternatives)
         actions, mask, plain = plans.actions, plans.mask(), plans.without_context()
         forecasts = [
-            torch.cat([log_probs for _, log_probs in e.forecasts(plans if e.takes_context else plain)])
-            for e in self._experts()
+            torch.cat([log_probs for _, log_probs in e.forecasts(plans if e.takes_context else plain)]) for e in experts
         ]
         held_out = HeldOut(torch.stack(forecasts, 2), actions, mask, (tried or len(forecasts)) + 2)
-        kept, powers = held_out.choose([sum(weight.numel() for weight in e.parameters()) for e in self._experts()])
+        kept, powers = held_out.choose([sum(weight.numel() for weight in e.parameters()) for e in experts])
         members = with_pool(held_out.forecasts[:, :, kept], powers)
         taken = taken_of(members, actions).masked_fill(~mask[..., None], 0)
         early = slice(0, MOST_STEPS)
@@ -240,7 +243,6 @@ class CombinedPrior(MixturePrior):
             tracked = torch.cat([taken, tracked.masked_fill(~mask[..., None], 0)], 2)
             if held_out.loss(tracked) > held_out.loss(taken) - held_out.tolerance:
                 share = 0.0
-        experts = self._experts()
         self.experts = nn.ModuleList([experts[number] for number in kept])
         left = [e for number, e in enumerate(experts) if number not in kept]
         self.spare = nn.ModuleList([e for e in left if _can_be_spare(e)])

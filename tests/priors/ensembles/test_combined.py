@@ -221,6 +221,19 @@ def test_experts_that_add_nothing_are_left_out():
     assert prior.alternatives == (quick, lower)
 
 
+def test_experts_that_were_left_out_are_tried_again():
+    """By plans of a source of order 1 a chain of order 0 is left out; by plans without structure the other one."""
+    plans = some_plans(400)
+    lower, higher = MarkovPrior(A, 0).fit(plans), MarkovPrior(A, 1).fit(plans)
+    prior = CombinedPrior(A, [lower, higher])
+    prior.learn_weights(some_plans(400, seed=5))
+    assert (list(prior.experts), list(prior.spare)) == ([higher], [lower])
+    actions = torch.multinomial(lower.start(1)[0].softmax(-1)[0], 4000, replacement=True, generator=seeded(1))
+    prior.learn_weights(Plans(actions.view(400, 10), A))
+    assert (list(prior.experts), list(prior.spare)) == ([lower], [higher])
+    assert prior.tried == 4
+
+
 def test_experts_that_were_left_out_are_saved_and_count_all_plans(tmp_path):
     """Of chains of order 0 and 1, in a source of order 1, the first is left out; it counts the held-out plans, too."""
     plans, other = some_plans(200), some_plans(200, seed=7)
