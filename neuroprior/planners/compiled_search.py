@@ -4,7 +4,6 @@ A position is held as cells and the place of the mover: in Sokoban the player, i
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from neuroprior._threads import share
 from neuroprior.priors.patterns import LogLinearPrior, PatternCounts, PatternNetwork
 from neuroprior.priors.patterns.compiled_fit import MIXER, hash_table, place
 from neuroprior.priors.uniform import UniformPrior
@@ -543,8 +543,7 @@ def search_all(
         plans[number] = path[:length].copy()
 
     try:
-        with ThreadPoolExecutor(max(torch.get_num_threads(), 1)) as pool:  # the loop releases Python's lock
-            list(pool.map(one, range(batch)))
+        share(one, range(batch))
     except MemoryError:
         raise ValueError(f"max_nodes: there is no memory for {max_nodes:,} nodes") from None
     return Found(solved, plans, log_bound, expansions, steps)

@@ -1,6 +1,6 @@
 """Rollouts in deterministic tables by a compiled loop, for `TabularWorld.rollout`; importing this loads numba."""
 
-from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,8 +9,14 @@ from numba import njit
 from torch import Tensor
 
 from neuroprior._memory import new_empty
+from neuroprior._threads import share
 
 Array = np.ndarray[Any, Any]
+
+PARTS, LEAST_STEPS = 8, 2**15
+"""Parts that each thread follows, one after the other, so that none waits long for another that a busy machine holds
+up; and the fewest steps of each part.
+"""
 
 
 def rollout(
@@ -41,12 +47,11 @@ def rollout(
     written = [x.numpy() for x in (last, gained, states)]
     sizes = num_plans, len(table) // reward.shape[1], reward.dim() == 2
 
-    def part(begin: int, end: int) -> None:
-        _follow(*given, *sizes, begin, end, *written)
+    def part(edges: tuple[int, int]) -> None:
+        _follow(*given, *sizes, *edges, *written)
 
-    edges = [batch * k // threads for k in range(threads + 1)]
-    with ThreadPoolExecutor(threads) as pool:  # the loop releases Python's lock
-        list(pool.map(part, edges[:-1], edges[1:]))
+    number = max(min(PARTS * threads, batch, plans.numel() // LEAST_STEPS), 1)
+    share(part, list(pairwise(batch * k // number for k in range(number + 1))))
     shaped = [x.view(*plans.shape[:2], *x.shape[1:]) for x in (last, gained, states)]
     return shaped[0], shaped[1], shaped[2] if keep_states else None
 
