@@ -1,4 +1,4 @@
-# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site. make results: all that the pages of results show, half a day; it goes on where it was interrupted.
+# make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site. make results: all that the pages of results show, most of a day; it goes on where it was interrupted.
 PYTHON ?= python3
 BIN := .venv/bin
 export PYTHONPATH :=
