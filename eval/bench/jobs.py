@@ -219,7 +219,7 @@ def sample_combined(scale: float) -> Job:
     of these.
     """
     number, plans = scaled(2_560_000, scale), chain_plans(10_000, 16)
-    parts = [MarkovPrior(4, 2).fit(plans), ContextTreePrior(4, 10).fit(plans), GRUPrior(4, 64, lags=1)]
+    parts = [MarkovPrior(4, 2).fit(plans), ContextTreePrior(4, DEPTH).fit(plans), GRUPrior(4, 64, lags=1)]
     prior = CombinedPrior(4, parts)
 
     def dearest() -> Run:
@@ -237,7 +237,7 @@ def sample_combined(scale: float) -> Job:
 
 def fit_combined(scale: float) -> Job:
     """The combined prior; its peer fits what it combines one after the other, each as it is fitted alone."""
-    plans, steps = chain_plans(scaled(10_000, scale), 16), {"max_steps": 200, "progress": False}
+    plans, how = chain_plans(scaled(10_000, scale), 16), {"max_steps": 200, "progress": False}
 
     def parts() -> None:
         generator = torch.Generator().manual_seed(0)
@@ -245,11 +245,11 @@ def fit_combined(scale: float) -> Job:
             MarkovPrior(4, order).fit(plans)
         ContextTreePrior(4, DEPTH).fit(plans)
         for prior in networks(4, {}, "standard", 0):
-            prior.fit(plans, generator=generator, **steps)
+            prior.fit(plans, generator=generator, **how)
 
     return Job(
         f"fit the combined prior on {len(plans):,} plans of length 16, 200 steps",
-        lambda device: lambda: CombinedPrior(4).fit(plans, generator=torch.Generator().manual_seed(0), **steps),
+        lambda device: lambda: CombinedPrior(4).fit(plans, generator=torch.Generator().manual_seed(0), **how),
         (Peer("its parts, one after the other", lambda: parts, round(1 / 1.5, 2)),),
     )
 

@@ -179,13 +179,12 @@ class VectorNetwork(VectorPrior):
     def continuations(
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
-        inputs = self._inputs(past, context)
-        out, hidden = self.encode(self.drop(self.inputs(inputs)), None)
-        state = torch.cat([hidden, inputs[:, -1]], 1).repeat_interleave(num_plans, 0)
+        out, state = self._encoded(self._inputs(past, context), None)
+        state = state.repeat_interleave(num_plans, 0)
         # All random numbers at once, so that compiled loops draw the same.
         uniform = torch.rand(len(state), length, generator=generator, device=self.device)
         noise = torch.randn(len(state), length, self.action_size, generator=generator, device=self.device)
-        plans = self.draw(out[:, -1], state, uniform, noise)
+        plans = self.draw(out, state, uniform, noise)
         return plans.view(len(past), num_plans, length, self.action_size)
 
     def draw(self, out: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
@@ -207,9 +206,13 @@ class VectorNetwork(VectorPrior):
 
     def _after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""
+        out, state = self._encoded(inputs, hidden)
+        return self._forecast(out, inputs[:, -1]), state
+
+    def _encoded(self, inputs: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
+        """What the forecast after the last of `inputs [N, T, E]` is made of, `[N, width]`, and the state."""
         out, hidden = self.encode(self.drop(self.inputs(inputs)), hidden)
-        last = inputs[:, -1]
-        return self._forecast(out[:, -1], last), torch.cat([hidden, last], 1)
+        return out[:, -1], torch.cat([hidden, inputs[:, -1]], 1)
 
     def log_probs_from(
         self, actions: Tensor, context: Tensor | None, previous: Tensor | None, state: Tensor | None
