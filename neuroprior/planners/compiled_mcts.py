@@ -3,6 +3,8 @@
 `descend` and `back_up` serve every world and prior; `search` also steps a table and evaluates a prior itself.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +12,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from neuroprior._threads import one_thread
 from neuroprior.planners.planner import PriorPlanner
 from neuroprior.plans import action_dtype
 from neuroprior.priors.counts.history_prior import HistoryPrior
@@ -30,6 +33,9 @@ ROWS = 2**16
 
 BLOCK = 40
 """Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
+
+SHARED = 2**15
+"""Hidden units of all starts' networks from which threads share the starts; tables are too fast for it."""
 
 
 class Nodes(NamedTuple):
@@ -285,6 +291,168 @@ def _evaluate(
                 probs[k, a] /= total
 
 
+class Descent(NamedTuple):
+    """Room for what `descend` finds for B starts: the arguments of these names, and `rows [B]`."""
+
+    rows: Array
+    path: Array
+    plan: Array
+    depth: Array
+    first: Array
+
+
+class Room(NamedTuple):
+    """Room for what `follow` needs of each of K plans, and `_evaluate` of a block of them.
+
+    Attributes:
+        alive: `[K]`: whether the budget allows the plan.
+        score: float64 `[K]`.
+        cell, observed: int64 `[K]`: where it is, and the state whose context the prior is given.
+        code, hidden: `[K]` and `[K, H]`: the prior's state.
+        weights, probs: `[K, A]`: its predictions, see `_evaluate`.
+        which: int64 `[K]`: the plans that are stepped.
+        block: float32: `BLOCK` rows of hidden states, products, gates and logits.
+    """
+
+    alive: Array
+    score: Array
+    cell: Array
+    observed: Array
+    code: Array
+    hidden: Array
+    weights: Array
+    probs: Array
+    which: Array
+    block: Any
+
+
+class Found(NamedTuple):
+    """What comes of the simulations: `[N, B, L]` plans, the reward of each step (float64) and the state after it, and
+    which plans there are: bool `[N, B]`."""
+
+    plans: Array
+    rewards: Array
+    states: Array
+    done: Array
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def unfinished(nodes: Nodes, known: Known, rows: Array) -> int:
+    """Write the starts whose trees may be extended to `rows [B]`; how many there are."""
+    number = 0
+    for b in range(len(known.left)):
+        if known.left[b] > 0 and not known.over[b] and not nodes.closed[b, 0].all():
+            rows[number] = b
+            number += 1
+    return number
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def follow(
+    nodes: Nodes,
+    known: Known,
+    moves: Moves,
+    policy: Policy,
+    discounts: Array,
+    any_prefix: bool,
+    simulation: int,
+    rows: Array,
+    path: Array,
+    plan: Array,
+    depth: Array,
+    draws: Array,
+    first: Array,
+    room: Room,
+    found: Found,
+) -> None:
+    """Follow plans to their ends, one from each of the starts `rows [K]`, and count them in the trees.
+
+    Args:
+        nodes, known: the trees; extended.
+        moves, policy: the world and the prior.
+        discounts: float64 `[L]`: weights of rewards in a return; empty: the last reward counts.
+        any_prefix: whether a plan is worth its best prefix.
+        simulation: the number of the plans.
+        rows, path, plan, depth: of `descend`; overwritten.
+        draws: float32: uniform numbers; that of row k at step t is `first[t] + k`.
+        first: int64 `[L]`.
+        room: for K plans.
+        found: gets the plans.
+    """
+    length, actions, size = path.shape[1], nodes.child.shape[2], known.hidden.shape[2]
+    alive, score, cell, observed, code, hidden, weights, probs, which, block = room
+    for k in range(len(rows)):
+        b = rows[k]
+        # A plan that the budget does not allow to the end is not begun.
+        alive[k] = known.left[b] >= length - depth[k]
+        known.over[b] |= not alive[k]
+        found.done[simulation, b] = alive[k]
+        observed[k] = known.state[b, 0]
+        for t in range(depth[k]):
+            child = path[k, t + 1]
+            found.states[simulation, b, t] = known.state[b, child]
+            found.rewards[simulation, b, t] = known.reward[b, child]
+    for t in range(length):
+        going = 0
+        for k in range(len(rows)):
+            if depth[k] > t or not alive[k]:
+                continue
+            b, action = rows[k], plan[k, t]
+            if depth[k] == t:
+                node = path[k, t]
+                cell[k], code[k] = known.state[b, node], known.code[b, node]
+                for j in range(size):
+                    hidden[k, j] = known.hidden[b, node, j]
+            else:
+                total, action = weights[k, actions - 1], 0
+                mark = draws[first[t] + k] * total
+                while weights[k, action] <= mark and weights[k, action] < total:
+                    action += 1
+                plan[k, t] = action
+            at = cell[k] % moves.cells
+            maps = cell[k] - at
+            taken = at * actions + action
+            cell[k] = moves.after[taken] + maps
+            gained = moves.reward[cell[k] if moves.on_arrival else taken + maps * actions]
+            found.states[simulation, b, t], found.rewards[simulation, b, t] = cell[k], gained
+            known.left[b] -= 1
+            if policy.each_step:
+                observed[k] = cell[k]
+            which[going] = k
+            going += 1
+        if t + 1 < length:
+            _evaluate(policy, which[:going], plan, t, observed, code, hidden, weights, probs, block)
+        for i in range(going):
+            k = which[i]
+            if depth[k] != t:
+                continue
+            b = rows[k]
+            new = known.size[b]
+            known.size[b] += 1
+            nodes.child[b, path[k, t], plan[k, t]] = new
+            nodes.child[b, new], nodes.visits[b, new], nodes.total[b, new] = 0, 0, 0
+            nodes.closed[b, new], nodes.probs[b, new] = False, probs[k]
+            known.state[b, new], known.reward[b, new] = cell[k], found.rewards[simulation, b, t]
+            known.code[b, new] = code[k]
+            for j in range(size):
+                known.hidden[b, new, j] = hidden[k, j]
+    going = 0
+    for k in range(len(rows)):
+        if not alive[k]:
+            continue
+        b = rows[k]
+        total, best = 0.0, -np.inf
+        for t in range(length):
+            found.plans[simulation, b, t] = plan[k, t]
+            gained = found.rewards[simulation, b, t]
+            total = total + gained * discounts[t] if len(discounts) else gained
+            best = max(best, total)
+        rows[going], score[going] = b, best if any_prefix else total
+        path[going], plan[going] = path[k], plan[k]
+        going += 1
+    back_up(nodes, rows[:going], path[:going], plan[:going], score[:going])
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(
     nodes: Nodes,
@@ -295,130 +463,51 @@ def search(
     any_prefix: bool,
     exploration: float,
     draws: Array,
-    plans: Array,
-    rewards: Array,
-    states: Array,
-    done: Array,
+    descent: Descent,
+    room: Room,
+    found: Found,
 ) -> tuple[int, int]:
-    """Simulate plans, one from each unfinished start at a time.
+    """Simulate plans, one from each unfinished start at a time: all on one thread.
 
     Args:
-        nodes, known: the trees; extended.
-        moves, policy: the world and the prior.
-        discounts: float64 `[L]`: weights of rewards in a return; empty: the last reward counts.
-        any_prefix: whether a plan is worth its best prefix.
+        nodes, known, moves, policy, discounts, any_prefix, room, found: see `follow`.
         exploration: c.
         draws: float32: uniform numbers.
-        plans, rewards, states: `[N, B, L]`: get the plans, the reward of each step (float64) and the state after it.
-        done: bool `[N, B]`: gets which plans there are.
+        descent: room for all starts.
 
     Returns:
         Simulations that were made: fewer than N where all starts are finished, or where the `draws` do not suffice for
         another one for sure; and the draws that were taken.
     """
-    batch, length, actions, size = len(known.left), plans.shape[2], nodes.child.shape[2], known.hidden.shape[2]
-    every = np.arange(batch)
-    path, depth, first = np.empty((batch, length), np.int64), np.empty(batch, np.int64), np.empty(length, np.int64)
-    chosen, alive, score = np.empty((batch, length), np.int64), np.empty(batch, np.bool_), np.empty(batch)
-    cell, code, hidden = np.empty(batch, np.int64), np.empty(batch, np.int64), np.empty((batch, size), np.float32)
-    observed, which = np.empty(batch, np.int64), np.empty(batch, np.int64)
-    weights, probs = np.empty((batch, actions), np.float32), np.empty((batch, actions))
-    wide = BLOCK if size else 0
-    work = (
-        np.empty((wide, size), np.float32),
-        np.empty((wide, 3 * size), np.float32),
-        np.empty((wide, 3 * size), np.float32),
-        np.empty((wide, actions), np.float32),
-    )
-    used = 0
-    for simulation in range(len(plans)):
-        number = 0
-        for b in range(batch):
-            if known.left[b] > 0 and not known.over[b] and not nodes.closed[b, 0].all():
-                every[number] = b
-                number += 1
-        rows = every[:number]
-        if number == 0 or len(draws) - used < number * length * (1 + actions):
+    every, path, plan, depth, first = descent
+    most, used = path.shape[1] * (1 + nodes.child.shape[2]), 0
+    for simulation in range(len(found.plans)):
+        number = unfinished(nodes, known, every)
+        if number == 0 or len(draws) - used < number * most:
             return simulation, used
-        own, path_of, plan_of = draws[used:], path[:number], chosen[:number]
-        used += descend(nodes, rows, exploration, own, path_of, plan_of, depth[:number], first)
-        done[simulation] = False
-        for k in range(number):
-            b = rows[k]
-            # A plan that the budget does not allow to the end is not begun.
-            alive[k] = known.left[b] >= length - depth[k]
-            known.over[b] |= not alive[k]
-            done[simulation, b] = alive[k]
-            observed[k] = known.state[b, 0]
-            for t in range(depth[k]):
-                child = path[k, t + 1]
-                states[simulation, b, t], rewards[simulation, b, t] = known.state[b, child], known.reward[b, child]
-        for t in range(length):
-            going = 0
-            for k in range(number):
-                if depth[k] > t or not alive[k]:
-                    continue
-                b, action = rows[k], chosen[k, t]
-                if depth[k] == t:
-                    node = path[k, t]
-                    cell[k], code[k] = known.state[b, node], known.code[b, node]
-                    for j in range(size):
-                        hidden[k, j] = known.hidden[b, node, j]
-                else:
-                    total, action = weights[k, actions - 1], 0
-                    mark = own[first[t] + k] * total
-                    while weights[k, action] <= mark and weights[k, action] < total:
-                        action += 1
-                    chosen[k, t] = action
-                at = cell[k] % moves.cells
-                maps = cell[k] - at
-                taken = at * actions + action
-                cell[k] = moves.after[taken] + maps
-                gained = moves.reward[cell[k] if moves.on_arrival else taken + maps * actions]
-                states[simulation, b, t], rewards[simulation, b, t] = cell[k], gained
-                known.left[b] -= 1
-                if policy.each_step:
-                    observed[k] = cell[k]
-                which[going] = k
-                going += 1
-            if t + 1 < length:
-                _evaluate(policy, which[:going], chosen, t, observed, code, hidden, weights, probs, work)
-            for i in range(going):
-                k = which[i]
-                if depth[k] != t:
-                    continue
-                b = rows[k]
-                new = known.size[b]
-                known.size[b] += 1
-                nodes.child[b, path[k, t], chosen[k, t]] = new
-                nodes.child[b, new], nodes.visits[b, new], nodes.total[b, new] = 0, 0, 0
-                nodes.closed[b, new], nodes.probs[b, new] = False, probs[k]
-                known.state[b, new], known.reward[b, new] = cell[k], rewards[simulation, b, t]
-                known.code[b, new] = code[k]
-                for j in range(size):
-                    known.hidden[b, new, j] = hidden[k, j]
-        going = 0
-        for k in range(number):
-            if not alive[k]:
-                continue
-            b = rows[k]
-            total, best = 0.0, -np.inf
-            for t in range(length):
-                plans[simulation, b, t] = chosen[k, t]
-                gained = rewards[simulation, b, t]
-                total = total + gained * discounts[t] if len(discounts) else gained
-                best = max(best, total)
-            rows[going], score[going] = b, best if any_prefix else total
-            path[going], chosen[going] = path[k], chosen[k]
-            going += 1
-        back_up(nodes, rows[:going], path[:going], chosen[:going], score[:going])
-    return len(plans), used
+        rows, own = every[:number], draws[used:]
+        used += descend(nodes, rows, exploration, own, path[:number], plan[:number], depth[:number], first)
+        found.done[simulation] = False
+        follow(
+            nodes, known, moves, policy, discounts, any_prefix, simulation,
+            rows, path[:number], plan[:number], depth[:number], own, first, room, found,
+        )  # fmt: skip
+    return len(found.plans), used
 
 
 def search_all(
     planner: Any, world: TabularWorld, state: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
     """What `neuroprior.planners.mcts` looks for; see `_Trees.search` there."""
+    threads = torch.get_num_threads()
+    with one_thread():  # operations on a few numbers, in which threads would only wait for one another
+        return _search_all(planner, world, state, generator, threads)
+
+
+def _search_all(
+    planner: Any, world: TabularWorld, state: Tensor, generator: torch.Generator, threads: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    """As `search_all`, by so many threads."""
     batch, actions, length = len(state), world.num_actions, planner.length
     steps = planner.num_plans * length
     policy = policy_of(planner.prior, world, planner.temperature)
@@ -450,24 +539,85 @@ def search_all(
     discounts = np.empty(0)
     if planner.objective == "return":
         discounts = (planner.discount ** torch.arange(length, dtype=torch.float64)).numpy()
-    found = list[tuple[Tensor, ...]]()
-    while not found or number == room:
-        if known.size.max() + room > nodes.child.shape[1]:  # each simulation adds a node
-            nodes, known = Nodes(*map(_widened, nodes)), Known(*map(_widened, known))
-        kinds = action_dtype(actions), torch.float64, torch.int64
-        out = *(torch.empty(room, batch, length, dtype=kind) for kind in kinds), torch.empty(room, batch) > 0
-        before = generator.get_state()
-        draws = torch.rand(room * most, generator=generator)
-        number, used = search(
-            nodes, known, moves, policy, discounts, planner.any_prefix, planner.exploration, draws.numpy(),
-            *(part.numpy() for part in out),
-        )  # fmt: skip
-        generator.set_state(before)
-        torch.rand(used, generator=generator)  # those that were not used are given back
-        found.append(tuple(part[:number] for part in out))
-    plans, rewards, states, done = (torch.cat(parts).transpose(0, 1) for parts in zip(*found, strict=True))
+    threads = threads if batch * size >= SHARED else 1
+    each = -(-batch // threads)
+    descent = Descent(
+        np.empty(batch, np.int64), np.empty((batch, length), np.int64), np.empty((batch, length), np.int64),
+        np.empty(batch, np.int64), np.empty(length, np.int64),
+    )  # fmt: skip
+    rooms = [_room(min(each, batch - begin), size, actions) for begin in range(0, batch, each)]
+    results = list[tuple[Tensor, ...]]()
+    with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
+        while not results or number == room:
+            if known.size.max() + room > nodes.child.shape[1]:  # each simulation adds a node
+                nodes, known = Nodes(*map(_widened, nodes)), Known(*map(_widened, known))
+            kinds = action_dtype(actions), torch.float64, torch.int64
+            out = *(torch.empty(room, batch, length, dtype=kind) for kind in kinds), torch.empty(room, batch) > 0
+            before = generator.get_state()
+            draws = torch.rand(room * most, generator=generator)
+            found = Found(*(part.numpy() for part in out))
+            if pool is None:
+                number, used = search(
+                    nodes, known, moves, policy, discounts, planner.any_prefix, planner.exploration, draws.numpy(),
+                    descent, rooms[0], found,
+                )  # fmt: skip
+            else:
+                given = nodes, known, moves, policy, discounts, planner.any_prefix
+                number, used = _search_shared(pool, given, planner.exploration, draws.numpy(), descent, rooms, found)
+            generator.set_state(before)
+            torch.rand(used, generator=generator)  # those that were not used are given back
+            results.append(tuple(part[:number] for part in out))
+    plans, rewards, states, done = (torch.cat(some).transpose(0, 1) for some in zip(*results, strict=True))
     taken = int(steps - known.left.min())
     return plans, rewards.to(world.reward.dtype), states if planner.any_prefix else states[:, :, -1:], done, taken
+
+
+def _search_shared(
+    pool: ThreadPoolExecutor,
+    given: tuple[Any, ...],
+    exploration: float,
+    draws: Array,
+    descent: Descent,
+    rooms: list[Room],
+    found: Found,
+) -> tuple[int, int]:
+    """As `search`, where threads share what comes after each descent: the same plans, since one draws the numbers.
+
+    Args:
+        pool: the threads.
+        given: the first six arguments of `follow`.
+        exploration, draws, descent, found: as for `search`.
+        rooms: room for each part of the starts.
+    """
+    nodes, known = given[:2]
+    to_the_end: Any = follow
+    most, used, each = descent.path.shape[1] * (1 + nodes.child.shape[2]), 0, len(rooms[0].alive)
+    for simulation in range(len(found.plans)):
+        number = unfinished(nodes, known, descent.rows)
+        if number == 0 or len(draws) - used < number * most:
+            return simulation, used
+        own = draws[used:]
+        on_the_way = rows, path, plan, depth = [x[:number] for x in descent[:4]]
+        used += descend(nodes, rows, exploration, own, path, plan, depth, descent.first)
+        found.done[simulation] = False
+
+        def part(begin: int) -> None:
+            some = [x[begin : begin + each] for x in on_the_way]  # noqa: B023
+            to_the_end(*given, simulation, *some, own[begin:], descent.first, rooms[begin // each], found)  # noqa: B023
+
+        list(pool.map(part, range(0, number, each)))
+    return len(found.plans), used
+
+
+def _room(number: int, size: int, actions: int) -> Room:
+    """Room for so many plans, hidden units and actions."""
+    rows = BLOCK if size else 0
+    return Room(
+        np.empty(number, np.bool_), np.empty(number), np.empty(number, np.int64), np.empty(number, np.int64),
+        np.empty(number, np.int64), np.empty((number, size), np.float32), np.empty((number, actions), np.float32),
+        np.empty((number, actions)), np.empty(number, np.int64),
+        tuple(np.empty((rows, width), np.float32) for width in (size, 3 * size, 3 * size, actions)),
+    )  # fmt: skip
 
 
 def _widened(values: Array) -> Array:

@@ -84,17 +84,18 @@ def sample(
         raise ValueError(f"context: {steps} steps are {what}, but it has only {context.shape[1]}")
     stepper.check_context(context, num_plans, steps)
     draw = Draw(prior.num_actions, temperature, generator_on(generator, device))
-    if past.dim() == 2 or (context is not None and (is_per_step(context) or not is_integer(context))):
-        one_each = torch.ones(num_plans, dtype=torch.long, device=device)
-        return _sample_from_roots(stepper, one_each, context, past, length, draw, "ancestral", batch_size)
-    if context is None:
-        roots = torch.full((min(num_plans, 1),), num_plans, device=device)
-        return _sample_from_roots(stepper, roots, None, past, length, draw, method, batch_size)
-    distinct, which, counts = context.unique(return_inverse=True, return_counts=True)
-    grouped = _sample_from_roots(stepper, counts, distinct, past, length, draw, method, batch_size)
-    plans = torch.empty_like(grouped)
-    plans[which.argsort(stable=True)] = grouped
-    return plans
+    with stepper.threads_for(num_plans):
+        if past.dim() == 2 or (context is not None and (is_per_step(context) or not is_integer(context))):
+            one_each = torch.ones(num_plans, dtype=torch.long, device=device)
+            return _sample_from_roots(stepper, one_each, context, past, length, draw, "ancestral", batch_size)
+        if context is None:
+            roots = torch.full((min(num_plans, 1),), num_plans, device=device)
+            return _sample_from_roots(stepper, roots, None, past, length, draw, method, batch_size)
+        distinct, which, counts = context.unique(return_inverse=True, return_counts=True)
+        grouped = _sample_from_roots(stepper, counts, distinct, past, length, draw, method, batch_size)
+        plans = torch.empty_like(grouped)
+        plans[which.argsort(stable=True)] = grouped
+        return plans
 
 
 @torch.no_grad()
@@ -144,9 +145,24 @@ def sample_in_world(
     # Memory of the plans and their rewards.
     check_memory(5 * len(state) * num_plans * length, num_plans=num_plans, length=length)
     stepper = Stepper(prior)
+    with stepper.threads_for(len(state) * num_plans):
+        return _sample_in_world(stepper, world, state, num_plans, length, temperature, generator, keep_states)
+
+
+def _sample_in_world(
+    stepper: Stepper,
+    world: World,
+    state: Tensor,
+    num_plans: int,
+    length: int,
+    temperature: float,
+    generator: torch.Generator | None,
+    keep_states: bool,
+) -> tuple[Tensor, Rollout]:
+    """As `sample_in_world`."""
     logits, hidden = stepper.start_in(world, state)
     generator, batch = generator_on(generator, logits.device), len(state)
-    draw = Draw(prior.num_actions, temperature, generator)
+    draw = Draw(stepper.num_actions, temperature, generator)
     now, root = state, torch.arange(batch, device=state.device)
     counts = torch.full((batch,), num_plans, device=state.device)
     begun: list[list[Tensor]] = [[], [], []]  # actions, rewards and states of each step of the tree

@@ -1,17 +1,24 @@
 """What sampling needs of a prior (`Steppable`), and one way to step any prior, whatever else it offers (`Stepper`)."""
 
+from contextlib import AbstractContextManager
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import is_integer
+from neuroprior._threads import one_thread
 from neuroprior.plans import is_per_step
 from neuroprior.sampling.draws import after_end
 from neuroprior.worlds.world import World, check_is_world
 
 FEWEST_TO_SHARE = 256
 """The number of states from which the distinct ones are found, so that each is observed once."""
+
+WORTH_THREADS, OF_A_STEP = 2**26, 2**13
+"""Plans times parameters of their prior from which threads share a step, and parameters that are added to these for the
+rest of a step. With less threads gain nothing, and on a busy machine wait for one another for milliseconds.
+"""
 
 
 @runtime_checkable
@@ -66,6 +73,9 @@ class Stepper:
         self.context_per: Literal["plan", "step"] | None = getattr(prior, "context_per", None)
         self.end: int | None = getattr(prior, "end", None)
         self.shares: bool = getattr(prior, "shares_steps", False)
+        self._alone = 0  # the most plans that are stepped on one thread
+        if isinstance(prior, torch.nn.Module):
+            self._alone = WORTH_THREADS // (OF_A_STEP + sum(weights.numel() for weights in prior.parameters()))
         self._advance = getattr(prior, "advance", None) if in_place else None
         self._advance_shared = getattr(prior, "advance_shared", None) if in_place else None
 
@@ -76,6 +86,10 @@ class Stepper:
         if device is None:  # no context is known yet that could be given to `start`
             device = "cpu" if self.context_per is not None else self._prior.start(1)[0].device
         return torch.device(device)
+
+    def threads_for(self, num_plans: int) -> AbstractContextManager[None]:
+        """torch on one thread, until the block ends, where more do not pay for so many plans."""
+        return one_thread(num_plans <= self._alone)
 
     def check_context(self, context: Tensor | None, num_plans: int = 0, length: int = 0) -> None:
         """Raise ValueError unless the prior takes such a context for so many plans of this length."""
@@ -89,7 +103,8 @@ class Stepper:
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Logits `[N, A]` of the first action, and the state `[N, ...]`."""
-        logits, state = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
+        with self.threads_for(batch_size):
+            logits, state = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
         return logits, state
 
     def step(
@@ -99,12 +114,13 @@ class Stepper:
 
         After the end symbol nothing else has a probability above 0.
         """
-        if self._advance is not None:
-            logits, state = self._advance(action, state, context, room)
-        elif context is None:
-            logits, state = self._prior.step(action, state)
-        else:
-            logits, state = self._prior.step(action, state, context)
+        with self.threads_for(len(action)):
+            if self._advance is not None:
+                logits, state = self._advance(action, state, context, room)
+            elif context is None:
+                logits, state = self._prior.step(action, state)
+            else:
+                logits, state = self._prior.step(action, state, context)
         return after_end(logits, action, self.end), state
 
     def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
@@ -129,7 +145,8 @@ class Stepper:
         if self.context_per == "step" and self._advance_shared is not None and _numbered(reached):
             pair, row = (reached * self.num_actions + action).unique(return_inverse=True)
             context, action = world.observe(pair // self.num_actions), pair % self.num_actions
-            logits, state = self._advance_shared(action, state, context, row, room)
+            with self.threads_for(len(row)):
+                logits, state = self._advance_shared(action, state, context, row, room)
             return logits, state
         return self.step(action, state, world.observe(reached) if self.context_per == "step" else None, room)
 

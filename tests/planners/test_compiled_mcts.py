@@ -138,6 +138,26 @@ def test_compiled_and_plain_searches_decide_alike(name, legal):
         assert drawn[0] == drawn[1]
 
 
+@pytest.mark.parametrize("takes", [{}, {"num_contexts": random_world(0).num_states}], ids=["blind", "seeing"])
+def test_threads_that_share_many_starts_decide_as_one_thread_does(takes):
+    """Some starts are finished before others: what the others draw depends on how many are left."""
+    pytest.importorskip("numba")
+    prior, world = wide(GRUPrior(ACTIONS, 64, lags=2, **takes)), exact_world(5)
+    state = world.reset(1000, seeded(0))
+    planner = MCTSPlanner(prior, LENGTH, 6, objective="return")
+    threads, found = torch.get_num_threads(), []
+    try:
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            generator = seeded(1)
+            found.append((*planner.plan(world, state, generator)[:4], float(torch.rand(1, generator=generator))))
+    finally:
+        torch.set_num_threads(threads)
+    for other in found[1:]:
+        for one, same in zip(found[0], other, strict=True):
+            assert torch.equal(torch.as_tensor(one), torch.as_tensor(same))
+
+
 @pytest.mark.parametrize("compile", [False, True])
 def test_scores_that_are_infinite_count_as_the_extremes(compile):
     world = exact_world(3)
