@@ -16,6 +16,7 @@ from neuroprior._threads import one_thread
 from neuroprior.planners.planner import PriorPlanner
 from neuroprior.plans import action_dtype
 from neuroprior.priors.counts.history_prior import HistoryPrior
+from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance
 from neuroprior.priors.neural.gru import GRUPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
@@ -31,11 +32,12 @@ DRAWS = 2**18
 ROWS = 2**16
 """Rows of tables that are made for a decision, however few its steps: still quicker than one step after another."""
 
-BLOCK = 40
-"""Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
-
 SHARED = 2**15
 """Hidden units of all starts' networks from which threads share the starts; tables are too fast for it."""
+
+
+NO_NETWORK = tuple(np.empty((0,) * dims, np.float32) for dims in (2, 3, 2, 2, 1, 2, 1))
+"""The parts of a `Network`, for a table."""
 
 
 class Nodes(NamedTuple):
@@ -96,11 +98,8 @@ class Policy(NamedTuple):
         row: int64 `[F, C]`: the row of the tables for each history and context.
         weights: float32 `[R, A]`: cumulative unnormalised probabilities.
         probs: float64 `[R, A]`.
-        action: float32 `[A + 1, 3 H]`: what the last action adds to the gates, with their biases.
-        past: float32 `[lags, A + 1, 3 H]`: what each of the last actions adds.
-        by_context: float32 `[C, 3 H]`: what each context adds.
-        recurrent: float32 `[H, 3 H]`, and `bias [H]` of its last part.
-        head: float32 `[H, A]`, and `head_bias [A]`.
+        by_context: float32 `[C, 3 H]`: what each context adds to the gates of a network.
+        network: H is 0 for a table.
         temperature: divides logits.
     """
 
@@ -110,13 +109,8 @@ class Policy(NamedTuple):
     row: Array
     weights: Array
     probs: Array
-    action: Array
-    past: Array
     by_context: Array
-    recurrent: Array
-    bias: Array
-    head: Array
-    head_bias: Array
+    network: Network
     temperature: float
 
 
@@ -202,19 +196,6 @@ def back_up(nodes: Nodes, rows: Array, path: Array, plan: Array, score: Array) -
                 finished &= nodes.closed[b, node, a]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _exp(x: Any) -> Any:
-    """e to the power of a float32, to 1e-7 of it; of arithmetic alone, so that loops over it are vectorised."""
-    x = min(max(x, np.float32(-87)), np.float32(87))
-    # x = n log 2 + r: n is rounded by adding what leaves no digits behind the point, log 2 is split in two.
-    n = (x * np.float32(1.4426950408889634) + np.float32(12582912)) - np.float32(12582912)
-    r = (x - n * np.float32(0.693359375)) + n * np.float32(2.1219444005469057e-4)
-    series = np.float32(1 / 5040)
-    for factor in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
-        series = series * r + np.float32(factor)
-    return series * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(
     policy: Policy,
@@ -240,7 +221,7 @@ def _evaluate(
         weights, probs: `[K, A]`: get its predictions: cumulative unnormalised probabilities, and probabilities.
         work: room for `BLOCK` rows of hidden states, products, gates and logits.
     """
-    size, actions, one = hidden.shape[1], weights.shape[1], np.float32(1)
+    size, actions = hidden.shape[1], weights.shape[1]
     if size == 0:
         for k in which:
             code[k] = policy.after[code[k], plans[k, t]]
@@ -248,8 +229,8 @@ def _evaluate(
             for a in range(actions):
                 weights[k, a], probs[k, a] = policy.weights[row, a], policy.probs[row, a]
         return
-    # Single numbers are indexed, not rows: numba counts references to each row, which takes as long as all else here.
     block, product, gates, logits = work
+    action, past, beyond = policy.network.action, policy.network.past, policy.network.beyond
     for begin in range(0, len(which), BLOCK):
         number = min(BLOCK, len(which) - begin)
         for i in range(number):
@@ -258,30 +239,25 @@ def _evaluate(
             for j in range(size):
                 block[i, j] = hidden[k, j]
             for j in range(3 * size):
-                gates[i, j] = policy.action[last, j]
-            for lag in range(min(len(policy.past), t + 2)):
-                before = plans[k, t - lag] if lag <= t else len(policy.action) - 1  # the start symbol
+                gates[i, j] = action[last, j]
+            for lag in range(min(len(past), t + 2)):
+                before = plans[k, t - lag] if lag <= t else len(action) - 1  # the start symbol
                 for j in range(3 * size):
-                    gates[i, j] += policy.past[lag, before, j]
+                    gates[i, j] += past[lag, before, j]
+            if len(beyond) and t + 2 > len(past):
+                for j in range(3 * size):
+                    gates[i, j] += beyond[0, j]
             if len(policy.context):
                 now = policy.context[observed[k]]
                 for j in range(3 * size):
                     gates[i, j] += policy.by_context[now, j]
-        np.dot(block[:number], policy.recurrent, product[:number])
-        for i in range(number):
-            k = which[begin + i]
-            for j in range(2 * size):
-                gates[i, j] = one / (one + _exp(-(gates[i, j] + product[i, j])))
-            for j in range(size):
-                new = gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + policy.bias[j])
-                new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
-                hidden[k, j] = block[i, j] = new + gates[i, size + j] * (block[i, j] - new)
-        np.dot(block[:number], policy.head, logits[:number])
+        advance(policy.network, number, block, gates, product, logits)
         for i in range(number):
             k = which[begin + i]
             top, total = np.float32(-np.inf), 0.0
+            for j in range(size):
+                hidden[k, j] = block[i, j]
             for a in range(actions):
-                logits[i, a] += policy.head_bias[a]
                 top = max(top, logits[i, a])
             for a in range(actions):
                 probs[k, a] = np.exp((logits[i, a] - top) / policy.temperature)
@@ -511,10 +487,10 @@ def _search_all(
     batch, actions, length = len(state), world.num_actions, planner.length
     steps = planner.num_plans * length
     policy = policy_of(planner.prior, world, planner.temperature)
-    if any(np.isnan(part).any() for part in policy[4:13]):
+    if any(np.isnan(part).any() for part in (policy.probs, policy.by_context, *policy.network)):
         raise ValueError("prior: its logits are NaN")
     logits, hidden = Stepper(planner.prior).start_in(world, state)
-    size, most = len(policy.recurrent), batch * length * (1 + actions)
+    size, most = len(policy.network.recurrent), batch * length * (1 + actions)
     room, number = max(min(DRAWS // most, 2 * planner.num_plans), 1), 0
     shape = (batch, min(room, steps) + 1, actions)
     nodes = Nodes(
@@ -632,7 +608,7 @@ def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
         return False
     known = world.all_legal and world.outcomes is None and planner.value is None
     known = known and world.reward.dtype in (torch.float32, torch.float64)
-    if not known or len(state) == 0 or not _knows(prior, planner.length) or Stepper(prior).device != state.device:
+    if not known or len(state) == 0 or not _knows(prior) or Stepper(prior).device != state.device:
         return False
     rows = len(prior.next_node) * (prior.num_contexts or 1) if isinstance(prior, HistoryPrior) else 0
     if getattr(prior, "context_per", None) is not None:
@@ -640,18 +616,17 @@ def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
     return rows <= max(len(state) * planner.num_plans * planner.length, ROWS)
 
 
-def _knows(prior: Steppable, length: int) -> bool:
-    """Whether `policy_of` can represent the prior, for plans of so many actions."""
+def _knows(prior: Steppable) -> bool:
+    """Whether `policy_of` can represent the prior."""
     if type(prior) is UniformPrior:
         return True
     if isinstance(prior, HistoryPrior):
         own = type(prior)
         same = own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
         return same and own.advance is Prior.advance and prior.log_probs.dtype == torch.float32
-    if type(prior) is not GRUPrior or prior.num_layers > 1 or prior.training:
+    if type(prior) is not GRUPrior or prior.num_layers > 1 or prior.training or prior.window == 0:
         return False
-    within = prior.window is None or length <= prior.window + 1 or prior.lags <= prior.window
-    return within and prior.head.weight.dtype == torch.float32
+    return prior.head.weight.dtype == torch.float32
 
 
 def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
@@ -663,39 +638,22 @@ def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
         observed = world.observe(torch.arange(world.num_maps * world.num_states))
         context = torch.arange(len(observed))
     after, row, logits = torch.zeros(1, actions), torch.zeros(1, 1), torch.zeros(1, actions)
-    gates: tuple[Tensor, ...] = (
-        torch.empty(0, 0), torch.empty(0, 0, 0), torch.empty(0, 0), torch.empty(0, 0),
-        torch.empty(0), torch.empty(0, actions), torch.empty(0),
-    )  # fmt: skip
+    network: Any = NO_NETWORK
+    by_context = torch.empty(0, 0)
     if isinstance(prior, HistoryPrior):
         after, number = prior.next_node, prior.num_contexts or 1
         node = torch.arange(len(after)).repeat_interleave(number)
         row = prior._row(node, torch.arange(number).repeat(len(after))).view(len(after), number)
         logits, context = prior.log_probs, observed.long()
     elif isinstance(prior, GRUPrior):
-        gates = _network(prior, observed)
+        network = prior.tables()
+        if prior.takes_context:
+            seen = torch.nn.functional.pad(observed.float().view(len(observed), -1), (1, 0))  # inputs without actions
+            by_context = prior.embedding.of_context(seen[:, None])[:, 0] @ prior.gru.all_weights[0][0].T
     weights = ((logits - logits.amax(1, keepdim=True)) / temperature).exp().T.cumsum(0).T
     probs = (logits.double() / temperature).softmax(1)
-    kinds = (torch.int64, torch.int64, torch.float32, torch.float64)
-    tables: Any = [x.to(kind).contiguous().numpy() for x, kind in zip((after, row, weights, probs), kinds, strict=True)]
-    network: Any = [x.detach().float().contiguous().numpy() for x in gates]
-    parts: Any = (context.numpy(), each_step, *tables, *network, float(temperature))
+    kinds = (torch.int64, torch.int64, torch.float32, torch.float64, torch.float32)
+    given = zip((after, row, weights, probs, by_context), kinds, strict=True)
+    tables: Any = [x.detach().to(kind).contiguous().numpy() for x, kind in given]
+    parts: Any = (context.numpy(), each_step, *tables, Network(*network), float(temperature))
     return Policy(*parts)
-
-
-def _network(prior: GRUPrior, observed: Tensor) -> tuple[Tensor, ...]:
-    """The parts of a network in `Policy`, from `action` on; `observed [W * S, ...]` are the contexts of all states."""
-    embedding, size = prior.embedding, prior.hidden_size
-    weight, recurrent, bias, recurrent_bias = prior.gru.all_weights[0]
-    both = bias + torch.cat([recurrent_bias[: 2 * size], torch.zeros(size)])
-    action = embedding.action.weight @ weight.T + both
-    past, by_context = torch.empty(0, 0, 3 * size), torch.empty(0, 3 * size)
-    if embedding.past is not None and embedding.mix is not None:
-        # The last tap of the convolution is that of the last action.
-        past = torch.einsum("av,hvk->kah", embedding.past.weight[:-1], embedding.mix.weight).flip(0) @ weight.T
-    if embedding.index is not None:
-        by_context = embedding.index(observed.long()) @ weight.T
-    elif embedding.features is not None:
-        by_context = embedding.features(observed.float()) @ weight.T
-    head = prior.head
-    return action, past, by_context, recurrent.T, recurrent_bias[2 * size :], head.weight.T, head.bias

@@ -333,6 +333,11 @@ def _sample_one_by_one(
                 parent, last = plans.extend(action)
                 if parent is not None:
                     hidden = rows_of(hidden, parent)
+                if plans.row is None and context is None:
+                    rest = stepper.draw_rest(last, hidden, uniform[k + 1 :, part], draw.temperature)
+                    if rest is not None:
+                        actions[part, k + 1 :] = rest
+                        return
                 given = None if context is None else context[row[part], t + 1]
                 now, hidden = stepper.step(last, hidden, given, len(steps) - k - 2)
 

@@ -36,6 +36,8 @@ class Steppable(Protocol):
     - `advance(action, state, context, room)`: as `step`, but may overwrite the state; `room` more steps will follow.
     - `advance_shared(action, state, context, row, room)`: as `advance`, where plans get the same input: `action [K]`
       and `context [K, ...]` are the distinct ones, `row [N]` says which of them each plan gets.
+    - `draw_rest(action, state, uniform, temperature)`: the actions `[N, T]` that follow `action [N]`, drawn with the
+      numbers `uniform [T, N]`; None: not now, so that the prior is stepped.
     - `device`: where the prior computes; a prior that takes a context computes on the CPU without it.
     - `shares_steps`: true where steps of different plans may be taken on several threads at once.
 
@@ -77,6 +79,7 @@ class Stepper:
         if isinstance(prior, torch.nn.Module):
             self._alone = WORTH_THREADS // (OF_A_STEP + sum(weights.numel() for weights in prior.parameters()))
         self._advance = getattr(prior, "advance", None) if in_place else None
+        self._draw_rest = getattr(prior, "draw_rest", None) if in_place and self.end is None else None
         self._advance_shared = getattr(prior, "advance_shared", None) if in_place else None
 
     @property
@@ -122,6 +125,11 @@ class Stepper:
             else:
                 logits, state = self._prior.step(action, state, context)
         return after_end(logits, action, self.end), state
+
+    def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
+        """The rest of N plans, `[N, T]`, where the prior draws it at once; see `Steppable`."""
+        rest: Tensor | None = None if self._draw_rest is None else self._draw_rest(action, state, uniform, temperature)
+        return rest
 
     def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
         """As `start`, with the observation of `state [B, ...]` as context.

@@ -1,6 +1,7 @@
-"""The gates of a recurrent network by compiled loops, for `gru_step` and `gru_sequence`; importing this loads numba."""
+"""A recurrent network by compiled loops: its gates, for `gru_step` and `gru_sequence`, whole steps of many plans, and
+plans that are drawn from it to their ends; importing this loads numba."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,6 +10,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 Array = np.ndarray[Any, Any]
+
+BLOCK = 40
+"""Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
 
 
 def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor:
@@ -58,6 +62,107 @@ def _gates(given: Array, rows: Array, hidden: Array, before: Array, stride: int,
             update = sigmoid(mine[width + k] + own[width + k])
             fresh = tanh(mine[2 * width + k] + reset * own[2 * width + k])
             new[k] = fresh + update * (last[k] - fresh)
+
+
+class Network(NamedTuple):
+    """A gated recurrent network of one layer, of float32.
+
+    Attributes:
+        action: `[A + 1, 3 H]`: what the last action adds to the gates, with their biases.
+        past: `[taps, A + 2, 3 H]`: what each of the last actions adds; the last row, of no action, is 0.
+        beyond: `[1, 3 H]`: what is added where there is an action before these; `[0, 3 H]`: nothing.
+        recurrent: `[H, 3 H]`, and `bias [H]` of its last part.
+        head: `[H, A]`, and `head_bias [A]`.
+    """
+
+    action: Array
+    past: Array
+    beyond: Array
+    recurrent: Array
+    bias: Array
+    head: Array
+    head_bias: Array
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def advance(network: Network, number: int, states: Array, gates: Array, product: Array, logits: Array) -> None:
+    """Step a block of so many plans, at most `BLOCK`.
+
+    Args:
+        network: the network.
+        number: of plans, the first rows of the arrays.
+        states: `[BLOCK, H]`: the hidden states, which are overwritten.
+        gates: `[BLOCK, 3 H]`: what the inputs add to the gates; overwritten.
+        product: `[BLOCK, 3 H]`: room.
+        logits: `[BLOCK, A]`: gets the logits of the next action.
+    """
+    size, actions = states.shape[1], logits.shape[1]
+    np.dot(states[:number], network.recurrent, product[:number])
+    # Single numbers are indexed, not rows: numba counts references to each row, which takes as long as all else here.
+    for i in range(number):
+        for j in range(2 * size):
+            gates[i, j] = sigmoid(gates[i, j] + product[i, j])
+        for j in range(size):
+            new = tanh(gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + network.bias[j]))
+            states[i, j] = new + gates[i, size + j] * (states[i, j] - new)
+    np.dot(states[:number], network.head, logits[:number])
+    for i in range(number):
+        for a in range(actions):
+            logits[i, a] += network.head_bias[a]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def draw_to_the_end(
+    network: Network, given: Array, hidden: Array, line: Array, uniform: Array, temperature: float
+) -> None:
+    """Draw the actions of N plans, as `neuroprior.sampling.draws.Draw` does, in blocks that stay in the cache.
+
+    Args:
+        network: the network.
+        given: float32 `[N, 3 H]`: what is added to the gates at each step; no rows: nothing.
+        hidden: `[N, H]`: before the last action is read.
+        line: int64 `[N, before + T]`: the actions up to the last one, A + 1 where there was none; gets the drawn ones.
+        uniform: float32 `[T, N]`: what they are drawn with.
+        temperature: divides logits.
+    """
+    (number, size), (steps, _), actions = hidden.shape, uniform.shape, len(network.head_bias)
+    taps, nothing, before = len(network.past), actions + 1, line.shape[1] - len(uniform)
+    states, logits = np.empty((BLOCK, size), np.float32), np.empty((BLOCK, actions), np.float32)
+    gates, product = np.empty((BLOCK, 3 * size), np.float32), np.empty((BLOCK, 3 * size), np.float32)
+    scale = float32(temperature)
+    for begin in range(0, number, BLOCK):
+        rows = min(BLOCK, number - begin)
+        states[:rows] = hidden[begin : begin + rows]
+        for t in range(steps):
+            at = before + t - 1
+            for i in range(rows):
+                n = begin + i
+                last = line[n, at]
+                for j in range(3 * size):
+                    gates[i, j] = network.action[last, j]
+                if len(given):
+                    for j in range(3 * size):
+                        gates[i, j] += given[n, j]
+                for lag in range(taps):
+                    symbol = line[n, at - lag]
+                    if symbol != nothing:
+                        for j in range(3 * size):
+                            gates[i, j] += network.past[lag, symbol, j]
+                if len(network.beyond) and line[n, at - taps] != nothing:
+                    for j in range(3 * size):
+                        gates[i, j] += network.beyond[0, j]
+            advance(network, rows, states, gates, product, logits)
+            for i in range(rows):
+                top, total = logits[i, 0], float32(0)
+                for a in range(1, actions):
+                    top = max(top, logits[i, a])
+                for a in range(actions):
+                    total += np.exp((logits[i, a] - top) / scale)
+                    logits[i, a] = total
+                mark, action = uniform[t, begin + i] * total, 0
+                while logits[i, action] <= mark and logits[i, action] < total:
+                    action += 1
+                line[begin + i, at + 1] = action
 
 
 class Sequence(torch.autograd.Function):

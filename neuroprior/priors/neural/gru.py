@@ -101,6 +101,58 @@ class GRUPrior(NeuralPrior):
         out, layers = gru_step(self.gru, vectors[:, 0], layers, row.int())
         return self.head(out), torch.cat([inputs.index_select(0, row), layers.transpose(0, 1).flatten(1)], 1)
 
+    def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
+        """The rest of many plans, drawn by a compiled loop; see `neuroprior.sampling.Steppable`.
+
+        Args:
+            action: integers `[N]`, the last ones.
+            state: `[N, D + H]`, before these.
+            uniform: `[T, N]`: what the next T actions are drawn with.
+            temperature: divides the logits.
+
+        Returns:
+            int64 `[N, T]`; None where there is no such loop, or it is not worth its call.
+        """
+        size, (steps, number) = self.hidden_size, uniform.shape
+        able = (
+            type(self) is GRUPrior
+            and self.num_layers == 1
+            and self._may_step(state[:, None])
+            and self.window != 0
+            and self.context_per != "step"
+        )
+        able = able and state.dtype == uniform.dtype == torch.float32 and COMPILE_FROM is not None
+        worth = able and number * size >= (COMPILE_FROM or 0) and self.lags * self.num_actions <= number * steps
+        fast = compiled("neuroprior.priors.neural.compiled_gru") if worth else None
+        if fast is None:
+            return None
+        last, hidden, recent = state.split([self.input_size, size, self.lags - 1], 1)
+        given = torch.empty(0, 3 * size)
+        if self.takes_context:
+            given = self.embedding.of_context(last[:, None])[:, 0] @ self.gru.all_weights[0][0].T
+        line = torch.cat([recent.long(), action[:, None], action.new_empty(number, steps)], 1)
+        arrays = (x.detach().contiguous().numpy() for x in (given, hidden, line, uniform))
+        fast.draw_to_the_end(fast.Network(*self.tables()), *arrays, float(temperature))
+        return line[:, self.lags :]
+
+    def tables(self) -> tuple[Any, ...]:
+        """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates.
+
+        Raises:
+            ValueError: the network has several layers.
+        """
+        if self.num_layers > 1:
+            raise ValueError(f"num_layers: a network of one layer is expected, not of {self.num_layers}")
+        weight, recurrent, bias, recurrent_bias = self.gru.all_weights[0]
+        size, embedding = self.hidden_size, self.embedding
+        both = bias + torch.cat([recurrent_bias[: 2 * size], torch.zeros(size)])
+        past, beyond = embedding.of_past(self.window)
+        parts = (
+            embedding.action.weight @ weight.T + both, past @ weight.T, beyond @ weight.T,
+            recurrent.T, recurrent_bias[2 * size :], self.head.weight.T, self.head.bias,
+        )  # fmt: skip
+        return tuple(x.detach().float().contiguous().numpy() for x in parts)
+
     def _may_step(self, inputs: Tensor) -> bool:
         """Whether `_one_step` gives the same as `nn.GRU`, and faster."""
         plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"))

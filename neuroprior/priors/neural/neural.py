@@ -366,8 +366,26 @@ class Embedding(nn.Module):
                 start = self.mix.weight[..., beyond - 1] @ self.past.weight[self.nothing - 1]
                 begun = line[:, beyond - 1 : beyond - 1 + now.shape[1]] != self.nothing
                 vectors = vectors + begun[..., None] * start
-        if self.index is not None:
-            vectors = vectors + self.index(inputs[..., 1].long())
-        if self.features is not None:
-            vectors = vectors + self.features(inputs[..., 1:])
+        if self.index is not None or self.features is not None:
+            vectors = vectors + self.of_context(inputs)
         return vectors, line[:, line.shape[1] - self.lags + 1 :]
+
+    def of_context(self, inputs: Tensor) -> Tensor:
+        """What the contexts of `inputs [N, T, D]` add to their vectors: `[N, T, width]`."""
+        own = [] if self.index is None else [self.index(inputs[..., 1].long())]
+        own += [] if self.features is None else [self.features(inputs[..., 1:])]
+        return torch.stack(own).sum(0)
+
+    def of_past(self, window: int | None) -> tuple[Tensor, Tensor]:
+        """What the last actions add to the vectors; see `forward`.
+
+        Returns:
+            `[taps, A + 2, width]`, from the last one back; and `[1, width]`, where there is an action before these, or
+            `[0, width]`, if it adds nothing.
+        """
+        if self.past is None or self.mix is None:
+            return torch.empty(0, 1, self.action.embedding_dim), torch.empty(0, self.action.embedding_dim)
+        taps = self.lags if window is None else min(window, self.lags)
+        weight = self.mix.weight.flip(2)  # the last tap of a convolution is that of the last input
+        past = torch.einsum("av,hvk->kah", self.past.weight, weight)
+        return past[:taps], past[taps : taps + 1, self.nothing - 1]

@@ -228,6 +228,37 @@ def test_a_compiled_sequence_of_a_gru_is_that_of_torch(num_layers, begun, monkey
         assert torch.allclose(gru.gru_sequence(network, inputs, first if begun else None)[0], found[0][0], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("made", "context"),
+    [
+        ({"lags": 1}, None),
+        ({"lags": 16}, None),
+        ({"lags": 16, "window": 5}, None),
+        ({"lags": 3, "window": 2}, None),
+        ({"lags": 2, "num_contexts": 5}, torch.arange(3000) % 5),
+        ({"lags": 2, "context_size": 2}, torch.randn(3000, 2, generator=seeded(3))),
+    ],
+    ids=lambda given: str(given) if isinstance(given, dict) else "",
+)
+def test_plans_that_a_compiled_loop_draws_to_their_ends_are_those_of_torch(made, context, monkeypatch):
+    """With the same numbers; also past the window, with a temperature, and after a past."""
+    pytest.importorskip("numba")
+    prior = GRUPrior(5, 16, **made)
+    prior.context_per = None if context is None else "plan"
+    with torch.no_grad():
+        for weights in prior.parameters():
+            weights.mul_(3)
+    rest, loops = prior.draw_rest, []
+    prior.draw_rest = lambda *given: loops.append(rest(*given)) or loops[-1]
+    found = []
+    for compile_from in (1, None):
+        monkeypatch.setattr(gru, "COMPILE_FROM", compile_from)
+        how = {"context": context, "past": torch.tensor([3, 1, 4]), "temperature": 0.7}
+        found.append(prior.sample(3000, 12, **how, generator=seeded(4)))
+    assert torch.equal(*found)
+    assert any(plans is not None for plans in loops)
+
+
 def test_compiled_gates_are_those_of_torch():
     """Over the whole range of activations, of states that have other numbers beside them."""
     module = compiled("neuroprior.priors.neural.compiled_gru")
