@@ -16,7 +16,7 @@ from neuroprior.sampling.rows import rows_of
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import Rollout, World, join_states
 
-CACHED, FEWEST = 2**17, 1024
+CACHED, FEWEST = 2**19, 1024
 """On a CPU, plans are stepped in parts of at most `CACHED` numbers in their states (or logits), so that they fit a
 processor's cache, and of at least `FEWEST` plans.
 """

@@ -15,13 +15,24 @@ BLOCK = 40
 """Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
 
 
-def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor:
-    """As `neuroprior.priors.neural.gru.gates`, of float32 on the CPU; columns of `before` must be contiguous."""
-    after = torch.empty(before.shape)
+def gates(
+    given: Tensor,
+    rows: Tensor,
+    hidden: Tensor,
+    before: Tensor,
+    bias: Tensor | None = None,
+    after: Tensor | None = None,
+) -> Tensor:
+    """As `neuroprior.priors.neural.gru.gates`, of float32 on the CPU; columns of `before` must be contiguous.
+
+    The new hidden states are written to `after [N, width]`, where it is given.
+    """
+    after = torch.empty(before.shape) if after is None else after
+    bias = torch.zeros(hidden.shape[1]) if bias is None else bias
     # rows of the hidden states may have other numbers behind them
     span = max((len(before) - 1) * before.stride(0) + before.shape[1], 0)
     flat = before.as_strided((span,), (1,)).numpy()
-    _gates(given.numpy(), rows.numpy(), hidden.numpy(), flat, before.stride(0), after.numpy())
+    _gates(given.numpy(), rows.numpy(), hidden.numpy(), bias.numpy(), flat, before.stride(0), after.numpy())
     return after
 
 
@@ -52,15 +63,15 @@ def sigmoid(x: Any) -> Any:
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _gates(given: Array, rows: Array, hidden: Array, before: Array, stride: int, after: Array) -> None:
+def _gates(given: Array, rows: Array, hidden: Array, bias: Array, before: Array, stride: int, after: Array) -> None:
     """`before` is flat, of rows at this `stride`."""
     width = after.shape[1]
     for n in range(len(after)):
         mine, own, last, new = given[rows[n]], hidden[n], before[n * stride : n * stride + width], after[n]
         for k in range(width):
-            reset = sigmoid(mine[k] + own[k])
-            update = sigmoid(mine[width + k] + own[width + k])
-            fresh = tanh(mine[2 * width + k] + reset * own[2 * width + k])
+            reset = sigmoid(mine[k] + own[k] + bias[k])
+            update = sigmoid(mine[width + k] + own[width + k] + bias[width + k])
+            fresh = tanh(mine[2 * width + k] + reset * (own[2 * width + k] + bias[2 * width + k]))
             new[k] = fresh + update * (last[k] - fresh)
 
 

@@ -1,6 +1,6 @@
 """The GRU prior: a recurrent network over the actions so far."""
 
-import sys
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -9,10 +9,14 @@ from torch.nn import functional
 
 from neuroprior._checks import check_memory, check_sizes
 from neuroprior._compiled import compiled
+from neuroprior._threads import share
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
 
 COMPILE_FROM: int | None = 4096
 """Numbers in the hidden states from which a compiled loop is worth its call, where numba is installed; None: never."""
+
+ROWS = 2048
+"""Rows of hidden states whose products stay in a processor's cache."""
 
 
 class GRUPrior(NeuralPrior):
@@ -226,15 +230,34 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
         w_in, w_hidden, b_in, b_hidden = gru.all_weights[layer]
         if layer > 0 or rows is None:
             rows = torch.arange(len(before), dtype=torch.int32)
-        given, hidden = functional.linear(below, w_in, b_in), functional.linear(before, w_hidden, b_hidden)
+        given = functional.linear(below, w_in, b_in)
         able = COMPILE_FROM is not None and before.numel() >= COMPILE_FROM and before.dtype == torch.float32
         fast = compiled("neuroprior.priors.neural.compiled_gru") if able and before.stride(1) == 1 else None
-        below = (fast or sys.modules[__name__]).gates(given, rows, hidden, before)
+        if fast is None:
+            below = gates(given, rows, functional.linear(before, w_hidden, b_hidden), before)
+        else:
+            below = _in_parts(fast.gates, given, rows, before, w_hidden, b_hidden)
         after.append(below)
     return below, after[0][None] if len(after) == 1 else torch.stack(after)
 
 
-def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor:
+def _in_parts(
+    compiled_gates: Callable[..., Tensor], given: Tensor, rows: Tensor, before: Tensor, weight: Tensor, bias: Tensor
+) -> Tensor:
+    """The new hidden states of one layer, where products of `ROWS` rows stay in the cache; threads share many."""
+    if len(before) <= ROWS:
+        return compiled_gates(given, rows, before @ weight.T, before, bias)
+    after = torch.empty(before.shape)
+
+    def part(begin: int) -> None:
+        some = slice(begin, begin + ROWS)
+        compiled_gates(given, rows[some], before[some] @ weight.T, before[some], bias, after[some])
+
+    share(part, range(0, len(before), ROWS))
+    return after
+
+
+def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor, bias: Tensor | None = None) -> Tensor:
     """The new hidden states `[N, width]` of one layer (Cho et al. 2014).
 
     Args:
@@ -242,8 +265,10 @@ def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor
         rows: integers `[N]`: which of the inputs each row reads.
         hidden: `[N, 3 * width]`: what the hidden states add, of which the reset gate lets a share into the new state.
         before: `[N, width]`: the hidden states.
+        bias: `[3 * width]`: what is added to `hidden`; None: nothing.
     """
     size, given = before.shape[1], given.index_select(0, rows)
-    share = hidden[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_()
-    new = given[:, 2 * size :].addcmul_(share[:, :size], hidden[:, 2 * size :]).tanh_()
-    return torch.lerp(new, before, share[:, size:])
+    hidden = hidden if bias is None else hidden + bias
+    opened = hidden[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_()
+    new = given[:, 2 * size :].addcmul_(opened[:, :size], hidden[:, 2 * size :]).tanh_()
+    return torch.lerp(new, before, opened[:, size:])
