@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from neuroprior import GRUPrior
+from neuroprior import GRUPrior, MarkovPrior
 from neuroprior._threads import share
-from neuroprior.sampling import ancestral
+from neuroprior.sampling import ancestral, stepping
 from tests.support.sources import seeded
 
 
@@ -39,6 +39,26 @@ def test_plans_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
     context = torch.randint(2, (50, 6), generator=seeded(1))
     whole = prior.sample(50, 6, context, generator=seeded(0))
     monkeypatch.setattr(ancestral, "FEWEST", 8)
+    monkeypatch.setattr(stepping, "WORTH_THREADS", 0)  # so few plans are not worth them else
     monkeypatch.setattr(ancestral, "share", lambda work, given: parts.append(len(given)) or share(work, given))
     assert torch.equal(prior.sample(50, 6, context, generator=seeded(0)), whole)
     assert parts == [{1: 7, 3: 9}[threads]]
+
+
+class Watched(MarkovPrior):
+    """Writes down how many threads torch takes for how many plans."""
+
+    def step(self, action, state, context=None):
+        self.log.append((len(action), torch.get_num_threads()))
+        return super().step(action, state, context)
+
+
+@pytest.mark.parametrize("number", [10, 20_000])
+def test_steps_of_few_plans_take_one_thread(threads, number):
+    prior = Watched(3, 1).fit(torch.randint(3, (50, 6), generator=seeded(0)))
+    prior.log = []
+    stepper = stepping.Stepper(prior)
+    _, state = stepper.start(number)
+    stepper.step(torch.zeros(number, dtype=torch.long), state)
+    assert prior.log == [(number, 1 if number == 10 else threads)]
+    assert torch.get_num_threads() == threads
