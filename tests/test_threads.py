@@ -45,7 +45,7 @@ def test_plans_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
     assert parts == [{1: 7, 3: 9}[threads]]
 
 
-class Watched(MarkovPrior):
+class Watched:
     """Writes down how many threads torch takes for how many plans."""
 
     def step(self, action, state, context=None):
@@ -53,12 +53,24 @@ class Watched(MarkovPrior):
         return super().step(action, state, context)
 
 
-@pytest.mark.parametrize("number", [10, 20_000])
-def test_steps_of_few_plans_take_one_thread(threads, number):
-    prior = Watched(3, 1).fit(torch.randint(3, (50, 6), generator=seeded(0)))
+class WatchedGRU(Watched, GRUPrior):
+    pass
+
+
+class WatchedChain(Watched, MarkovPrior):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("prior", "number", "shared"),
+    [(WatchedGRU(3, 64), 10, False), (WatchedGRU(3, 64), 20_000, True), (WatchedChain(3, 1), 20_000, False)],
+    ids=["few plans", "many plans", "a table"],
+)
+def test_only_steps_of_many_plans_and_weights_take_several_threads(threads, prior, number, shared):
     prior.log = []
     stepper = stepping.Stepper(prior)
-    _, state = stepper.start(number)
-    stepper.step(torch.zeros(number, dtype=torch.long), state)
-    assert prior.log == [(number, 1 if number == 10 else threads)]
+    with torch.no_grad():
+        _, state = stepper.start(number)
+        stepper.step(torch.zeros(number, dtype=torch.long), state)
+    assert prior.log == [(number, threads if shared else 1)]
     assert torch.get_num_threads() == threads

@@ -64,7 +64,9 @@ class FrontierPlanner(PriorPlanner):
         generator = self._check(world, state, generator)
         steps = sum(self._widths(world.num_actions))
         chunks = self.chunks(state, steps)
-        return join_decisions((self._plan(world, some, generator, steps) for some in chunks), len(state))
+        most = max(self._widths(world.num_actions))
+        with Stepper(self.prior).threads_for(max(map(len, chunks)) * most):
+            return join_decisions((self._plan(world, some, generator, steps) for some in chunks), len(state))
 
     def _widths(self, actions: int) -> list[int]:
         """How many continuations are tried at each step."""

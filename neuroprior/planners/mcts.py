@@ -95,7 +95,8 @@ class MCTSPlanner(PriorPlanner):
         if module is not None and module.can_search(self, world, state):
             *found, steps = module.search_all(self, world, state, generator)
         else:
-            *found, steps = _Trees(self, module, world, state, generator).search()
+            with Stepper(self.prior).threads_for(len(state)):
+                *found, steps = _Trees(self, module, world, state, generator).search()
         plans, rewards, states, done = found
         rollout = Rollout(states[:, :, -1], rewards, states if self.any_prefix else None)
         score, ends = self.score_rollout(rollout)

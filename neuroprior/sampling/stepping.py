@@ -15,9 +15,9 @@ from neuroprior.worlds.world import World, check_is_world
 FEWEST_TO_SHARE = 256
 """The number of states from which the distinct ones are found, so that each is observed once."""
 
-WORTH_THREADS, OF_A_STEP = 2**26, 2**13
-"""Plans times parameters of their prior from which threads share a step, and parameters that are added to these for the
-rest of a step. With less threads gain nothing, and on a busy machine wait for one another for milliseconds.
+WORTH_THREADS = 2**27
+"""Plans times parameters of their prior from which threads share a step. With less, or with a table, they gain next to
+nothing, and on a busy machine wait for one another for milliseconds at each operation.
 """
 
 
@@ -75,9 +75,10 @@ class Stepper:
         self.context_per: Literal["plan", "step"] | None = getattr(prior, "context_per", None)
         self.end: int | None = getattr(prior, "end", None)
         self.shares: bool = getattr(prior, "shares_steps", False)
-        self._alone = 0  # the most plans that are stepped on one thread
+        self._alone = 0.0  # the most plans that are stepped on one thread
         if isinstance(prior, torch.nn.Module):
-            self._alone = WORTH_THREADS // (OF_A_STEP + sum(weights.numel() for weights in prior.parameters()))
+            parameters = sum(weights.numel() for weights in prior.parameters())
+            self._alone = WORTH_THREADS / parameters if parameters else float("inf")
         self._advance = getattr(prior, "advance", None) if in_place else None
         self._draw_rest = getattr(prior, "draw_rest", None) if in_place and self.end is None else None
         self._advance_shared = getattr(prior, "advance_shared", None) if in_place else None

@@ -9,14 +9,15 @@ from torch.nn import functional
 
 from neuroprior._checks import check_memory, check_sizes
 from neuroprior._compiled import compiled
-from neuroprior._threads import share
+from neuroprior._threads import one_thread, share
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
 
 COMPILE_FROM: int | None = 4096
 """Numbers in the hidden states from which a compiled loop is worth its call, where numba is installed; None: never."""
 
-ROWS = 2048
-"""Rows of hidden states whose products stay in a processor's cache."""
+ROWS, WORTH_THREADS = 2048, 8
+"""Rows of hidden states whose products stay in a processor's cache, and so many times these from which threads share
+them."""
 
 
 class GRUPrior(NeuralPrior):
@@ -253,7 +254,9 @@ def _in_parts(
         some = slice(begin, begin + ROWS)
         compiled_gates(given, rows[some], before[some] @ weight.T, before[some], bias, after[some])
 
-    share(part, range(0, len(before), ROWS))
+    begins = range(0, len(before), ROWS)
+    with one_thread(len(begins) < WORTH_THREADS):
+        share(part, begins)
     return after
 
 
