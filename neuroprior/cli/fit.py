@@ -301,10 +301,13 @@ def _in_full(arguments: list[str]) -> list[str]:
         if "--data.file" in given and not given & OTHERWISE:
             arguments = ["fit", "--config", OF_MODES if "--modes" in given else DEFAULT, *arguments[1:]]
     out: list[str] = []
+    given_recipes = set()
     for argument in arguments:
         if out and out[-1] in ("--config", "-c"):
+            given_recipes.add(argument)
             argument = recipe_path(argument)
         elif argument.startswith("--config="):
+            given_recipes.add(argument.removeprefix("--config="))
             argument = f"--config={recipe_path(argument.removeprefix('--config='))}"
         elif argument.startswith(OF_TABLES):
             argument = f"--data.{argument.removeprefix('--')}"
@@ -314,6 +317,8 @@ def _in_full(arguments: list[str]) -> list[str]:
         return out
     if effort.startswith("--"):
         raise ValueError("effort: fast, standard or full is expected after --effort")
+    if without := sorted(given_recipes & set(recipes()) - {DEFAULT}):
+        raise ValueError(f"effort: it is of the recipe {DEFAULT}, and the recipe {without[0]} has none")
     return [*out, f"{EFFORT}={effort}"]  # last: the prior that it belongs to may be given after it
 
 

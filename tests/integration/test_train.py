@@ -331,6 +331,10 @@ def test_ctrl_c_says_how_to_resume(tmp_path, capsys, monkeypatch):
         ([*recipe("gru"), "--trainer.devices", "0"], "devices"),
         ([*recipe("gru"), "--effort", "fast"], "error: model.prior: it has no option 'effort'"),
         (
+            ["fit", "--config=gru", "--effort", "fast"],
+            "error: effort: it is of the recipe combined, and the recipe gru",
+        ),
+        (
             [*recipe("combined"), "--effort", "quick"],
             "error: effort: one of fast, standard, full is expected, not quick",
         ),
