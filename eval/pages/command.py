@@ -25,7 +25,8 @@ HOURS = {
     "control": "1.5",
     "macro-actions": "2",
     "agents": "0.5",
-    "speed": "0.2",
+    "quality": "1.3",
+    "speed": "0.3",
 }
 """By page: the hours that it states, on one or two cores; + where it states them for some of its commands only."""
 
