@@ -14,8 +14,10 @@ Part = TypeVar("Part")
 def one_thread(wanted: bool = True) -> Iterator[None]:
     """torch on one thread where that is `wanted`, and on as many as before when the block ends."""
     threads = torch.get_num_threads()
-    if wanted:
-        torch.set_num_threads(1)
+    if not wanted or threads == 1:
+        yield
+        return
+    torch.set_num_threads(1)
     try:
         yield
     finally:

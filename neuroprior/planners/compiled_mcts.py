@@ -16,7 +16,7 @@ from neuroprior._threads import one_thread
 from neuroprior.planners.planner import PriorPlanner
 from neuroprior.plans import action_dtype
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance
+from neuroprior.priors.neural.compiled_gru import ALONE, BLOCK, Network
 from neuroprior.priors.neural.gru import GRUPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
@@ -196,6 +196,19 @@ def back_up(nodes: Nodes, rows: Array, path: Array, plan: Array, score: Array) -
                 finished &= nodes.closed[b, node, a]
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _exp(x: Any) -> Any:
+    """e to the power of a float32, to 1e-7 of it; of arithmetic alone, so that loops over it are vectorised."""
+    x = min(max(x, np.float32(-87)), np.float32(87))
+    # x = n log 2 + r: n is rounded by adding what leaves no digits behind the point, log 2 is split in two.
+    n = (x * np.float32(1.4426950408889634) + np.float32(12582912)) - np.float32(12582912)
+    r = (x - n * np.float32(0.693359375)) + n * np.float32(2.1219444005469057e-4)
+    series = np.float32(1 / 5040)
+    for factor in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
+        series = series * r + np.float32(factor)
+    return series * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(
     policy: Policy,
@@ -221,7 +234,7 @@ def _evaluate(
         weights, probs: `[K, A]`: get its predictions: cumulative unnormalised probabilities, and probabilities.
         work: room for `BLOCK` rows of hidden states, products, gates and logits.
     """
-    size, actions = hidden.shape[1], weights.shape[1]
+    size, actions, one = hidden.shape[1], weights.shape[1], np.float32(1)
     if size == 0:
         for k in which:
             code[k] = policy.after[code[k], plans[k, t]]
@@ -229,6 +242,8 @@ def _evaluate(
             for a in range(actions):
                 weights[k, a], probs[k, a] = policy.weights[row, a], policy.probs[row, a]
         return
+    # Gates of its own: what numba compiled of a file is kept until this file changes, not those that it calls.
+    # Single numbers are indexed, not rows: numba counts references to each row, which takes as long as all else here.
     block, product, gates, logits = work
     action, past, beyond = policy.network.action, policy.network.past, policy.network.beyond
     for begin in range(0, len(which), BLOCK):
@@ -251,13 +266,21 @@ def _evaluate(
                 now = policy.context[observed[k]]
                 for j in range(3 * size):
                     gates[i, j] += policy.by_context[now, j]
-        advance(policy.network, number, block, gates, product, logits)
+        np.dot(block[:number], policy.network.recurrent, product[:number])
+        for i in range(number):
+            k = which[begin + i]
+            for j in range(2 * size):
+                gates[i, j] = one / (one + _exp(-(gates[i, j] + product[i, j])))
+            for j in range(size):
+                new = gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + policy.network.bias[j])
+                new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
+                hidden[k, j] = block[i, j] = new + gates[i, size + j] * (block[i, j] - new)
+        np.dot(block[:number], policy.network.head, logits[:number])
         for i in range(number):
             k = which[begin + i]
             top, total = np.float32(-np.inf), 0.0
-            for j in range(size):
-                hidden[k, j] = block[i, j]
             for a in range(actions):
+                logits[i, a] += policy.network.head_bias[a]
                 top = max(top, logits[i, a])
             for a in range(actions):
                 probs[k, a] = np.exp((logits[i, a] - top) / policy.temperature)
@@ -515,7 +538,7 @@ def _search_all(
     discounts = np.empty(0)
     if planner.objective == "return":
         discounts = (planner.discount ** torch.arange(length, dtype=torch.float64)).numpy()
-    threads = threads if batch * size >= SHARED else 1
+    threads = threads if batch * size >= SHARED and BLOCK * size * max(3 * size, actions) <= ALONE else 1
     each = -(-batch // threads)
     descent = Descent(
         np.empty(batch, np.int64), np.empty((batch, length), np.int64), np.empty((batch, length), np.int64),
@@ -567,7 +590,7 @@ def _search_shared(
     """
     nodes, known = given[:2]
     to_the_end: Any = follow
-    most, used, each = descent.path.shape[1] * (1 + nodes.child.shape[2]), 0, len(rooms[0].alive)
+    most, used = descent.path.shape[1] * (1 + nodes.child.shape[2]), 0
     for simulation in range(len(found.plans)):
         number = unfinished(nodes, known, descent.rows)
         if number == 0 or len(draws) - used < number * most:
@@ -576,6 +599,7 @@ def _search_shared(
         on_the_way = rows, path, plan, depth = [x[:number] for x in descent[:4]]
         used += descend(nodes, rows, exploration, own, path, plan, depth, descent.first)
         found.done[simulation] = False
+        each = -(-number // len(rooms))
 
         def part(begin: int) -> None:
             some = [x[begin : begin + each] for x in on_the_way]  # noqa: B023
@@ -624,7 +648,7 @@ def _knows(prior: Steppable) -> bool:
         own = type(prior)
         same = own.start is HistoryPrior.start and own.step is HistoryPrior.step and own._at is HistoryPrior._at
         return same and own.advance is Prior.advance and prior.log_probs.dtype == torch.float32
-    if type(prior) is not GRUPrior or prior.num_layers > 1 or prior.training or prior.window == 0:
+    if not isinstance(prior, GRUPrior) or prior.training or not prior.is_plain:
         return False
     return prior.head.weight.dtype == torch.float32
 

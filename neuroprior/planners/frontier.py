@@ -1,5 +1,6 @@
 """The frontier planner: plans are extended step by step, and of those that reach the same state one is kept."""
 
+from contextlib import nullcontext
 from typing import NamedTuple, Unpack
 
 import torch
@@ -65,7 +66,8 @@ class FrontierPlanner(PriorPlanner):
         steps = sum(self._widths(world.num_actions))
         chunks = self.chunks(state, steps)
         most = max(self._widths(world.num_actions))
-        with Stepper(self.prior).threads_for(max(map(len, chunks)) * most):
+        few = self.value is None  # the user's values may be worth threads
+        with Stepper(self.prior).threads_for(max(map(len, chunks)) * most) if few else nullcontext():
             return join_decisions((self._plan(world, some, generator, steps) for some in chunks), len(state))
 
     def _widths(self, actions: int) -> list[int]:

@@ -11,8 +11,10 @@ from torch.autograd.function import once_differentiable
 
 Array = np.ndarray[Any, Any]
 
-BLOCK = 40
-"""Rows of a matrix product: few enough to stay in the cache, and for numpy to take one thread for a network 64 wide."""
+BLOCK, ALONE = 40, 2**20
+"""Rows of a matrix product, few enough to stay in the cache; and the most multiplications for which OpenBLAS takes one
+thread: in larger products its threads, of which torch does not know, would wait for one another.
+"""
 
 
 def gates(
@@ -25,10 +27,11 @@ def gates(
 ) -> Tensor:
     """As `neuroprior.priors.neural.gru.gates`, of float32 on the CPU; columns of `before` must be contiguous.
 
-    The new hidden states are written to `after [N, width]`, where it is given.
+    `bias [3 * width]` is added to `hidden`, which is left as it is. The new hidden states are written to
+    `after [N, width]`, where it is given.
     """
-    after = torch.empty(before.shape) if after is None else after
-    bias = torch.zeros(hidden.shape[1]) if bias is None else bias
+    after = before.new_empty(before.shape) if after is None else after
+    bias = hidden.new_zeros(hidden.shape[1]) if bias is None else bias
     # rows of the hidden states may have other numbers behind them
     span = max((len(before) - 1) * before.stride(0) + before.shape[1], 0)
     flat = before.as_strided((span,), (1,)).numpy()
@@ -126,7 +129,9 @@ def advance(network: Network, number: int, states: Array, gates: Array, product:
 def draw_to_the_end(
     network: Network, given: Array, hidden: Array, line: Array, uniform: Array, temperature: float
 ) -> None:
-    """Draw the actions of N plans, as `neuroprior.sampling.draws.Draw` does, in blocks that stay in the cache.
+    """Draw the actions of N plans, in blocks that stay in the cache.
+
+    But for rounding, they are those that `neuroprior.sampling.draws.Draw` takes with the same numbers.
 
     Args:
         network: the network.
@@ -156,7 +161,7 @@ def draw_to_the_end(
                         gates[i, j] += given[n, j]
                 for lag in range(taps):
                     symbol = line[n, at - lag]
-                    if symbol != nothing:
+                    if symbol != nothing:  # it adds 0
                         for j in range(3 * size):
                             gates[i, j] += network.past[lag, symbol, j]
                 if len(network.beyond) and line[n, at - taps] != nothing:
@@ -164,14 +169,15 @@ def draw_to_the_end(
                         gates[i, j] += network.beyond[0, j]
             advance(network, rows, states, gates, product, logits)
             for i in range(rows):
-                top, total = logits[i, 0], float32(0)
+                top, total = logits[i, 0], 0.0  # float64, as torch sums
                 for a in range(1, actions):
                     top = max(top, logits[i, a])
                 for a in range(actions):
                     total += np.exp((logits[i, a] - top) / scale)
                     logits[i, a] = total
-                mark, action = uniform[t, begin + i] * total, 0
-                while logits[i, action] <= mark and logits[i, action] < total:
+                whole = logits[i, actions - 1]
+                mark, action = uniform[t, begin + i] * whole, 0
+                while logits[i, action] <= mark and logits[i, action] < whole:
                     action += 1
                 line[begin + i, at + 1] = action
 

@@ -19,6 +19,9 @@ ROWS, WORTH_THREADS = 2048, 8
 """Rows of hidden states whose products stay in a processor's cache, and so many times these from which threads share
 them."""
 
+LARGEST = 2**22
+"""The most numbers in the tables of what the last actions add to the gates."""
+
 
 class GRUPrior(NeuralPrior):
     """A gated recurrent network (Cho et al. 2014) as a prior.
@@ -109,6 +112,8 @@ class GRUPrior(NeuralPrior):
     def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
         """The rest of many plans, drawn by a compiled loop; see `neuroprior.sampling.Steppable`.
 
+        If they have a context, it goes on.
+
         Args:
             action: integers `[N]`, the last ones.
             state: `[N, D + H]`, before these.
@@ -118,21 +123,16 @@ class GRUPrior(NeuralPrior):
         Returns:
             int64 `[N, T]`; None where there is no such loop, or it is not worth its call.
         """
-        size, (steps, number) = self.hidden_size, uniform.shape
-        able = (
-            type(self) is GRUPrior
-            and self.num_layers == 1
-            and self._may_step(state[:, None])
-            and self.window != 0
-            and self.context_per != "step"
-        )
-        able = able and state.dtype == uniform.dtype == torch.float32 and COMPILE_FROM is not None
-        worth = able and number * size >= (COMPILE_FROM or 0) and self.lags * self.num_actions <= number * steps
+        size, (steps, number), kinds = self.hidden_size, uniform.shape, self.num_actions
+        able = self.is_plain and self._may_step(state[:, None]) and state.dtype == uniform.dtype == torch.float32
+        # Tables of what each of the last actions adds have to be worth their making.
+        able = able and COMPILE_FROM is not None and 4 * self.lags * kinds <= number * steps
+        worth = able and number * size >= (COMPILE_FROM or 0) and 3 * size * self.lags * kinds <= LARGEST
         fast = compiled("neuroprior.priors.neural.compiled_gru") if worth else None
-        if fast is None:
+        if fast is None or fast.BLOCK * size * max(3 * size, kinds) > fast.ALONE:
             return None
         last, hidden, recent = state.split([self.input_size, size, self.lags - 1], 1)
-        given = torch.empty(0, 3 * size)
+        given = state.new_empty(0, 3 * size)
         if self.takes_context:
             given = self.embedding.of_context(last[:, None])[:, 0] @ self.gru.all_weights[0][0].T
         line = torch.cat([recent.long(), action[:, None], action.new_empty(number, steps)], 1)
@@ -140,17 +140,18 @@ class GRUPrior(NeuralPrior):
         fast.draw_to_the_end(fast.Network(*self.tables()), *arrays, float(temperature))
         return line[:, self.lags :]
 
-    def tables(self) -> tuple[Any, ...]:
-        """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates.
+    @property
+    def is_plain(self) -> bool:
+        """Whether its predictions can be computed from `tables`: one layer, and no module replaced or hooked."""
+        made = type(self) is GRUPrior and self.num_layers == 1 and self.window != 0
+        whole = made and (type(self.embedding), type(self.gru), type(self.head)) == (Embedding, nn.GRU, nn.Linear)
+        return whole and not any(part._forward_hooks or part._forward_pre_hooks for part in self.modules())
 
-        Raises:
-            ValueError: the network has several layers.
-        """
-        if self.num_layers > 1:
-            raise ValueError(f"num_layers: a network of one layer is expected, not of {self.num_layers}")
+    def tables(self) -> tuple[Any, ...]:
+        """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates."""
         weight, recurrent, bias, recurrent_bias = self.gru.all_weights[0]
         size, embedding = self.hidden_size, self.embedding
-        both = bias + torch.cat([recurrent_bias[: 2 * size], torch.zeros(size)])
+        both = bias + torch.cat([recurrent_bias[: 2 * size], bias.new_zeros(size)])
         past, beyond = embedding.of_past(self.window)
         parts = (
             embedding.action.weight @ weight.T + both, past @ weight.T, beyond @ weight.T,
@@ -248,7 +249,7 @@ def _in_parts(
     """The new hidden states of one layer, where products of `ROWS` rows stay in the cache; threads share many."""
     if len(before) <= ROWS:
         return compiled_gates(given, rows, before @ weight.T, before, bias)
-    after = torch.empty(before.shape)
+    after = before.new_empty(before.shape)
 
     def part(begin: int) -> None:
         some = slice(begin, begin + ROWS)
@@ -260,7 +261,7 @@ def _in_parts(
     return after
 
 
-def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor, bias: Tensor | None = None) -> Tensor:
+def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor:
     """The new hidden states `[N, width]` of one layer (Cho et al. 2014).
 
     Args:
@@ -268,10 +269,8 @@ def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor, bias: Ten
         rows: integers `[N]`: which of the inputs each row reads.
         hidden: `[N, 3 * width]`: what the hidden states add, of which the reset gate lets a share into the new state.
         before: `[N, width]`: the hidden states.
-        bias: `[3 * width]`: what is added to `hidden`; None: nothing.
     """
     size, given = before.shape[1], given.index_select(0, rows)
-    hidden = hidden if bias is None else hidden + bias
     opened = hidden[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_()
     new = given[:, 2 * size :].addcmul_(opened[:, :size], hidden[:, 2 * size :]).tanh_()
     return torch.lerp(new, before, opened[:, size:])

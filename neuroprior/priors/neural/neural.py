@@ -372,9 +372,10 @@ class Embedding(nn.Module):
 
     def of_context(self, inputs: Tensor) -> Tensor:
         """What the contexts of `inputs [N, T, D]` add to their vectors: `[N, T, width]`."""
-        own = [] if self.index is None else [self.index(inputs[..., 1].long())]
-        own += [] if self.features is None else [self.features(inputs[..., 1:])]
-        return torch.stack(own).sum(0)
+        made: nn.Module | None = self.features if self.index is None else self.index
+        assert made is not None
+        given: Tensor = made(inputs[..., 1:] if self.index is None else inputs[..., 1].long())
+        return given
 
     def of_past(self, window: int | None) -> tuple[Tensor, Tensor]:
         """What the last actions add to the vectors; see `forward`.

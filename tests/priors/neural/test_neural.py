@@ -244,7 +244,6 @@ def test_plans_that_a_compiled_loop_draws_to_their_ends_are_those_of_torch(made,
     """With the same numbers; also past the window, with a temperature, and after a past."""
     pytest.importorskip("numba")
     prior = GRUPrior(5, 16, **made)
-    prior.context_per = None if context is None else "plan"
     with torch.no_grad():
         for weights in prior.parameters():
             weights.mul_(3)
@@ -257,6 +256,32 @@ def test_plans_that_a_compiled_loop_draws_to_their_ends_are_those_of_torch(made,
         found.append(prior.sample(3000, 12, **how, generator=seeded(4)))
     assert torch.equal(*found)
     assert any(plans is not None for plans in loops)
+
+
+@pytest.mark.parametrize("changed", ["wide", "other head", "hooked", "two layers"])
+def test_other_networks_are_stepped(changed):
+    """Where the loop would be slower, or would not see what was changed: the same plans as without it."""
+    prior = GRUPrior(5, 256 if changed == "wide" else 16, num_layers=1 + (changed == "two layers"))
+    if changed == "other head":
+        prior.head = torch.nn.Sequential(prior.head)
+    elif changed == "hooked":
+        prior.head.register_forward_hook(lambda module, given, logits: logits * 0.1)
+    _, state = prior.start(2000)
+    with torch.no_grad():
+        assert prior.draw_rest(torch.zeros(2000, dtype=torch.long), state, torch.rand(9, 2000), 1.0) is None
+    assert prior.sample(2000, 12, generator=seeded(0)).shape == (2000, 12)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_steps_of_many_rows_in_parts_are_those_of_few(layers, monkeypatch):
+    network = torch.nn.GRU(16, 16, layers, batch_first=True)
+    below, before = torch.randn(20, 16, generator=seeded(0)), torch.randn(layers, 20_000, 16, generator=seeded(1))
+    rows = torch.arange(20_000, dtype=torch.int32) % 20
+    with torch.no_grad():
+        whole, _ = gru.gru_step(network, below, before, rows)
+        monkeypatch.setattr(gru, "COMPILE_FROM", None)
+        plain, _ = gru.gru_step(network, below, before, rows)
+    assert torch.allclose(whole, plain, atol=1e-5)
 
 
 def test_compiled_gates_are_those_of_torch():
