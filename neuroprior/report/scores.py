@@ -219,9 +219,11 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Eval
 
 
 def plans_digest(plans: Plans) -> str:
-    """A digest of all that plans hold."""
+    """A digest of all that plans hold but the notes of their reader, which files do not keep."""
     digest = hashlib.sha256()
     for name, value in vars(plans).items():
+        if name == "notes":
+            continue
         if isinstance(value, Tensor):
             digest.update(f"{name} {value.dtype} {[*value.shape]}".encode())
             digest.update(value.cpu().contiguous().numpy().tobytes())
