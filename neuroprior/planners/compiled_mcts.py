@@ -16,7 +16,7 @@ from neuroprior._threads import one_thread
 from neuroprior.planners.planner import PriorPlanner
 from neuroprior.plans import action_dtype
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.neural.compiled_gru import ALONE, BLOCK, Network
+from neuroprior.priors.neural.compiled_gru import BLOCK, Network, on_one_thread
 from neuroprior.priors.neural.gru import GRUPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
@@ -34,7 +34,6 @@ ROWS = 2**16
 
 SHARED = 2**15
 """Hidden units of all starts' networks from which threads share the starts; tables are too fast for it."""
-
 
 NO_NETWORK = tuple(np.empty((0,) * dims, np.float32) for dims in (2, 3, 2, 2, 1, 2, 1))
 """The parts of a `Network`, for a table."""
@@ -336,14 +335,24 @@ class Found(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def unfinished(nodes: Nodes, known: Known, rows: Array) -> int:
-    """Write the starts whose trees may be extended to `rows [B]`; how many there are."""
+def begin(nodes: Nodes, known: Known, exploration: float, draws: Array, descent: Descent) -> tuple[int, int]:
+    """Descend in the trees of the starts that may be extended.
+
+    Returns:
+        How many these are, 0 where the `draws` might not suffice; and how many numbers were taken.
+    """
+    rows, path, plan, depth, first = descent
     number = 0
     for b in range(len(known.left)):
         if known.left[b] > 0 and not known.over[b] and not nodes.closed[b, 0].all():
             rows[number] = b
             number += 1
-    return number
+    if len(draws) < number * path.shape[1] * (1 + nodes.child.shape[2]):
+        number = 0
+    if number == 0:
+        return 0, 0
+    given = rows[:number], exploration, draws, path[:number], plan[:number], depth[:number], first
+    return number, descend(nodes, *given)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -478,18 +487,18 @@ def search(
         Simulations that were made: fewer than N where all starts are finished, or where the `draws` do not suffice for
         another one for sure; and the draws that were taken.
     """
-    every, path, plan, depth, first = descent
-    most, used = path.shape[1] * (1 + nodes.child.shape[2]), 0
+    rows, path, plan, depth, first = descent
+    used = 0
     for simulation in range(len(found.plans)):
-        number = unfinished(nodes, known, every)
-        if number == 0 or len(draws) - used < number * most:
+        own = draws[used:]
+        number, taken = begin(nodes, known, exploration, own, descent)
+        if number == 0:
             return simulation, used
-        rows, own = every[:number], draws[used:]
-        used += descend(nodes, rows, exploration, own, path[:number], plan[:number], depth[:number], first)
+        used += taken
         found.done[simulation] = False
         follow(
             nodes, known, moves, policy, discounts, any_prefix, simulation,
-            rows, path[:number], plan[:number], depth[:number], own, first, room, found,
+            rows[:number], path[:number], plan[:number], depth[:number], own, first, room, found,
         )  # fmt: skip
     return len(found.plans), used
 
@@ -538,7 +547,7 @@ def _search_all(
     discounts = np.empty(0)
     if planner.objective == "return":
         discounts = (planner.discount ** torch.arange(length, dtype=torch.float64)).numpy()
-    threads = threads if batch * size >= SHARED and BLOCK * size * max(3 * size, actions) <= ALONE else 1
+    threads = threads if batch * size >= SHARED and on_one_thread(size, actions) else 1
     each = -(-batch // threads)
     descent = Descent(
         np.empty(batch, np.int64), np.empty((batch, length), np.int64), np.empty((batch, length), np.int64),
@@ -590,20 +599,19 @@ def _search_shared(
     """
     nodes, known = given[:2]
     to_the_end: Any = follow
-    most, used = descent.path.shape[1] * (1 + nodes.child.shape[2]), 0
+    used = 0
     for simulation in range(len(found.plans)):
-        number = unfinished(nodes, known, descent.rows)
-        if number == 0 or len(draws) - used < number * most:
-            return simulation, used
         own = draws[used:]
-        on_the_way = rows, path, plan, depth = [x[:number] for x in descent[:4]]
-        used += descend(nodes, rows, exploration, own, path, plan, depth, descent.first)
+        number, taken = begin(nodes, known, exploration, own, descent)
+        if number == 0:
+            return simulation, used
+        used += taken
         found.done[simulation] = False
-        each = -(-number // len(rooms))
+        on_the_way, each = [x[:number] for x in descent[:4]], -(-number // len(rooms))
 
-        def part(begin: int) -> None:
-            some = [x[begin : begin + each] for x in on_the_way]  # noqa: B023
-            to_the_end(*given, simulation, *some, own[begin:], descent.first, rooms[begin // each], found)  # noqa: B023
+        def part(at: int) -> None:
+            some = [x[at : at + each] for x in on_the_way]  # noqa: B023
+            to_the_end(*given, simulation, *some, own[at:], descent.first, rooms[at // each], found)  # noqa: B023
 
         list(pool.map(part, range(0, number, each)))
     return len(found.plans), used
@@ -672,8 +680,8 @@ def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
     elif isinstance(prior, GRUPrior):
         network = prior.tables()
         if prior.takes_context:
-            seen = torch.nn.functional.pad(observed.float().view(len(observed), -1), (1, 0))  # inputs without actions
-            by_context = prior.embedding.of_context(seen[:, None])[:, 0] @ prior.gru.all_weights[0][0].T
+            inputs = torch.nn.functional.pad(observed.float().view(len(observed), -1), (1, 0))  # without actions
+            by_context = prior.context_gates(inputs)
     weights = ((logits - logits.amax(1, keepdim=True)) / temperature).exp().T.cumsum(0).T
     probs = (logits.double() / temperature).softmax(1)
     kinds = (torch.int64, torch.int64, torch.float32, torch.float64, torch.float32)

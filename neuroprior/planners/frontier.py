@@ -1,6 +1,5 @@
 """The frontier planner: plans are extended step by step, and of those that reach the same state one is kept."""
 
-from contextlib import nullcontext
 from typing import NamedTuple, Unpack
 
 import torch
@@ -63,11 +62,10 @@ class FrontierPlanner(PriorPlanner):
         if world.stochastic:
             raise ValueError("world: a deterministic one is expected: plans that reach the same state are merged")
         generator = self._check(world, state, generator)
-        steps = sum(self._widths(world.num_actions))
+        widths = self._widths(world.num_actions)
+        steps = sum(widths)
         chunks = self.chunks(state, steps)
-        most = max(self._widths(world.num_actions))
-        few = self.value is None  # the user's values may be worth threads
-        with Stepper(self.prior).threads_for(max(map(len, chunks)) * most) if few else nullcontext():
+        with self._threads_for(max(map(len, chunks)) * max(widths)):
             return join_decisions((self._plan(world, some, generator, steps) for some in chunks), len(state))
 
     def _widths(self, actions: int) -> list[int]:

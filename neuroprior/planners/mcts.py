@@ -1,6 +1,5 @@
 """Monte Carlo tree search: a tree of plans, extended where plans scored well and where the prior points."""
 
-from contextlib import nullcontext
 from typing import Any, Unpack
 
 import torch
@@ -96,8 +95,7 @@ class MCTSPlanner(PriorPlanner):
         if module is not None and module.can_search(self, world, state):
             *found, steps = module.search_all(self, world, state, generator)
         else:
-            few = self.value is None  # the user's values may be worth threads
-            with Stepper(self.prior).threads_for(len(state)) if few else nullcontext():
+            with self._threads_for(len(state)):
                 *found, steps = _Trees(self, module, world, state, generator).search()
         plans, rewards, states, done = found
         rollout = Rollout(states[:, :, -1], rewards, states if self.any_prefix else None)

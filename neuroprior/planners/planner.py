@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Literal, NamedTuple, TypedDict, Unpack
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.sampling.draws import check_temperature
-from neuroprior.sampling.stepping import Steppable, check_in_world
+from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
 from neuroprior.worlds.world import Rollout, World
 
 STEPS_CACHED = 2**19
@@ -170,6 +171,10 @@ class PriorPlanner(Planner):
         if not isinstance(prior, Steppable):
             raise ValueError(f"prior: a prior with num_actions, start and step is expected, not {type(prior).__name__}")
         self.prior, self.length, self.num_plans, self.temperature = prior, length, num_plans, temperature
+
+    def _threads_for(self, num_plans: int) -> AbstractContextManager[None]:
+        """As `Stepper.threads_for`, but all threads where a value of the user's may be worth them."""
+        return nullcontext() if self.value is not None else Stepper(self.prior).threads_for(num_plans)
 
     def _check(self, world: World, state: Tensor, generator: torch.Generator | None) -> torch.Generator:
         """Raise ValueError unless the prior can act in the world from `state`; the generator to draw with."""

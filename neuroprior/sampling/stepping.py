@@ -1,6 +1,7 @@
 """What sampling needs of a prior (`Steppable`), and one way to step any prior, whatever else it offers (`Stepper`)."""
 
 from contextlib import AbstractContextManager
+from functools import cached_property
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
@@ -75,10 +76,6 @@ class Stepper:
         self.context_per: Literal["plan", "step"] | None = getattr(prior, "context_per", None)
         self.end: int | None = getattr(prior, "end", None)
         self.shares: bool = getattr(prior, "shares_steps", False)
-        self._alone = 0.0  # the most plans that are stepped on one thread
-        if isinstance(prior, torch.nn.Module):
-            parameters = sum(weights.numel() for weights in prior.parameters())
-            self._alone = WORTH_THREADS / parameters if parameters else float("inf")
         self._advance = getattr(prior, "advance", None) if in_place else None
         self._draw_rest = getattr(prior, "draw_rest", None) if in_place and self.end is None else None
         self._advance_shared = getattr(prior, "advance_shared", None) if in_place else None
@@ -90,6 +87,14 @@ class Stepper:
         if device is None:  # no context is known yet that could be given to `start`
             device = "cpu" if self.context_per is not None else self._prior.start(1)[0].device
         return torch.device(device)
+
+    @cached_property
+    def _alone(self) -> float:
+        """The most plans that are stepped on one thread."""
+        if not isinstance(self._prior, torch.nn.Module):
+            return 0.0
+        parameters = sum(weights.numel() for weights in self._prior.parameters())
+        return WORTH_THREADS / parameters if parameters else float("inf")
 
     def threads_for(self, num_plans: int) -> AbstractContextManager[None]:
         """torch on one thread, until the block ends, where more do not pay for so many plans."""

@@ -17,6 +17,11 @@ thread: in larger products its threads, of which torch does not know, would wait
 """
 
 
+def on_one_thread(width: int, num_actions: int) -> bool:
+    """Whether OpenBLAS takes one thread for the products of a block of a network so wide."""
+    return BLOCK * width * max(3 * width, num_actions) <= ALONE
+
+
 def gates(
     given: Tensor,
     rows: Tensor,

@@ -124,17 +124,15 @@ class GRUPrior(NeuralPrior):
             int64 `[N, T]`; None where there is no such loop, or it is not worth its call.
         """
         size, (steps, number), kinds = self.hidden_size, uniform.shape, self.num_actions
-        able = self.is_plain and self._may_step(state[:, None]) and state.dtype == uniform.dtype == torch.float32
         # Tables of what each of the last actions adds have to be worth their making.
-        able = able and COMPILE_FROM is not None and 4 * self.lags * kinds <= number * steps
-        worth = able and number * size >= (COMPILE_FROM or 0) and 3 * size * self.lags * kinds <= LARGEST
-        fast = compiled("neuroprior.priors.neural.compiled_gru") if worth else None
-        if fast is None or fast.BLOCK * size * max(3 * size, kinds) > fast.ALONE:
+        worth = 4 * self.lags * kinds <= number * steps and 3 * size * self.lags * kinds <= LARGEST
+        worth = worth and COMPILE_FROM is not None and number * size >= COMPILE_FROM
+        able = worth and state.dtype == uniform.dtype == torch.float32 and self._may_step(state[:, None])
+        fast = compiled("neuroprior.priors.neural.compiled_gru") if able and self.is_plain else None
+        if fast is None or not fast.on_one_thread(size, kinds):
             return None
         last, hidden, recent = state.split([self.input_size, size, self.lags - 1], 1)
-        given = state.new_empty(0, 3 * size)
-        if self.takes_context:
-            given = self.embedding.of_context(last[:, None])[:, 0] @ self.gru.all_weights[0][0].T
+        given = self.context_gates(last) if self.takes_context else state.new_empty(0, 3 * size)
         line = torch.cat([recent.long(), action[:, None], action.new_empty(number, steps)], 1)
         arrays = (x.detach().contiguous().numpy() for x in (given, hidden, line, uniform))
         fast.draw_to_the_end(fast.Network(*self.tables()), *arrays, float(temperature))
@@ -146,6 +144,10 @@ class GRUPrior(NeuralPrior):
         made = type(self) is GRUPrior and self.num_layers == 1 and self.window != 0
         whole = made and (type(self.embedding), type(self.gru), type(self.head)) == (Embedding, nn.GRU, nn.Linear)
         return whole and not any(part._forward_hooks or part._forward_pre_hooks for part in self.modules())
+
+    def context_gates(self, inputs: Tensor) -> Tensor:
+        """What the contexts of `inputs [N, D]` add to the gates of the first layer: `[N, 3 * hidden_size]`."""
+        return self.embedding.of_context(inputs[:, None])[:, 0] @ self.gru.all_weights[0][0].T
 
     def tables(self) -> tuple[Any, ...]:
         """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates."""

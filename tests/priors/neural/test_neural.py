@@ -260,7 +260,7 @@ def test_plans_that_a_compiled_loop_draws_to_their_ends_are_those_of_torch(made,
 
 @pytest.mark.parametrize("changed", ["wide", "other head", "hooked", "two layers"])
 def test_other_networks_are_stepped(changed):
-    """Where the loop would be slower, or would not see what was changed: the same plans as without it."""
+    """Where the loop would be slower, or would leave out what was changed."""
     prior = GRUPrior(5, 256 if changed == "wide" else 16, num_layers=1 + (changed == "two layers"))
     if changed == "other head":
         prior.head = torch.nn.Sequential(prior.head)
