@@ -25,13 +25,13 @@ from neuroprior.cli.fit_recipe import PlansData, PriorModel, recipe_path, recipe
 from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import one_line
 from neuroprior.plans import write_plans
-from neuroprior.priors import SwitchingPrior
+from neuroprior.priors import Prior, SwitchingPrior, load
 from neuroprior.priors.neural import NeuralPrior
 from neuroprior.report.document import printed, write_frames
 from neuroprior.report.modes import choice_table
 from neuroprior.training import Settings, make_trainer, quiet, run_training
 
-USAGE = """{0} fit PLANS [--effort fast|standard|full] [--out FOLDER]
+USAGE = """{0} fit PLANS [--effort fast|standard|full] [--max-steps N] [--out FOLDER]
        {0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        {0} fit --resume FOLDER"""
 CONFIG, PLANS = "run.yaml", "plans.npz"
@@ -63,6 +63,9 @@ OF_TABLES = ("--columns", "--missing", "--merge_repeats", "--max_gap")
 
 EFFORT = "--model.prior.effort"
 """What `--effort` stands for, an option that other commands have, too."""
+
+STEPS = "--max_steps"
+"""`--trainer.max_steps`, as other commands call it."""
 
 NETWORKS_ALONE = {"devices": 1, "num_nodes": 1, "precision": "32-true", "accumulate_grad_batches": 1, "max_time": None}
 """Options of the trainer, with their defaults, that do not reach the networks inside other priors."""
@@ -166,9 +169,12 @@ class FitCLI(LightningCLI):
         chosen = self.datamodule.settings
         given = self.config.fit.trainer.patience
         patience = chosen.patience if given is None else given
-        return super().instantiate_trainer(
-            enable_progress_bar=bar, max_steps=chosen.max_steps, patience=patience, **more
-        )
+        try:
+            return super().instantiate_trainer(
+                enable_progress_bar=bar, max_steps=chosen.max_steps, patience=patience, **more
+            )
+        except TypeError as error:  # Lightning's, of devices
+            raise ValueError(f"trainer: {error}") from error
 
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
@@ -180,12 +186,15 @@ class FitCLI(LightningCLI):
         if isinstance(model.prior, NeuralPrior):
             model.prior.prepare(datamodule.learned_from, datamodule.settings.window)
             self._check_checkpoints(model, datamodule)
+        saved = None if neural else self._saved()
         if self.trainer.is_global_zero:
             self._keep(datamodule)
             for note in datamodule.source.notes:
                 print(f"note: {note}")
         if neural:
             self._train(model, datamodule)
+        elif saved is not None:
+            model.prior = saved
         else:
             generator = torch.Generator().manual_seed(datamodule.seed)
             model.prior.fit(datamodule.plans if many else datamodule.learned_from, generator=generator, **settings)
@@ -244,11 +253,24 @@ class FitCLI(LightningCLI):
                 f" {data.settings.max_steps}"
             )
 
+    def _saved(self) -> Prior | None:
+        """The prior that a run which is resumed had learned, unless options of the trainer were changed; or None."""
+        fit = self.config.fit
+        if fit.resume is None or not (self.folder / "model.safetensors").exists():
+            return None
+        before = yaml.safe_load((self.folder / CONFIG).read_text(encoding="utf-8")).get("trainer")
+        return load(self.folder) if before == self._as_written()["trainer"] else None
+
+    def _as_written(self) -> dict[str, Any]:
+        """The configuration of the run, as it is written."""
+        written: dict[str, Any] = yaml.safe_load(self._parser("fit").dump(self.config.fit))
+        return written
+
     def _keep(self, data: PlansData) -> None:
         """Keep what the run needs to be resumed, and nothing else is needed then: its configuration and its plans."""
         if self.config.fit.resume is None or not (self.folder / PLANS).exists():
             write_plans(data.source, self.folder / PLANS)
-        config = yaml.safe_load(self._parser("fit").dump(self.config.fit))
+        config = self._as_written()
         if (self.folder / CONFIG).exists():
             # What is resumed with other trainer options goes on with them when it is resumed again.
             config = yaml.safe_load((self.folder / CONFIG).read_text()) | {"trainer": config["trainer"]}
@@ -311,6 +333,8 @@ def _in_full(arguments: list[str]) -> list[str]:
             argument = f"--config={recipe_path(argument.removeprefix('--config='))}"
         elif argument.startswith(OF_TABLES):
             argument = f"--data.{argument.removeprefix('--')}"
+        elif argument.partition("=")[0] == STEPS:
+            argument = f"--trainer.{argument.removeprefix('--')}"
         out.append(argument)
     effort, out = _taken_out("--effort", out)
     if effort is None:

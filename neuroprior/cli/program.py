@@ -146,6 +146,11 @@ def one_line(message: str, hints: Mapping[str, Any]) -> str:
     if inner := re.search(choice, line):
         known, typed = inner[2].replace("'", ""), inner[3].strip()
         return f"{inner[1]}: one of {known} is expected, not {typed or repr(typed)}"
+    if several := re.search(r'Parser key "([^"]+)".*Subtypes: \[(.*?)\] Errors: .*Given value: (.*)$', line):
+        kinds = [name for name in re.findall(r"<class '(?:\w+\.)*(\w+)'>", several[2]) if name != "NoneType"]
+        if kinds and several[1] not in hints:
+            expected = " or ".join(TYPES.get(name, name) for name in kinds)
+            return f"{several[1]}: {expected} is expected, not {several[3]}"
     found = re.match(r'Parser key "([^"]+)"(?: element \d+)?: (.*)', line)
     if found is None or found[1] not in hints:
         return line

@@ -10,6 +10,8 @@ import pytest
 import torch
 import yaml
 
+from neuroprior.plans import Plans, write_plans
+from neuroprior.priors import CombinedPrior
 from tests.integration.test_train import ROOT, Poison, small
 from tests.integration.test_train_faults import metrics, one_line
 from train.__main__ import main
@@ -226,3 +228,24 @@ def test_a_resumed_run_cannot_be_made_shorter_than_it_is(whole, capsys):
     assert (whole / "run.yaml").read_bytes() == before
     assert main(["fit", "--resume", str(whole)]) == 0
     assert len(metrics(whole)["curve"]) == 5
+
+
+def test_a_resumed_run_does_not_learn_a_saved_combined_prior_again(tmp_path, monkeypatch):
+    """But it does where steps are changed."""
+    torch.manual_seed(0)
+    plans = Plans(torch.randint(3, (40, 6)), 3)
+    write_plans(plans, tmp_path / "plans.npz")
+    run = tmp_path / "run"
+    assert main(["fit", str(tmp_path / "plans.npz"), "--effort", "fast", "--max-steps", "5", "--out", str(run)]) == 0
+    model, table = (run / "model.safetensors").read_bytes(), metrics(run)["rows"]
+    (run / "metrics.json").unlink()
+    fitted, fit = [], CombinedPrior.fit
+    monkeypatch.setattr(
+        CombinedPrior, "fit", lambda self, *given, **more: fitted.append(more) or fit(self, *given, **more)
+    )
+    assert main(["fit", "--resume", str(run)]) == 0
+    assert not fitted
+    assert metrics(run)["rows"] == table
+    assert (run / "model.safetensors").read_bytes() == model
+    assert main(["fit", "--resume", str(run), "--max-steps", "6"]) == 0
+    assert [more["max_steps"] for more in fitted] == [6]
