@@ -173,6 +173,8 @@ def _unordered(
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+    if threading.excepthook is threading.__excepthook__:
+        threading.excepthook = _unless_given_up
     tasks = (delayed(call)(job, index) for index, job in enumerate(jobs))
     with _cluster(dask):
         how: dict[str, Any] = {"backend": "dask"} if dask else {"backend": "loky", "inner_max_num_threads": 1}
@@ -196,6 +198,12 @@ def _stop_workers() -> None:
     from joblib.externals.loky import get_reusable_executor
 
     get_reusable_executor().shutdown(wait=False, kill_workers=True)
+
+
+def _unless_given_up(error: threading.ExceptHookArgs) -> None:
+    """Print the error of a thread, but for that of joblib's own, which misses the jobs that were given up."""
+    if error.thread is None or error.thread.name != "ExecutorManagerThread" or error.exc_type is not KeyError:
+        threading.__excepthook__(error)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -179,7 +180,10 @@ def test_a_damaged_result_is_named(tmp_path: Path) -> None:
         runs.do([1])
 
 
-def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "interrupt", [os.kill, os.killpg]
+)  # the program alone, or with its workers, as a terminal does
+def test_an_interrupted_run_goes_on(tmp_path: Path, interrupt: Callable[[int, int], None]) -> None:
     program = (
         "from tests.support.jobs import *; from neuroprior._jobs import JobRun; from pathlib import Path; import sys\n"
     )
@@ -198,7 +202,7 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     )
     assert process.stderr is not None
     process.stderr.readline()
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the program and to its workers
+    interrupt(process.pid, signal.SIGINT)
     said = process.stderr.read()
     assert process.wait(60) == 1
     assert "finished jobs are kept in" in said

@@ -46,7 +46,8 @@ def fit(
         The fitted prior.
 
     Raises:
-        ValueError: an unknown name, plans that the prior cannot learn from, or a setting that it does not have.
+        ValueError: an unknown name, plans without actions or that the prior cannot learn from, or a setting that
+            it does not have.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
@@ -61,6 +62,8 @@ def fit(
     if not isinstance(plans, Plans):
         actions = as_actions(plans)
         plans = Plans(actions, int(actions.max()) + 1 if actions.numel() else 1)
+    if not plans.mask().any():
+        raise ValueError(f"plans: at least one action to learn from is expected, and the {len(plans)} plans have none")
     if isinstance(prior, str):
         if prior not in NAMES:
             raise ValueError(f"prior: one of {', '.join(NAMES)} is expected, not {prior!r}")

@@ -411,6 +411,8 @@ def test_a_share_is_saved_too(tmp_path):
         (some_plans(), {"efort": "fast"}, "efort: not a setting"),
         (some_plans(), {"effort": "fast", "prior": "gru"}, "effort: for the combined prior alone"),
         (some_plans(1, 1), {}, "cannot be split"),
+        (some_plans()[:0], {"prior": "markov"}, "the 0 plans have none"),
+        (some_plans().steps(0, 0), {"prior": "markov"}, "plans have none"),
         (some_plans(), {"validation": 1.5}, "validation"),
         (some_plans(), {"validation": Plans(torch.zeros(3, 3, dtype=torch.long), 7)}, "not 7"),
     ],
