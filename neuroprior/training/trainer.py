@@ -12,10 +12,11 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint, WeightAveraging
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from torch import nn
+from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from neuroprior._files import write_whole
 from neuroprior._threads import one_thread
@@ -27,6 +28,10 @@ from neuroprior.training.settings import FEWEST, PATIENCE, Settings
 
 SMALL_STEP = 1e9
 """Operations in a training step below which it runs on one thread."""
+
+DECAY, WARM_UP = 0.98, 10
+"""Of the moving average of the weights over steps: after n steps it decays by (n + 1) / (n + `WARM_UP`), at most by
+`DECAY`."""
 
 CHECKPOINTS = "checkpoints"
 """Folder of `best.ckpt` and `last.ckpt`, in the folder of a training."""
@@ -115,7 +120,8 @@ def make_trainer(
 ) -> lightning.Trainer:
     """Lightning's trainer for a `PriorModule` and a `PlansModule`.
 
-    An epoch is what lies between two validations. After each of them the best and the last checkpoint are kept; without
+    What is validated and kept is a moving average of the weights; see `AverageWeights`. An epoch is what lies between
+    two validations. After each of them the best and the last checkpoint are kept; without
     logs the best weights, in memory.
 
     Args:
@@ -147,7 +153,8 @@ def make_trainer(
         if number < 1:
             raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
     stopping = Stopping("validation_bits", patience=ceil(patience / validate_every), min_delta=1e-4)
-    kept: list[lightning.Callback] = [BestWeights()]
+    average = AverageWeights()
+    kept: list[lightning.Callback] = [BestWeights(average)]
     if logs:
         # Two callbacks: with `save_last` Lightning writes the last one only where it writes the best one, too.
         kept = [
@@ -171,7 +178,7 @@ def make_trainer(
         accumulate_grad_batches=accumulate_grad_batches,
         max_time=max_time,
         enable_progress_bar=enable_progress_bar,
-        callbacks=[stopping, *kept, *(callbacks or [])],
+        callbacks=[average, stopping, *kept, *(callbacks or [])],
         enable_checkpointing=logs,
         logger=[CSVLogger(folder, "logs"), TensorBoardLogger(folder, "tensorboard", "")] if logs else False,
         plugins=[WholeCheckpoints()],
@@ -224,23 +231,56 @@ def run_training(
     return float(kept.best_model_score)
 
 
+class AverageWeights(WeightAveraging):
+    """A moving average of the weights over steps, which is what is validated and kept (Polyak and Juditsky 1992).
+
+    The weights themselves are as noisy as the learning rate is high, and where training is stopped early it has not
+    fallen far.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(use_buffers=False, multi_avg_fn=self._take_in)
+        self._step = 0
+
+    def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
+        """After each step."""
+        if step_idx is None:
+            return False
+        self._step = step_idx
+        return True
+
+    def _take_in(self, averages: Any, weights: Any, _: Any) -> None:
+        decay = min(DECAY, (self._step + 1) / (self._step + WARM_UP))
+        get_ema_multi_avg_fn(decay)(averages, weights, None)
+
+    @property
+    def weights(self) -> dict[str, Tensor]:
+        """The present averages, by the names of the module's weights."""
+        assert self._average_model is not None
+        return {name: value.clone() for name, value in self._average_model.module.state_dict().items()}
+
+
 class BestWeights(lightning.Callback):
-    """Keeps the weights with the lowest validation bits in memory, as `ModelCheckpoint` does in a file.
+    """Keeps the average weights with the lowest validation bits in memory, as `ModelCheckpoint` does in a file.
+
+    Args:
+        average: of the same trainer.
 
     Attributes:
         best_model_score: bits; infinite where the training diverged, None before the first validation.
         weights: of the module.
     """
 
-    def __init__(self) -> None:
-        self.best_model_score: torch.Tensor | None = None
-        self.weights: dict[str, torch.Tensor] = {}
+    def __init__(self, average: AverageWeights) -> None:
+        self.average = average
+        self.best_model_score: Tensor | None = None
+        self.weights: dict[str, Tensor] = {}
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         score = trainer.callback_metrics["validation_bits"].nan_to_num(torch.inf)
         if self.best_model_score is None or score < self.best_model_score:
             self.best_model_score = score
-            self.weights = {name: value.clone() for name, value in pl_module.state_dict().items()}
+            self.weights = self.average.weights
 
 
 class Stopping(EarlyStopping):

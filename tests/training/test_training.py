@@ -67,27 +67,61 @@ def test_the_best_weights_are_kept_not_the_last() -> None:
 
 
 def trained(
-    prior: GRUPrior, plans: Plans, held_out: Plans, how: Settings, folder: Path, logs: bool = False
+    prior: GRUPrior,
+    plans: Plans,
+    held_out: Plans,
+    how: Settings,
+    folder: Path,
+    logs: bool = False,
+    callbacks: list[lightning.Callback] | None = None,
 ) -> PriorModule:
     """The module after a training on these plans, with its learning curve."""
     data = PlansModule(plans, held_out, how, seed=0)
-    progress = {"enable_progress_bar": False, "logs": logs}
-    trainer = make_trainer(str(folder), how.max_steps, how.patience, data.steps, "cpu", **progress)
+    more = {"enable_progress_bar": False, "logs": logs, "callbacks": callbacks}
+    trainer = make_trainer(str(folder), how.max_steps, how.patience, data.steps, "cpu", **more)
     module = PriorModule(prior, how.learning_rate, how.weight_decay)
     run_training(trainer, module, data)
     return module
 
 
-def test_the_curve_holds_the_learning_rate_and_the_bits_of_each_epoch(tmp_path: Path) -> None:
+class Watch(lightning.Callback):
+    """The weights after each step."""
+
+    def __init__(self) -> None:
+        self.weights: list[dict[str, torch.Tensor]] = []
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, *_: Any) -> None:
+        self.weights.append({name: value.detach().clone() for name, value in pl_module.prior.state_dict().items()})
+
+
+@pytest.mark.parametrize("logs", [False, True])
+def test_the_curve_holds_the_learning_rate_and_the_bits_of_each_epoch(logs: bool, tmp_path: Path) -> None:
+    """Of the weights in training; in validation of their moving average, of which the best is what is learned."""
     plans = Plans(torch.randint(3, (40, 4), generator=generator()), 3)
-    how = Settings(20, learning_rate=0.01, check_every=1)
-    curve = trained(GRUPrior(3, 4, lags=1), plans, plans, how, tmp_path).curve
+    how, watch = Settings(20, learning_rate=0.01, check_every=1), Watch()
+    prior = GRUPrior(3, 4, lags=1)
+    curve = trained(prior, plans, plans, how, tmp_path, logs, [watch]).curve
     assert [entry["step"] for entry in curve] == list(range(1, 21))
     due = [0.01 * min((k / 20 + 1e-3) / 0.1, (1 + math.cos(math.pi * k / 20)) / 2) for k in range(1, 21)]
     assert [entry["learning_rate"] for entry in curve] == pytest.approx(due, abs=1e-9)
-    # A step takes all plans, which are also those of the validation before it.
-    before = [entry["validation_bits"] for entry in curve[:-1]]
-    assert [entry["train_bits"] for entry in curve[1:]] == pytest.approx(before, rel=1e-5)
+
+    learned, average, averages = {name: value.clone() for name, value in prior.state_dict().items()}, {}, []
+    for step, weights in enumerate(watch.weights):
+        decay = min(0.98, (step + 1) / (step + 10)) if step else 0
+        average = {name: decay * average.get(name, 0) + (1 - decay) * value for name, value in weights.items()}
+        averages.append(average)
+
+    def bits(weights: dict[str, torch.Tensor]) -> float:
+        prior.load_state_dict(weights)
+        return -float(prior.log_prob(plans).detach().mean()) / 4 / math.log(2)
+
+    # A step takes all plans, with the weights after the step before it.
+    assert [entry["train_bits"] for entry in curve[1:]] == pytest.approx(list(map(bits, watch.weights[:-1])), rel=1e-5)
+    held_out = [entry["validation_bits"] for entry in curve]
+    assert held_out == pytest.approx(list(map(bits, averages)), rel=1e-5)
+    best = averages[held_out.index(min(held_out))]
+    for name, value in learned.items():
+        assert torch.allclose(value, best[name], atol=1e-6)
 
 
 class Constant(torch.nn.Module):
