@@ -118,7 +118,7 @@ def sources(generator: torch.Generator) -> list[Source]:
 
 
 def quality(
-    num_plans: PositiveInt = 100_000,
+    num_plans: NonNegativeInt = 100_000,
     held_out: PositiveInt = 5_000,
     num_sequences: NonNegativeInt = 40,
     seed: NonNegativeInt = 0,
@@ -129,16 +129,18 @@ def quality(
     Printed are how many bits more than the source they take, bits per action, and the seconds that they learn.
 
     Args:
-        num_plans: plans of 32 actions to learn from, at least 100.
+        num_plans: plans of 32 actions to learn from, at least 100; 0 leaves the sources of known entropy out.
         held_out: plans to score, at least 100.
         num_sequences: long sequences to learn from, of 1,000 actions each; half as many are scored; 0 for none.
         seed: draws sources and plans.
         out: folder for `quality.csv`, `sequences.csv` and `results.json`.
     """
-    if num_plans < 100 or held_out < 100:
+    if 0 < num_plans < 100 or held_out < 100:
         raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
+    if not num_plans and not num_sequences:
+        raise ValueError("num_plans and num_sequences: one of them above 0 is expected")
     generator = torch.Generator().manual_seed(seed)
-    every, long = sources(generator), sequences(num_sequences, torch.Generator().manual_seed(seed))
+    every, long = sources(generator) if num_plans else [], sequences(num_sequences, torch.Generator().manual_seed(seed))
     rows, of_long, jobs = [], [], len(every) * len(OF_SOURCES) + len(long) * len(OF_SEQUENCES)
     with Progress("quality", jobs, jobs) as progress:
         for source in every:
@@ -151,15 +153,16 @@ def quality(
             for name in OF_SEQUENCES:
                 of_long.append(_fit_long(given, name, seed))
                 progress.advance(f"{given.name}: {name} {of_long[-1]['bits_per_action']:.4f} bits")
-    frame = pd.DataFrame(rows)
-    lead = f"{num_plans:,} plans of {LENGTH} actions to learn from, {held_out:,} held out."
-    sections = [Section("Bits more than the source, %", tables=_tables(frame))]
-    frames, keys = {"quality": frame}, {"quality": "rows"}
+    sections, frames, lead = [], {}, ""
+    if rows:
+        frames["quality"] = pd.DataFrame(rows)
+        sections.append(Section("Bits more than the source, %", tables=_tables(frames["quality"])))
+        lead = f"{num_plans:,} plans of {LENGTH} actions to learn from, {held_out:,} held out."
     if of_long:
         frames["sequences"] = pd.DataFrame(of_long)
         sections.append(Section("Bits per action of long sequences", tables=[_table_of_long(frames["sequences"])]))
     settings = {"num_plans": num_plans, "held_out": held_out, "num_sequences": num_sequences, "seed": seed}
-    publish(Document("Sources of known entropy", lead, sections, frames, settings, keys=keys), Path(out))
+    publish(Document("Sources of known entropy", lead, sections, frames, settings, keys={"quality": "rows"}), Path(out))
 
 
 def _fit(source: Source, name: str, training: Plans, test: Plans, true: Tensor, seed: int) -> dict[str, Any]:
