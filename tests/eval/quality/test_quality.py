@@ -163,6 +163,15 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
     assert f"{rows[0]['bits_per_action']:.4f}" in said
     assert "Those of the combined prior divided by" in said
     assert SOURCES[0].name in said
+    alone = tmp_path / "alone"
+    assert main(["quality", "--num-plans", "0", "--num-sequences", "4", "--out", str(alone)]) == 0
+    assert SOURCES[0].name not in capsys.readouterr().out
+    again = json.loads((alone / "results.json").read_text())
+    assert "rows" not in again
+    for row, before in zip(again["sequences"], rows, strict=True):
+        assert row["bits_per_action"] == before["bits_per_action"]
+    assert main(["quality", "--num-plans", "0", "--num-sequences", "0"]) == 2
+    assert "one of them above 0" in capsys.readouterr().err
 
 
 def test_the_price_of_the_combined_prior_is_that_of_its_parts():
