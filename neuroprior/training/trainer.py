@@ -121,8 +121,8 @@ def make_trainer(
     """Lightning's trainer for a `PriorModule` and a `PlansModule`.
 
     What is validated and kept is a moving average of the weights; see `AverageWeights`. An epoch is what lies between
-    two validations. After each of them the best and the last checkpoint are kept; without
-    logs the best weights, in memory.
+    two validations. After each of them the best and the last checkpoint are kept; without logs the best weights, in
+    memory.
 
     Args:
         folder: of checkpoints and logs.
@@ -234,13 +234,18 @@ def run_training(
 class AverageWeights(WeightAveraging):
     """A moving average of the weights over steps, which is what is validated and kept (Polyak and Juditsky 1992).
 
-    The weights themselves are as noisy as the learning rate is high, and where training is stopped early it has not
-    fallen far.
+    The weights themselves are as noisy as the learning rate is high, and where training is stopped early, the rate has
+    not fallen far.
     """
 
     def __init__(self) -> None:
         super().__init__(use_buffers=False, multi_avg_fn=self._take_in)
         self._step = 0
+
+    def setup(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Make the averages, on the device of the training: the module itself is moved there only later."""
+        self._device = trainer.strategy.root_device
+        super().setup(trainer, pl_module, stage)
 
     def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
         """After each step."""
