@@ -53,7 +53,7 @@ nb_output_stderr = "remove"  # progress
 
 nitpicky = True
 # names of other libraries, which only their own sites could resolve
-OTHERS = "torch|Tensor|numpy|np|pandas|matplotlib|lightning|rich|collections|pathlib|abc|os"
+OTHERS = "torch|Tensor|numpy|np|pandas|matplotlib|lightning|rich|collections|contextlib|pathlib|abc|os"
 nitpick_ignore_regex = [("py:.*", rf"({OTHERS})(\..*)?")]
 autosummary_generate = True
 autodoc_default_options = {"members": True, "show-inheritance": True}
