@@ -239,30 +239,24 @@ class AverageWeights(WeightAveraging):
     """
 
     def __init__(self) -> None:
-        super().__init__(use_buffers=False, multi_avg_fn=self._take_in)
-        self._step = 0
+        super().__init__(use_buffers=False, multi_avg_fn=_take_in)
 
     def setup(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
         """Make the averages, on the device of the training: the module itself is moved there only later."""
         self._device = trainer.strategy.root_device
         super().setup(trainer, pl_module, stage)
 
-    def should_update(self, step_idx: int | None = None, epoch_idx: int | None = None) -> bool:
-        """After each step."""
-        if step_idx is None:
-            return False
-        self._step = step_idx
-        return True
-
-    def _take_in(self, averages: Any, weights: Any, _: Any) -> None:
-        decay = min(DECAY, (self._step + 1) / (self._step + WARM_UP))
-        get_ema_multi_avg_fn(decay)(averages, weights, None)
-
     @property
     def weights(self) -> dict[str, Tensor]:
         """The present averages, by the names of the module's weights."""
         assert self._average_model is not None
         return {name: value.clone() for name, value in self._average_model.module.state_dict().items()}
+
+
+def _take_in(averages: Any, weights: Any, steps: Tensor) -> None:
+    """Take the weights after a step into their averages over the `steps` before it."""
+    done = int(steps)
+    get_ema_multi_avg_fn(min(DECAY, (done + 1) / (done + WARM_UP)))(averages, weights, None)
 
 
 class BestWeights(lightning.Callback):
