@@ -254,12 +254,16 @@ class FitCLI(LightningCLI):
             )
 
     def _saved(self) -> Prior | None:
-        """The prior that a run which is resumed had learned, unless options of the trainer were changed; or None."""
-        fit = self.config.fit
-        if fit.resume is None or not (self.folder / "model.safetensors").exists():
+        """The prior that a resumed run had learned and saved; None where options of the trainer were changed."""
+        if self.config.fit.resume is None:
             return None
         before = yaml.safe_load((self.folder / CONFIG).read_text(encoding="utf-8")).get("trainer")
-        return load(self.folder) if before == self._as_written()["trainer"] else None
+        if before != self._as_written()["trainer"]:
+            return None
+        try:
+            return load(self.folder)
+        except (ValueError, OSError):  # the run ended before the prior was saved, or meanwhile: it learns anew
+            return None
 
     def _as_written(self) -> dict[str, Any]:
         """The configuration of the run, as it is written."""

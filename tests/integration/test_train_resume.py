@@ -231,7 +231,7 @@ def test_a_resumed_run_cannot_be_made_shorter_than_it_is(whole, capsys):
 
 
 def test_a_resumed_run_does_not_learn_a_saved_combined_prior_again(tmp_path, monkeypatch):
-    """But it does where steps are changed."""
+    """But it does where steps are changed, or only a part of it was saved."""
     torch.manual_seed(0)
     plans = Plans(torch.randint(3, (40, 6)), 3)
     write_plans(plans, tmp_path / "plans.npz")
@@ -249,3 +249,8 @@ def test_a_resumed_run_does_not_learn_a_saved_combined_prior_again(tmp_path, mon
     assert (run / "model.safetensors").read_bytes() == model
     assert main(["fit", "--resume", str(run), "--max-steps", "6"]) == 0
     assert [more["max_steps"] for more in fitted] == [6]
+    model = (run / "model.safetensors").read_bytes()
+    (run / "config.json").unlink()
+    assert main(["fit", "--resume", str(run)]) == 0
+    assert [more["max_steps"] for more in fitted] == [6, 6]
+    assert (run / "model.safetensors").read_bytes() == model
