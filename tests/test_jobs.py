@@ -180,10 +180,9 @@ def test_a_damaged_result_is_named(tmp_path: Path) -> None:
         runs.do([1])
 
 
-@pytest.mark.parametrize(
-    "interrupt", [os.kill, os.killpg]
-)  # the program alone, or with its workers, as a terminal does
+@pytest.mark.parametrize("interrupt", [os.kill, os.killpg])
 def test_an_interrupted_run_goes_on(tmp_path: Path, interrupt: Callable[[int, int], None]) -> None:
+    """Whether the program alone is interrupted, or its workers, too, as a terminal does."""
     program = (
         "from tests.support.jobs import *; from neuroprior._jobs import JobRun; from pathlib import Path; import sys\n"
     )
