@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-MODULES = ("neuroprior.cli", "neuroprior.cli.__main__", "eval", "train")
+MODULES = ("neuroprior", "neuroprior.__main__", "eval", "train")
 """What `python -m` runs as a command of this project."""
 
 

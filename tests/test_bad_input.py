@@ -24,7 +24,7 @@ from neuroprior import (
     score,
     write_plans,
 )
-from neuroprior.cli.__main__ import main
+from neuroprior.__main__ import main
 from neuroprior.planners import ICEMPlanner, control, expected_score
 from neuroprior.plans import folds
 from neuroprior.priors import CombinedPrior, learn_macros

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, StackedPrior, TabularWorld, UniformPrior
+from neuroprior.__main__ import main
 from neuroprior.analysis import forecast, infer
-from neuroprior.cli.__main__ import main
 from neuroprior.plans import VectorPlans, read_vector_plans, vector_plans_from_trajectories, write_vector_plans
 from neuroprior.priors import (
     BoardNetwork,

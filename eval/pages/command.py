@@ -84,7 +84,7 @@ def perform(steps: Mapping[str, Sequence[str]], folder: Path) -> None:
     Raises:
         ValueError: a command failed.
     """
-    programs = {"python": [sys.executable], "neuroprior": [sys.executable, "-m", "neuroprior.cli"]}
+    programs = {"python": [sys.executable], "neuroprior": [sys.executable, "-m", "neuroprior"]}
     folder.mkdir(parents=True, exist_ok=True)
     for name, words in steps.items():
         file = folder / f"{name}.txt"

@@ -102,24 +102,24 @@ class ConditionChains:
 
     @property
     def cost(self) -> int:
-        """Numbers that are computed for each labeling and condition."""
+        """Numbers that are computed for each labelling and condition."""
         return len(self._cells.times) + len(self._rows.times)
 
-    def gains(self, labelings: Tensor, num: int) -> Tensor:
+    def gains(self, labellings: Tensor, num: int) -> Tensor:
         """The log2-likelihood of each block under each condition's chain, less that under the one without.
 
         Args:
-            labelings: integers `[B, P]`: the condition of each block.
+            labellings: integers `[B, P]`: the condition of each block.
             num: of conditions, C.
 
         Returns:
             float64 `[C, B, P]`, in bits.
         """
-        found = torch.empty(num, *labelings.shape, dtype=torch.double)
+        found = torch.empty(num, *labellings.shape, dtype=torch.double)
         size = max(CELLS_AT_ONCE // self.cost, 1)
-        for at in range(0, labelings.shape[1], size):
+        for at in range(0, labellings.shape[1], size):
             for condition in range(num):
-                taken = (labelings[:, at : at + size] == condition).double()
+                taken = (labellings[:, at : at + size] == condition).double()
                 sums = torch.zeros_like(taken) - self.unknown[:, None]
                 for counts, added, sign in ((self._cells, self._prior, 1), (self._rows, 1, -1)):
                     logs = counts.without_unit(taken, self._blocks).add_(SMOOTHING * added).log2_()

@@ -120,7 +120,7 @@ class ConditionComparison:
             these tests (`neuroprior.analysis.holm`).
         p_value: of all tests together: Fisher's combination of their p-values, itself tested in the same permutations
             (Pesarin and Salmaso 2010, nonparametric combination); NaN if nothing could be tested.
-        labelings: how many ways of giving blocks their conditions were compared, with the one observed.
+        labellings: how many ways of giving blocks their conditions were compared, with the one observed.
         exact: whether these were all.
         smallest_p: the smallest p-value that is possible.
         conclusive: whether there are enough units for a verdict.
@@ -133,7 +133,7 @@ class ConditionComparison:
     prediction: ConditionPrediction | None
     tests: dict[str, tuple[float, float]]
     p_value: float
-    labelings: int
+    labellings: int
     exact: bool
     smallest_p: float
     conclusive: bool
@@ -158,7 +158,7 @@ def compare_conditions(
     """Whether behaviour differs between the conditions of plans.
 
     Units are groups (plans, where there are no groups). If each is under one condition, the conditions are permuted
-    among units; if units are under several, among the blocks of each unit. All labelings are compared where there
+    among units; if units are under several, among the blocks of each unit. All labellings are compared where there
     are no more than `permutations` + 1. So the tests hold however alike the plans of a unit are. The null hypothesis is
     that units (blocks of a unit) under different conditions have the same distribution; statistics are studentised, so
     that for many units differences in mean matter alone (Janssen 1997).
@@ -204,13 +204,13 @@ def compare_conditions(
     num = len(names)
     cost = num * (chains.cost + sum(numbers.smoothed.numel() for numbers in found) // 8)
     drawn = min(permutations, max(max_work // max(cost, 1), FEWEST_PERMUTATIONS))
-    labelings = design.labelings(drawn, generator)
+    labellings = design.labellings(drawn, generator)
     families, statistics = [], {}
     for numbers in found:
-        family, statistics[numbers.name] = _tested(numbers, design, labelings)
+        family, statistics[numbers.name] = _tested(numbers, design, labellings)
         families.append(family)
     prediction, statistics["bits"], statistics["classifier"] = _predicted(
-        chains, design, labelings, block.bincount().double()
+        chains, design, labellings, block.bincount().double()
     )
     ranked = torch.stack([_shares_reaching(values) for values in statistics.values()])
     p_values = ranked[:, 0].tolist()
@@ -221,7 +221,7 @@ def compare_conditions(
     verdict = _verdict(design, names, tests, p_value, smallest, conclusive) + f" {design.odd}." * bool(design.odd)
     exact = design.possible <= drawn + 1
     return ConditionComparison(
-        design, names, families, prediction, tests, p_value, labelings.shape[1], exact, smallest, conclusive, verdict
+        design, names, families, prediction, tests, p_value, labellings.shape[1], exact, smallest, conclusive, verdict
     )
 
 
@@ -286,12 +286,12 @@ def _sums(
     return features, sums, counts
 
 
-def _tested(numbers: _Numbers, design: PermutationDesign, labelings: Tensor) -> tuple[ConditionFamily, Tensor]:
-    """The family, and its largest statistic under each labeling `[P]`."""
+def _tested(numbers: _Numbers, design: PermutationDesign, labellings: Tensor) -> tuple[ConditionFamily, Tensor]:
+    """The family, and its largest statistic under each labelling `[P]`."""
     size = max(NUMBERS_AT_ONCE // len(numbers.features), 1)
-    observed = _statistics(numbers.smoothed, design, labelings[:, :1])
+    observed = _statistics(numbers.smoothed, design, labellings[:, :1])
     greatest, reached = [], torch.zeros(len(observed), dtype=torch.double)
-    for part in labelings.split(size, 1):
+    for part in labellings.split(size, 1):
         statistics = _statistics(numbers.smoothed, design, part)
         greatest.append(statistics.amax(0))
         reached += (statistics >= _least(observed)).sum(1)
@@ -320,8 +320,8 @@ def _least(statistic: Tensor) -> Tensor:
     return statistic - TIE * (1 + statistic)
 
 
-def _statistics(values: Tensor, design: PermutationDesign, labelings: Tensor) -> Tensor:
-    """`[F, P]`: how unlike the conditions are, for `values [B, F]` under each of `labelings [B, P]`."""
+def _statistics(values: Tensor, design: PermutationDesign, labellings: Tensor) -> Tensor:
+    """`[F, P]`: how unlike the conditions are, for `values [B, F]` under each of `labellings [B, P]`."""
     num, within = len(design.conditions), design.kind == "within"
     if within:
         # What a unit has in common is no difference between conditions.
@@ -334,7 +334,7 @@ def _statistics(values: Tensor, design: PermutationDesign, labelings: Tensor) ->
     squares, units = values.square(), len(design.units)
     weights, means = [], []
     for condition, size in enumerate(design.sizes):
-        taken = (labelings == condition).double()
+        taken = (labellings == condition).double()
         mean = values @ taken / size
         means.append(mean)
         if not within:
@@ -386,19 +386,19 @@ def _half(error: Tensor, freedom: Tensor) -> Tensor:
 
 
 def _predicted(
-    chains: ConditionChains, design: PermutationDesign, labelings: Tensor, actions: Tensor
+    chains: ConditionChains, design: PermutationDesign, labellings: Tensor, actions: Tensor
 ) -> tuple[ConditionPrediction, Tensor, Tensor]:
-    """The prediction; the bits that knowing the condition saves, and the accuracy, under each labeling `[P]`."""
+    """The prediction; the bits that knowing the condition saves, and the accuracy, under each labelling `[P]`."""
     num, label = len(design.conditions), design.label
-    gains = chains.gains(labelings, num)  # [C, B, P]
-    right = gains.gather(0, labelings.long()[None])[0]
+    gains = chains.gains(labellings, num)  # [C, B, P]
+    right = gains.gather(0, labellings.long()[None])[0]
     bits = right.sum(0)
-    others = gains.scatter(0, labelings.long()[None], -torch.inf).amax(0)
+    others = gains.scatter(0, labellings.long()[None], -torch.inf).amax(0)
     near = TIE * (1 + right.abs())
     credit = (right > others + near).double() + ((right - others).abs() <= near) / 2
     share = torch.zeros_like(bits)
     for condition, size in enumerate(design.sizes):
-        share += (credit * (labelings == condition)).sum(0) / (num * size)
+        share += (credit * (labellings == condition)).sum(0) / (num * size)
     odds = (num * gains - gains.sum(0)) / (num - 1)
     own = (num * right - gains.sum(0)) / (num - 1) / actions[:, None]
     # Accuracies differ by no less than this: of equal ones the larger log odds are the better.
@@ -424,7 +424,7 @@ def _predicted(
 
 
 def _shares_reaching(statistics: Tensor) -> Tensor:
-    """`[P]`: for each labeling the share of all whose statistic is at least as large: its p-value."""
+    """`[P]`: for each labelling the share of all whose statistic is at least as large: its p-value."""
     ordered, tie = statistics.sort().values, TIE * (statistics.abs() + 0.1)
     return (len(ordered) - torch.searchsorted(ordered, statistics - tie)).double() / len(ordered)
 

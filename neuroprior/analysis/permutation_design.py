@@ -99,7 +99,7 @@ class PermutationDesign:
 
     @property
     def possible(self) -> int:
-        """The number of labelings, of ways to give the blocks their conditions."""
+        """The number of labellings, of ways to give the blocks their conditions."""
         if self.kind == "within":
             every: int = factorial(len(self.conditions)) ** len(self.units)
             return every
@@ -108,17 +108,17 @@ class PermutationDesign:
 
     @property
     def equivalent(self) -> int:
-        """How many labelings are one and the same division, with conditions renamed; their statistics are equal."""
+        """How many labellings are one and the same division, with conditions renamed; their statistics are equal."""
         return prod(map(factorial, Counter(self.sizes).values()))
 
     def smallest_p(self, drawn: int) -> float:
         """The smallest p-value that a test with at most `drawn` random permutations can give."""
         return self.equivalent / self.possible if self.possible <= drawn + 1 else 1 / (drawn + 1)
 
-    def labelings(self, drawn: int, generator: torch.Generator | None = None) -> Tensor:
-        """`[B, P]`, int16: all labelings if there are at most `drawn` + 1, else random ones; the first is the observed.
+    def labellings(self, drawn: int, generator: torch.Generator | None = None) -> Tensor:
+        """`[B, P]`, int16: all labellings if at most `drawn` + 1, else random ones; the first is the observed.
 
-        As the observed labeling is among them, the p-value of a statistic is the share of labelings that reach it.
+        As the observed labelling is among them, the p-value of a statistic is the share of labellings that reach it.
         """
         if self.possible <= drawn + 1:
             found = self._every()

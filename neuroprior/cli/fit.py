@@ -1,6 +1,5 @@
 """The command `fit`: trains a prior as a recipe says, by LightningCLI's conventions, and compares it with baselines."""
 
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
@@ -164,15 +163,12 @@ class FitCLI(LightningCLI):
             self.folder.mkdir(parents=True, exist_ok=True)
 
     def instantiate_trainer(self, **more: Any) -> Trainer:
-        """The trainer; its progress bar is for terminals."""
-        bar = self.config.fit.trainer.enable_progress_bar and sys.stdout.isatty()
+        """The trainer, with the steps and the patience that suit the plans."""
         chosen = self.datamodule.settings
         given = self.config.fit.trainer.patience
         patience = chosen.patience if given is None else given
         try:
-            return super().instantiate_trainer(
-                enable_progress_bar=bar, max_steps=chosen.max_steps, patience=patience, **more
-            )
+            return super().instantiate_trainer(max_steps=chosen.max_steps, patience=patience, **more)
         except TypeError as error:  # Lightning's, of devices
             raise ValueError(f"trainer: {error}") from error
 
@@ -235,10 +231,10 @@ class FitCLI(LightningCLI):
             "weight_decay": model.weight_decay,
             "gradient_clip": trainer.gradient_clip_val,
             "patience": trainer.patience,
-            "progress": trainer.enable_progress_bar and sys.stdout.isatty(),
+            "progress": trainer.enable_progress_bar,
         }
         # Defaults are left to the prior, as in `neuroprior.fit`: those of the networks inside it may be others.
-        default = vars(Settings()) | {"progress": None}
+        default = vars(Settings())
         return {name: settings[name] for name in prior.fit_settings if settings.get(name) != default.get(name)}
 
     def _check_checkpoints(self, model: PriorModel, data: PlansData) -> None:

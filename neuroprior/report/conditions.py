@@ -64,8 +64,8 @@ def _text(result: ConditionComparison) -> list[str]:
     return [
         result.verdict,
         f"{how} Plans of one unit under one condition always stay together, so that it does not matter how alike they"
-        f" are. {'All' if result.exact else 'Random'} labelings that were compared, with the observed one:"
-        f" {result.labelings:,}." + f" {left} {item} that are not under every condition were left out." * (left > 0),
+        f" are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
+        f" {result.labellings:,}." + f" {left} {item} that are not under every condition were left out." * (left > 0),
         "Families of features are tested by their most different feature (Westfall and Young); the tests are corrected"
         " for their number (Holm), and all of them are combined into one (p of the first sentence; Fisher's"
         " combination in the same permutations). A star marks a feature that is significant, corrected for its family,"
@@ -103,7 +103,7 @@ def _test_table(result: ConditionComparison, tests: pd.DataFrame) -> Table:
         f"Smallest possible p: {result.smallest_p:.2g}; corrected for {len(result.tests)} tests:"
         f" {min(len(result.tests) * result.smallest_p, 1):.2g}. *: p < 0.05, corrected. A Markov chain that knows the"
         f" condition saves {mean:+.4f} bits per held-out action (95 % interval {low:+.4f} to {high:+.4f} over"
-        f" {result.design.item}; the test asks whether other labelings save as much, not whether this is above 0)."
+        f" {result.design.item}; the test asks whether other labellings save as much, not whether this is above 0)."
     )
     return table(tests, columns, caption, "Do conditions differ?")
 

@@ -2,6 +2,8 @@
 
 import io
 import logging
+import sys
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +34,9 @@ SMALL_STEP = 1e9
 DECAY, WARM_UP = 0.98, 10
 """Of the moving average of the weights over steps: after n steps it decays by (n + 1) / (n + `WARM_UP`), at most by
 `DECAY`."""
+
+QUIET = 10.0
+"""Seconds at least between two lines of progress."""
 
 CHECKPOINTS = "checkpoints"
 """Folder of `best.ckpt` and `last.ckpt`, in the folder of a training."""
@@ -139,7 +144,7 @@ def make_trainer(
         gradient_clip_val: the largest norm of a gradient.
         accumulate_grad_batches: batches for one step of the optimiser.
         max_time: stop after so much time, DD:HH:MM:SS.
-        enable_progress_bar: show it.
+        enable_progress_bar: show it, in a terminal or a notebook; elsewhere see `ProgressLines`.
         logs: write checkpoints, and logs as CSV and for TensorBoard.
         callbacks: further callbacks of Lightning's.
 
@@ -154,6 +159,8 @@ def make_trainer(
             raise ValueError(f"trainer.{name}: at least 1 is expected, not {number}")
     stopping = Stopping("validation_bits", patience=ceil(patience / validate_every), min_delta=1e-4)
     average = AverageWeights()
+    bar = enable_progress_bar and (sys.stdout.isatty() or "ipykernel" in sys.modules)
+    lines = [ProgressLines(max_steps)] if enable_progress_bar and not bar else []
     kept: list[lightning.Callback] = [BestWeights(average)]
     if logs:
         # Two callbacks: with `save_last` Lightning writes the last one only where it writes the best one, too.
@@ -177,8 +184,8 @@ def make_trainer(
         gradient_clip_val=gradient_clip_val,
         accumulate_grad_batches=accumulate_grad_batches,
         max_time=max_time,
-        enable_progress_bar=enable_progress_bar,
-        callbacks=[average, stopping, *kept, *(callbacks or [])],
+        enable_progress_bar=bar,
+        callbacks=[average, stopping, *kept, *lines, *(callbacks or [])],
         enable_checkpointing=logs,
         logger=[CSVLogger(folder, "logs"), TensorBoardLogger(folder, "tensorboard", "")] if logs else False,
         plugins=[WholeCheckpoints()],
@@ -280,6 +287,25 @@ class BestWeights(lightning.Callback):
         if self.best_model_score is None or score < self.best_model_score:
             self.best_model_score = score
             self.weights = self.average.weights
+
+
+class ProgressLines(lightning.Callback):
+    """Progress where there is no terminal, as in a log file: a line on standard error, at most one in `QUIET` seconds.
+
+    Args:
+        max_steps: of the training.
+    """
+
+    def __init__(self, max_steps: int) -> None:
+        self.max_steps, self.last = max_steps, time.monotonic()
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if not trainer.is_global_zero or time.monotonic() - self.last < QUIET:
+            return
+        self.last = time.monotonic()
+        bits = float(trainer.callback_metrics["validation_bits"])
+        steps = f"step {trainer.global_step:,} of at most {self.max_steps:,}"
+        print(f"training: {steps}, {bits:.4f} validation bits", file=sys.stderr, flush=True)
 
 
 class Stopping(EarlyStopping):

@@ -59,7 +59,7 @@ def smoothed_shares(plans: Plans) -> np.ndarray:
 
 
 def expect_p_values(family, statistics: np.ndarray) -> None:
-    """`statistics [P, F]` of all labelings, the observed one first."""
+    """`statistics [P, F]` of all labellings, the observed one first."""
     reach = statistics >= statistics[:1] * (1 - 1e-9)
     np.testing.assert_allclose(family.statistic, statistics[0], rtol=1e-9)
     np.testing.assert_allclose(family.p_values, reach.mean(0))
@@ -68,14 +68,14 @@ def expect_p_values(family, statistics: np.ndarray) -> None:
     assert family.p_value == pytest.approx(largest.mean(0).min())
 
 
-def test_between_units_all_labelings_are_compared_by_welchs_t():
+def test_between_units_all_labellings_are_compared_by_welchs_t():
     plans = study(0, [[0], [0, 0], [1], [1, 1, 1], [0], [1, 1], [0]])
     shares, label = smoothed_shares(plans), np.array([0, 0, 1, 1, 0, 1, 0])
     others = [np.isin(range(7), chosen).astype(int) for chosen in itertools.combinations(range(7), 3)]
     others.sort(key=lambda own: tuple(own) != tuple(label))
     welch = [stats.ttest_ind(shares[own == 1], shares[own == 0], equal_var=False).statistic ** 2 for own in others]
     found = compare_conditions(plans)
-    assert (found.labelings, found.exact, found.smallest_p) == (35, True, 1 / 35)
+    assert (found.labellings, found.exact, found.smallest_p) == (35, True, 1 / 35)
     expect_p_values(family_of(found, "actions"), np.array(welch))
 
 
@@ -88,22 +88,22 @@ def test_within_units_conditions_are_swapped_and_compared_by_the_paired_t():
     for swap in swaps:
         pair = np.where(np.array(swap)[:, None, None], shares[:, ::-1], shares)
         paired.append(stats.ttest_rel(pair[:, 1], pair[:, 0]).statistic ** 2)
-    assert (found.labelings, found.exact, found.smallest_p) == (32, True, 2 / 32)
+    assert (found.labellings, found.exact, found.smallest_p) == (32, True, 2 / 32)
     expect_p_values(family_of(found, "actions"), np.array(paired))
 
 
 def test_three_conditions_between_units():
     plans = study(2, [[0], [1, 1], [2, 2], [0, 0, 0], [1], [2]])
     shares = smoothed_shares(plans)
-    labelings = sorted(set(itertools.permutations([0, 1, 2, 0, 1, 2])), key=lambda own: own != (0, 1, 2, 0, 1, 2))
+    labellings = sorted(set(itertools.permutations([0, 1, 2, 0, 1, 2])), key=lambda own: own != (0, 1, 2, 0, 1, 2))
     statistics = []
-    for own in np.array(labelings):
+    for own in np.array(labellings):
         mean = np.stack([shares[own == k].mean(0) for k in range(3)])
         weight = np.stack([2 / shares[own == k].var(0, ddof=1) for k in range(3)])
         common = (weight * mean).sum(0) / weight.sum(0)
         statistics.append((weight * (mean - common) ** 2).sum(0) / 2)
     found = compare_conditions(plans)
-    assert (found.labelings, found.smallest_p) == (90, 6 / 90)
+    assert (found.labellings, found.smallest_p) == (90, 6 / 90)
     expect_p_values(family_of(found, "actions"), np.array(statistics))
     assert family_of(found, "actions").difference.isnan().all()
 
@@ -119,7 +119,7 @@ def test_three_conditions_within_units_are_compared_by_the_f_of_repeated_measure
         rest = (middle**2).sum((0, 1)) - conditions
         statistics.append((conditions / 2) / (rest / 6))
     found = compare_conditions(plans)
-    assert (found.labelings, found.smallest_p) == (6**4, 6 / 6**4)
+    assert (found.labellings, found.smallest_p) == (6**4, 6 / 6**4)
     expect_p_values(family_of(found, "actions"), np.array(statistics))
 
 
@@ -176,7 +176,7 @@ def test_the_prediction_is_that_of_chains_refitted_without_the_unit(conditions):
 
 
 def test_the_p_values_of_bits_and_classifier_are_those_of_relabelled_plans():
-    """Computed anew under each labeling, they are ranked as the permutation test says."""
+    """Computed anew under each labelling, they are ranked as the permutation test says."""
     plans = study(1, between(6, 2), length=20, num_actions=3)
     found = compare_conditions(plans)
     bits, shares, odds = [], [], []
@@ -207,7 +207,7 @@ def test_all_tests_are_corrected_and_combined():
     p_values = [found.tests[name][0] for name in TESTS]
     assert [found.tests[name][1] for name in TESTS] == pytest.approx(holm(p_values).tolist())
     assert [family.p_value for family in found.families] == pytest.approx(p_values[:4])
-    # Fisher's combination, from the p-values of every labeling.
+    # Fisher's combination, from the p-values of every labelling.
     statistics = []
     for chosen in itertools.combinations(range(8), 4):
         label = torch.isin(plans.group, torch.tensor(chosen)).long()
@@ -283,15 +283,15 @@ def test_features_are_shares_and_mean_log_durations_by_hand():
 def test_four_against_four():
     found = compare_conditions(study(0, between(8)))
     assert found.smallest_p == pytest.approx(2 / 70)
-    assert found.labelings == 70
+    assert found.labellings == 70
     assert found.conclusive
     assert "With 4 against 4 groups the smallest possible p is 0.029" in found.verdict
 
 
-@pytest.mark.parametrize(("permutations", "labelings", "smallest"), [(69, 70, 2 / 70), (68, 69, 1 / 69)])
-def test_all_labelings_are_compared_where_they_are_no_more(permutations, labelings, smallest):
+@pytest.mark.parametrize(("permutations", "labellings", "smallest"), [(69, 70, 2 / 70), (68, 69, 1 / 69)])
+def test_all_labellings_are_compared_where_they_are_no_more(permutations, labellings, smallest):
     found = compare_conditions(study(0, between(8)), permutations, seeded(0))
-    assert (found.labelings, found.exact, found.smallest_p) == (labelings, labelings == 70, pytest.approx(smallest))
+    assert (found.labellings, found.exact, found.smallest_p) == (labellings, labellings == 70, pytest.approx(smallest))
 
 
 def test_four_against_four_can_show_that_behaviour_differs_but_not_in_what():
@@ -344,13 +344,13 @@ def test_plans_without_condition_are_refused():
 def test_permutations_never_split_an_animal(drawn):
     plans = study(0, [[0], [1, 1], [0, 0, 0], [1], [1] * 4, [0, 0], [0]], length=5)
     design = PermutationDesign.of(plans)
-    of_plans = design.labelings(drawn, seeded(0))[design.block]
+    of_plans = design.labellings(drawn, seeded(0))[design.block]
     assert of_plans.shape[1] == (35 if drawn > 50 else 21)
     for group in range(7):
         own = of_plans[plans.group == group]
         assert own.eq(own[:1]).all()
     assert of_plans[:, 0].equal(plans.condition.short())
-    each = design.labelings(drawn, seeded(0))
+    each = design.labellings(drawn, seeded(0))
     assert (each == 0).sum(0).unique().tolist() == [4]
 
 
@@ -358,24 +358,24 @@ def test_permutations_never_split_an_animal(drawn):
 def test_within_animals_whole_blocks_change_places(drawn):
     plans = study(0, [[0, 1, 2], [2, 1, 0, 0], [1, 2, 0], [0, 1, 2, 2]], length=5)
     design = PermutationDesign.of(plans)
-    labelings = design.labelings(drawn, seeded(0))
-    assert labelings.shape[1] == min(6**4, drawn + 1)
-    assert labelings.view(4, 3, -1).sort(1).values.eq(torch.arange(3)[:, None]).all()
-    of_plans = labelings[design.block]
+    labellings = design.labellings(drawn, seeded(0))
+    assert labellings.shape[1] == min(6**4, drawn + 1)
+    assert labellings.view(4, 3, -1).sort(1).values.eq(torch.arange(3)[:, None]).all()
+    of_plans = labellings[design.block]
     assert of_plans[:, 0].equal(plans.condition.short())
     for group, label in {*zip(plans.group.tolist(), plans.condition.tolist(), strict=True)}:
         own = of_plans[(plans.group == group) & (plans.condition == label)]
         assert own.eq(own[:1]).all()
-    assert len(labelings.unique(dim=1).T) == (6**4 if drawn > 10**3 else len({*map(tuple, labelings.T.tolist())}))
+    assert len(labellings.unique(dim=1).T) == (6**4 if drawn > 10**3 else len({*map(tuple, labellings.T.tolist())}))
 
 
-def test_all_labelings_are_distinct_and_the_observed_one_is_first():
+def test_all_labellings_are_distinct_and_the_observed_one_is_first():
     for sizes in ([3, 4], [2, 2, 3], [2, 2, 2, 2]):
         label = torch.tensor([k for k, size in enumerate(sizes) for _ in range(size)])
         label = label[torch.randperm(len(label), generator=seeded(0))]
         plans = Plans(torch.zeros(len(label), 1, dtype=torch.long), 2, condition=label)
         design = PermutationDesign.of(plans)
-        found = [tuple(own) for own in design.labelings(design.possible - 1).T.tolist()]
+        found = [tuple(own) for own in design.labellings(design.possible - 1).T.tolist()]
         assert found[0] == tuple(label.tolist())
         assert {*found} == {*itertools.permutations(label.tolist())}
         assert len(found) == len({*found}) == design.possible
@@ -385,7 +385,7 @@ def test_random_permutations_give_the_exact_p_value():
     """With 2,000 permutations a p-value is 5 standard errors off with a probability below 1e-6."""
     plans = study(8, between(14), length=30, num_actions=3)
     exact, drawn = compare_conditions(plans), compare_conditions(plans, 2000, seeded(0))
-    assert (exact.exact, exact.labelings, drawn.exact, drawn.labelings) == (True, 3432, False, 2001)
+    assert (exact.exact, exact.labellings, drawn.exact, drawn.labellings) == (True, 3432, False, 2001)
     for name in TESTS:
         p = exact.tests[name][0]
         assert abs(drawn.tests[name][0] - p) < 5 * (p * (1 - p) / 2000) ** 0.5 + 1 / 2001
@@ -399,7 +399,7 @@ def test_work_is_bounded():
     plans = study(8, between(14, 1), length=20, num_actions=3)
 
     def drawn(max_work):
-        return compare_conditions(plans, generator=seeded(0), max_work=max_work).labelings - 1
+        return compare_conditions(plans, generator=seeded(0), max_work=max_work).labellings - 1
 
     assert drawn(1) == drawn(300_000) == 999
     assert 999 < drawn(10**6) < 3431
@@ -420,7 +420,7 @@ def test_parts_that_fit_the_memory_change_nothing(conditions, monkeypatch):
         for what in ("statistic", "p_values", "corrected"):
             assert getattr(one, what).equal(getattr(other, what))
     monkeypatch.setattr("neuroprior.analysis.permutation_design.DRAWN_AT_ONCE", 7 * len(design.label))
-    drawn = design.labelings(20, seeded(0))
+    drawn = design.labellings(20, seeded(0))
     assert drawn.shape == (len(design.label), 21)
     assert drawn[:, 0].equal(design.label.short())
     shape = (-1, 2, 21) if design.kind == "within" else (1, -1, 21)

@@ -11,8 +11,8 @@ import pytest
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 from neuroprior import load
+from neuroprior.__main__ import main as neuroprior_main
 from neuroprior._interrupts import is_command
-from neuroprior.cli.__main__ import main as neuroprior_main
 from neuroprior.cli.program import Command, run_commands, run_program
 from train.__main__ import main as train_main
 
@@ -139,7 +139,7 @@ def test_help_lists_commands_and_options(capsys):
 
 
 @pytest.mark.parametrize(
-    ("module", "after"), [("neuroprior.cli", 0.15), ("neuroprior.cli", 0.6), ("eval", 0.3), ("train", 0.5)]
+    ("module", "after"), [("neuroprior", 0.15), ("neuroprior", 0.6), ("eval", 0.3), ("train", 0.5)]
 )
 def test_ctrl_c_while_libraries_load(module, after):
     """It takes about two seconds until a command runs: no traceback before that either."""
@@ -165,7 +165,7 @@ sys.exit(running.wait())
 @pytest.mark.parametrize(
     ("line", "is_one"),
     [
-        ("python -m neuroprior.cli fit", True),
+        ("python -m neuroprior fit", True),
         ("python /usr/bin/neuroprior report x.csv", True),
         ("python -W error -m eval paper", True),
         ("python mine.py", False),

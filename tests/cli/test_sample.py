@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans, save
-from neuroprior.cli.__main__ import main
+from neuroprior.__main__ import main
 from neuroprior.plans import read_plans
 from neuroprior.priors import SemiMarkovPrior
 from tests.support.sources import seeded

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans, save
+from neuroprior.__main__ import main
 from neuroprior.cli import score as command
-from neuroprior.cli.__main__ import main
 from neuroprior.plans import write_plans
 from neuroprior.priors.scoring import keep_learned
 from tests.support.sources import seeded

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from neuroprior import load
-from neuroprior.cli.__main__ import main
+from neuroprior.__main__ import main
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 

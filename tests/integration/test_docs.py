@@ -26,7 +26,7 @@ OTHERS = ROOT / "docs/how-to/other-libraries.md"
 PACKAGES = {"huggingface_hub", "imitation", "jax", "mctx", "pytorch_mppi", "sklearn", "tensordict", "torchrl"}
 """What examples of `OTHERS` need, and no extra installs for tests."""
 
-PROGRAMS = {"neuroprior": "neuroprior.cli.__main__", "eval": "eval.__main__"}
+PROGRAMS = {"neuroprior": "neuroprior.__main__", "eval": "eval.__main__"}
 
 
 def name(page: Path) -> str:

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from neuroprior.cli.__main__ import main
+from neuroprior.__main__ import main
 from neuroprior.plans import Plans, read_plans, write_plans
 from neuroprior.priors import GRUPrior, MarkovPrior, SemiMarkovPrior, load, match_plans
 from tests.support.sources import seeded

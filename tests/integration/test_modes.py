@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuroprior import Plans, load, write_plans
-from neuroprior.cli.__main__ import main
+from neuroprior.__main__ import main
 from neuroprior.priors import SwitchingPrior
 from neuroprior.report import report
 from tests.support.sources import seeded

@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from neuroprior.cli.__main__ import main
+from neuroprior.__main__ import main
 
 ROOT = Path(__file__).parents[2]
 
@@ -58,7 +58,7 @@ def run(installed: Path, folder: Path, *words: str, code: int = 0) -> subprocess
 IN_ONE_PROCESS = """
 import json, sys
 import neuroprior
-from neuroprior.cli.__main__ import main
+from neuroprior.__main__ import main
 
 assert neuroprior.__file__.startswith(sys.prefix), neuroprior.__file__
 for words in json.loads(sys.argv[1]):

@@ -262,6 +262,19 @@ def test_ctrl_c_is_a_keyboard_interrupt(monkeypatch: pytest.MonkeyPatch) -> None
         GRUPrior(3, 8).fit(torch.randint(3, (50, 4), generator=generator()), progress=False)
 
 
+@pytest.mark.parametrize("progress", [True, False])
+def test_progress_in_a_log_file_is_lines(
+    progress: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("neuroprior.training.trainer.QUIET", 0.0)
+    plans = torch.randint(3, (40, 4), generator=generator())
+    GRUPrior(3, 4).fit(plans, generator=generator(), progress=progress, max_steps=8, check_every=2, patience=100)
+    out, lines = capsys.readouterr()
+    assert out == ""
+    steps = [line.partition(",")[0] for line in lines.splitlines() if line.startswith("training: ")]
+    assert steps == ([f"training: step {step} of at most 8" for step in (2, 4, 6, 8)] if progress else [])
+
+
 def test_fitting_again_takes_the_new_plans_window() -> None:
     prior = GRUPrior(3, 8)
     for length in (3, 6):

@@ -176,7 +176,7 @@ def conditions():
         found[name] = dict(vars(result)) | {
             "design": vars(design),
             "smallest": design.smallest_p(199),
-            "labelings": design.labelings(5, seeded(1)),
+            "labellings": design.labellings(5, seeded(1)),
             "differs": {test: result.differs(test) for test in result.tests},
             "significant": [result.significant(family) for family in result.families],
         }

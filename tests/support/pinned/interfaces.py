@@ -19,7 +19,7 @@ import yaml
 import eval.__main__ as eval_program
 import neuroprior
 from neuroprior import Plans
-from neuroprior.cli import __main__ as program
+from neuroprior import __main__ as program
 from neuroprior.planners import LevinPlanner, MCTSPlanner, SamplingPlanner, oracle
 from neuroprior.planners.continuous import ICEMPlanner
 from neuroprior.plans import folds, read_plans
