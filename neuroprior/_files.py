@@ -74,7 +74,7 @@ def written_whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
 def versions(*more: str) -> dict[str, str]:
     """The versions that results depend on, with those of more packages; without those that are not installed."""
     found = {"neuroprior": __version__, "python": platform.python_version()}
-    for name in ("torch", "numpy", "lightning", *more):
+    for name in ("torch", "numpy", "scipy", "lightning", "numba", *more):
         with suppress(PackageNotFoundError):
             found[name] = version(name)
     return found

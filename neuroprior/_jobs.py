@@ -277,7 +277,10 @@ def _clock(seconds: float) -> str:
 
 
 def code_version(run: Callable[..., Any]) -> str:
-    """A digest of the source of a function's module and of all modules of this project that it imports."""
+    """A digest of the source of a function's module and of all modules of this project that it imports.
+
+    Those with compiled loops, which `compiled` imports by name, are among them.
+    """
     while isinstance(run, partial):
         run = run.func
     return _digest(getattr(run, "__module__", None) or type(run).__module__)
@@ -297,6 +300,8 @@ def _digest(module: str) -> str:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "compiled":
+                names = [str(one.value) for one in node.args if isinstance(one, ast.Constant)]
             new = {each for each in names if each.split(".")[0] in PACKAGES} - met
             todo += new
             met |= new

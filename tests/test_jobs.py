@@ -131,7 +131,9 @@ def test_the_version_of_code_counts_what_it_imports() -> None:
     assert code_version(partial(jobs.square, 1)) == code_version(jobs.dies)
 
 
-@pytest.mark.parametrize("line", ["import made.part", "from made import part", "from made.part import x as y"])
+@pytest.mark.parametrize(
+    "line", ["import made.part", "from made import part", "from made.part import x as y", "compiled('made.part')"]
+)
 def test_the_version_of_code_follows_every_import(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "made"
     folder.mkdir()

@@ -75,10 +75,13 @@ def drawn_uniformly(starts: Starts, share: float, num_plans: int, generator: tor
     return drawn(starts, UniformPrior(starts.world.num_actions), number, Sampling(), generator) if number else None
 
 
-def decided(own: Drawn, uniform: Drawn | None, num_plans: int, share: float) -> Tensor:
+def decided(
+    starts: Starts, own: Drawn, uniform: Drawn | None, num_plans: int, share: float, generator: torch.Generator
+) -> Tensor:
     """The exact scores `[B, D]` of D decisions of each start, each for the best of a block of candidates."""
+    ties = generator if starts.world.stochastic else None
     whole = own if uniform is None else Drawn(*(torch.cat(pair, 1) for pair in zip(own, uniform, strict=True)))
-    return whole.exact.gather(1, choices(whole.estimated, own.exact.shape[1], num_plans, share))
+    return whole.exact.gather(1, choices(whole.estimated, own.exact.shape[1], num_plans, share, ties))
 
 
 def tried(
@@ -96,7 +99,7 @@ def tried(
         own = drawn(starts, prior, most, alike, generator)
         for one in (one for one in ways if one._replace(uniform_share=0.0) == alike):
             for number in numbers:
-                score = decided(own, uniform, number, one.uniform_share)
+                score = decided(starts, own, uniform, number, one.uniform_share, generator)
                 found[number][one] = starts.reached(score)["share"]
     return found
 
@@ -120,7 +123,7 @@ def curve(
     share = sampling.uniform_share
     uniform = drawn_uniformly(starts, share, max(budgets), generator)
     own = drawn(starts, prior, max(budgets), sampling, generator)
-    found = [starts.reached(decided(own, uniform, number, share)) for number in budgets]
+    found = [starts.reached(decided(starts, own, uniform, number, share, generator)) for number in budgets]
     return {name: [one[name] for one in found] for name in found[0]}
 
 

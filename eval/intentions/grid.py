@@ -1,7 +1,7 @@
 """Agents that walk to one of K goals in a grid, and what observers make of their moves."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from math import log
 from typing import Any, NamedTuple
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from eval.worlds.labyrinth import data_digest
 from neuroprior import MarkovPrior, Plans, Prior, TabularWorld
 from neuroprior._random import draw_seed
 from neuroprior.analysis import forecast, infer
@@ -61,6 +62,11 @@ class IntentionSettings:
     temperature: float
     seed: int
 
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings, and the mice's moves: what distinguishes finished runs."""
+        return asdict(self) | {"data": data_digest()}
+
 
 class Scene(NamedTuple):
     """A grid with K goals.
@@ -98,7 +104,7 @@ class Agents(NamedTuple):
         return [{"at": t, **scores(scale * logits[rows, t], self.goal[rows])} for rows, t in there if rows.any()]
 
     def best_scale(self, logits: Tensor, times: tuple[int, ...]) -> float:
-        """The factor of the logits under which the goals are likeliest."""
+        """The factor of the logits with the least log-loss of the goals, in which all times count the same."""
         losses = [sum(row["loss"] for row in self.scores(logits, times, scale)) for scale in SCALES]
         return SCALES[losses.index(min(losses))]
 

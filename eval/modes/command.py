@@ -24,7 +24,7 @@ from eval.modes.experiment import (
 )
 from eval.modes.figures import maze_figure, since_figure
 from eval.worlds import runs
-from eval.worlds.labyrinth import DATA
+from eval.worlds.labyrinth import DATA, data_digest
 from neuroprior import read_plans
 from neuroprior._jobs import JobRun
 from neuroprior.analysis.modes import STABLE, mode_table
@@ -63,7 +63,7 @@ def modes(
     run = JobRun(
         partial(fit_and_infer, settings=settings),
         Path(out) / "fits",
-        {"command": "modes"} | asdict(settings),
+        {"command": "modes", "data": data_digest()} | asdict(settings),
         save=save_arrays,
         load=load_arrays,
         suffix=".npz",

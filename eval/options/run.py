@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from eval.options.priors import Entrant, entrants
 from eval.worlds.contexts import ContextIndex
-from eval.worlds.labyrinth import DATA, cut_plans, dry_nodes, reaching_planner, shares_reached
+from eval.worlds.labyrinth import DATA, cut_plans, data_digest, dry_nodes, reaching_planner, shares_reached
 from eval.worlds.runs import Run
 from eval.worlds.starts import Starts, starts_of
 from eval.worlds.suite import TASKS
@@ -44,6 +44,11 @@ class OptionSettings:
     starts: int
     training_starts: int
     seed: int
+
+    @property
+    def asked(self) -> dict[str, Any]:
+        """The settings, and the mice's moves: what distinguishes finished runs."""
+        return asdict(self) | {"data": data_digest()}
 
 
 def options_run(run: Run, settings: OptionSettings) -> dict[str, Any]:

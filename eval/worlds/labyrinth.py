@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import torch
@@ -17,6 +18,11 @@ NODES, LONGEST = 126, 500
 
 ROWS = 2048
 """Candidates drawn together; with more the caches of a transformer are slower to move than to compute."""
+
+
+def data_digest() -> str:
+    """A digest of the moves: what was computed from others is not used again."""
+    return sha256(DATA.read_bytes()).hexdigest()
 
 
 def check_fits(starts: int, lengths: Sequence[int]) -> None:

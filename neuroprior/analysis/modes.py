@@ -82,7 +82,7 @@ def choose_modes(
     *,
     number_of_folds: int | None = None,
     use_context: bool = True,
-    skip: int = 0,
+    mask: Tensor | None = None,
     generator: torch.Generator | None = None,
     **arguments: Any,
 ) -> ModeChoice:
@@ -101,7 +101,7 @@ def choose_modes(
         number_of_folds: F; at most as many as there are groups (plans, where there are no two groups); None: so many,
             but no more than `FOLDS`.
         use_context: whether the prior takes the context of the plans, if that is an index.
-        skip: actions at the beginning of each plan that do not count in the bits.
+        mask: `[N, L]` bool: the actions that count in the bits; None: all.
         generator: draws the folds and what EM starts from.
         arguments: of `SwitchingPrior`, such as `order=2`.
 
@@ -126,7 +126,9 @@ def choose_modes(
     if number_of_folds is None:
         number_of_folds = min(FOLDS, len(given) if given.group is None else len(given.group.unique()))
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)
-    mask = given.mask() & (torch.arange(given.max_length) >= skip)
+    if mask is not None and mask.shape != given.actions.shape:
+        raise ValueError(f"mask: {list(given.actions.shape)} is expected, as the actions, not {list(mask.shape)}")
+    mask = given.mask() if mask is None else given.mask() & mask
     scores, priors, stability = {}, {}, {}
     inputs = "actions" if given.context is None else "actions and context"
     for number in numbers:

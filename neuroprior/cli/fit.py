@@ -33,7 +33,7 @@ from neuroprior.training import Settings, make_trainer, quiet, run_training
 USAGE = """{0} fit PLANS [--effort fast|standard|full] [--max-steps N] [--out FOLDER]
        {0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        {0} fit --resume FOLDER"""
-CONFIG, PLANS = "run.yaml", "plans.npz"
+CONFIG, PLANS, MODEL = "run.yaml", "plans.npz", "model.safetensors"
 LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 """What a checkpoint must hold for a training to go on from it."""
@@ -156,7 +156,7 @@ class FitCLI(LightningCLI):
         if getattr(rank_zero_only, "rank", 0) != 0:
             return
         if fit.resume is None:
-            if any((self.folder / name).exists() for name in (CONFIG, "model.safetensors")):
+            if any((self.folder / name).exists() for name in (CONFIG, MODEL)):
                 raise ValueError(
                     f"{self.folder}: holds a run already; --resume {self.folder} goes on with it, or give another --out"
                 )
@@ -183,8 +183,10 @@ class FitCLI(LightningCLI):
             model.prior.prepare(datamodule.learned_from, datamodule.settings.window)
             self._check_checkpoints(model, datamodule)
         saved = None if neural else self._saved()
+        # A prior of other options is in the folder, with these, until the new one has been learned.
+        other = not neural and saved is None and (self.folder / MODEL).exists()
         if self.trainer.is_global_zero:
-            self._keep(datamodule)
+            self._keep(datamodule, options=not other)
             for note in datamodule.source.notes:
                 print(f"note: {note}")
         if neural:
@@ -194,6 +196,9 @@ class FitCLI(LightningCLI):
         else:
             generator = torch.Generator().manual_seed(datamodule.seed)
             model.prior.fit(datamodule.plans if many else datamodule.learned_from, generator=generator, **settings)
+            if other:
+                (self.folder / MODEL).unlink()
+                self._keep(datamodule)
         if self.trainer.is_global_zero:
             with self._saying_how_to_go_on(lambda: "the prior is saved"):
                 report(self.folder, model, datamodule, fresh, settings | {"progress": False} if settings else {})
@@ -266,12 +271,17 @@ class FitCLI(LightningCLI):
         written: dict[str, Any] = yaml.safe_load(self._parser("fit").dump(self.config.fit))
         return written
 
-    def _keep(self, data: PlansData) -> None:
-        """Keep what the run needs to be resumed, and nothing else is needed then: its configuration and its plans."""
+    def _keep(self, data: PlansData, options: bool = True) -> None:
+        """Keep what the run needs to be resumed, and nothing else is needed then: its configuration and its plans.
+
+        Without `options` those of the trainer stay as they were written before.
+        """
         if self.config.fit.resume is None or not (self.folder / PLANS).exists():
             write_plans(data.source, self.folder / PLANS)
         config = self._as_written()
         if (self.folder / CONFIG).exists():
+            if not options:
+                return
             # What is resumed with other trainer options goes on with them when it is resumed again.
             config = yaml.safe_load((self.folder / CONFIG).read_text()) | {"trainer": config["trainer"]}
         write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())

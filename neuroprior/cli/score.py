@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pandas as pd
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
@@ -93,7 +94,7 @@ def score(
     console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)
     place = Path(out)
     place.mkdir(parents=True, exist_ok=True)
-    write_frames(place, frames)
+    write_frames(place, dict.fromkeys(("groups", "conditions"), pd.DataFrame()) | frames)
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
     )

@@ -125,6 +125,8 @@ def bootstrap(
     generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
     digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
     asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
+    asked |= {"max_actions": max_actions, "teacher": teacher and [type(teacher).__name__, teacher.max_nodes]}
+    asked["settings"] = {name: repr(value) for name, value in sorted(settings.items()) if name != "progress"}
     run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
     yield from run.done
     while len(run.done) < sweeps:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_share, check_sizes
 from neuroprior._random import generator_on
-from neuroprior.planners.planner import Objective
+from neuroprior.planners.planner import Objective, random_best
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner, uniform_plans
 from neuroprior.plans import Plans
@@ -147,8 +147,10 @@ def _decided(
     plans, estimates = drawn if uniform is None else (torch.cat(pair, 1) for pair in zip(drawn, uniform, strict=True))
     prefix = None
     if estimates.dim() == 3:  # any prefix may win
-        estimates, prefix = estimates.max(-1)
-    best = choices(estimates, planner.num_plans, planner.num_plans, share)
+        if world.stochastic:
+            prefix = random_best(estimates.flatten(0, 1), generator).view(estimates.shape[:2])
+        estimates = estimates.amax(-1)
+    best = choices(estimates, planner.num_plans, planner.num_plans, share, generator if world.stochastic else None)
     if not world.stochastic:
         return estimates.gather(1, best)[:, 0]
     row = torch.arange(len(plans), device=plans.device)[:, None]
@@ -156,7 +158,7 @@ def _decided(
     return scores[:, 0] if prefix is None else scores[:, 0].gather(1, prefix.gather(1, best))[:, 0]
 
 
-def choices(score: Tensor, drawn: int, num_plans: int, share: float) -> Tensor:
+def choices(score: Tensor, drawn: int, num_plans: int, share: float, ties: torch.Generator | None = None) -> Tensor:
     """The best of each block of `num_plans` candidates, a share of which are uniform plans.
 
     Args:
@@ -164,6 +166,7 @@ def choices(score: Tensor, drawn: int, num_plans: int, share: float) -> Tensor:
         drawn: M.
         num_plans: P.
         share: of uniform plans among the P.
+        ties: breaks them; None: of equal scores the first is taken, where plans with equal scores are as good.
 
     Returns:
         The columns `[B, D]` of the best in each of the D blocks that there are enough candidates for.
@@ -176,7 +179,8 @@ def choices(score: Tensor, drawn: int, num_plans: int, share: float) -> Tensor:
         for first, size in zip((0, drawn), sizes, strict=True)
     ]
     column = torch.cat(parts, 1)
-    best = score[:, column].argmax(-1)
+    scores = score[:, column]
+    best = scores.argmax(-1) if ties is None else random_best(scores.flatten(0, 1), ties).view(scores.shape[:2])
     return column.expand(len(score), -1, -1).gather(2, best[..., None])[..., 0]
 
 

@@ -4,6 +4,7 @@ Needs pandas, matplotlib, jinja2 and rich (`neuroprior[report]`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
-from neuroprior._files import versions, write_json, written_whole
+from neuroprior._files import read_json, versions, write_json, written_whole
 from neuroprior.report.page import Section, Table, write_page
 
 Column = str | Callable[[Any], str]
@@ -110,12 +111,19 @@ def show(document: Document, console: Console) -> None:
 def write_document(document: Document, folder: Path) -> None:
     """Write `report.html`, `results.json` and a CSV file for each frame to a folder, which is made if it is not there.
 
+    CSV files of an earlier document there, whose frames this one does not have, are removed.
+
     Raises:
         OSError: the files cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    results = folder / "results.json"
+    with suppress(OSError, ValueError):
+        names = {key: name for name, key in document.keys.items()}
+        earlier = [names.get(key, key) for key in read_json(results)]
+        write_frames(folder, dict.fromkeys(set(earlier) - {*document.frames}, pd.DataFrame()))
     write_frames(folder, document.written)
-    write_json(folder / "results.json", results_of(document))
+    write_json(results, results_of(document))
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
     write_page(folder / "report.html", document.title, document.lead, document.sections, shown, document.command)
 

@@ -23,6 +23,7 @@ from neuroprior.priors import SwitchingPrior
 from neuroprior.report import figures
 from neuroprior.report.conditions import condition_section
 from neuroprior.report.document import Column, table
+from neuroprior.report.fits import counted
 from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.report.part import SIGNIFICANT, Part, action_names, p_text
 from neuroprior.report.scores import Evaluation
@@ -37,9 +38,11 @@ def mode_section(found: Evaluation) -> Part | None:
     if not numbers:
         return None
     plans = divided = found.plans
-    if found.settings.get("cut"):
+    cut = bool(found.settings.get("cut"))
+    if cut:
         divided = in_parts(plans, min(BLOCKS, max(int(plans.mask().sum()) // 2, 1)))
-    choice = choose_modes(divided, numbers, skip=found.settings["skip"], generator=torch.Generator().manual_seed(0))
+    mask = counted(divided, found.settings["skip"], cut)
+    choice = choose_modes(divided, numbers, mask=mask, generator=torch.Generator().manual_seed(0))
     prior, stable = choice.prior, choice.stable().tolist()
     tables, boxes, frames = [choice_table(choice)], list[FigureBox](), {"modes": choice.frame()}
     text = [

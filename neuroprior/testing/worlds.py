@@ -13,6 +13,9 @@ from neuroprior.testing.rules import FALSE_ALARM, raises, require, same
 from neuroprior.worlds import TabularWorld, World
 from neuroprior.worlds.continuous import ContinuousWorld
 
+TIMES = 200
+"""Rollouts from each start, in a stochastic world."""
+
 
 def check_world(world: World | ContinuousWorld, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `world` does what a world must.
@@ -197,13 +200,11 @@ def _step_through(
     return torch.stack(finals, 1), torch.stack(rewards, 1), random
 
 
-def _check_distribution(
-    world: World | ContinuousWorld, state: Tensor, plans: Tensor, seed: int, times: int = 200
-) -> None:
-    """Rollouts in a stochastic world against steps, `times` from each start `[N, ...]` by its plan."""
+def _check_distribution(world: World | ContinuousWorld, state: Tensor, plans: Tensor, seed: int) -> None:
+    """Rollouts in a stochastic world against steps, `TIMES` from each start `[N, ...]` by its plan."""
     generator = torch.Generator().manual_seed(seed)
-    group = torch.arange(len(state)).repeat_interleave(times)
-    now, plans = state.repeat_interleave(times, 0), plans.repeat_interleave(times, 0)
+    group = torch.arange(len(state)).repeat_interleave(TIMES)
+    now, plans = state.repeat_interleave(TIMES, 0), plans.repeat_interleave(TIMES, 0)
     rollout = world.rollout(now, plans[:, None], generator)
     again = world.rollout(now, plans[:, None], torch.Generator().manual_seed(seed))
     require(same(rollout.final_state, again.final_state), "rollout: the same seed gave other states")
@@ -218,7 +219,7 @@ def _check_distribution(
         what = "rewards" if column >= observed.shape[1] - plans.shape[1] else "final states"
         require(p > FALSE_ALARM / observed.shape[1], f"{what} of rollout do not fit those of steps: p = {p:.2g}")
     if isinstance(world, TabularWorld):
-        twice = world.rollout(state, plans[::times, None].expand(-1, 2, -1), generator)
+        twice = world.rollout(state, plans[::TIMES, None].expand(-1, 2, -1), generator)
         require(
             twice.rewards[:, 0].equal(twice.rewards[:, 1]), "rollout: the same plan twice had different random numbers"
         )

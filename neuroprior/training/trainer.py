@@ -309,7 +309,10 @@ class ProgressLines(lightning.Callback):
 
 
 class Stopping(EarlyStopping):
-    """Early stopping that also stops a training which is resumed after it was stopped."""
+    """Early stopping that also stops a training which is resumed after it was stopped, unless with more patience."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict | {"patience": self.patience})
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         if self.wait_count >= self.patience:

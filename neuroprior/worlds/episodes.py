@@ -31,9 +31,9 @@ class EpisodicWorld(TabularWorld):
     Example:
         >>> table = torch.tensor([[1, 0], [1, 1]])  # action 0 leads to cell 1, where the episode is over
         >>> starts, ended = torch.tensor([1.0, 0.0]), torch.tensor([False, True])
-        >>> world = EpisodicWorld(table, torch.tensor([0.0, 1.0]), None, starts=starts, ended=ended)
+        >>> world = EpisodicWorld(table, torch.tensor([[[1.0, 0], [0, 0]]]), None, starts=starts, ended=ended)
         >>> world.terminated(torch.tensor([0, 1])).tolist()
-        [False, False]
+        [False, True]
     """
 
     def __init__(

@@ -68,7 +68,7 @@ def test_the_rule_is_that_of_one_standard_error_paired():
 def test_bits_are_of_held_out_groups_and_begin_after_those_left_out():
     plans, _ = source(20, 30, seed=4)
     grouped = replace(plans, group=torch.arange(20) // 4)
-    choice = choose_modes(grouped, [1], order=0, skip=3, generator=seeded(0))
+    choice = choose_modes(grouped, [1], order=0, mask=plans.mask() & (torch.arange(30) >= 3), generator=seeded(0))
     score = choice.scores[1]
     assert score.actions.tolist() == [4 * 27] * 5
     # each group under what the other four did
@@ -172,6 +172,8 @@ def test_wrong_arguments_are_named():
         choose_modes(plans, [1], number_of_folds=7)
     with refuses("order"):
         choose_modes(plans, [1], order=-1)
+    with pytest.raises(ValueError, match=r"mask: \[\d+, \d+\] is expected"):
+        choose_modes(plans, [1], mask=torch.ones(2, dtype=torch.bool))
     assert isinstance(choose_modes(plans, [1], number_of_folds=2, generator=seeded(0)), ModeChoice)
 
 

@@ -43,6 +43,13 @@ def scored(folder, plans, learned=(), **options):
     return prior, {path.stem: pd.read_csv(path) for path in (folder / "out").glob("*.csv")}
 
 
+def test_tables_of_an_earlier_file_are_not_left_beside_those_of_another(tmp_path):
+    _, frames = scored(tmp_path, drawn(9, group=torch.arange(9) % 3, condition=torch.arange(9) % 3))
+    assert set(frames) == {"plans", "groups", "conditions"}
+    _, frames = scored(tmp_path, drawn(9))
+    assert set(frames) == {"plans"}
+
+
 def drawn(num, **more):
     return Plans(torch.randint(3, (num, 5), generator=seeded(0)), 3, **more)
 

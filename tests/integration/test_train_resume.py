@@ -254,3 +254,40 @@ def test_a_resumed_run_does_not_learn_a_saved_combined_prior_again(tmp_path, mon
     assert main(["fit", "--resume", str(run)]) == 0
     assert [more["max_steps"] for more in fitted] == [6, 6]
     assert (run / "model.safetensors").read_bytes() == model
+
+
+def test_a_combined_prior_of_other_options_does_not_pass_for_the_one_that_was_interrupted(tmp_path, monkeypatch):
+    write_plans(Plans(torch.randint(3, (40, 6), generator=torch.Generator().manual_seed(0)), 3), tmp_path / "plans.npz")
+    run = tmp_path / "run"
+    assert main(["fit", str(tmp_path / "plans.npz"), "--effort", "fast", "--max-steps", "5", "--out", str(run)]) == 0
+    model, fit = (run / "model.safetensors").read_bytes(), CombinedPrior.fit
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(CombinedPrior, "fit", interrupted)
+    assert main(["fit", "--resume", str(run), "--max-steps", "6"]) == 130
+    # Prior and options still belong together.
+    assert (run / "model.safetensors").read_bytes() == model
+    assert yaml.safe_load((run / "run.yaml").read_text())["trainer"]["max_steps"] == 5
+    fitted = []
+    monkeypatch.setattr(
+        CombinedPrior, "fit", lambda self, *given, **more: fitted.append(more) or fit(self, *given, **more)
+    )
+    assert main(["fit", "--resume", str(run), "--max-steps", "6"]) == 0
+    assert [more["max_steps"] for more in fitted] == [6]
+    assert yaml.safe_load((run / "run.yaml").read_text())["trainer"]["max_steps"] == 6
+
+
+def test_a_resumed_run_has_the_patience_that_it_is_given(tmp_path):
+    """Noise is learned by heart: held-out bits rise from the first steps on."""
+    plans = Plans(torch.randint(3, (40, 8), generator=torch.Generator().manual_seed(0)), 3)
+    write_plans(plans, tmp_path / "plans.npz")
+    run = tmp_path / "run"
+    line = ["fit", str(tmp_path / "plans.npz"), "--config", "gru", "--out", str(run), "--model.learning_rate", "0.02"]
+    line += ["--trainer.max_steps", "60", "--data.check_every", "5", "--trainer.patience", "10", "--data.folds", "1"]
+    assert main(line) == 0
+    stopped = metrics(run)["curve"][-1]["step"]
+    assert stopped < 60
+    assert main(["fit", "--resume", str(run), "--trainer.patience", "1000"]) == 0
+    assert metrics(run)["curve"][-1]["step"] == 60

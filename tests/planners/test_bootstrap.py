@@ -62,6 +62,10 @@ def test_an_interrupted_call_goes_on(tmp_path: Path) -> None:
     for others in (world.boards[:10], world.boards.flip(0)):
         with pytest.raises(ValueError, match="another call"):
             list(bootstrap(world, prior_for(world), others, folder=tmp_path, **how))
+    for other in ({"epochs": 3}, {"max_actions": 10}, {"teacher": AStarPlanner(world.lower_bound)}, {"l2": 0.5}):
+        with pytest.raises(ValueError, match="another call"):
+            list(bootstrap(world, prior_for(world), world.boards, folder=tmp_path, **how | other))
+    assert len(list(bootstrap(world, prior_for(world), world.boards, folder=tmp_path, sweeps=3, **how))) == 3
     rarer = LogLinearPrior(4, len(world.windows.windows), min_count=3)
     with pytest.raises(ValueError, match="its prior is"):
         list(bootstrap(world, rarer, world.boards, folder=tmp_path, **how))

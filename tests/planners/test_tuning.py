@@ -184,6 +184,29 @@ def test_choices_are_the_best_of_blocks():
     assert choices(score, 4, 7, 3 / 7).tolist() == [[4]]
 
 
+def test_equal_scores_of_a_prior_and_of_uniform_plans_win_alike():
+    """The false-alarm probability is below 1e-6: five standard deviations of a share of 2,000 draws."""
+    score, generator = torch.ones(1, 4), seeded(0)
+    own = [int(choices(score, 3, 4, 0.25, generator)) < 3 for _ in range(2000)]
+    assert sum(own) / 2000 == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 2000) ** 0.5)
+
+
+def test_in_a_stochastic_world_what_is_tuned_is_what_is_found():
+    """The prior always takes the better of two actions, which pay with chances of .9 and .5: with one rollout, luck
+    decides among candidates that seem equal, and those of the prior have no right of way.
+
+    The false-alarm probability is below 1e-5: five standard deviations of the difference of two means.
+    """
+    after, chance_of = torch.tensor([[[0, 1]] * 2] * 2), torch.tensor([[[0.1, 0.9], [0.5, 0.5]]] * 2)
+    world = TabularWorld(after, torch.tensor([[0.0, 1.0]]), probability=chance_of)
+    prior = MarkovPrior(2, 0).fit(torch.zeros(400, 50, dtype=torch.long))
+    starts, how = torch.zeros(16_000, dtype=torch.long), {"temperatures": (1.0,), "uniform_shares": (0.5,)}
+    tuned = best_sampling(prior, world, starts, 1, 8, generator=seeded(0), **how)
+    decision = SamplingPlanner(prior, 1, 8, uniform_share=0.5).plan(world, starts, seeded(1))
+    found = torch.where(decision.plan[:, 0] == 0, 0.9, 0.5).mean()
+    assert tuned.scores[prior, 1.0, 0.5] == pytest.approx(float(found), abs=5 * (0.25 / 16_000) ** 0.5)
+
+
 def chance(prior: MarkovPrior, plan: list[int], heat: float, share: float, number: int) -> float:
     """That one of `number` candidates is a plan, from the prior's steps."""
     prob, logits, state = 1.0, *prior.start(1)

@@ -33,6 +33,15 @@ def test_a_table_that_is_empty_now_leaves_no_file_of_an_earlier_run(tmp_path):
     assert json.loads((tmp_path / "results.json").read_text())["two"] == []
 
 
+def test_a_table_that_another_document_has_not_leaves_no_file_but_other_files_stay(tmp_path):
+    full = pd.DataFrame({"bits": [1.5]})
+    (tmp_path / "mine.csv").write_text("a\n1\n")
+    for keys in ({}, {"two": "second"}):
+        write_document(Document("", "", [], {"one": full, "two": full}, keys=keys), tmp_path)
+        write_document(Document("", "", [], {"one": full}, keys=keys), tmp_path)
+        assert {path.name for path in tmp_path.glob("*.csv")} == {"one.csv", "mine.csv"}
+
+
 def test_tables_are_printed_under_their_own_titles_else_that_of_their_section():
     shown = [Table(["a wide heading"], [["1"]], title="Own title")]
     shown += [Table(["a wide heading"], [["2"]], caption="A caption")]

@@ -12,6 +12,7 @@ from neuroprior import Plans
 from neuroprior.analysis import choose_modes, mode_table, motifs
 from neuroprior.priors import UniformPrior
 from neuroprior.report import group_transition_figure
+from neuroprior.report.fits import counted
 from neuroprior.report.modes import MOST_MOTIFS, mode_section
 from neuroprior.report.part import Part
 from neuroprior.report.scores import evaluate_saved
@@ -65,7 +66,7 @@ def smoothed(part, plans) -> np.ndarray:
 
 
 def test_modes_are_chosen_on_the_actions_that_count(part, plans, smoothed):
-    choice = choose_modes(plans, [1, 2], skip=SKIP, generator=seeded(0))
+    choice = choose_modes(plans, [1, 2], mask=counted(plans, SKIP), generator=seeded(0))
     assert choice.chosen == 2
     pd.testing.assert_frame_equal(part.frames["modes"], choice.frame())
     pd.testing.assert_frame_equal(part.frames["mode_table"].drop(columns="stable"), mode_table(choice.prior, plans))

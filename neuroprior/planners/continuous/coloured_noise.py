@@ -9,10 +9,10 @@ from torch import Tensor
 from neuroprior._checks import is_number
 
 
-def check_noise(std: float, noise_beta: float, name: str = "std") -> None:
+def check_noise(std: float, noise_beta: float) -> None:
     """Raise ValueError unless these are a standard deviation, and an exponent of a spectrum."""
     if not is_number(std) or not 0 < std < inf:
-        raise ValueError(f"{name}: a positive finite number is expected, not {std!r}")
+        raise ValueError(f"std: a positive finite number is expected, not {std!r}")
     if not is_number(noise_beta) or not 0 <= noise_beta < inf:
         raise ValueError(f"noise_beta: a finite number of at least 0 is expected, not {noise_beta!r}")
 

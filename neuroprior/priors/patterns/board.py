@@ -99,8 +99,8 @@ class BoardNetwork(Prior):
         Args:
             plans: `Plans` with features.
             generator: draws the first weights, the plans that are held out, and the order of the steps.
-            settings: `epochs` (10), `batch_size` (256), `learning_rate` (1e-3), and `validation` (0.1): the share of
-                plans that are held out, on which the training is stopped; None: no plans.
+            settings: `epochs` (10), `batch_size` (256), `learning_rate` (1e-3), and `validation` (0.1): the `Plans`
+                that are held out, or their share, on which the training is stopped; None: no plans.
 
         Raises:
             ValueError: plans that this prior cannot learn from, or a setting that it does not have.
@@ -114,7 +114,11 @@ class BoardNetwork(Prior):
         if not is_number(learning_rate) or not 0 < learning_rate < inf:
             raise ValueError(f"learning_rate: a finite number above 0 is expected, not {learning_rate}")
         units = len(plans) if plans.group is None else len(plans.group.unique())
-        training, held_out = (plans, None) if share is None or units < 2 else plans.split(share, generator)
+        training, held_out = plans, None
+        if isinstance(share, Plans):
+            held_out = self.training_plans(share)
+        elif share is not None and units > 1:
+            training, held_out = plans.split(share, generator)
         self._begin(generator)
         boards, actions = _boards(training)
         if not len(actions):

@@ -1,12 +1,13 @@
 """Networks on patterns and on boards."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from neuroprior import Plans
-from neuroprior.priors import BoardNetwork, LogLinearPrior, PatternNetwork, load, save
+from neuroprior.priors import BoardNetwork, LogLinearPrior, MixturePrior, PatternNetwork, UniformPrior, load, save
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -53,6 +54,16 @@ def test_a_network_learns_from_boards(tmp_path: Path) -> None:
     assert copy.log_prob(plans).equal(network.log_prob(plans))
     again = BoardNetwork(4, (1, 4, 4), 8, 1).fit(plans, generator=seeded(), epochs=20, batch_size=32)
     assert again.out.equal(network.out)
+
+
+def test_a_network_is_stopped_by_the_plans_that_it_is_given() -> None:
+    """Those of another rule get less likely with each epoch: the network stays as it began. A mixture gives such."""
+    plans = boards()
+    others = replace(plans, actions=3 - plans.actions)
+    network = BoardNetwork(4, (1, 4, 4), 8, 1).fit(plans, generator=seeded(), validation=others, epochs=20)
+    assert not network.out.any()
+    prior = MixturePrior(4, [BoardNetwork(4, (1, 4, 4), 8, 1), UniformPrior(4)])
+    assert prior.fit(plans, generator=seeded(), epochs=20, batch_size=32).log_prob(plans).mean() > -1
 
 
 def test_bad_input_is_refused() -> None:
