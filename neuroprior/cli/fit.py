@@ -143,7 +143,7 @@ class FitCLI(LightningCLI):
             help="Numbers of hidden modes to choose from: the fewest that predict held-out plans as well as the best.",
         )
         parser.link_arguments("seed_everything", "data.seed")
-        parser.link_arguments(("out", "resume"), "trainer.folder", compute_fn=lambda out, resume: resume or out)
+        parser.link_arguments(("out", "resume"), "trainer.folder", compute_fn=folder_of)
         parser.link_arguments("trainer.max_steps", "data.max_steps")
         parser.link_arguments("data", "model.data", apply_on="instantiate")
         parser.link_arguments("data.steps", "trainer.validate_every", apply_on="instantiate")
@@ -250,8 +250,8 @@ class FitCLI(LightningCLI):
         _check(self.folder / BEST, model)
         if epoch >= data.epochs:
             raise ValueError(
-                f"trainer.max_steps: more steps than the run in {self.folder} has made are expected, not"
-                f" {data.settings.max_steps}"
+                f"trainer.max_steps: more than the {epoch * data.steps} steps are expected that {self.folder} has"
+                f" made, not {data.settings.max_steps}"
             )
 
     def _saved(self) -> Prior | None:
@@ -301,6 +301,11 @@ class FitCLI(LightningCLI):
                 f"interrupted; {saved() or 'nothing to save yet'}; go on with: {self.program} fit --resume"
                 f" {self.folder}"
             ) from interrupted
+
+
+def folder_of(out: str | None, resume: str | None) -> str | None:
+    """The folder of a run, new or resumed; the help names this function."""
+    return resume or out
 
 
 def _check(checkpoint: Path, model: PriorModel) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from importlib import import_module
 from types import NoneType, UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
+from neuroprior._version import __version__
+
 TYPES = {
     "int": "an integer",
     "PositiveInt": "an integer of at least 1",
@@ -67,6 +69,9 @@ def run_commands(
             print(f"usage: {program} COMMAND ...\n\n{about}\n\ncommands:")
             print("\n".join(lines) + f"\n\n{program} COMMAND --help lists the options of a command.")
             return
+        if given[0] == "--version":
+            print(f"neuroprior {__version__}")
+            return
         name, *options = given
         if name not in commands:
             raise ValueError(f"{name!r} is no command; there are {', '.join(commands)}")
@@ -102,9 +107,8 @@ def call(function: Callable[..., Any], program: str, arguments: Sequence[str]) -
 
     described = parse(inspect.getdoc(function) or "")
     texts = {entry.arg_name: " ".join((entry.description or "").split()) for entry in described.params}
-    parser = ArgumentParser(
-        prog=program, description=described.short_description or "", exit_on_error=False, allow_abbrev=True
-    )
+    about = f"{described.short_description or ''} Options may be written with hyphens for underscores."
+    parser = ArgumentParser(prog=program, description=about, exit_on_error=False, allow_abbrev=True)
     hints = get_type_hints(function)
     items = {name: found for name, hint in hints.items() if (found := _item_of(hint)) is not None}
     parser.add_function_arguments(function, as_group=False, as_positional=True, skip=set(items))
@@ -185,11 +189,14 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
         The exit code.
     """
     given = sys.argv[1:] if arguments is None else arguments
+    main = threading.current_thread() is threading.main_thread()
+    # Where time is up, a cluster ends a program by this signal: it says what is saved, as after Ctrl-C.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None
     try:
         run([_with_underscores(argument) for argument in given])
     except KeyboardInterrupt as interrupted:
         # An impatient second Ctrl-C should not spoil the message.
-        if threading.current_thread() is threading.main_thread():
+        if main:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         return _fail(str(interrupted) or "interrupted; what was not yet written is lost", 130)
     except BrokenPipeError:
@@ -207,6 +214,9 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
         if "memory" not in str(error):
             raise
         return _fail(f"error: out of memory; a smaller run may fit ({str(error).splitlines()[0]})", 2)
+    finally:
+        if main:
+            signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
     return 0
 
 

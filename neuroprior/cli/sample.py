@@ -30,10 +30,13 @@ def sample(
         context: for a prior with a context index: its name or number, which holds for the whole of each plan.
         temperature: divides the logits; above 1 plans are more varied, below 1 more alike.
         seed: of the random numbers: the same seed gives the same plans.
-        out: file to write, `.jsonl`, `.csv` or `.npz`; JSON lines on standard output by default.
+        out: file to write, `.jsonl`, `.csv` or `.npz`, which is not there yet; JSON lines on standard output by
+            default.
     """
     if seed >= 2**63:
         raise ValueError(f"seed: an integer from 0 to 2**63 - 1 is expected, not {seed}")
+    if out is not None and Path(out).is_file():
+        raise ValueError(f"{out}: is there already; give another name")
     prior = load(folder)
     generator = torch.Generator().manual_seed(seed)
     given = _context(prior, context, folder, num_plans)

@@ -1,12 +1,14 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
 from neuroprior.plans import Columns, Missing, read_plans
+from neuroprior.plans.columns import listed, number_in
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.priors.scoring import learned_from, scores_by
@@ -43,18 +45,14 @@ def score(
         max_gap: a longer pause between two actions ends the plan, too; in the unit of the starts.
         out: folder for `plans.csv` and, where there are any, `groups.csv` and `conditions.csv`.
     """
-    prior = load(folder)
-    # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
-    names = action_names or (learned_names(prior) if file.lower().endswith((".csv", ".tsv")) else None)
-    plans = read_plans(
-        file,
-        num_actions=num_actions,
-        action_names=names,
-        columns=columns,
-        missing=missing,
-        merge_repeats=merge_repeats,
-        max_gap=max_gap,
-    )
+    prior, place = load(folder), Path(out)
+    how: dict[str, Any] = {"num_actions": num_actions, "columns": columns, "missing": missing}
+    how |= {"merge_repeats": merge_repeats, "max_gap": max_gap}
+    plans, names = read_plans(file, action_names=action_names, **how), learned_names(prior)
+    by_number = action_names is None and plans.action_names is None
+    if by_number and names is not None and file.lower().endswith((".csv", ".tsv")):
+        # Texts that look like numbers may be the prior's names; else they are its numbers, and there are as many.
+        plans = read_plans(file, action_names=names, **how)
     plans = plans if plans.end is None else plans.without_end()
     own = match_plans(plans, prior, folder)
     bits = action_bits(prior, own)
@@ -81,10 +79,14 @@ def score(
         )
     notes = list(plans.notes)
     if plans.action_names and action_names is None and prior.action_names is None:
-        order = ", ".join(f"{name} = {number}" for number, name in enumerate(plans.action_names))
+        order = listed([f"{name} = {number}" for number, name in enumerate(plans.action_names)])
         notes.append(
             f"the prior knows actions by number, so the file's were numbered: {order}; --action_names orders them"
         )
+    if by_number and names is not None and all(number_in(name) is None for name in names):
+        order = listed([f"{number} = {name}" for number, name in enumerate(names)])
+        notes.append(f"the actions are numbers, which are taken for those of the prior's names: {order}")
+    place.mkdir(parents=True, exist_ok=True)
     console = Console()
     for note in notes:
         console.print(f"note: {note}", highlight=False, markup=False, soft_wrap=True)
@@ -92,8 +94,6 @@ def score(
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     few = too_few(plans)
     console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)
-    place = Path(out)
-    place.mkdir(parents=True, exist_ok=True)
     write_frames(place, dict.fromkeys(("groups", "conditions"), pd.DataFrame()) | frames)
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True

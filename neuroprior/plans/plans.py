@@ -22,7 +22,7 @@ MOST_ACTIONS = 2**31
 """The most actions; larger numbers are unlikely to be indices of actions."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Plans(Sequences):
     """N executed plans of up to L actions.
 

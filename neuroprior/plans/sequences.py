@@ -26,6 +26,16 @@ class Sequences(ABC):
     context: Tensor | None
     group: Tensor | None
 
+    def __repr__(self) -> str:
+        """The numbers, and the shapes of the tensors."""
+        parts = []
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                parts.append(f"{name} {list(value.shape)}")
+            elif isinstance(value, int):
+                parts.append(f"{name} {value}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
     def __len__(self) -> int:
         """The number of plans, N."""
         return self.actions.shape[0]
@@ -71,7 +81,8 @@ class Sequences(ABC):
         unit = torch.arange(len(self)) if self.group is None else self.group.unique(return_inverse=True)[1].cpu()
         units = int(unit.max()) + 1 if len(unit) else 0
         if units < 2:
-            raise ValueError(f"plans: {units} {'plans' if self.group is None else 'groups'} cannot be split in two")
+            what = "plans" if self.group is None else "groups"
+            raise ValueError(f"plans: at least two {what} are needed, to learn from and to hold out, not {units}")
         held_out = min(max(round(units * validation), 1), units - 1)
         order = torch.randperm(units, generator=generator_on(generator, "cpu"))
         chosen = torch.zeros(units, dtype=torch.bool)

@@ -12,7 +12,7 @@ from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.sequences import Sequences
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class VectorPlans(Sequences):
     """N executed plans of up to L vectors of D numbers, such as the torques of D joints.
 

@@ -177,6 +177,8 @@ def report(
         left = int(counted(learned if other is None else other, skip, cut).sum())
         if left < FEWEST_UNITS:
             raise ValueError(f"skip: {left} actions are left to score after the first {skip} of each plan")
+        if out is not None:
+            Path(out).mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as temporary:
             run = cross_validation(Path(out or temporary), learned, other, design)
             todo = jobs(design, kinds, given)

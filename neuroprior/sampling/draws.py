@@ -42,11 +42,15 @@ class Draw:
             logits: `[K, A]`.
             uniform: `[N]`: what to draw with; None: new uniform numbers.
             row: integers `[N]`: which of the K logits each plan has; None: plan i has those of row i.
+
+        Raises:
+            ValueError: logits from which nothing can be drawn.
         """
         if uniform is None:
             uniform = self.uniform((len(logits if row is None else row),), logits)
         # Actions first: with few actions and many rows each operation is several times as fast this way round.
         cumulative = self._weights(logits.T.contiguous(), 0).cumsum(0)
+        _check_totals(cumulative[-1])
         # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
         most = (cumulative < cumulative[-1]).sum(0)
         if row is not None:
@@ -63,6 +67,7 @@ class Draw:
         probs = self._weights(logits.double(), -1)
         # The share of an action among the remaining ones; summing from the end keeps shares of exactly 0 and 1.
         rest = probs.flip(-1).cumsum(-1).flip(-1)
+        _check_totals(rest[:, 0])
         share = torch.where(rest > 0, probs / rest, 0).clamp_(0, 1)
         share[:, -1] = 1
         left = counts.double()
@@ -72,6 +77,12 @@ class Draw:
             parts.append(part)
             left = left - part
         return torch.stack(parts, -1).long()
+
+
+def _check_totals(total: Tensor) -> None:
+    """Raise ValueError unless the sums of the weights of all actions are positive: they are NaN where a logit is."""
+    if not (total > 0).all():
+        raise ValueError("prior: its logits are NaN, or -inf for all actions")
 
 
 def worth_splitting(children: int, total: int) -> bool:

@@ -41,6 +41,11 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     Example:
         >>> check_world(gridworld(5, 5, seed=0))
     """
+    kinds = World | ContinuousWorld
+    require(isinstance(world, kinds), f"a World or ContinuousWorld is expected, not {type(world).__name__}")
+    if isinstance(world, World):
+        number = world.num_actions
+        require(isinstance(number, int) and number > 0, f"num_actions: an integer above 0 is expected, not {number!r}")
     generator = torch.Generator().manual_seed(seed)
     state = world.reset(num_states, torch.Generator().manual_seed(seed))
     again = world.reset(num_states, torch.Generator().manual_seed(seed))

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from neuroprior import load
 from neuroprior.__main__ import main as neuroprior_main
 from neuroprior._interrupts import is_command
+from neuroprior._version import __version__
 from neuroprior.cli.program import Command, run_commands, run_program
 from train.__main__ import main as train_main
 
@@ -209,3 +211,23 @@ def test_no_room_for_the_last_figure(error, tmp_path, capsys, monkeypatch):
     assert not (out / "learning_curve.png").exists()
     assert json.loads((out / "metrics.json").read_text())["rows"]
     assert load(out).num_actions == 2
+
+
+def test_the_version_is_an_option(capsys):
+    assert neuroprior_main(["--version"]) == 0
+    assert capsys.readouterr().out == f"neuroprior {__version__}\n"
+
+
+def test_the_signal_of_a_cluster_is_answered_as_ctrl_c_is(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+
+    def run(_):
+        signal.raise_signal(signal.SIGTERM)
+
+    ctrl_c = signal.getsignal(signal.SIGINT)
+    try:
+        assert run_program(run, []) == 130
+    finally:
+        signal.signal(signal.SIGINT, ctrl_c)
+    assert capsys.readouterr().err == "interrupted; what was not yet written is lost\n"
+    assert signal.getsignal(signal.SIGTERM) == before

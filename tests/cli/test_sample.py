@@ -48,3 +48,12 @@ def test_a_context_is_given_by_name(given, index, tmp_path):
     assert main(["sample", str(tmp_path / "prior"), *OPTIONS, "--context", given, "--out", str(out)]) == 0
     due = prior.sample(50, 4, torch.full((50,), index), temperature=3.0, generator=seeded(7))
     assert torch.equal(read_plans(out).actions, due)
+
+
+def test_a_file_that_is_there_is_left_alone(tmp_path, capsys):
+    save(learned(), tmp_path / "prior")
+    recorded = tmp_path / "recorded.csv"
+    recorded.write_text("plan,action\n1,a\n")
+    assert main(["sample", str(tmp_path / "prior"), "--out", str(recorded)]) == 2
+    assert capsys.readouterr().err == f"error: {recorded}: is there already; give another name\n"
+    assert recorded.read_text() == "plan,action\n1,a\n"

@@ -92,19 +92,19 @@ def test_plans_that_were_learned_from_are_marked(tmp_path, capsys):
 
 
 def test_how_a_file_is_read_is_passed_on(tmp_path, monkeypatch, capsys):
-    """All options; the prior's names go with tables alone, unless others are given; notes are printed."""
-    plans, asked = replace(drawn(8, action_names=("a", "b", "c")), notes=("something was odd",)), []
-    save(MarkovPrior(3, 1).fit(plans), tmp_path / "prior")
+    """All options; the prior's names go with tables of numbers alone, unless others are given; notes are printed."""
+    plans, asked = replace(drawn(8), notes=("something was odd",)), []
+    save(MarkovPrior(3, 1).fit(replace(plans, action_names=("a", "b", "c"))), tmp_path / "prior")
     monkeypatch.setattr(command, "read_plans", lambda *given, **options: asked.append((given, options)) or plans)
     options = {"missing": "label", "merge_repeats": True, "max_gap": 3.5, "columns": object(), "num_actions": 3}
-    names = {"plans.CSV": ["a", "b", "c"], "plans.tsv": ["a", "b", "c"], "plans.npz": None}
-    for file in names:
+    for file in ("plans.CSV", "plans.tsv", "plans.npz"):
         command.score(str(tmp_path / "prior"), file, out=str(tmp_path / "out"), **options)
     command.score(
         str(tmp_path / "prior"), "plans.csv", action_names=["b", "a", "c"], out=str(tmp_path / "out"), **options
     )
-    files = {**names, "plans.csv": ["b", "a", "c"]}
-    assert asked == [((file,), {**options, "action_names": own}) for file, own in files.items()]
+    calls = [("plans.CSV", None), ("plans.CSV", ["a", "b", "c"]), ("plans.tsv", None), ("plans.tsv", ["a", "b", "c"])]
+    calls += [("plans.npz", None), ("plans.csv", ["b", "a", "c"])]
+    assert asked == [((file,), {**options, "action_names": own}) for file, own in calls]
     assert capsys.readouterr().out.count("note: something was odd") == 4
 
 
@@ -120,3 +120,24 @@ def test_a_prior_of_numbers_says_how_it_numbers_a_file_of_names(tmp_path, capsys
     assert "were numbered" not in " ".join(capsys.readouterr().out.split())
     found = pd.read_csv(tmp_path / "out" / "plans.csv")["log_likelihood"]
     assert found.item() == pytest.approx(float(prior.log_prob(torch.tensor([[0, 1, 0]]))), abs=1e-4)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "jsonl"])
+def test_numbers_that_are_taken_for_names_are_said(suffix, tmp_path, capsys):
+    plans = Plans(torch.tensor([[0, 1, 0]]), 2, action_names=("rest", "walk"))
+    save(MarkovPrior(2, 0).fit(plans), tmp_path / "prior")
+    for name, some in (("numbers", replace(plans, action_names=None)), ("names", plans)):
+        write_plans(some, tmp_path / f"{name}.{suffix}")
+        how = ["score", str(tmp_path / "prior"), str(tmp_path / f"{name}.{suffix}"), "--out", str(tmp_path / "out")]
+        assert main(how) == 0
+        said = "0 = rest, 1 = walk" in " ".join(capsys.readouterr().out.split())
+        assert said == (name == "numbers")
+
+
+def test_a_folder_that_cannot_be_made_is_said_before_the_table(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    save(MarkovPrior(2, 0).fit(torch.tensor([[0, 1, 0]])), tmp_path / "prior")
+    write_plans(Plans(torch.tensor([[0, 1]]), 2), tmp_path / "plans.npz")
+    how = ["score", str(tmp_path / "prior"), str(tmp_path / "plans.npz"), "--out", str(tmp_path / "file")]
+    assert main(how) == 2
+    assert capsys.readouterr().out == ""

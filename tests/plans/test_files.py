@@ -402,3 +402,39 @@ def test_suffixes_may_be_in_capitals(name, tmp_path):
     assert read_plans(tmp_path / name, num_actions=4).plan_names == some.plan_names
     write_plans(some, tmp_path / name.lower())
     assert (tmp_path / name).read_bytes() == (tmp_path / name.lower()).read_bytes()
+
+
+def test_what_is_not_read_is_noted(tmp_path):
+    """A misspelt key would make plans of one animal independent ones."""
+    write = {
+        "plans.jsonl": lambda file, key: file.write_text(
+            "".join(json.dumps({"actions": [0, 1], key: 3}) + "\n" for _ in range(2))
+        ),
+        "plans.npz": lambda file, key: np.savez(file, actions=np.array([[0, 1], [0, 1]]), **{key: np.array([3, 3])}),
+    }
+    for name, save in write.items():
+        for key, notes in (("group", 0), ("grup", 1)):
+            save(tmp_path / name, key)
+            plans = read_plans(tmp_path / name)
+            assert (plans.group is None) == (key == "grup")
+            assert [note for note in plans.notes if "not used: grup" in note] == list(plans.notes)[:notes]
+            assert len(plans.notes) == notes
+
+
+def test_groups_in_an_npz_file_may_be_names(tmp_path):
+    groups = np.array(["b", "a", "b"])
+    np.savez(tmp_path / "plans.npz", actions=np.array([[0, 1]] * 3), group=groups, condition=groups)
+    plans = read_plans(tmp_path / "plans.npz")
+    for number, names in ((plans.group, plans.group_names), (plans.condition, plans.condition_names)):
+        assert [names[i] for i in number.tolist()] == groups.tolist()
+
+
+def test_arrays_of_other_names_are_named(tmp_path):
+    np.savez(tmp_path / "plans.npz", act=np.array([[0, 1]]))
+    with pytest.raises(ValueError, match="no array 'actions'; it has act"):
+        read_plans(tmp_path / "plans.npz")
+
+
+def test_plans_are_shown_in_short(tmp_path):
+    plans = Plans(torch.zeros(300, 40, dtype=torch.long), 2, torch.full((300,), 7))
+    assert repr(plans) == "Plans(actions [300, 40], num_actions 2, lengths [300])"

@@ -487,3 +487,15 @@ def test_states_on_the_way_are_kept_where_they_are_asked_for(asked):
     assert (rollout.states is not None) == asked.get("keep_states", False)
     if rollout.states is not None:
         assert rollout.states.equal(due.states)
+
+
+@pytest.mark.parametrize("method", ["ancestral", "tree"])
+@pytest.mark.parametrize("wrong", [torch.nan, -torch.inf])
+def test_nothing_is_drawn_from_logits_that_are_none(method, wrong):
+    class Wrong(UniformPrior):
+        def step(self, action, state, context=None):
+            logits, state = super().step(action, state, context)
+            return torch.full_like(logits, wrong), state
+
+    with pytest.raises(ValueError, match="prior: its logits are NaN, or -inf for all actions"):
+        sample(Wrong(3), 1000, 4, generator=seeded(0), method=method)

@@ -406,3 +406,12 @@ def test_alike_raises_false_alarms_as_often_as_it_says(continuous: bool) -> None
         p.append(alike(draws[0], draws[1], group))
     assert stats.kstest(p, "uniform", alternative="greater").pvalue > 1e-6  # small p-values are no more frequent
     assert sum(p) / 300 < 0.62  # and it is not blind
+
+
+def test_a_world_without_actions_and_what_is_no_world_are_refused() -> None:
+    world = gridworld(3, 3, seed=0)
+    world.num_actions = 0
+    with pytest.raises(AssertionError, match="num_actions: an integer above 0 is expected, not 0"):
+        check_world(world)
+    with pytest.raises(AssertionError, match="a World or ContinuousWorld is expected, not int"):
+        check_world(3)  # type: ignore[arg-type]

@@ -120,7 +120,7 @@ def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
     if not table.keys() - {"num_actions", "action_names"} and not usual:
         raise ValueError(
             f"{sheet.path}, line {sheet.top}: both columns 'plan' and 'action', or 'action_1', are expected; or"
-            " say which columns they are (--columns.action, --columns.plan)"
+            " say which columns they are (--columns.action, --columns.plan; with the first alone the file is one plan)"
         )
     try:
         # Where semicolons part the columns, commas are decimal: so spreadsheets write in much of Europe.

@@ -23,6 +23,7 @@ from neuroprior.plans.columns import (
     Place,
     check_distinct,
     check_names,
+    listed,
     named,
     open_text,
     padded,
@@ -35,6 +36,9 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 OF_PLANS = ("group", "condition")
 """What a plan has one of."""
+
+KEYS = {"actions", "context", "durations", "plan", *OF_PLANS}
+"""What a line may hold."""
 
 KINDS = {
     "none": "no context",
@@ -144,9 +148,11 @@ class _Rows:
         self.durations: array[float] | None = None
         self.lengths, self.lines = array("q"), array("q")
         self.plan_names: list[str] = []
+        self.unused = dict.fromkeys(header.keys() - {*HEADER})
 
     def add(self, line: int, row: dict[str, Any]) -> None:
         """Append one plan; ValueError says what is wrong with it."""
+        self.unused |= dict.fromkeys(row.keys() - KEYS)
         actions = row.get("actions")
         if type(actions) is not list:
             raise ValueError(f'"actions": a list is expected, not {_short(actions) if "actions" in row else "nothing"}')
@@ -241,6 +247,8 @@ class _Rows:
             plans = replace(plans, condition=numbers, condition_names=condition_names)
         if self.plan_names:
             plans = replace(plans, plan_names=self.plan_names)
+        if self.unused:
+            plans = replace(plans, notes=(*plans.notes, f"keys that are not used: {listed(list(self.unused))}"))
         return renamed(plans, self.given_names, str(self.path))
 
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from neuroprior._files import written_whole
-from neuroprior.plans.columns import Names, check_file, never_notes
+from neuroprior.plans.columns import Names, check_file, listed, never_notes
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
 
@@ -21,12 +21,15 @@ NAMES = ("action_names", "context_names", "group_names", "condition_names", "pla
 
 def read_npz(path: Path, num_actions: int | None, action_names: Names | None) -> Plans:
     """Plans of a `.npz` file: see `read_plans`."""
-    arrays = arrays_of(path, (*NUMBERS, *NAMES, "num_actions", "end"))
+    arrays, unused = arrays_of(path, (*NUMBERS, *NAMES, "num_actions", "end"))
+    for key in ("group", "condition"):
+        if key in arrays and arrays[key].dtype.kind == "U" and f"{key}_names" not in arrays:
+            arrays[f"{key}_names"], arrays[key] = np.unique(arrays[key], return_inverse=True)
     for key in NUMBERS:
         if key in arrays and arrays[key].dtype.kind not in "iuf":
             raise ValueError(f"{path}: {key}: an array of numbers is expected, not of {arrays[key].dtype}")
     if "actions" not in arrays:
-        raise ValueError(f"{path}: no array 'actions'; it has {', '.join(sorted(arrays)) or 'none'}")
+        raise ValueError(f"{path}: no array 'actions'; it has {', '.join(sorted([*arrays, *unused])) or 'none'}")
     if arrays["actions"].ndim == 3:
         raise ValueError(f"{path}: actions {list(arrays['actions'].shape)} are vectors; read_vector_plans reads them")
     numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in NUMBERS if key in arrays}
@@ -40,9 +43,10 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
         if known is None:
             known = _largest(numbers) + 1 if action_names is None else len(action_names)
         plans = Plans(num_actions=known, end=end, **numbers, **names)
-        if guessed:
-            notes = never_notes(plans.actions[plans.mask()].numpy(), known)
-            plans = replace(plans, notes=tuple(notes))
+        notes = list(never_notes(plans.actions[plans.mask()].numpy(), known) if guessed else [])
+        if unused:
+            notes.append(f"arrays that are not used: {listed(unused)}")
+        plans = replace(plans, notes=tuple(notes))
         return renamed(plans, action_names, str(path))
     except (ValueError, TypeError, RuntimeError) as error:
         reason = str(error).removeprefix(f"{path}: ")
@@ -63,8 +67,8 @@ def write_npz(plans: Plans, path: Path) -> None:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def arrays_of(path: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Those arrays of a `.npz` file that have one of these names."""
+def arrays_of(path: Path, keys: Sequence[str]) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Those arrays of a `.npz` file that have one of these names, and the names of the others."""
     check_file(path)
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not a .npz file (a zip archive of arrays), or cut off; np.savez writes one")
@@ -74,7 +78,7 @@ def arrays_of(path: Path, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
             found = {}
             for key in [key for key in file.files if key in keys]:
                 found[key] = np.asarray(file[key])
-            return found
+            return found, [key for key in file.files if key not in keys]
     except Exception as error:  # numpy, zipfile and zlib raise a dozen unrelated kinds over damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         if "allow_pickle" in reason:
@@ -110,7 +114,7 @@ def _whole(path: Path, key: str, arrays: dict[str, NDArray[Any]]) -> int | None:
 def _largest(numbers: dict[str, torch.Tensor]) -> int:
     """The largest action, of those that count."""
     actions, lengths = numbers["actions"], numbers.get("lengths")
-    if actions.dim() == 2 and lengths is not None and lengths.shape == actions.shape[:1]:
+    if actions.dim() == 2 and lengths is not None and lengths.shape == actions.shape[:1] and bool((lengths >= 0).all()):
         actions = actions.long()[torch.arange(actions.shape[1]) < lengths[:, None]]
     if not actions.numel():
         raise ValueError("no plan has an action, so num_actions must be given")

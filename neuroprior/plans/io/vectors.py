@@ -43,10 +43,10 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
     if isinstance(path, str) and path.startswith(MINARI):
         return _read_minari(path.removeprefix(MINARI))
     place = _npz(path)
-    arrays = arrays_of(place, (*NUMBERS, "action_names"))
+    arrays, unused = arrays_of(place, (*NUMBERS, "action_names"))
     for key in ("actions", "action_low", "action_high"):
         if key not in arrays:
-            raise ValueError(f"{place}: no array {key!r}; it has {', '.join(sorted(arrays)) or 'none'}")
+            raise ValueError(f"{place}: no array {key!r}; it has {', '.join(sorted([*arrays, *unused])) or 'none'}")
     for key, array in arrays.items():
         if key in NUMBERS and array.dtype.kind not in "iuf":
             raise ValueError(f"{place}: {key}: an array of numbers is expected, not of {array.dtype}")
