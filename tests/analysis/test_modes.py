@@ -36,11 +36,12 @@ def source(num, length, seed, modes=2, stay=0.95):
 @pytest.mark.parametrize("modes", [1, 2, 3])
 def test_the_number_of_modes_is_found(modes):
     plans, _ = source(30, 80, seed=modes, modes=modes)
-    choice = choose_modes(plans, [1, 2, 3, 4], order=0, restarts=1, max_iterations=25, generator=seeded(0))
+    numbers = [*range(1, modes + 2)]
+    choice = choose_modes(plans, numbers, order=0, restarts=1, max_iterations=25, generator=seeded(0))
     assert choice.chosen == modes
     assert bool(choice.stable().all())
     frame = choice.frame()
-    assert frame["modes"].tolist() == [1, 2, 3, 4]
+    assert frame["modes"].tolist() == numbers
     assert frame.loc[frame["chosen"], "modes"].tolist() == [modes]
     assert frame["more"].min() == 0
     assert (frame["low"] < frame["bits"]).all()

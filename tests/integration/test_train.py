@@ -207,7 +207,7 @@ def test_the_settings_of_a_recipe_reach_the_networks_inside_other_priors(name, p
     """All of them, and a seed that depends on that of the command."""
     trained = []
     monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append((how, seed)))
-    asked = {"trainer": {"max_steps": 3, "patience": 7, "gradient_clip_val": 0.3}}
+    asked = {"trainer": {"max_steps": 3, "patience": 7, "gradient_clip_val": 0.3, "enable_progress_bar": "false"}}
     asked |= {"data": {"batch_size": 16, "window": 5, "validation": 0.2, "check_every": 2}}
     asked |= {"model": {"learning_rate": 0.02, "weight_decay": 0.5}}
     options = [f"--{part}.{option}={value}" for part, own in asked.items() for option, value in own.items()]
@@ -243,7 +243,7 @@ def test_what_a_recipe_does_not_set_is_left_to_the_prior(plans_file, tmp_path, m
     monkeypatch.setattr("neuroprior.training.train", lambda prior, plans, how, seed: trained.append(how))
     arguments = ["--model.prior", "StackedPrior", *MADE_OF_PRIORS["StackedPrior"], "--data.file", plans_file]
     assert main(["fit", *arguments, "--out", str(tmp_path / "run")]) == 0
-    StackedPrior(3, 8, depth=2).fit(some_plans(60), progress=False)
+    StackedPrior(3, 8, depth=2).fit(some_plans(60))
     assert trained[0] == trained[1]
 
 
