@@ -120,7 +120,7 @@ def write_document(document: Document, folder: Path) -> None:
     results = folder / "results.json"
     with suppress(OSError, ValueError):
         names = {key: name for name, key in document.keys.items()}
-        earlier = [names.get(key, key) for key in read_json(results)]
+        earlier = [names.get(key, key) for key, rows in read_json(results).items() if isinstance(rows, list)]
         write_frames(folder, dict.fromkeys(set(earlier) - {*document.frames}, pd.DataFrame()))
     write_frames(folder, document.written)
     write_json(results, results_of(document))

@@ -35,11 +35,12 @@ def test_a_table_that_is_empty_now_leaves_no_file_of_an_earlier_run(tmp_path):
 
 def test_a_table_that_another_document_has_not_leaves_no_file_but_other_files_stay(tmp_path):
     full = pd.DataFrame({"bits": [1.5]})
-    (tmp_path / "mine.csv").write_text("a\n1\n")
+    for name in ("mine", "settings"):
+        (tmp_path / f"{name}.csv").write_text("a\n1\n")
     for keys in ({}, {"two": "second"}):
         write_document(Document("", "", [], {"one": full, "two": full}, keys=keys), tmp_path)
         write_document(Document("", "", [], {"one": full}, keys=keys), tmp_path)
-        assert {path.name for path in tmp_path.glob("*.csv")} == {"one.csv", "mine.csv"}
+        assert {path.name for path in tmp_path.glob("*.csv")} == {"one.csv", "mine.csv", "settings.csv"}
 
 
 def test_tables_are_printed_under_their_own_titles_else_that_of_their_section():

@@ -248,7 +248,7 @@ class _Rows:
         if self.plan_names:
             plans = replace(plans, plan_names=self.plan_names)
         if self.unused:
-            plans = replace(plans, notes=(*plans.notes, f"keys that are not used: {listed(list(self.unused))}"))
+            plans = replace(plans, notes=(*plans.notes, f"keys that are not used: {listed(sorted(self.unused))}"))
         return renamed(plans, self.given_names, str(self.path))
 
 
