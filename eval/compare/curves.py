@@ -79,9 +79,12 @@ def decided(
     starts: Starts, own: Drawn, uniform: Drawn | None, num_plans: int, share: float, generator: torch.Generator
 ) -> Tensor:
     """The exact scores `[B, D]` of D decisions of each start, each for the best of a block of candidates."""
-    ties = generator if starts.world.stochastic else None
     whole = own if uniform is None else Drawn(*(torch.cat(pair, 1) for pair in zip(own, uniform, strict=True)))
-    return whole.exact.gather(1, choices(whole.estimated, own.exact.shape[1], num_plans, share, ties))
+    estimated = whole.estimated
+    keys = (
+        torch.rand(estimated.shape, generator=generator, device=estimated.device) if starts.world.stochastic else None
+    )
+    return whole.exact.gather(1, choices(whole.estimated, own.exact.shape[1], num_plans, share, keys))
 
 
 def tried(

@@ -126,8 +126,9 @@ def choose_modes(
     if number_of_folds is None:
         number_of_folds = min(FOLDS, len(given) if given.group is None else len(given.group.unique()))
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)
-    if mask is not None and mask.shape != given.actions.shape:
-        raise ValueError(f"mask: {list(given.actions.shape)} is expected, as the actions, not {list(mask.shape)}")
+    if mask is not None and (mask.dtype != torch.bool or mask.shape != given.actions.shape):
+        shape = list(given.actions.shape)
+        raise ValueError(f"mask: bool {shape}, as the actions, is expected, not {mask.dtype} {list(mask.shape)}")
     mask = given.mask() if mask is None else given.mask() & mask
     scores, priors, stability = {}, {}, {}
     inputs = "actions" if given.context is None else "actions and context"

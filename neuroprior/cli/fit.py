@@ -1,5 +1,6 @@
 """The command `fit`: trains a prior as a recipe says, by LightningCLI's conventions, and compares it with baselines."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
@@ -29,6 +30,7 @@ from neuroprior.priors.neural import NeuralPrior
 from neuroprior.report.document import printed, write_frames
 from neuroprior.report.modes import choice_table
 from neuroprior.training import Settings, make_trainer, quiet, run_training
+from neuroprior.training.trainer import ProgressLines
 
 USAGE = """{0} fit PLANS [--effort fast|standard|full] [--max-steps N] [--out FOLDER]
        {0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
@@ -175,10 +177,12 @@ class FitCLI(LightningCLI):
     def fit(self, model: PriorModel, datamodule: PlansData, **_: Any) -> None:
         """Train, or count; then compare and save."""
         neural, many = isinstance(model.prior, NeuralPrior), datamodule.folds > 1
+        ProgressLines.last = time.monotonic()  # what is done at once is not commented on
         if self.config.fit.modes:
             self._choose_modes(model, datamodule)
         settings = {} if neural and not many else self._settings(model, datamodule)
         fresh = deepcopy(model.prior) if many else None
+        silent = {"progress": False} if "progress" in model.prior.fit_settings else {}
         if isinstance(model.prior, NeuralPrior):
             model.prior.prepare(datamodule.learned_from, datamodule.settings.window)
             self._check_checkpoints(model, datamodule)
@@ -196,12 +200,12 @@ class FitCLI(LightningCLI):
         else:
             generator = torch.Generator().manual_seed(datamodule.seed)
             model.prior.fit(datamodule.plans if many else datamodule.learned_from, generator=generator, **settings)
-            if other:
+            if other and self.trainer.is_global_zero:
                 (self.folder / MODEL).unlink()
                 self._keep(datamodule)
         if self.trainer.is_global_zero:
             with self._saying_how_to_go_on(lambda: "the prior is saved"):
-                report(self.folder, model, datamodule, fresh, settings | {"progress": False} if settings else {})
+                report(self.folder, model, datamodule, fresh, settings | silent)
 
     def _choose_modes(self, model: PriorModel, data: PlansData) -> None:
         """Choose the number of modes on the plans that the prior learns from; print and write what speaks for it."""
@@ -246,11 +250,11 @@ class FitCLI(LightningCLI):
         last = self.folder / LAST
         if not last.exists():
             return
-        epoch = _check(last, model)["epoch"]
+        saved = _check(last, model)
         _check(self.folder / BEST, model)
-        if epoch >= data.epochs:
+        if saved["epoch"] >= data.epochs:
             raise ValueError(
-                f"trainer.max_steps: more than the {epoch * data.steps} steps are expected that {self.folder} has"
+                f"trainer.max_steps: more than the {saved['global_step']} steps are expected that {self.folder} has"
                 f" made, not {data.settings.max_steps}"
             )
 

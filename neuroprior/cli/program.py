@@ -189,15 +189,17 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
         The exit code.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    main = threading.current_thread() is threading.main_thread()
-    # Where time is up, a cluster ends a program by this signal: it says what is saved, as after Ctrl-C.
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None
+    main, before = threading.current_thread() is threading.main_thread(), signal.getsignal(signal.SIGTERM)
+    if main and before == signal.SIG_DFL:
+        # Where time is up, a cluster ends a program by this signal: it says what is saved, as after Ctrl-C.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         run([_with_underscores(argument) for argument in given])
     except KeyboardInterrupt as interrupted:
         # An impatient second Ctrl-C should not spoil the message.
         if main:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
         return _fail(str(interrupted) or "interrupted; what was not yet written is lost", 130)
     except BrokenPipeError:
         # The reader of our output, such as `head`, has enough.
@@ -215,8 +217,8 @@ def run_program(run: Callable[[Sequence[str]], None], arguments: Sequence[str] |
             raise
         return _fail(f"error: out of memory; a smaller run may fit ({str(error).splitlines()[0]})", 2)
     finally:
-        if main:
-            signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+        if main and before == signal.SIG_DFL:
+            signal.signal(signal.SIGTERM, before)
     return 0
 
 

@@ -1,5 +1,7 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -7,8 +9,8 @@ import pandas as pd
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
-from neuroprior.plans import Columns, Missing, read_plans
-from neuroprior.plans.columns import listed, number_in
+from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.plans.columns import listed
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.priors.scoring import learned_from, scores_by
@@ -48,18 +50,18 @@ def score(
     prior, place = load(folder), Path(out)
     how: dict[str, Any] = {"num_actions": num_actions, "columns": columns, "missing": missing}
     how |= {"merge_repeats": merge_repeats, "max_gap": max_gap}
-    plans, names = read_plans(file, action_names=action_names, **how), learned_names(prior)
-    by_number = action_names is None and plans.action_names is None
-    if by_number and names is not None and file.lower().endswith((".csv", ".tsv")):
-        # Texts that look like numbers may be the prior's names; else they are its numbers, and there are as many.
-        plans = read_plans(file, action_names=names, **how)
+    known = learned_names(prior)
+    is_table = file.lower().endswith((".csv", ".tsv"))
+    # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
+    plans = read_plans(file, action_names=action_names or (known if is_table else None), **how)
+    by_number = plans.action_names is None or (is_table and action_names is None and _by_number(plans, file, how))
     plans = plans if plans.end is None else plans.without_end()
     own = match_plans(plans, prior, folder)
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()
     scores = scores_by(bits, plans, "plan")
-    known = learned_from(Path(folder), plans)
-    scores.insert(1, "training_data", known)
+    seen = learned_from(Path(folder), plans)
+    scores.insert(1, "training_data", seen)
     frames = {"plans": scores}
     for by in ("group", "condition"):
         if getattr(plans, by) is not None:
@@ -73,9 +75,9 @@ def score(
         "bits per action": "bits_per_action:.4f",
     }
     caption = f"the first {MOST_ROWS} of {len(frame):,}; all are in the CSV file. " if len(frame) > MOST_ROWS else ""
-    if any(known):
+    if any(seen):
         caption += (
-            f"Training data: {sum(known):,} of {len(known):,} plans are the same as plans that it has learned from."
+            f"Training data: {sum(seen):,} of {len(seen):,} plans are the same as plans that it has learned from."
         )
     notes = list(plans.notes)
     if plans.action_names and action_names is None and prior.action_names is None:
@@ -83,8 +85,8 @@ def score(
         notes.append(
             f"the prior knows actions by number, so the file's were numbered: {order}; --action_names orders them"
         )
-    if by_number and names is not None and all(number_in(name) is None for name in names):
-        order = listed([f"{number} = {name}" for number, name in enumerate(names)])
+    if by_number and known is not None:
+        order = listed([f"{number} = {name}" for number, name in enumerate(known)])
         notes.append(f"the actions are numbers, which are taken for those of the prior's names: {order}")
     place.mkdir(parents=True, exist_ok=True)
     console = Console()
@@ -94,7 +96,23 @@ def score(
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     few = too_few(plans)
     console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)
-    write_frames(place, dict.fromkeys(("groups", "conditions"), pd.DataFrame()) | frames)
+    earlier = [name for name in ("groups", "conditions") if name not in frames and _is_of_scores(place / f"{name}.csv")]
+    write_frames(place, dict.fromkeys(earlier, pd.DataFrame()) | frames)
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
     )
+
+
+def _by_number(plans: Plans, file: str, how: Mapping[str, Any]) -> bool:
+    """Whether actions in the table that plans were read from are numbers, and none of the prior's names."""
+    with suppress(ValueError):  # without the names of the prior it might not be read
+        plain = read_plans(file, **how)
+        return plain.action_names is None and plain.actions.equal(plans.actions)
+    return False
+
+
+def _is_of_scores(file: Path) -> bool:
+    """Whether a file is one of the tables that `score` writes."""
+    with suppress(OSError, ValueError):
+        return "bits_per_action" in file.open(encoding="utf-8").readline()
+    return False

@@ -17,6 +17,7 @@ from neuroprior._checks import check_sizes
 from neuroprior._files import read_json, write_json, written_whole
 from neuroprior.planners.best_first import BestFirstPlanner, LevinPlanner, Search
 from neuroprior.plans import Plans, action_dtype
+from neuroprior.plans.sequences import Sequences
 from neuroprior.priors import PatternPrior, Prior, load, save
 from neuroprior.priors.patterns import Steps
 from neuroprior.sampling.stepping import Stepper
@@ -126,7 +127,7 @@ def bootstrap(
     digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
     asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
     asked |= {"max_actions": max_actions, "teacher": teacher and [type(teacher).__name__, teacher.max_nodes]}
-    asked["settings"] = {name: repr(value) for name, value in sorted(settings.items()) if name != "progress"}
+    asked["settings"] = {name: _described(value) for name, value in sorted(settings.items()) if name != "progress"}
     run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
     yield from run.done
     while len(run.done) < sweeps:
@@ -150,6 +151,16 @@ def bootstrap(
             f"problems: none of {last.problems} was solved within {last.max_nodes} expansions; give a larger max_nodes,"
             " more sweeps, a teacher or easier problems"
         )
+
+
+def _described(value: Any) -> str:
+    """A setting as a text; of plans a digest."""
+    if not isinstance(value, Sequences):
+        return repr(value)
+    digest = sha256(repr(value).encode())
+    for tensor in (value.actions, value.lengths, value.context):
+        digest.update(b"" if tensor is None else tensor.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 class _Bootstrap:
@@ -216,9 +227,11 @@ class _Bootstrap:
         self.done = kept["sweeps"][:sweeps]
         last = self.done[-1].number
         saved = load(folder / f"prior-{last}")
+        if type(saved) is type(self.prior):
+            # First: it may choose sizes, and make the modules that hold the state.
+            self.prior.restore(saved.learned)
         if type(saved) is not type(self.prior) or saved.config != self.prior.config:
             raise ValueError(f"{folder}: its prior is {saved}, not {self.prior}; give another folder")
-        self.prior.restore(saved.learned)  # first: it may make the modules that hold the state
         self.prior.load_state_dict(saved.state_dict())
         self.plans = read_solutions(folder, last)
         self.generator.set_state(torch.tensor(kept["generator"], dtype=torch.uint8))

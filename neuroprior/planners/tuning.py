@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_share, check_sizes
 from neuroprior._random import generator_on
-from neuroprior.planners.planner import Objective, random_best
+from neuroprior.planners.planner import Objective
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner, uniform_plans
 from neuroprior.plans import Plans
@@ -145,12 +145,14 @@ def _decided(
 ) -> Tensor:
     """The scores `[B]` of the best of some plans that were drawn and some uniform ones, each with their scores."""
     plans, estimates = drawn if uniform is None else (torch.cat(pair, 1) for pair in zip(drawn, uniform, strict=True))
-    prefix = None
+    prefix, keys = None, None
+    if world.stochastic:  # else plans with equal scores are as good
+        keys = torch.rand(estimates.shape, generator=generator, device=estimates.device)
     if estimates.dim() == 3:  # any prefix may win
-        if world.stochastic:
-            prefix = random_best(estimates.flatten(0, 1), generator).view(estimates.shape[:2])
+        if keys is not None:
+            keys, prefix = keys.masked_fill(estimates < estimates.amax(-1, keepdim=True), -1).max(-1)
         estimates = estimates.amax(-1)
-    best = choices(estimates, planner.num_plans, planner.num_plans, share, generator if world.stochastic else None)
+    best = choices(estimates, planner.num_plans, planner.num_plans, share, keys)
     if not world.stochastic:
         return estimates.gather(1, best)[:, 0]
     row = torch.arange(len(plans), device=plans.device)[:, None]
@@ -158,7 +160,7 @@ def _decided(
     return scores[:, 0] if prefix is None else scores[:, 0].gather(1, prefix.gather(1, best))[:, 0]
 
 
-def choices(score: Tensor, drawn: int, num_plans: int, share: float, ties: torch.Generator | None = None) -> Tensor:
+def choices(score: Tensor, drawn: int, num_plans: int, share: float, keys: Tensor | None = None) -> Tensor:
     """The best of each block of `num_plans` candidates, a share of which are uniform plans.
 
     Args:
@@ -166,7 +168,8 @@ def choices(score: Tensor, drawn: int, num_plans: int, share: float, ties: torch
         drawn: M.
         num_plans: P.
         share: of uniform plans among the P.
-        ties: breaks them; None: of equal scores the first is taken, where plans with equal scores are as good.
+        keys: `[B, M + U]`, at least 0: of candidates with equal scores that with the greatest is taken; None: the
+            first.
 
     Returns:
         The columns `[B, D]` of the best in each of the D blocks that there are enough candidates for.
@@ -180,7 +183,9 @@ def choices(score: Tensor, drawn: int, num_plans: int, share: float, ties: torch
     ]
     column = torch.cat(parts, 1)
     scores = score[:, column]
-    best = scores.argmax(-1) if ties is None else random_best(scores.flatten(0, 1), ties).view(scores.shape[:2])
+    if keys is not None:
+        scores = keys[:, column].masked_fill(scores < scores.amax(-1, keepdim=True), -1)
+    best = scores.argmax(-1)
     return column.expand(len(score), -1, -1).gather(2, best[..., None])[..., 0]
 
 

@@ -119,9 +119,11 @@ def write_document(document: Document, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     results = folder / "results.json"
     with suppress(OSError, ValueError):
-        names = {key: name for name, key in document.keys.items()}
-        earlier = [names.get(key, key) for key, rows in read_json(results).items() if isinstance(rows, list)]
-        write_frames(folder, dict.fromkeys(set(earlier) - {*document.frames}, pd.DataFrame()))
+        names, content = {key: name for name, key in document.keys.items()}, read_json(results)
+        ours = isinstance(content, dict) and {"settings", "versions"} <= content.keys()
+        tables = [key for key, rows in content.items() if isinstance(rows, list)] if ours else []
+        earlier = {names.get(key, key) for key in tables} - {*document.frames}
+        write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()))
     write_frames(folder, document.written)
     write_json(results, results_of(document))
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}

@@ -284,6 +284,8 @@ def start_beams_in_world(
 
 def child_log_probs(log_prob: Tensor, logits: Tensor, temperature: float) -> Tensor:
     """The log-probabilities `[M, A]` of plans of `log_prob [M, 1]` after one more action, by its `logits [M, A]`."""
+    if (logits.isnan() & (log_prob > -torch.inf)).any():
+        raise ValueError("prior: its logits are NaN")
     child = log_prob + (logits.double() / temperature).log_softmax(-1)
     # After an impossible prefix a prior may give NaN.
     return torch.where(log_prob > -torch.inf, child, -torch.inf)

@@ -82,7 +82,7 @@ class Draw:
 def _check_totals(total: Tensor) -> None:
     """Raise ValueError unless the sums of the weights of all actions are positive: they are NaN where a logit is."""
     if not (total > 0).all():
-        raise ValueError("prior: its logits are NaN, or -inf for all actions")
+        raise ValueError("prior: its logits are NaN or infinite, or -inf for all actions that are legal")
 
 
 def worth_splitting(children: int, total: int) -> bool:

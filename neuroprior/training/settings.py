@@ -41,7 +41,7 @@ class Settings:
         check_every: steps between two validations (on the held-out plans); None: two passes through the plans, but at
             least `FEWEST_STEPS` and at most `MOST_STEPS`, so that small data sets are not overfitted before the first.
         patience: steps without a lower validation loss after which training stops. None: `PATIENCE` of all steps.
-        progress: show a progress bar.
+        progress: show it: a bar in a terminal or a notebook, elsewhere a line now and then.
 
     Raises:
         ValueError: a value out of range.

@@ -67,7 +67,7 @@ def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> 
     with one_thread():
         if isinstance(settings.validation, Sequences):
             training, validation = plans, settings.validation
-            _check_alike(training, validation)
+            check_alike(training, validation)
         else:
             training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
         window = settings.window if in_windows else plans.max_length
@@ -92,7 +92,7 @@ def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> 
     return best
 
 
-def _check_alike(training: Sequences, validation: Sequences) -> None:
+def check_alike(training: Sequences, validation: Sequences) -> None:
     """Raise ValueError unless the actions and contexts of both are the same ones."""
     if type(training) is not type(validation):
         raise ValueError(f"validation: {type(training).__name__} are expected, not {type(validation).__name__}")
@@ -160,7 +160,8 @@ def make_trainer(
     stopping = Stopping("validation_bits", patience=ceil(patience / validate_every), min_delta=1e-4)
     average = AverageWeights()
     bar = enable_progress_bar and (sys.stdout.isatty() or "ipykernel" in sys.modules)
-    lines = [ProgressLines(max_steps)] if enable_progress_bar and not bar else []
+    epochs = ceil(max_steps / validate_every)
+    lines = [ProgressLines(epochs * validate_every)] if enable_progress_bar and not bar else []
     kept: list[lightning.Callback] = [BestWeights(average)]
     if logs:
         # Two callbacks: with `save_last` Lightning writes the last one only where it writes the best one, too.
@@ -175,7 +176,7 @@ def make_trainer(
             for name, monitor in (("best", "validation_bits"), ("last", None))
         ]
     return lightning.Trainer(
-        max_epochs=ceil(max_steps / validate_every),
+        max_epochs=epochs,
         accelerator=accelerator,
         devices=devices,
         num_nodes=num_nodes,
@@ -296,13 +297,16 @@ class ProgressLines(lightning.Callback):
         max_steps: of the training.
     """
 
+    last = time.monotonic()
+    """When the last line was printed, of this training or one before."""
+
     def __init__(self, max_steps: int) -> None:
-        self.max_steps, self.last = max_steps, time.monotonic()
+        self.max_steps = max_steps
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         if not trainer.is_global_zero or time.monotonic() - self.last < QUIET:
             return
-        self.last = time.monotonic()
+        ProgressLines.last = time.monotonic()
         bits = float(trainer.callback_metrics["validation_bits"])
         steps = f"step {trainer.global_step:,} of at most {self.max_steps:,}"
         print(f"training: {steps}, {bits:.4f} validation bits", file=sys.stderr, flush=True)

@@ -173,8 +173,9 @@ def test_wrong_arguments_are_named():
         choose_modes(plans, [1], number_of_folds=7)
     with refuses("order"):
         choose_modes(plans, [1], order=-1)
-    with pytest.raises(ValueError, match=r"mask: \[\d+, \d+\] is expected"):
-        choose_modes(plans, [1], mask=torch.ones(2, dtype=torch.bool))
+    for mask in (torch.ones(2, dtype=torch.bool), torch.ones_like(plans.actions)):
+        with pytest.raises(ValueError, match=r"mask: bool \[\d+, \d+\], as the actions, is expected"):
+            choose_modes(plans, [1], mask=mask)
     assert isinstance(choose_modes(plans, [1], number_of_folds=2, generator=seeded(0)), ModeChoice)
 
 

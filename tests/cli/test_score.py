@@ -50,6 +50,15 @@ def test_tables_of_an_earlier_file_are_not_left_beside_those_of_another(tmp_path
     assert set(frames) == {"plans"}
 
 
+def test_tables_of_others_are_left_alone(tmp_path):
+    (tmp_path / "out").mkdir()
+    for name in ("groups", "conditions"):
+        (tmp_path / "out" / f"{name}.csv").write_text("group,weight\na,1\n")
+    _, frames = scored(tmp_path, drawn(9))
+    assert set(frames) == {"plans", "groups", "conditions"}
+    assert frames["groups"]["weight"].tolist() == [1]
+
+
 def drawn(num, **more):
     return Plans(torch.randint(3, (num, 5), generator=seeded(0)), 3, **more)
 
@@ -92,19 +101,26 @@ def test_plans_that_were_learned_from_are_marked(tmp_path, capsys):
 
 
 def test_how_a_file_is_read_is_passed_on(tmp_path, monkeypatch, capsys):
-    """All options; the prior's names go with tables of numbers alone, unless others are given; notes are printed."""
-    plans, asked = replace(drawn(8), notes=("something was odd",)), []
-    save(MarkovPrior(3, 1).fit(replace(plans, action_names=("a", "b", "c"))), tmp_path / "prior")
+    """All options; the prior's names go with tables alone, unless others are given; notes are printed.
+
+    Tables are read again without the names, to see whether they hold numbers.
+    """
+    plans, asked = replace(drawn(8, action_names=("a", "b", "c")), notes=("something was odd",)), []
+    save(MarkovPrior(3, 1).fit(plans), tmp_path / "prior")
     monkeypatch.setattr(command, "read_plans", lambda *given, **options: asked.append((given, options)) or plans)
     options = {"missing": "label", "merge_repeats": True, "max_gap": 3.5, "columns": object(), "num_actions": 3}
-    for file in ("plans.CSV", "plans.tsv", "plans.npz"):
+    names = {"plans.CSV": ["a", "b", "c"], "plans.tsv": ["a", "b", "c"], "plans.npz": None}
+    for file in names:
         command.score(str(tmp_path / "prior"), file, out=str(tmp_path / "out"), **options)
     command.score(
         str(tmp_path / "prior"), "plans.csv", action_names=["b", "a", "c"], out=str(tmp_path / "out"), **options
     )
-    calls = [("plans.CSV", None), ("plans.CSV", ["a", "b", "c"]), ("plans.tsv", None), ("plans.tsv", ["a", "b", "c"])]
-    calls += [("plans.npz", None), ("plans.csv", ["b", "a", "c"])]
-    assert asked == [((file,), {**options, "action_names": own}) for file, own in calls]
+    files = {**names, "plans.csv": ["b", "a", "c"]}
+    again = [((file,), options) for file in ("plans.CSV", "plans.tsv")]
+    assert [one for one in asked if one not in again] == [
+        ((file,), {**options, "action_names": own}) for file, own in files.items()
+    ]
+    assert [one for one in asked if one in again] == again
     assert capsys.readouterr().out.count("note: something was odd") == 4
 
 
@@ -132,6 +148,20 @@ def test_numbers_that_are_taken_for_names_are_said(suffix, tmp_path, capsys):
         assert main(how) == 0
         said = "0 = rest, 1 = walk" in " ".join(capsys.readouterr().out.split())
         assert said == (name == "numbers")
+
+
+@pytest.mark.parametrize(("names", "said"), [(("1", "2", "rest"), False), (("0.5", "1.5", "7"), False)])
+def test_names_that_look_like_numbers_are_names(names, said, tmp_path, capsys):
+    prior = MarkovPrior(3, 0).fit(Plans(torch.tensor([[0, 1, 1, 2]]), 3, action_names=names))
+    save(prior, tmp_path / "prior")
+    (tmp_path / "f.csv").write_text("plan,action\n" + "".join(f"p,{names[i]}\n" for i in (1, 0, 2)))
+    assert main(["score", str(tmp_path / "prior"), str(tmp_path / "f.csv"), "--out", str(tmp_path / "out")]) == 0
+    assert ("are numbers" in capsys.readouterr().out) == said
+    found = pd.read_csv(tmp_path / "out" / "plans.csv")["log_likelihood"]
+    assert found.item() == pytest.approx(float(prior.log_prob(torch.tensor([[1, 0, 2]]))), abs=1e-4)
+    (tmp_path / "f.csv").write_text("plan,action\np,run\n")
+    assert main(["score", str(tmp_path / "prior"), str(tmp_path / "f.csv"), "--out", str(tmp_path / "out")]) == 2
+    assert "f.csv, line 2" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_made_is_said_before_the_table(tmp_path, capsys):

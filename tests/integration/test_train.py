@@ -247,6 +247,16 @@ def test_what_a_recipe_does_not_set_is_left_to_the_prior(plans_file, tmp_path, m
     assert trained[0] == trained[1]
 
 
+def test_folds_are_silent_also_with_default_settings(plans_file, tmp_path, monkeypatch):
+    """Bars and lines of several processes would get mixed."""
+    given = []
+    monkeypatch.setattr("neuroprior.cli.fit.report", lambda *_: given.append(_[-1]))
+    monkeypatch.setattr("neuroprior.training.train", lambda *_: 0.0)
+    arguments = ["--model.prior", "StackedPrior", *MADE_OF_PRIORS["StackedPrior"], "--data.file", plans_file]
+    assert main(["fit", *arguments, "--out", str(tmp_path / "run")]) == 0
+    assert given == [{"progress": False}]
+
+
 def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans_file, tmp_path, capsys):
     arguments = ["fit", "--model.prior", "StackedPrior", "--data.file", plans_file, "--out", str(tmp_path / "run")]
     assert main([*arguments, "--trainer.precision", "bf16-mixed"]) == 2

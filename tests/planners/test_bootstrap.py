@@ -1,5 +1,6 @@
 """Solve and learn: more gets solved, and an interrupted call goes on as if nothing had happened."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from neuroprior import CombinedPrior, MarkovPrior
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior
 from neuroprior.planners import AStarPlanner, LevinPlanner, bootstrap
 from neuroprior.planners.bootstrap import read_solutions, solution_plans, solution_steps, with_symmetries
 from neuroprior.priors import LogLinearPrior
@@ -79,6 +80,32 @@ def test_a_combined_prior_goes_on_with_what_it_learned(tmp_path: Path) -> None:
     for prior in (first, again):
         list(bootstrap(world, prior, problems, sweeps=1, generator=seeded(), folder=tmp_path))
     assert again.log_prob(plans).equal(first.log_prob(plans))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [lambda: GRUPrior(4), lambda: CombinedPrior(4, [MarkovPrior(4, 0), MarkovPrior(4, 1)])],
+    ids=["network", "several experts"],
+)
+def test_what_a_fit_chooses_does_not_keep_a_prior_from_going_on(make: Callable[[], Prior], tmp_path: Path) -> None:
+    world = sliding_tiles(shape=(2, 2), scramble=6)
+    problems, plans = world.reset(60, seeded()), torch.randint(4, (5, 6), generator=seeded(1))
+    how: dict[str, Any] = {"max_steps": 2, "progress": False} if isinstance(make(), GRUPrior) else {}
+    first, again = make(), make()
+    for prior in (first, again):
+        list(bootstrap(world, prior, problems, sweeps=1, generator=seeded(), folder=tmp_path, **how))
+    assert again.log_prob(plans).equal(first.log_prob(plans))
+
+
+def test_other_validation_plans_are_another_call(tmp_path: Path) -> None:
+    world = sliding_tiles(shape=(2, 2), scramble=6)
+    problems = world.reset(60, seeded())
+    how: dict[str, Any] = {"sweeps": 1, "max_steps": 2, "progress": False, "folder": tmp_path}
+    validation = Plans(torch.zeros(6, 5, dtype=torch.long), 4)
+    list(bootstrap(world, GRUPrior(4), problems, validation=validation, generator=seeded(), **how))
+    other = Plans(torch.ones(6, 5, dtype=torch.long), 4)
+    with pytest.raises(ValueError, match="another call"):
+        list(bootstrap(world, GRUPrior(4), problems, validation=other, **how))
 
 
 def test_fewer_sweeps_of_a_folder_are_those_of_a_call_with_fewer(tmp_path: Path) -> None:

@@ -184,14 +184,15 @@ def test_choices_are_the_best_of_blocks():
     assert choices(score, 4, 7, 3 / 7).tolist() == [[4]]
 
 
-def test_equal_scores_of_a_prior_and_of_uniform_plans_win_alike():
-    """The false-alarm probability is below 1e-6: five standard deviations of a share of 2,000 draws."""
-    score, generator = torch.ones(1, 4), seeded(0)
-    own = [int(choices(score, 3, 4, 0.25, generator)) < 3 for _ in range(2000)]
-    assert sum(own) / 2000 == pytest.approx(0.75, abs=5 * (0.75 * 0.25 / 2000) ** 0.5)
+def test_of_equal_scores_the_greatest_key_wins():
+    score, keys = torch.tensor([[1.0, 2, 2, 0, 2, 1]]), torch.tensor([[0.9, 0.2, 0.5, 0.8, 0.7, 0.9]])
+    assert choices(score, 4, 6, 2 / 6, keys).tolist() == [[4]]
+    assert choices(score, 4, 3, 1 / 3, keys).tolist() == [[4, 2]]
+    assert choices(score, 4, 6, 2 / 6).tolist() == [[1]]
 
 
-def test_in_a_stochastic_world_what_is_tuned_is_what_is_found():
+@pytest.mark.parametrize("any_prefix", [False, True])
+def test_in_a_stochastic_world_what_is_tuned_is_what_is_found(any_prefix):
     """The prior always takes the better of two actions, which pay with chances of .9 and .5: with one rollout, luck
     decides among candidates that seem equal, and those of the prior have no right of way.
 
@@ -201,8 +202,8 @@ def test_in_a_stochastic_world_what_is_tuned_is_what_is_found():
     world = TabularWorld(after, torch.tensor([[0.0, 1.0]]), probability=chance_of)
     prior = MarkovPrior(2, 0).fit(torch.zeros(400, 50, dtype=torch.long))
     starts, how = torch.zeros(16_000, dtype=torch.long), {"temperatures": (1.0,), "uniform_shares": (0.5,)}
-    tuned = best_sampling(prior, world, starts, 1, 8, generator=seeded(0), **how)
-    decision = SamplingPlanner(prior, 1, 8, uniform_share=0.5).plan(world, starts, seeded(1))
+    tuned = best_sampling(prior, world, starts, 1, 8, generator=seeded(0), any_prefix=any_prefix, **how)
+    decision = SamplingPlanner(prior, 1, 8, uniform_share=0.5, any_prefix=any_prefix).plan(world, starts, seeded(1))
     found = torch.where(decision.plan[:, 0] == 0, 0.9, 0.5).mean()
     assert tuned.scores[prior, 1.0, 0.5] == pytest.approx(float(found), abs=5 * (0.25 / 16_000) ** 0.5)
 

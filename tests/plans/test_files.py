@@ -438,3 +438,12 @@ def test_arrays_of_other_names_are_named(tmp_path):
 def test_plans_are_shown_in_short(tmp_path):
     plans = Plans(torch.zeros(300, 40, dtype=torch.long), 2, torch.full((300,), 7))
     assert repr(plans) == "Plans(actions [300, 40], num_actions 2, lengths [300])"
+
+
+def test_groups_in_an_npz_file_have_names_and_no_spaces(tmp_path):
+    actions = np.array([[0, 1]] * 3)
+    np.savez(tmp_path / "plans.npz", actions=actions, group=np.array(["a ", "a", "b"]))
+    assert read_plans(tmp_path / "plans.npz").group_names == ("a", "b")
+    np.savez(tmp_path / "plans.npz", actions=actions, group=np.array(["a", "", "b"]))
+    with pytest.raises(ValueError, match="group: an empty text"):
+        read_plans(tmp_path / "plans.npz")

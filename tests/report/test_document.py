@@ -62,3 +62,11 @@ def test_tables_are_printed_under_their_own_titles_else_that_of_their_section():
 )
 def test_p_values_have_a_digit(value, text):
     assert p_text(value) == text
+
+
+@pytest.mark.parametrize("content", ['{"subjects": [1, 2]}', "[1, 2]", "{"])
+def test_what_another_program_wrote_names_no_tables(content, tmp_path):
+    (tmp_path / "results.json").write_text(content)
+    (tmp_path / "subjects.csv").write_text("a\n1\n")
+    write_document(Document("", "", [], {"one": pd.DataFrame({"bits": [1.5]})}), tmp_path)
+    assert {path.name for path in tmp_path.glob("*.csv")} == {"one.csv", "subjects.csv"}

@@ -216,3 +216,11 @@ def test_refuses_in_worlds():
         sample_distinct_in_world(UniformPrior(3), stochastic_world(0), state, 2, 3)
     with refuses("state"):
         sample_distinct_in_world(UniformPrior(3), world, state + 99, 2, 3)
+
+
+def test_logits_that_are_no_numbers_are_refused():
+    prior = TablePrior.random(3, 3)
+    prior.logits[1][:, 0] = torch.nan
+    for draw in (lambda: sample_distinct(prior, 5, 3, generator=seeded(0)), lambda: most_probable(prior, 5, 3)):
+        with refuses("prior", "NaN"):
+            draw()

@@ -497,5 +497,5 @@ def test_nothing_is_drawn_from_logits_that_are_none(method, wrong):
             logits, state = super().step(action, state, context)
             return torch.full_like(logits, wrong), state
 
-    with pytest.raises(ValueError, match="prior: its logits are NaN, or -inf for all actions"):
+    with pytest.raises(ValueError, match="prior: its logits are NaN or infinite, or -inf for all"):
         sample(Wrong(3), 1000, 4, generator=seeded(0), method=method)

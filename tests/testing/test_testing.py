@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -410,6 +411,8 @@ def test_alike_raises_false_alarms_as_often_as_it_says(continuous: bool) -> None
 
 def test_a_world_without_actions_and_what_is_no_world_are_refused() -> None:
     world = gridworld(3, 3, seed=0)
+    world.num_actions = np.int64(4)  # type: ignore[assignment]
+    check_world(world)
     world.num_actions = 0
     with pytest.raises(AssertionError, match="num_actions: an integer above 0 is expected, not 0"):
         check_world(world)

@@ -24,10 +24,14 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
     arrays, unused = arrays_of(path, (*NUMBERS, *NAMES, "num_actions", "end"))
     for key in ("group", "condition"):
         if key in arrays and arrays[key].dtype.kind == "U" and f"{key}_names" not in arrays:
-            arrays[f"{key}_names"], arrays[key] = np.unique(arrays[key], return_inverse=True)
+            texts = np.char.strip(arrays[key])
+            if (texts == "").any():
+                raise ValueError(f"{path}: {key}: an empty text; a name for every plan is expected")
+            arrays[f"{key}_names"], arrays[key] = np.unique(texts, return_inverse=True)
     for key in NUMBERS:
         if key in arrays and arrays[key].dtype.kind not in "iuf":
-            raise ValueError(f"{path}: {key}: an array of numbers is expected, not of {arrays[key].dtype}")
+            what = "numbers, or of texts without names," if key in ("group", "condition") else "numbers"
+            raise ValueError(f"{path}: {key}: an array of {what} is expected, not of {arrays[key].dtype}")
     if "actions" not in arrays:
         raise ValueError(f"{path}: no array 'actions'; it has {', '.join(sorted([*arrays, *unused])) or 'none'}")
     if arrays["actions"].ndim == 3:
