@@ -34,6 +34,10 @@ LINES = {
 """Colours and styles of the lines of figures."""
 
 
+CLOSEST = 1.4
+"""Ratio of two numbers of candidates from which both have a label."""
+
+
 class Results(NamedTuple):
     """What the runs of the experiment found, a row each; see `eval.control.run`.
 
@@ -282,6 +286,7 @@ def return_figure(rows: pd.DataFrame) -> Figure:
     conditions = [condition for condition in CONDITIONS if (rows["condition"] == condition).any()]
     figure, axes = panels(1, len(conditions), (WIDTH, 3.0), sharex=True)
     budgets = sorted(rows["budget"].unique())
+    budgets = [one for one, more in zip(budgets, [*budgets[1:], np.inf], strict=True) if more >= CLOSEST * one]
     for panel, condition in zip(axes, conditions, strict=True):
         here = rows[rows["condition"] == condition]
         for prior in here["prior"].unique():
