@@ -194,7 +194,8 @@ class PriorModel(PriorModule):
             if "unexpected keyword" not in str(error) or data.plans.context is None:
                 raise
             raise ValueError(
-                "model.prior: it cannot take the context of these plans; use another one, or --model.use_context false"
+                "model.prior: it cannot take the context of these plans; use --model.use_context false, or another"
+                f" prior ({error})"
             ) from error
         if made.takes_context:
             made.past_durations = data.past_durations

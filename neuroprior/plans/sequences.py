@@ -82,7 +82,7 @@ class Sequences(ABC):
         units = int(unit.max()) + 1 if len(unit) else 0
         if units < 2:
             what = "plans" if self.group is None else "groups"
-            raise ValueError(f"plans: at least two {what} are needed, to learn from and to hold out, not {units}")
+            raise ValueError(f"plans: {units} {what} cannot be split in two; at least two are needed")
         held_out = min(max(round(units * validation), 1), units - 1)
         order = torch.randperm(units, generator=generator_on(generator, "cpu"))
         chosen = torch.zeros(units, dtype=torch.bool)

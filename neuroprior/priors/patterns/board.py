@@ -13,7 +13,6 @@ from neuroprior._random import generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.patterns.minibatches import train
 from neuroprior.priors.prior import Prior
-from neuroprior.training.trainer import check_alike
 
 VALIDATION = 0.1
 """The share of plans (or groups) that are held out to decide when training stops."""
@@ -117,6 +116,8 @@ class BoardNetwork(Prior):
         units = len(plans) if plans.group is None else len(plans.group.unique())
         training, held_out = plans, None
         if isinstance(share, Plans):
+            from neuroprior.training.trainer import check_alike  # loads Lightning, which takes seconds
+
             check_alike(plans, share)
             held_out = share
         elif share is not None and units > 1:
