@@ -27,6 +27,7 @@ from neuroprior.cli.program import one_line
 from neuroprior.plans import write_plans
 from neuroprior.priors import Prior, SwitchingPrior, load
 from neuroprior.priors.neural import NeuralPrior
+from neuroprior.priors.serialization import FILES
 from neuroprior.report.document import printed, write_frames
 from neuroprior.report.modes import choice_table
 from neuroprior.training import Settings, make_trainer, quiet, run_training
@@ -35,7 +36,7 @@ from neuroprior.training.trainer import ProgressLines
 USAGE = """{0} fit PLANS [--effort fast|standard|full] [--max-steps N] [--out FOLDER]
        {0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        {0} fit --resume FOLDER"""
-CONFIG, PLANS, MODEL = "run.yaml", "plans.npz", "model.safetensors"
+CONFIG, PLANS, MODEL = "run.yaml", "plans.npz", FILES[0]
 LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 """What a checkpoint must hold for a training to go on from it."""

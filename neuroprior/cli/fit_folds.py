@@ -14,9 +14,10 @@ from neuroprior.analysis.comparison import Score, action_bits, baselines, score_
 from neuroprior.cli.fit_recipe import PlansData
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import divisible, folds
+from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import Prior
 from neuroprior.report.fits import ACTIONS, CONTEXT, Arrays
-from neuroprior.report.scores import load_arrays, plans_digest, save_arrays
+from neuroprior.report.scores import load_arrays, save_arrays
 
 TRAINED = "trained"
 """The recipe's prior among the models of a fold."""

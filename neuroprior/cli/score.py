@@ -60,8 +60,8 @@ def score(
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()
     scores = scores_by(bits, plans, "plan")
-    seen = learned_from(Path(folder), plans)
-    scores.insert(1, "training_data", seen)
+    learned = learned_from(Path(folder), plans)
+    scores.insert(1, "training_data", learned)
     frames = {"plans": scores}
     for by in ("group", "condition"):
         if getattr(plans, by) is not None:
@@ -75,9 +75,9 @@ def score(
         "bits per action": "bits_per_action:.4f",
     }
     caption = f"the first {MOST_ROWS} of {len(frame):,}; all are in the CSV file. " if len(frame) > MOST_ROWS else ""
-    if any(seen):
+    if any(learned):
         caption += (
-            f"Training data: {sum(seen):,} of {len(seen):,} plans are the same as plans that it has learned from."
+            f"Training data: {sum(learned):,} of {len(learned):,} plans are the same as plans that it has learned from."
         )
     notes = list(plans.notes)
     if plans.action_names and action_names is None and prior.action_names is None:
@@ -113,6 +113,6 @@ def _by_number(plans: Plans, file: str, how: Mapping[str, Any]) -> bool:
 
 def _is_of_scores(file: Path) -> bool:
     """Whether a file is one of the tables that `score` writes."""
-    with suppress(OSError, ValueError):
-        return "bits_per_action" in file.open(encoding="utf-8").readline()
+    with suppress(OSError, ValueError), file.open(encoding="utf-8") as lines:
+        return "bits_per_action" in lines.readline()
     return False

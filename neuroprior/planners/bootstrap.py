@@ -17,7 +17,7 @@ from neuroprior._checks import check_sizes
 from neuroprior._files import read_json, write_json, written_whole
 from neuroprior.planners.best_first import BestFirstPlanner, LevinPlanner, Search
 from neuroprior.plans import Plans, action_dtype
-from neuroprior.plans.sequences import Sequences
+from neuroprior.plans.sequences import Sequences, plans_digest
 from neuroprior.priors import PatternPrior, Prior, load, save
 from neuroprior.priors.patterns import Steps
 from neuroprior.sampling.stepping import Stepper
@@ -127,7 +127,11 @@ def bootstrap(
     digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
     asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
     asked |= {"max_actions": max_actions, "teacher": teacher and [type(teacher).__name__, teacher.max_nodes]}
-    asked["settings"] = {name: _described(value) for name, value in sorted(settings.items()) if name != "progress"}
+    asked["settings"] = {
+        name: plans_digest(value) if isinstance(value, Sequences) else repr(value)
+        for name, value in sorted(settings.items())
+        if name != "progress"
+    }
     run = _Bootstrap(world, prior, problems, asked, None if folder is None else Path(folder), generator, sweeps)
     yield from run.done
     while len(run.done) < sweeps:
@@ -151,16 +155,6 @@ def bootstrap(
             f"problems: none of {last.problems} was solved within {last.max_nodes} expansions; give a larger max_nodes,"
             " more sweeps, a teacher or easier problems"
         )
-
-
-def _described(value: Any) -> str:
-    """A setting as a text; of plans a digest."""
-    if not isinstance(value, Sequences):
-        return repr(value)
-    digest = sha256(repr(value).encode())
-    for tensor in (value.actions, value.lengths, value.context):
-        digest.update(b"" if tensor is None else tensor.cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 class _Bootstrap:

@@ -1,5 +1,6 @@
 """What plans of numbered actions and plans of vectors have in common: they are split into training and validation."""
 
+import hashlib
 from abc import ABC, abstractmethod
 from numbers import Real
 from typing import Self
@@ -96,3 +97,17 @@ def check_validation(share: object) -> None:
     if not is_number(share) or not 0 < share < 1:
         said = share if isinstance(share, Real | str | None) else type(share).__name__
         raise ValueError(f"validation: a share between 0 and 1 is expected, not {said}")
+
+
+def plans_digest(plans: Sequences) -> str:
+    """A digest of all that plans hold but the notes of their reader, which files do not keep."""
+    digest = hashlib.sha256()
+    for name, value in vars(plans).items():
+        if name == "notes":
+            continue
+        if isinstance(value, Tensor):
+            digest.update(f"{name} {value.dtype} {[*value.shape]}".encode())
+            digest.update(value.cpu().contiguous().numpy().tobytes())
+        else:
+            digest.update(f"{name} {value!r}".encode())
+    return digest.hexdigest()

@@ -1,6 +1,5 @@
 """Models scored on held-out plans: by cross-validation, or saved priors on plans that they have not learned from."""
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -19,6 +18,7 @@ from neuroprior._jobs import JobRun
 from neuroprior.analysis import Reliability
 from neuroprior.analysis.comparison import Score, score_bits, too_few, unit_name, units
 from neuroprior.plans import Plans
+from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import Prior
 from neuroprior.priors.ensembles.candidates import ORDERS
 from neuroprior.priors.matching import match_plans
@@ -216,20 +216,6 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Eval
     mask = counted(plans, skip)
     settings = {"priors": ", ".join(priors), "skip": skip, "unit": unit_name(plans, mask)}
     return Evaluation(plans, plans, mask, models, (models[0], models[0].name), plans, pd.DataFrame(), settings)
-
-
-def plans_digest(plans: Plans) -> str:
-    """A digest of all that plans hold but the notes of their reader, which files do not keep."""
-    digest = hashlib.sha256()
-    for name, value in vars(plans).items():
-        if name == "notes":
-            continue
-        if isinstance(value, Tensor):
-            digest.update(f"{name} {value.dtype} {[*value.shape]}".encode())
-            digest.update(value.cpu().contiguous().numpy().tobytes())
-        else:
-            digest.update(f"{name} {value!r}".encode())
-    return digest.hexdigest()
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:

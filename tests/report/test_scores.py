@@ -11,6 +11,7 @@ import torch
 from neuroprior.analysis.comparison import score_bits, units
 from neuroprior.plans import PastDurations, Plans
 from neuroprior.plans.folds import folds
+from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import GRUPrior, MarkovPrior, UniformPrior
 from neuroprior.report.fits import ACTIONS, CONTEXT, DURATIONS, Design, Job, score_arrays
 from neuroprior.report.scores import (
@@ -20,7 +21,6 @@ from neuroprior.report.scores import (
     evaluate_saved,
     jobs,
     load_arrays,
-    plans_digest,
     save_arrays,
 )
 from tests.support.sources import refuses, seeded
