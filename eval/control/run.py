@@ -268,12 +268,14 @@ def planning_run(run: Planning, settings: ControlSettings) -> dict[str, Any]:
     if run.prior != NONE:
         assert run.plans is not None
         prior = fitted(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
+    # Without a share of candidates it is the plain planner, and draws the same numbers: they do not differ by chance.
+    drawn_as = run.prior if run.choice.share else NONE
     entries = []
     for budget in (*settings.budgets, *(settings.plain_budgets if prior is None else ())):
         planner = planner_of(run.planner, task.horizon, budget, run.choice, prior)
         began = process_time()
         with drawing(prior) as drawn:
-            done = controlled(planner, world, settings, run.seed, 1, run.planner, run.prior, budget)
+            done = controlled(planner, world, settings, run.seed, 1, run.planner, drawn_as, budget)
         seconds, decisions = process_time() - began, max(int(done.plans.mask().sum()), 1)
         entries.append(
             place

@@ -25,10 +25,14 @@ from eval.control.run import (
     EXPONENTS,
     STDS,
     Choice,
+    Collecting,
     ControlSettings,
+    Planning,
     Tuning,
+    collecting_run,
     drawing,
     planner_of,
+    planning_run,
     tuning_run,
 )
 from eval.control.tasks import CONDITIONS, TASKS
@@ -86,6 +90,19 @@ def test_a_small_run(tmp_path, capsys):
     assert {row["prior"] for row in results["rows"]} == {"none", "autoregressive"}
     assert all(path.stat().st_mtime_ns == time for path, time in kept.items())
     assert len(list(out.glob("scoring/*/double*-stored-*.json"))) == 2
+
+
+def test_a_prior_that_proposes_nothing_leaves_the_plain_planner_as_it_is():
+    settings = ControlSettings((4, 8), (16,), 6, 2, 4, 4, 1, seed=3)
+    plans = collecting_run(Collecting("double_integrator", 0, Choice(0.3, 1.0)), settings)
+
+    def returns(prior, choice):
+        run = Planning("double_integrator", 0, "masses", "icem", prior, choice, plans)
+        return [entry["return"] for entry in planning_run(run, settings)["entries"]]
+
+    plain = returns("none", Choice(0.3, 1.0))
+    assert returns("autoregressive", Choice(0.3, 1.0)) == plain[:2]
+    assert returns("autoregressive", Choice(0.3, 1.0, share=0.5)) != plain[:2]
 
 
 def test_nothing_is_called_significant_with_fewer_than_five_seeds():
