@@ -265,7 +265,7 @@ class Mixer(NeuralPrior):
         check_sizes(hidden_size=hidden_size, num_experts=num_experts)
         self.num_experts, self.contexts = num_experts, contexts
         size = num_experts * num_actions + (0 if contexts is None else 1 + num_actions)
-        super().__init__(num_actions, hidden_size, None, 1, dropout, None, size, seed)
+        super().__init__(num_actions, hidden_size, 1, None, 1, dropout, None, size, seed)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -31,8 +31,8 @@ class GRUPrior(NeuralPrior):
         hidden_size: width of the hidden state and of the input vectors.
         num_layers: number of layers.
         window, lags, dropout, num_contexts, context_size, seed: see `NeuralPrior`. Dropout is applied to the input
-            vectors and to the output of each layer. What is None of `hidden_size`, `lags` and `dropout` is chosen by
-            `fit` for its first plans, see `neuroprior.priors.neural.Sizes`.
+            vectors and to the output of each layer. What is None of `hidden_size`, `num_layers`, `lags` and `dropout`
+            is chosen by `fit` for its first plans, see `neuroprior.priors.neural.Sizes`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -47,7 +47,7 @@ class GRUPrior(NeuralPrior):
         self,
         num_actions: int,
         hidden_size: int | None = None,
-        num_layers: int = 1,
+        num_layers: int | None = None,
         window: int | None = None,
         lags: int | None = None,
         dropout: float | None = None,
@@ -55,10 +55,11 @@ class GRUPrior(NeuralPrior):
         context_size: int | None = None,
         seed: int = 0,
     ) -> None:
-        check_sizes(hidden_size=1 if hidden_size is None else hidden_size, num_layers=num_layers)
-        check_memory(24 * num_layers * (hidden_size or 1) ** 2, num_layers=num_layers, hidden_size=hidden_size)
-        self.num_layers = num_layers
-        super().__init__(num_actions, hidden_size, window, lags, dropout, num_contexts, context_size, seed)
+        sizes = {"num_layers": num_layers, "hidden_size": hidden_size}
+        given = {name: size for name, size in sizes.items() if size is not None}
+        check_sizes(**given)
+        check_memory(24 * given.get("num_layers", 1) * given.get("hidden_size", 1) ** 2, **given)
+        super().__init__(num_actions, hidden_size, num_layers, window, lags, dropout, num_contexts, context_size, seed)
 
     @property
     def hidden_size(self) -> int:

@@ -36,26 +36,28 @@ class Sizes(NamedTuple):
         width: of its hidden state and vectors.
         lags: past actions that each input shows directly.
         dropout: share of activations that is set to 0 in training.
+        layers: of a recurrent network.
     """
 
     width: int = 64
     lags: int = 16
     dropout: float = 0.0
+    layers: int = 1
 
     @classmethod
     def of(cls, plans: Plans) -> "Sizes":
         """Those with which networks predict plans like these best; see `python -m eval quality`.
 
         Short plans are learned exactly: a small network, without dropout unless they are few. In long sequences a wider
-        network with dropout finds more, and is overfitted less by what it has to carry itself than by the last actions
-        shown to it directly.
+        and deeper network with dropout finds more, and is overfitted less by what it has to carry itself than by the
+        last actions shown to it directly.
         """
         few = int(plans.mask().sum()) < FEW
         if plans.max_length <= SHORT:
             return cls(dropout=0.2 if few else 0.0)
         if few or plans.num_actions <= KINDS:
-            return cls(64 if few else 128, 1, 0.3)
-        return cls(256, 1, 0.4)
+            return cls(64 if few else 128, 1, 0.3, 2)
+        return cls(256, 1, 0.4, 2)
 
 
 class NeuralPrior(Prior):
@@ -82,6 +84,7 @@ class NeuralPrior(Prior):
     Args:
         num_actions: A.
         width: of the network's vectors, and of its hidden state.
+        num_layers: number of layers.
         window: past actions up to which it is trained; None: set by `fit`, and no limit before that.
         lags: past actions that each input shows to the network directly; see `Embedding`.
         dropout: share of the network's activations that is set to 0 at random in training.
@@ -99,6 +102,7 @@ class NeuralPrior(Prior):
         self,
         num_actions: int,
         width: int | None,
+        num_layers: int | None,
         window: int | None,
         lags: int | None,
         dropout: float | None,
@@ -114,15 +118,15 @@ class NeuralPrior(Prior):
         check_seed(seed)
         self._given_window = self.window = window
         check_sizes(lags=1 if lags is None else lags)
-        self._given = (width, lags, dropout)
+        self._given = (width, lags, dropout, num_layers)
         self._seed, self._sized = seed, False
         self.input_size = 1 + (1 if num_contexts is not None else context_size or 0)
         self._make(Sizes())
 
     def _make(self, sizes: Sizes) -> None:
         """Make the layers, with the sizes that were given and these where none were."""
-        width, lags, dropout = (own if own is not None else size for own, size in zip(self._given, sizes, strict=True))
-        self.width, self.lags, self.dropout = int(width), int(lags), float(dropout)
+        made = [own if own is not None else size for own, size in zip(self._given, sizes, strict=True)]
+        self.width, self.lags, self.dropout, self.num_layers = int(made[0]), int(made[1]), float(made[2]), int(made[3])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
             self.build()
@@ -134,7 +138,7 @@ class NeuralPrior(Prior):
 
     @property
     def learned(self) -> dict[str, Any]:
-        sizes = [self.width, self.lags, self.dropout] if self._sized else None
+        sizes = [self.width, self.lags, self.dropout, self.num_layers] if self._sized else None
         return super().learned | {"window": self.window, "sizes": sizes}
 
     def restore(self, learned: dict[str, Any]) -> None:

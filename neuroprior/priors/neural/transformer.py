@@ -59,9 +59,9 @@ class TransformerPrior(NeuralPrior):
         if width % (2 * num_heads):
             raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
         check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
-        self.num_layers, self.num_heads = num_layers, num_heads
+        self.num_heads = num_heads
         self.span: int | None = None
-        super().__init__(num_actions, width, window, lags, dropout, num_contexts, context_size, seed)
+        super().__init__(num_actions, width, num_layers, window, lags, dropout, num_contexts, context_size, seed)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -440,7 +440,7 @@ def test_no_more_room_is_taken_than_is_used(window, span):
 def test_sizes_follow_from_the_first_plans(kind, tmp_path):
     """Short plans: small, with dropout where they are few; long sequences: the wider the more there are.
 
-    Of long sequences a GRU is shown no lags, a transformer only none where they are few.
+    Of long sequences a GRU, then of two layers, is shown no lags, a transformer only none where they are few.
     """
 
     def plans(num: int, length: int, actions: int = 3) -> Plans:
@@ -458,12 +458,14 @@ def test_sizes_follow_from_the_first_plans(kind, tmp_path):
         if kind is TransformerPrior:
             expected = (64, 1 if len(few) == 20 else 16, expected[2])
         assert (prior.width, prior.lags, prior.dropout) == expected
+        assert prior.num_layers == (2 if kind is TransformerPrior or few.max_length == 100 else 1)
     again = load(save(prior, tmp_path / "prior"))
     for kept in (prior, again):  # what has learned keeps its sizes
         kept.fit(plans(100, 8, 17), generator=seeded(0), **quick)
-        assert (kept.lags, kept.dropout) == expected[1:]
+        assert (kept.lags, kept.dropout, kept.num_layers) == (*expected[1:], 2)
     given = kind(3, 16, lags=2).fit(plans(20, 100), generator=seeded(0), **quick)
-    assert (given.width, given.lags, given.dropout) == (16, 2, 0.3)
+    assert (given.width, given.lags, given.dropout, given.num_layers) == (16, 2, 0.3, 2)
+    assert kind(3, num_layers=3).fit(plans(20, 100), generator=seeded(0), **quick).num_layers == 3
 
 
 def test_sizes_that_were_chosen_are_restored_and_trained_further():
