@@ -53,11 +53,12 @@ class StackedPrior(Prior):
     Args:
         num_actions: A.
         hidden_size: of the network.
-        dropout: in training, of the network's input vectors and of its output.
+        dropout: in training, of the network's input vectors and of the output of each layer.
         orders: of the Markov priors among the experts.
         depth: of the context trees among them; with contexts, one of two trees takes the context.
         num_contexts: number of context indices, for a prior that takes an index.
         seed: draws the initial weights.
+        num_layers: of the network; None: chosen by `fit` for its first plans, see `neuroprior.priors.neural.Sizes`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -81,6 +82,7 @@ class StackedPrior(Prior):
         depth: int = 10,
         num_contexts: int | None = None,
         seed: int = 0,
+        num_layers: int | None = None,
     ) -> None:
         super().__init__(num_actions, num_contexts)
         self.hidden_size, self.dropout, self.orders, self.depth = hidden_size, dropout, tuple(orders), depth
@@ -92,12 +94,16 @@ class StackedPrior(Prior):
             for contexts in ([None] if num_contexts is None else [num_contexts, None])
         ]
         self.experts = nn.ModuleList([*chains, *trees])
-        self.mixer = Mixer(num_actions, len(self.experts), hidden_size, dropout, num_contexts, seed)
+        self.mixer = Mixer(num_actions, len(self.experts), hidden_size, num_layers, dropout, num_contexts, seed)
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"hidden_size": self.hidden_size, "dropout": self.dropout}
+        own = {"hidden_size": self.hidden_size, "dropout": self.dropout, "num_layers": self.mixer.num_layers}
         return super().config | own | {"orders": list(self.orders), "depth": self.depth}
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return super().learned | {"network": self.mixer.learned}
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         forecasts, states = zip(*(e.start(batch_size, context_for(e, context)) for e in self._experts()), strict=True)
@@ -178,7 +184,9 @@ class StackedPrior(Prior):
 
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
-        self.mixer.window = None
+        # What was saved when no network had more layers says nothing of it.
+        one_layer = {"window": None, "sizes": [self.hidden_size, 1, self.dropout, 1]}
+        self.mixer.restore(learned.get("network", self.mixer.learned | one_layer))
 
     def _forecasts(self, plans: Plans, generator: torch.Generator) -> Tensor:
         """`[N, L, E, A]`: log-probabilities of experts that did not learn from the plan they predict."""
@@ -258,18 +266,22 @@ class Mixer(NeuralPrior):
         num_actions: int,
         num_experts: int,
         hidden_size: int,
+        num_layers: int | None,
         dropout: float,
         contexts: int | None,
         seed: int,
     ) -> None:
-        check_sizes(hidden_size=hidden_size, num_experts=num_experts)
+        check_sizes(
+            hidden_size=hidden_size, num_experts=num_experts, num_layers=1 if num_layers is None else num_layers
+        )
         self.num_experts, self.contexts = num_experts, contexts
         size = num_experts * num_actions + (0 if contexts is None else 1 + num_actions)
-        super().__init__(num_actions, hidden_size, 1, None, 1, dropout, None, size, seed)
+        super().__init__(num_actions, hidden_size, num_layers, None, 1, dropout, None, size, seed)
 
     @property
     def config(self) -> dict[str, Any]:
         own = {"num_experts": self.num_experts, "hidden_size": self.width, "contexts": self.contexts}
+        own |= {"num_layers": self.num_layers}
         return own | {"num_actions": self.num_actions, "dropout": self.dropout, "seed": 0}
 
     def build(self) -> None:
@@ -277,7 +289,7 @@ class Mixer(NeuralPrior):
         self.action = nn.Embedding(self.num_actions + 1, width)
         self.index = None if self.contexts is None else context_embedding(self.contexts, width)
         self.features = nn.Linear(forecasts + (0 if self.contexts is None else self.num_actions), width)
-        self.gru = nn.GRU(width, width, batch_first=True)
+        self.gru = nn.GRU(width, width, self.num_layers, batch_first=True, dropout=self.dropout * (self.num_layers > 1))
         self.drop = nn.Dropout(self.dropout)
         self.head = nn.Linear(width, self.num_actions)
         self.weights = nn.Linear(width, self.num_experts)
@@ -293,10 +305,11 @@ class Mixer(NeuralPrior):
             vectors, rest = vectors + self.index(rest[..., 0].long()), rest[..., 1:]
         forecasts = rest[..., : self.num_experts * self.num_actions]
         vectors = vectors + self.features(rest / 2)
-        out, last = gru_sequence(self.gru, self.drop(vectors), None if hidden is None else hidden[None])
+        layers = None if hidden is None else hidden.unflatten(1, (self.num_layers, -1)).transpose(0, 1)
+        out, layers = gru_sequence(self.gru, self.drop(vectors), layers)
         out = self.drop(out)
         mixed = (self.weights(out)[..., None] * forecasts.unflatten(-1, (self.num_experts, -1))).sum(-2)
-        return self.head(out) + mixed, last[0]
+        return self.head(out) + mixed, layers.transpose(0, 1).flatten(1)
 
 
 def context_for(expert: Prior, context: Tensor | None) -> Tensor | None:
