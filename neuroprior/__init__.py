@@ -2,13 +2,15 @@
 
 Here are the names that most programs need; everything else is in its room: `neuroprior.worlds`, `neuroprior.sampling`,
 `neuroprior.priors`, `neuroprior.planners`, `neuroprior.agents`, `neuroprior.analysis`, `neuroprior.report` and
-`neuroprior.testing`.
+`neuroprior.testing`. A room is imported when one of its names is first used: torch, which all need, takes seconds.
 """
 
-from neuroprior._interrupts import ending_at_interrupts
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from neuroprior._version import __version__
 
-with ending_at_interrupts():
+if TYPE_CHECKING:
     from neuroprior.planners import (
         ExhaustivePlanner,
         FrontierPlanner,
@@ -74,3 +76,24 @@ __all__ = [
     "score",
     "write_plans",
 ]
+
+_ROOMS = ("plans", "values", "worlds", "sampling", "priors", "priors.scoring", "planners")
+"""Where the names above are: those that import the fewest others first."""
+
+_OTHER_ROOMS = ("agents", "analysis", "report", "testing", "training")
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        if name in (*_ROOMS, *_OTHER_ROOMS):
+            return import_module(f"neuroprior.{name}")
+        if name in __all__:
+            for room in map(import_module, (f"neuroprior.{room}" for room in _ROOMS)):
+                if name in getattr(room, "__all__", vars(room)):
+                    globals()[name] = getattr(room, name)
+                    return globals()[name]
+        raise AttributeError(f"module 'neuroprior' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_ROOMS, *_OTHER_ROOMS} - {"priors.scoring"})

@@ -146,7 +146,9 @@ def _busy(rows: pd.DataFrame) -> Table:
 def _imports(rows: pd.DataFrame) -> Table:
     columns = {"": "what", "seconds": "seconds:.2f", "torch, s": "torch_seconds:.2f", "ratio": "ratio:.3f"}
     columns |= {"min": "low:.3f", "max": "high:.3f", "goal": "goal"}
-    return table(rows.assign(what="import neuroprior:"), columns, title="Time to import (ratio: to that of torch)")
+    return table(
+        rows.assign(what="from neuroprior import *:"), columns, title="Time to import (ratio: to that of torch)"
+    )
 
 
 def _sizes(rows: pd.DataFrame) -> Table:

@@ -10,6 +10,7 @@ from importlib import import_module
 from types import NoneType, UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
+from neuroprior._interrupts import ending_at_interrupts
 from neuroprior._version import __version__
 
 TYPES = {
@@ -43,7 +44,8 @@ class Command(NamedTuple):
     def load(self) -> Callable[..., Any]:
         """Import the function."""
         module, _, name = self.target.partition(":")
-        found: Callable[..., Any] = getattr(import_module(module), name)
+        with ending_at_interrupts():
+            found: Callable[..., Any] = getattr(import_module(module), name)
         return found
 
 

@@ -7,6 +7,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 import yaml
 
 import neuroprior
@@ -59,13 +60,18 @@ BUDGET = 0.5
 """Most that an import of the library may take beyond that of torch, as a share of that of torch."""
 
 
-def imported() -> tuple[float, set[str]]:
-    """How much longer than torch an import of the library takes, as a share of torch's time; and what is imported."""
-    command = [sys.executable, "-X", "importtime", "-c", "import torch, neuroprior"]
+def imported(code: str = "import torch; from neuroprior import *") -> tuple[float, set[str]]:
+    """How much longer than torch an import of all names takes, as a share of torch's time; and what is imported."""
+    command = [sys.executable, "-X", "importtime", "-c", code]
     said = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True).stderr
-    lines = re.findall(r"\| +(\d+) \| ( *)(\S+)$", said, re.MULTILINE)
-    seconds = {name: float(cumulative) for cumulative, _, name in lines}
-    return seconds["neuroprior"] / seconds["torch"], {name.partition(".")[0] for name in seconds}
+    # With one space the module was imported by the code itself, with more by another module.
+    lines = [
+        (int(cumulative), len(spaces) == 1, name)
+        for cumulative, spaces, name in re.findall(r"\| +(\d+) \|( +)(\S+)$", said, re.MULTILINE)
+    ]
+    own = sum(time for time, first, name in lines if first and name.partition(".")[0] == "neuroprior")
+    torchs = sum(time for time, first, name in lines if first and name == "torch")
+    return own / max(torchs, 1), {name.partition(".")[0] for _, _, name in lines}
 
 
 def test_import_is_light() -> None:
@@ -76,6 +82,20 @@ def test_import_is_light() -> None:
     if share > BUDGET:
         share = min(imported()[0] for _ in range(2))
     assert share <= BUDGET
+
+
+def test_what_needs_no_library_imports_none() -> None:
+    assert not imported("import neuroprior; neuroprior.__version__; dir(neuroprior)")[1] & {*HEAVY, "torch", "numpy"}
+    assert "torch" not in imported("from neuroprior.__main__ import COMMANDS")[1]
+
+
+def test_the_top_level_has_its_names_and_rooms() -> None:
+    assert {*neuroprior.__all__, "plans", "priors", "worlds", "agents", "report"} <= set(dir(neuroprior))
+    for name in dir(neuroprior):
+        assert getattr(neuroprior, name) is not None
+    assert neuroprior.priors.MarkovPrior is neuroprior.MarkovPrior
+    with pytest.raises(AttributeError, match="no attribute 'MarkovPriors'"):
+        _ = neuroprior.MarkovPriors
 
 
 def test_issue_forms_are_well_formed() -> None:

@@ -285,7 +285,7 @@ def test_the_program(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "…" not in shown
     assert "numpy bincount" in shown
-    assert "import neuroprior:" in shown
+    assert "from neuroprior import *:" in shown
 
 
 def test_jobs_of_an_accelerator(tmp_path, capsys):
