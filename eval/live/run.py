@@ -151,5 +151,5 @@ def untrained(condition: Condition, table: TabularWorld, seed: int) -> Prior:
     if condition.prior == "markov":
         return MarkovPrior(table.num_actions, ORDERS[condition.context], num_contexts=num_contexts)
     if condition.prior == "gru":
-        return GRUPrior(table.num_actions, lags=1, dropout=0.2, seed=seed, num_contexts=num_contexts)
+        return GRUPrior(table.num_actions, num_layers=1, lags=1, dropout=0.2, seed=seed, num_contexts=num_contexts)
     return UniformPrior(table.num_actions)
