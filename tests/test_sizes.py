@@ -3,7 +3,16 @@
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, SamplingPlanner, TransformerPrior, UniformPrior, collect, gridworld
+from neuroprior import (
+    GRUPrior,
+    MarkovPrior,
+    SamplingPlanner,
+    StackedPrior,
+    TransformerPrior,
+    UniformPrior,
+    collect,
+    gridworld,
+)
 from neuroprior._checks import physical_memory
 from neuroprior.sampling import sample_distinct, sample_in_world
 from neuroprior.worlds import cube
@@ -27,6 +36,7 @@ PRIOR = UniformPrior(4)
         (lambda: GRUPrior(3, hidden_size=10**7), ["hidden_size", "2,400,000,000,000,000 bytes"]),
         (lambda: GRUPrior(3, num_layers=10**12), ["num_layers"]),
         (lambda: GRUPrior(3, lags=10**13), ["lags"]),
+        (lambda: StackedPrior(3, num_layers=10**12), ["num_layers"]),
         (lambda: GRUPrior(3, num_contexts=10**13), ["num_contexts"]),
         (lambda: TransformerPrior(3, width=8 * 10**7), ["width"]),
         (lambda: MarkovPrior(10**14), ["num_actions"]),

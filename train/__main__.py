@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 
+from neuroprior._interrupts import ending_at_interrupts
 from neuroprior.cli.program import run_program
 
 
@@ -13,7 +14,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> None:
     # Imported here, so that Ctrl-C is answered while the libraries load too.
-    from neuroprior.cli.fit import run
+    with ending_at_interrupts():
+        from neuroprior.cli.fit import run
 
     run(list(arguments), "python -m train")
 

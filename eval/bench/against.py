@@ -59,7 +59,7 @@ def compared(before: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame:
         for row in now.get(part, []):
             key = tuple(row[name] for name in names)
             if key in earlier:
-                rows.append(_row(": ".join(map(str, key)) or "import neuroprior", part, earlier[key], row))
+                rows.append(_row(": ".join(map(str, key)) or "from neuroprior import *", part, earlier[key], row))
     if not rows:
         raise ValueError("against: results of the same measurements are expected; the two have none in common")
     return pd.DataFrame(rows)

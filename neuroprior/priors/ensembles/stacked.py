@@ -58,7 +58,8 @@ class StackedPrior(Prior):
         depth: of the context trees among them; with contexts, one of two trees takes the context.
         num_contexts: number of context indices, for a prior that takes an index.
         seed: draws the initial weights.
-        num_layers: of the network; None: chosen by `fit` for its first plans, see `neuroprior.priors.neural.Sizes`.
+        num_layers: of the network; None: chosen by `fit` for its first plans (or parts of a single one), see
+            `neuroprior.priors.neural.Sizes`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -98,7 +99,9 @@ class StackedPrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        own = {"hidden_size": self.hidden_size, "dropout": self.dropout, "num_layers": self.mixer.num_layers}
+        own: dict[str, Any] = {"hidden_size": self.hidden_size, "dropout": self.dropout}
+        if self.mixer.num_layers > 1:  # one, as all had before, is left out: checkpoints of agents compare settings
+            own["num_layers"] = self.mixer.num_layers
         return super().config | own | {"orders": list(self.orders), "depth": self.depth}
 
     @property
@@ -276,7 +279,7 @@ class Mixer(NeuralPrior):
         )
         self.num_experts, self.contexts = num_experts, contexts
         size = num_experts * num_actions + (0 if contexts is None else 1 + num_actions)
-        super().__init__(num_actions, hidden_size, num_layers, None, 1, dropout, None, size, seed)
+        super().__init__(num_actions, hidden_size, None, 1, dropout, None, size, seed, num_layers)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -84,12 +84,12 @@ class NeuralPrior(Prior):
     Args:
         num_actions: A.
         width: of the network's vectors, and of its hidden state.
-        num_layers: number of layers.
         window: past actions up to which it is trained; None: set by `fit`, and no limit before that.
         lags: past actions that each input shows to the network directly; see `Embedding`.
         dropout: share of the network's activations that is set to 0 at random in training.
         num_contexts, context_size: see `Prior`.
         seed: draws the initial weights; torch's global generator is left alone.
+        num_layers: number of layers; None: chosen by `fit`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -102,13 +102,13 @@ class NeuralPrior(Prior):
         self,
         num_actions: int,
         width: int | None,
-        num_layers: int | None,
         window: int | None,
         lags: int | None,
         dropout: float | None,
         num_contexts: int | None,
         context_size: int | None,
         seed: int,
+        num_layers: int | None = 1,
     ) -> None:
         super().__init__(num_actions, num_contexts, context_size)
         if window is not None:

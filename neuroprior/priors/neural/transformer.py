@@ -61,7 +61,7 @@ class TransformerPrior(NeuralPrior):
         check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
         self.num_heads = num_heads
         self.span: int | None = None
-        super().__init__(num_actions, width, num_layers, window, lags, dropout, num_contexts, context_size, seed)
+        super().__init__(num_actions, width, window, lags, dropout, num_contexts, context_size, seed, num_layers)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -23,7 +23,8 @@ class SwitchingNetwork(GRUPrior):
     Args:
         num_actions: A.
         num_modes: K.
-        hidden_size, num_layers, window, lags, dropout, num_contexts, context_size, seed: see `GRUPrior`.
+        hidden_size, window, lags, dropout, num_contexts, context_size, seed: see `GRUPrior`.
+        num_layers: number of layers.
 
     Raises:
         ValueError: an argument is out of range.

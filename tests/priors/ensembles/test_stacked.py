@@ -153,14 +153,13 @@ def test_its_layers_follow_from_its_first_plans_and_are_saved(tmp_path):
     short, long = some_plans(), some_plans(8, 40)
     for plans, given, expected in ((short, None, 1), (long, None, 2), (long, 1, 1), (short, 2, 2)):
         prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C, num_layers=given)
-        assert "num_layers" in prior.config
         prior.fit(plans, generator=seeded(0), max_steps=2, progress=False)
-        assert prior.config["num_layers"] == expected
+        assert prior.mixer.num_layers == expected
         again = load(save(prior, tmp_path / f"{plans.max_length}-{given}"))
         assert again.log_prob(plans).equal(prior.log_prob(plans))
         for one in (prior, again):  # what has learned keeps its layers
             one.fit(long, generator=seeded(1), max_steps=2, progress=False)
-            assert one.config["num_layers"] == expected
+            assert one.mixer.num_layers == expected
         assert again.log_prob(plans).equal(prior.log_prob(plans))
     check_prior(
         StackedPrior(A, 8, orders=(1, 2), num_layers=2).fit(short.without_context(), max_steps=5, progress=False),
@@ -174,9 +173,9 @@ def test_models_that_were_saved_when_networks_had_one_layer_still_load(tmp_path)
     prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_contexts=C, num_layers=1)
     folder = save(prior.fit(plans, generator=seeded(0), max_steps=2, progress=False), tmp_path / "old")
     description = json.loads((folder / "config.json").read_text())
-    del description["config"]["num_layers"], description["learned"]["network"]
+    del description["learned"]["network"]
     (folder / "config.json").write_text(json.dumps(description))
     again = load(folder)
     assert again.log_prob(plans).equal(prior.log_prob(plans))
     again.fit(plans, generator=seeded(0), max_steps=2, progress=False)
-    assert again.config["num_layers"] == 1
+    assert again.mixer.num_layers == 1
