@@ -15,7 +15,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 HOURS = {
     "paper": "0.3+",
-    "mice": "0.6",
+    "mice": "0.7",
     "compare": "12+",
     "planners": "0.7",
     "puzzles": "1+",
