@@ -3,7 +3,10 @@
 import sys
 from collections.abc import Sequence
 
-from neuroprior.cli.program import Command, run_commands
+from neuroprior._interrupts import ending_at_interrupts
+
+with ending_at_interrupts():
+    from neuroprior.cli.program import Command, run_commands
 
 COMMANDS = {
     "fit": Command("neuroprior.cli.fit:run", "train a prior on executed plans and save it", raw=True),

@@ -4,7 +4,9 @@ import sys
 from collections.abc import Sequence
 
 from neuroprior._interrupts import ending_at_interrupts
-from neuroprior.cli.program import run_program
+
+with ending_at_interrupts():
+    from neuroprior.cli.program import run_program
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
