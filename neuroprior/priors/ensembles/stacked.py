@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
@@ -274,9 +274,9 @@ class Mixer(NeuralPrior):
         contexts: int | None,
         seed: int,
     ) -> None:
-        check_sizes(
-            hidden_size=hidden_size, num_experts=num_experts, num_layers=1 if num_layers is None else num_layers
-        )
+        layers = {} if num_layers is None else {"num_layers": num_layers}
+        check_sizes(hidden_size=hidden_size, num_experts=num_experts, **layers)
+        check_memory(24 * layers.get("num_layers", 1) * hidden_size**2, hidden_size=hidden_size, **layers)
         self.num_experts, self.contexts = num_experts, contexts
         size = num_experts * num_actions + (0 if contexts is None else 1 + num_actions)
         super().__init__(num_actions, hidden_size, None, 1, dropout, None, size, seed, num_layers)
