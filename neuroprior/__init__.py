@@ -77,10 +77,10 @@ __all__ = [
     "write_plans",
 ]
 
-_ROOMS = ("plans", "values", "worlds", "sampling", "priors", "priors.scoring", "planners")
+_ROOMS = ("plans", "worlds", "sampling", "priors", "priors.scoring", "planners")
 """Where the names above are: those that import the fewest others first."""
 
-_OTHER_ROOMS = ("agents", "analysis", "report", "testing", "training")
+_OTHER_ROOMS = ("agents", "analysis", "report", "testing", "training", "values")
 
 if not TYPE_CHECKING:
 

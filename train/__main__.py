@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from neuroprior._interrupts import ending_at_interrupts
 
 with ending_at_interrupts():
+    from neuroprior.__main__ import COMMANDS
     from neuroprior.cli.program import run_program
 
 
@@ -15,11 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str]) -> None:
-    # Imported here, so that Ctrl-C is answered while the libraries load too.
-    with ending_at_interrupts():
-        from neuroprior.cli.fit import run
-
-    run(list(arguments), "python -m train")
+    COMMANDS["fit"].load()(list(arguments), "python -m train")
 
 
 if __name__ == "__main__":
