@@ -35,7 +35,7 @@ ROWS = 2**16
 SHARED = 2**15
 """Hidden units of all starts' networks from which threads share the starts; tables are too fast for it."""
 
-NO_NETWORK = tuple(np.empty((0,) * dims, np.float32) for dims in (2, 3, 2, 2, 1, 2, 1))
+NO_NETWORK = tuple(np.empty((0,) * dims, np.float32) for dims in (2, 3, 2, 3, 2, 3, 2, 2, 1))
 """The parts of a `Network`, for a table."""
 
 
@@ -58,7 +58,7 @@ class Known(NamedTuple):
         state: int64 `[B, M]`.
         reward: float64 `[B, M]`, of the step into the node.
         code: int64 `[B, M]`: the history, for a prior that is a table.
-        hidden: float32 `[B, M, H]`: the hidden state of a network.
+        hidden: float32 `[B, M, K H]`: the hidden states of the K layers of a network.
         size, left, over: `[B]`: nodes so far, simulator steps left, and whether they are too few for the next plan.
     """
 
@@ -88,7 +88,7 @@ class Moves(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """A prior: a table of histories, or a gated recurrent network of one layer.
+    """A prior: a table of histories, or a gated recurrent network.
 
     Attributes:
         context: int64 `[W * S]`: the context in each state; empty: there is none.
@@ -97,7 +97,7 @@ class Policy(NamedTuple):
         row: int64 `[F, C]`: the row of the tables for each history and context.
         weights: float32 `[R, A]`: cumulative unnormalised probabilities.
         probs: float64 `[R, A]`.
-        by_context: float32 `[C, 3 H]`: what each context adds to the gates of a network.
+        by_context: float32 `[C, 3 H]`: what each context adds to the gates of the first layer of a network.
         network: H is 0 for a table.
         temperature: divides logits.
     """
@@ -229,11 +229,11 @@ def _evaluate(
         plans: `[K, L]`.
         t: the step.
         observed: `[K]`: the states whose contexts the prior is given.
-        code, hidden: `[K]` and `[K, H]`: its state, which is overwritten.
+        code, hidden: `[K]` and `[K, layers * H]`: its state, which is overwritten.
         weights, probs: `[K, A]`: get its predictions: cumulative unnormalised probabilities, and probabilities.
-        work: room for `BLOCK` rows of hidden states, products, gates and logits.
+        work: room for `BLOCK` rows of one layer's states, products, gates and logits.
     """
-    size, actions, one = hidden.shape[1], weights.shape[1], np.float32(1)
+    (layers, size, _), actions, one = policy.network.recurrent.shape, weights.shape[1], np.float32(1)
     if size == 0:
         for k in which:
             code[k] = policy.after[code[k], plans[k, t]]
@@ -250,8 +250,6 @@ def _evaluate(
         for i in range(number):
             k = which[begin + i]
             last = plans[k, t]
-            for j in range(size):
-                block[i, j] = hidden[k, j]
             for j in range(3 * size):
                 gates[i, j] = action[last, j]
             for lag in range(min(len(past), t + 2)):
@@ -265,15 +263,27 @@ def _evaluate(
                 now = policy.context[observed[k]]
                 for j in range(3 * size):
                     gates[i, j] += policy.by_context[now, j]
-        np.dot(block[:number], policy.network.recurrent, product[:number])
-        for i in range(number):
-            k = which[begin + i]
-            for j in range(2 * size):
-                gates[i, j] = one / (one + _exp(-(gates[i, j] + product[i, j])))
-            for j in range(size):
-                new = gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + policy.network.bias[j])
-                new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
-                hidden[k, j] = block[i, j] = new + gates[i, size + j] * (block[i, j] - new)
+        for layer in range(layers):
+            first = layer * size
+            if layer > 0:
+                np.dot(block[:number], policy.network.above[layer - 1], gates[:number])
+                for i in range(number):
+                    for j in range(3 * size):
+                        gates[i, j] += policy.network.above_bias[layer - 1, j]
+            for i in range(number):
+                k = which[begin + i]
+                for j in range(size):
+                    block[i, j] = hidden[k, first + j]
+            np.dot(block[:number], policy.network.recurrent[layer], product[:number])
+            for i in range(number):
+                k = which[begin + i]
+                for j in range(2 * size):
+                    gates[i, j] = one / (one + _exp(-(gates[i, j] + product[i, j])))
+                for j in range(size):
+                    own = product[i, 2 * size + j] + policy.network.bias[layer, j]
+                    new = gates[i, 2 * size + j] + gates[i, j] * own
+                    new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
+                    hidden[k, first + j] = block[i, j] = new + gates[i, size + j] * (block[i, j] - new)
         np.dot(block[:number], policy.network.head, logits[:number])
         for i in range(number):
             k = which[begin + i]
@@ -306,10 +316,10 @@ class Room(NamedTuple):
         alive: `[K]`: whether the budget allows the plan.
         score: float64 `[K]`.
         cell, observed: int64 `[K]`: where it is, and the state whose context the prior is given.
-        code, hidden: `[K]` and `[K, H]`: the prior's state.
+        code, hidden: `[K]` and `[K, layers * H]`: the prior's state.
         weights, probs: `[K, A]`: its predictions, see `_evaluate`.
         which: int64 `[K]`: the plans that are stepped.
-        block: float32: `BLOCK` rows of hidden states, products, gates and logits.
+        block: float32: `BLOCK` rows of one layer's states, products, gates and logits.
     """
 
     alive: Array
@@ -522,7 +532,7 @@ def _search_all(
     if any(np.isnan(part).any() for part in (policy.probs, policy.by_context, *policy.network)):
         raise ValueError("prior: its logits are NaN")
     logits, hidden = Stepper(planner.prior).start_in(world, state)
-    size, most = len(policy.network.recurrent), batch * length * (1 + actions)
+    (layers, size, _), most = policy.network.recurrent.shape, batch * length * (1 + actions)
     room, number = max(min(DRAWS // most, 2 * planner.num_plans), 1), 0
     shape = (batch, min(room, steps) + 1, actions)
     nodes = Nodes(
@@ -531,7 +541,7 @@ def _search_all(
     )  # fmt: skip
     known = Known(
         np.empty(shape[:2], np.int64), np.empty(shape[:2]), np.empty(shape[:2], np.int64),
-        np.empty((*shape[:2], size), np.float32), np.ones(batch, np.int64), np.full(batch, steps),
+        np.empty((*shape[:2], layers * size), np.float32), np.ones(batch, np.int64), np.full(batch, steps),
         np.zeros(batch, np.bool_),
     )  # fmt: skip
     nodes.child[:, 0], nodes.visits[:, 0], nodes.total[:, 0], nodes.closed[:, 0] = 0, 0, 0, False
@@ -540,7 +550,7 @@ def _search_all(
     known.code[:, 0] = int(planner.prior.start_node) if isinstance(planner.prior, HistoryPrior) else 0
     if isinstance(planner.prior, GRUPrior):
         first = planner.prior.input_size
-        known.hidden[:, 0] = hidden[:, first : first + size].numpy()
+        known.hidden[:, 0] = hidden[:, first : first + layers * size].numpy()
     moves = Moves(
         world.next_state.view(-1).numpy(), world.reward.reshape(-1).numpy(), world.reward.dim() == 2, world.num_states
     )
@@ -553,7 +563,7 @@ def _search_all(
         np.empty(batch, np.int64), np.empty((batch, length), np.int64), np.empty((batch, length), np.int64),
         np.empty(batch, np.int64), np.empty(length, np.int64),
     )  # fmt: skip
-    rooms = [_room(min(each, batch - begin), size, actions) for begin in range(0, batch, each)]
+    rooms = [_room(min(each, batch - begin), layers, size, actions) for begin in range(0, batch, each)]
     results = list[tuple[Tensor, ...]]()
     with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
         while not results or number == room:
@@ -617,12 +627,12 @@ def _search_shared(
     return len(found.plans), used
 
 
-def _room(number: int, size: int, actions: int) -> Room:
-    """Room for so many plans, hidden units and actions."""
+def _room(number: int, layers: int, size: int, actions: int) -> Room:
+    """Room for so many plans, layers, hidden units of each, and actions."""
     rows = BLOCK if size else 0
     return Room(
         np.empty(number, np.bool_), np.empty(number), np.empty(number, np.int64), np.empty(number, np.int64),
-        np.empty(number, np.int64), np.empty((number, size), np.float32), np.empty((number, actions), np.float32),
+        np.empty(number, np.int64), np.empty((number, layers * size), np.float32), np.empty((number, actions), np.float32),
         np.empty((number, actions)), np.empty(number, np.int64),
         tuple(np.empty((rows, width), np.float32) for width in (size, 3 * size, 3 * size, actions)),
     )  # fmt: skip

@@ -84,13 +84,15 @@ def _gates(given: Array, rows: Array, hidden: Array, bias: Array, before: Array,
 
 
 class Network(NamedTuple):
-    """A gated recurrent network of one layer, of float32.
+    """A gated recurrent network of float32, of K layers.
 
     Attributes:
-        action: `[A + 1, 3 H]`: what the last action adds to the gates, with their biases.
+        action: `[A + 1, 3 H]`: what the last action adds to the gates of the first layer, with their biases.
         past: `[taps, A + 2, 3 H]`: what each of the last actions adds; the last row, of no action, is 0.
         beyond: `[1, 3 H]`: what is added where there is an action before these; `[0, 3 H]`: nothing.
-        recurrent: `[H, 3 H]`, and `bias [H]` of its last part.
+        recurrent: `[K, H, 3 H]`, and `bias [K, H]` of its last part.
+        above: `[K - 1, H, 3 H]`: what the state of a layer adds to the gates of the next, and `above_bias [K - 1, 3 H]`
+            with all their other biases.
         head: `[H, A]`, and `head_bias [A]`.
     """
 
@@ -99,6 +101,8 @@ class Network(NamedTuple):
     beyond: Array
     recurrent: Array
     bias: Array
+    above: Array
+    above_bias: Array
     head: Array
     head_bias: Array
 
@@ -110,21 +114,27 @@ def advance(network: Network, number: int, states: Array, gates: Array, product:
     Args:
         network: the network.
         number: of plans, the first rows of the arrays.
-        states: `[BLOCK, H]`: the hidden states, which are overwritten.
-        gates: `[BLOCK, 3 H]`: what the inputs add to the gates; overwritten.
+        states: `[K, BLOCK, H]`: the hidden states, which are overwritten.
+        gates: `[BLOCK, 3 H]`: what the inputs add to the gates of the first layer; overwritten.
         product: `[BLOCK, 3 H]`: room.
         logits: `[BLOCK, A]`: gets the logits of the next action.
     """
-    size, actions = states.shape[1], logits.shape[1]
-    np.dot(states[:number], network.recurrent, product[:number])
+    (layers, _, size), actions = states.shape, logits.shape[1]
     # Single numbers are indexed, not rows: numba counts references to each row, which takes as long as all else here.
-    for i in range(number):
-        for j in range(2 * size):
-            gates[i, j] = sigmoid(gates[i, j] + product[i, j])
-        for j in range(size):
-            new = tanh(gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + network.bias[j]))
-            states[i, j] = new + gates[i, size + j] * (states[i, j] - new)
-    np.dot(states[:number], network.head, logits[:number])
+    for layer in range(layers):
+        if layer > 0:
+            np.dot(states[layer - 1][:number], network.above[layer - 1], gates[:number])
+            for i in range(number):
+                for j in range(3 * size):
+                    gates[i, j] += network.above_bias[layer - 1, j]
+        np.dot(states[layer][:number], network.recurrent[layer], product[:number])
+        for i in range(number):
+            for j in range(2 * size):
+                gates[i, j] = sigmoid(gates[i, j] + product[i, j])
+            for j in range(size):
+                new = tanh(gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + network.bias[layer, j]))
+                states[layer, i, j] = new + gates[i, size + j] * (states[layer, i, j] - new)
+    np.dot(states[layers - 1][:number], network.head, logits[:number])
     for i in range(number):
         for a in range(actions):
             logits[i, a] += network.head_bias[a]
@@ -141,19 +151,20 @@ def draw_to_the_end(
     Args:
         network: the network.
         given: float32 `[N, 3 H]`: what is added to the gates at each step; no rows: nothing.
-        hidden: `[N, H]`: before the last action is read.
+        hidden: `[N, K, H]`: before the last action is read.
         line: int64 `[N, before + T]`: the actions up to the last one, A + 1 where there was none; gets the drawn ones.
         uniform: float32 `[T, N]`: what they are drawn with.
         temperature: divides logits.
     """
-    (number, size), (steps, _), actions = hidden.shape, uniform.shape, len(network.head_bias)
+    (number, layers, size), (steps, _), actions = hidden.shape, uniform.shape, len(network.head_bias)
     taps, nothing, before = len(network.past), actions + 1, line.shape[1] - len(uniform)
-    states, logits = np.empty((BLOCK, size), np.float32), np.empty((BLOCK, actions), np.float32)
+    states, logits = np.empty((layers, BLOCK, size), np.float32), np.empty((BLOCK, actions), np.float32)
     gates, product = np.empty((BLOCK, 3 * size), np.float32), np.empty((BLOCK, 3 * size), np.float32)
     scale = float32(temperature)
     for begin in range(0, number, BLOCK):
         rows = min(BLOCK, number - begin)
-        states[:rows] = hidden[begin : begin + rows]
+        for layer in range(layers):
+            states[layer, :rows] = hidden[begin : begin + rows, layer]
         for t in range(steps):
             at = before + t - 1
             for i in range(rows):

@@ -132,17 +132,18 @@ class GRUPrior(NeuralPrior):
         fast = compiled("neuroprior.priors.neural.compiled_gru") if able and self.is_plain else None
         if fast is None or not fast.on_one_thread(size, kinds):
             return None
-        last, hidden, recent = state.split([self.input_size, size, self.lags - 1], 1)
+        last, hidden, recent = state.split([self.input_size, self.num_layers * size, self.lags - 1], 1)
         given = self.context_gates(last) if self.takes_context else state.new_empty(0, 3 * size)
         line = torch.cat([recent.long(), action[:, None], action.new_empty(number, steps)], 1)
+        hidden = hidden.unflatten(1, (self.num_layers, size))
         arrays = (x.detach().contiguous().numpy() for x in (given, hidden, line, uniform))
         fast.draw_to_the_end(fast.Network(*self.tables()), *arrays, float(temperature))
         return line[:, self.lags :]
 
     @property
     def is_plain(self) -> bool:
-        """Whether its predictions can be computed from `tables`: one layer, and no module replaced or hooked."""
-        made = type(self) is GRUPrior and self.num_layers == 1 and self.window != 0
+        """Whether its predictions can be computed from `tables`: no module is replaced or hooked."""
+        made = type(self) is GRUPrior and self.window != 0
         whole = made and (type(self.embedding), type(self.gru), type(self.head)) == (Embedding, nn.GRU, nn.Linear)
         return whole and not any(part._forward_hooks or part._forward_pre_hooks for part in self.modules())
 
@@ -152,13 +153,15 @@ class GRUPrior(NeuralPrior):
 
     def tables(self) -> tuple[Any, ...]:
         """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates."""
-        weight, recurrent, bias, recurrent_bias = self.gru.all_weights[0]
         size, embedding = self.hidden_size, self.embedding
-        both = bias + torch.cat([recurrent_bias[: 2 * size], bias.new_zeros(size)])
+        inputs, recurrent, biases, own = (torch.stack(part) for part in zip(*self.gru.all_weights, strict=True))
+        # The last part of a layer's own biases is left: the reset gate lets a share of it into the new state.
+        biases = biases + torch.cat([own[:, : 2 * size], torch.zeros_like(own[:, 2 * size :])], 1)
         past, beyond = embedding.of_past(self.window)
+        first, above = inputs[0].T, inputs[1:].mT
         parts = (
-            embedding.action.weight @ weight.T + both, past @ weight.T, beyond @ weight.T,
-            recurrent.T, recurrent_bias[2 * size :], self.head.weight.T, self.head.bias,
+            embedding.action.weight @ first + biases[0], past @ first, beyond @ first,
+            recurrent.mT, own[:, 2 * size :], above, biases[1:], self.head.weight.T, self.head.bias,
         )  # fmt: skip
         return tuple(x.detach().float().contiguous().numpy() for x in parts)
 
