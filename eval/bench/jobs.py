@@ -161,12 +161,21 @@ def _against_generate(number: int, length: int, batches: list[int], goal: float)
 
 
 def sample_gru(scale: float) -> Job:
-    """Long plans of a GRU."""
+    """Long plans of a small GRU."""
+    return _sample_gru("GRU", 64, 1, scale)
+
+
+def sample_gru_two(scale: float) -> Job:
+    """Long plans of a GRU as `fit` makes it for long plans."""
+    return _sample_gru("GRU of two layers of 128", 128, 2, scale)
+
+
+def _sample_gru(name: str, size: int, num_layers: int, scale: float) -> Job:
     number = scaled(8192, scale)
     return Job(
-        f"sample {number:,} plans of length 64, GRU",
-        lambda device: partial(GRUPrior(4, lags=1).to(device).sample, number, 64),
-        (Peer("plain PyTorch", lambda: partial(peers.PlainGRU(4).eval().sample, number, 64), 3),),
+        f"sample {number:,} plans of length 64, {name}",
+        lambda device: partial(GRUPrior(4, size, num_layers, lags=1).to(device).sample, number, 64),
+        (Peer("plain PyTorch", lambda: partial(peers.PlainGRU(4, size, num_layers).eval().sample, number, 64), 3),),
     )
 
 
@@ -489,7 +498,7 @@ def simulations(planner: MCTSPlanner, world: TabularWorld, state: Tensor) -> int
 JOBS: dict[str, Callable[[float], Job]] = {
     make.__name__: make
     for make in (
-        *(sample_short, sample_long, sample_gru, sample_beside, sample_beside_cube),
+        *(sample_short, sample_long, sample_gru, sample_gru_two, sample_beside, sample_beside_cube),
         *(sample_combined, fit_combined, sample_markov, fit_markov, fit_tree),
         *(evaluate, table_1, train, shoot, decide, search_tiles, control),
     )

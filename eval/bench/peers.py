@@ -70,11 +70,11 @@ def torch_rollout(next_state: Tensor, reward: Tensor, state: Tensor, plans: Tens
 class PlainGRU(nn.Module):
     """Actions embedded, `nn.GRU`, a linear head: the prior that one writes first."""
 
-    def __init__(self, num_actions: int, hidden_size: int = 64) -> None:
+    def __init__(self, num_actions: int, hidden_size: int = 64, num_layers: int = 1) -> None:
         super().__init__()
         self.num_actions = num_actions
         self.embedding = nn.Embedding(num_actions + 1, hidden_size)
-        self.gru = nn.GRU(hidden_size, hidden_size, batch_first=True)
+        self.gru = nn.GRU(hidden_size, hidden_size, num_layers, batch_first=True)
         self.head = nn.Linear(hidden_size, num_actions)
 
     def forward(self, plans: Tensor) -> Tensor:

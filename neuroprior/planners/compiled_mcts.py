@@ -632,8 +632,8 @@ def _room(number: int, layers: int, size: int, actions: int) -> Room:
     rows = BLOCK if size else 0
     return Room(
         np.empty(number, np.bool_), np.empty(number), np.empty(number, np.int64), np.empty(number, np.int64),
-        np.empty(number, np.int64), np.empty((number, layers * size), np.float32), np.empty((number, actions), np.float32),
-        np.empty((number, actions)), np.empty(number, np.int64),
+        np.empty(number, np.int64), np.empty((number, layers * size), np.float32),
+        np.empty((number, actions), np.float32), np.empty((number, actions)), np.empty(number, np.int64),
         tuple(np.empty((rows, width), np.float32) for width in (size, 3 * size, 3 * size, actions)),
     )  # fmt: skip
 

@@ -39,7 +39,7 @@ class MCTSPlanner(PriorPlanner):
         temperature: divides the prior's logits.
         compile: search by compiled loops where numba is installed, on the CPU: the whole search in a deterministic
             `TabularWorld` where all actions are legal, without `value`, with a prior that is uniform, counts histories
-            or is a GRU of one layer; otherwise selection and backup alone. They find the same, but for rounding.
+            or is a GRU; otherwise selection and backup alone. They find the same, but for rounding.
         **goal: objective, discount, value, any_prefix: see `Planner`. With `any_prefix` the score of a simulation is
             that of its best prefix.
 

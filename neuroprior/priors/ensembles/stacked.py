@@ -14,7 +14,7 @@ from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
 from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.neural.gru import gru_sequence
-from neuroprior.priors.neural.neural import NeuralPrior, context_embedding
+from neuroprior.priors.neural.neural import NeuralPrior, Sizes, context_embedding
 from neuroprior.priors.prior import Prior
 
 LEAST = -6.0
@@ -58,8 +58,8 @@ class StackedPrior(Prior):
         depth: of the context trees among them; with contexts, one of two trees takes the context.
         num_contexts: number of context indices, for a prior that takes an index.
         seed: draws the initial weights.
-        num_layers: of the network; None: chosen by `fit` for its first plans (or parts of a single one), see
-            `neuroprior.priors.neural.Sizes`.
+        num_layers: of the network; None: chosen by `fit` for its first plans (or parts of a single one): one with
+            contexts, else see `neuroprior.priors.neural.Sizes`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -286,6 +286,11 @@ class Mixer(NeuralPrior):
         own = {"num_experts": self.num_experts, "hidden_size": self.width, "contexts": self.contexts}
         own |= {"num_layers": self.num_layers}
         return own | {"num_actions": self.num_actions, "dropout": self.dropout, "seed": 0}
+
+    def sizes_for(self, plans: Plans) -> Sizes:
+        """As for other networks, but of one layer where the context is known: a second one gains nothing there."""
+        sizes = super().sizes_for(plans)
+        return sizes if self.contexts is None else sizes._replace(layers=1)
 
     def build(self) -> None:
         width, forecasts = self.width, self.num_experts * self.num_actions
