@@ -1,6 +1,7 @@
 """Checks of arguments, each of which names the argument that is wrong."""
 
 import os
+from collections.abc import Sequence
 from functools import cache
 from numbers import Real
 from typing import TypeGuard
@@ -72,6 +73,24 @@ def check_share(name: str, share: object) -> None:
     """Raise ValueError, naming the argument, unless it is a number from 0 to 1."""
     if not is_number(share) or not 0 <= share <= 1:
         raise ValueError(f"{name}: a number from 0 to 1 is expected, not {share!r}")
+
+
+def check_same_names(
+    name: str, own: Sequence[str] | None, given: Sequence[str] | None, where: str, whose: str, remedy: str = ""
+) -> None:
+    """Raise ValueError where both have names and these are not the same, in the same order.
+
+    Without names the numbers are taken to mean the same.
+
+    Args:
+        name: of the argument, such as "action_names".
+        own, given: the names that are expected, and those that were found.
+        where, whose: what has the found names, and what the expected ones.
+        remedy: the end of the message.
+    """
+    if own is not None and given is not None and tuple(own) != tuple(given):
+        remedy = remedy or "number them alike"
+        raise ValueError(f"{name}: {', '.join(given)} in {where}, {', '.join(own)} in {whose}; {remedy}")
 
 
 def check_level(level: object) -> None:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from neuroprior._checks import is_number
+from neuroprior._checks import check_count, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.worlds.tabular import TabularWorld, check_tabular
 
@@ -70,8 +70,8 @@ def q_learning(
     """
     goal = _check_goal(world, goal)
     _require(world.num_states > 1, "world", "a cell that is not the goal", "the goal alone")
-    _require(is_number(num_agents) and num_agents >= 1, "num_agents", "at least 1", num_agents)
-    _require(is_number(steps) and steps >= 0, "steps", "a number that is not negative", steps)
+    check_sizes(num_agents=num_agents)
+    check_count("steps", steps, 0)
     _require(is_number(step_size) and 0 < step_size <= 1, "step_size", "a number above 0 and at most 1", step_size)
     _require(is_number(discount) and 0 < discount < 1, "discount", "a number above 0 and below 1", discount)
     _require(
@@ -147,7 +147,8 @@ def value_iteration(
         >>> value_iteration(world, discount=0.5).round(decimals=2).tolist()
         [[2.0, 2.0]]
     """
-    _require(sweeps is None or (is_number(sweeps) and sweeps >= 0), "sweeps", "a number that is not negative", sweeps)
+    if sweeps is not None:
+        check_count("sweeps", sweeps, 0)
     _require(is_number(tolerance) and tolerance > 0, "tolerance", "a positive number", tolerance)
     _require(is_number(discount) and 0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
     if goal is not None:
@@ -203,7 +204,7 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
     world.check_state(state)
     goal = _check_goal(world, goal)
     _require(not world.stochastic, "world", "a deterministic one", "a stochastic one")
-    _require(length >= 0, "length", "a number of steps that is not negative", length)
+    check_count("length", length, 0)
     cells = torch.arange(world.num_states, device=world.device)
     ends, legal = cells == goal, world.legal_actions(cells)
     for _ in range(length):
@@ -236,7 +237,7 @@ def tile_approximation(values: Tensor, coordinates: Tensor, tile_size: float, nu
     """
     _check_fit(values, coordinates)
     _require(is_number(tile_size) and 0 < tile_size < math.inf, "tile_size", "a positive, finite number", tile_size)
-    _require(num_tilings >= 1, "num_tilings", "at least 1", num_tilings)
+    check_sizes(num_tilings=num_tilings)
     place = (coordinates - coordinates.amin(0)).double().cpu() / tile_size
     tilings = [(place + tiling / num_tilings).floor() for tiling in range(num_tilings)]
     tiles = [torch.unique(tiling, dim=0, return_inverse=True)[1] for tiling in tilings]
@@ -278,8 +279,9 @@ def network_approximation(
         torch.Size([1, 4])
     """
     _check_fit(values, coordinates)
-    for name, number in (("hidden_size", hidden_size), ("steps", steps), ("learning_rate", learning_rate)):
-        _require(is_number(number) and 0 < number < math.inf, name, "a positive, finite number", number)
+    check_sizes(hidden_size=hidden_size, steps=steps)
+    finite = is_number(learning_rate) and 0 < learning_rate < math.inf
+    _require(finite, "learning_rate", "a positive, finite number", learning_rate)
     generator = generator_on(generator, values.device)
     target, mean, scale = _standardised(values.detach())
     inputs = _standardised(coordinates.to(values.device).T)[0].T.expand(len(values), -1, -1)

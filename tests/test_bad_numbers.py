@@ -40,7 +40,7 @@ from neuroprior.analysis import (
 )
 from neuroprior.planners import AStarPlanner, CrossEntropyPlanner, ForagingOracle, HorizonPlanner, expected_score
 from neuroprior.planners.continuous import ICEMPlanner, MPPIPlanner, ShootingPlanner
-from neuroprior.plans import all_plans, folds, in_parts
+from neuroprior.plans import VectorPlans, all_plans, folds, in_parts
 from neuroprior.priors import (
     CombinedPrior,
     NoisePrior,
@@ -54,13 +54,14 @@ from neuroprior.priors import (
 from neuroprior.report import report
 from neuroprior.sampling import most_probable, sample_distinct
 from neuroprior.training import Settings
-from neuroprior.values import q_learning, value_iteration
+from neuroprior.values import can_reach, q_learning, tile_approximation, value_iteration
 from neuroprior.worlds import four_rooms, maze
 from tests.support.sources import refuses, seeded
 
 PLANS = Plans(torch.randint(3, (8, 6), generator=seeded(0)), 3)
 UNIFORM, WORLD, STATE = UniformPrior(4), gridworld(4, 4), torch.tensor([0, 5])
 ENDS = [-1.0], [1.0]
+VECTORS = VectorPlans(torch.zeros(2, 5, 1), *ENDS)
 VALUES, MATRIX = [0.1, 0.4, 0.3, 0.8], np.arange(12.0).reshape(3, 4)
 FRAME = pd.DataFrame({"world": list("aabb"), "value": VALUES})
 NONE_OF_THEM = [nan, True, "1"]
@@ -132,8 +133,12 @@ ORDERS = {
     "depth": [partial(ContextTreePrior, 3)],
     "max_order": [partial(order_selection, PLANS)],
     "skip": [partial(mutual_information, PLANS, 2)],
-    "first": [PLANS.steps],
-    "length": [partial(all_plans, 2)],
+    "first": [PLANS.steps, VECTORS.steps],
+    "stop": [partial(VECTORS.steps, 1)],
+    "length": [partial(all_plans, 2), partial(can_reach, WORLD, STATE, 1)],
+    "sweeps": [partial(value_iteration, WORLD)],
+    "num_tilings": [partial(tile_approximation, torch.rand(1, 4), torch.arange(4)[:, None], 2.0)],
+    "steps": [partial(q_learning, WORLD, 1)],
 }
 SIZES = {
     "num_contexts": [
@@ -210,6 +215,7 @@ def test_lengths_of_motifs(length):
 def test_what_is_in_range_is_taken():
     """Among it numbers of numpy, and the ends of ranges that belong to them."""
     assert MarkovPrior(3, 1, smoothing=np.float32(0.5)).smoothing == 0.5
+    assert VECTORS.steps(1, 9).max_length == 4
     assert SamplingPlanner(UNIFORM, 2, 2, uniform_share=1).uniform_share == 1
     assert GRUPrior(3, hidden_size=4, dropout=0).dropout == 0
     assert SamplingPlanner(UNIFORM, 2, 2, objective="return", discount=1).discount == 1

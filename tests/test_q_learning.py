@@ -123,7 +123,7 @@ def test_progress_is_reported():
         ({"goal": 9}, "goal: a cell from 0 to 8 is expected, not 9"),
         ({"goal": -1}, "goal: a cell"),
         ({"goal": 1.5}, "goal: a cell from 0 to 8 is expected, not 1.5"),
-        ({"num_agents": 0}, "num_agents: at least 1 is expected, not 0"),
+        ({"num_agents": 0}, "num_agents: an integer of at least 1 is expected, not 0"),
         ({"steps": -1}, "steps: "),
         ({"step_size": 0}, "step_size: "),
         ({"step_size": 1.5}, "step_size: a number above 0 and at most 1 is expected, not 1.5"),

@@ -261,7 +261,6 @@ class Contest:
             "seconds": [timed[number][0] if number in timed else None for number in budgets],
             "model_steps": [timed[number][1] if number in timed else None for number in budgets],
             "bits": score(one.label, one.prior, held_out).bits_per_action().mean,
-            "actions": int(held_out.mask().sum()),
         }
 
     def curriculum_entry(self, one: Contestant, length: int) -> dict[str, Any]:
@@ -290,11 +289,9 @@ class Contest:
         begin = perf_counter()
         decision = ExhaustivePlanner(self.task.depth, **self.task.scoring).plan(world, starts.state, self.generator)
         seconds = (perf_counter() - begin) / self.settings.starts
-        named = {"planner": "exhaustive", "prior": None, "context": "none", "rounds": 0, "depth": self.task.depth}
+        named = {"planner": "exhaustive", "prior": None, "context": "none", "rounds": 0}
         reached = {name: [value] for name, value in starts.reached(decision.score).items()}
-        return [
-            named | reached | {"model_steps": [decision.model_steps], "seconds": [seconds], "bits": None, "actions": 0}
-        ]
+        return [named | reached | {"model_steps": [decision.model_steps], "seconds": [seconds], "bits": None}]
 
 
 def transitions(prior: Prior, world: World, generator: torch.Generator) -> list[list[float]]:

@@ -63,11 +63,6 @@ def parted(name: str) -> tuple[str, int | None]:
     return (base, int(number)) if base and number.isdecimal() and int(number) else (name, None)
 
 
-def sees_state(name: str) -> bool:
-    """Whether a prior takes the observations."""
-    return name == CLONING
-
-
 def fitted(name: str, plans: VectorPlans, horizon: int, generator: torch.Generator) -> VectorPrior:
     """The prior of a name, fitted to executed plans.
 

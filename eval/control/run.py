@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from eval.control.priors import CLONING, NONE, fitted, sees_state
+from eval.control.priors import CLONING, NONE, fitted
 from eval.control.tasks import TASKS, Condition
 from neuroprior.planners import Control, ICEMPlanner, MPPIPlanner, ShootingPlanner, VectorPlanner, control
 from neuroprior.plans import VectorPlans
@@ -246,7 +246,7 @@ def scoring_run(run: Scoring, settings: ControlSettings) -> dict[str, Any]:
     began = process_time()
     prior = fitted(run.prior, run.plans, task.horizon, generator_of(settings, run.seed, run.prior))
     seconds = process_time() - began
-    held_out = run.held_out if sees_state(run.prior) else run.held_out.without_context()
+    held_out = run.held_out if run.prior == CLONING else run.held_out.without_context()
     with torch.no_grad():
         nats = float(prior.log_prob(held_out).sum() / held_out.mask().sum())
     explained = getattr(prior, "explained", ())

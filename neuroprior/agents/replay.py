@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from neuroprior._checks import is_number
+from neuroprior._checks import check_same_names, is_number
 from neuroprior.plans import Plans
 
 
@@ -46,7 +46,7 @@ class Replay:
         """Store more plans.
 
         Raises:
-            ValueError: they do not have as many actions as those before, or another kind of context.
+            ValueError: they do not have the actions of those before, or another kind of context.
         """
         if self.plans is None:
             self.plans = plans
@@ -57,6 +57,8 @@ class Replay:
                 f"plans: {before.max_length} steps of {before.num_actions} actions are expected, as in the stored"
                 f" plans, not {plans.max_length} of {plans.num_actions}"
             )
+        names = before.action_names, plans.action_names
+        check_same_names("action_names", *names, "the plans", "the stored ones")
         kinds = [None if one.context is None else (one.context.dtype, one.context.shape[1:]) for one in (before, plans)]
         if kinds[0] != kinds[1]:
             raise ValueError("plans: their context is of another kind than that of the stored plans")

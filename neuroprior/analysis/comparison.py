@@ -82,14 +82,17 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
         mask: `[N, L]` bool: the actions that count; None: all.
 
     Raises:
-        ValueError: fewer than two actions count, or bits of another shape or that are NaN.
+        ValueError: fewer than two actions count, bits of another shape or that are NaN, or a mask of another shape or
+            with actions behind the end of a plan.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2], [2, 1, 0]]), 3)
         >>> score_bits("uniform", "past actions", action_bits(UniformPrior(3), plans), plans).actions.tolist()
         [3.0, 3.0]
     """
-    mask = (plans.mask() if mask is None else mask).cpu()
+    mask, within = (plans.mask() if mask is None else mask).cpu(), plans.mask().cpu()
+    if mask.dtype != torch.bool or mask.shape != within.shape or bool((mask & ~within).any()):
+        raise ValueError(f"mask: bool of shape {list(within.shape)}, False behind the end of a plan, is expected")
     if bits.shape != mask.shape or bool(bits[mask].isnan().any()):
         raise ValueError(f"bits: numbers of shape {list(mask.shape)} are expected, not NaN, and not {list(bits.shape)}")
     unit = units(plans, mask)[mask].unique(return_inverse=True)[1]

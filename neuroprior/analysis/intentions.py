@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_same_names, check_share, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.priors.matching import match_plans
+from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.scoring import plan_frame
 from neuroprior.sampling import sample_in_world
@@ -89,10 +89,9 @@ def infer(
         'left'
     """
     named = _named(priors)
-    observed = _observed(plans, context, next(iter(named.values())))
-    if isinstance(switch, bool) or not isinstance(switch, int | float) or not 0 <= switch <= 1:
-        raise ValueError(f"switch: a probability from 0 to 1 is expected, not {switch!r}")
-    if isinstance(power, bool) or not isinstance(power, int | float) or not 0 <= power < inf:
+    observed = _observed(plans, context, named)
+    check_share("switch", switch)
+    if not is_number(power) or not 0 <= power < inf:
         raise ValueError(f"power: a finite number of at least 0 is expected, not {power!r}")
     batch, length = len(observed), observed.max_length
     prior_log = _log_weights(weights, batch, len(named))
@@ -171,6 +170,9 @@ def forecast(
     named = _named(priors)
     check_sizes(length=length, num_plans=num_plans)
     world.check_state(state)
+    if isinstance(posterior, Posterior) and list(posterior.names) != list(named):
+        names = ", ".join(named), ", ".join(posterior.names)
+        raise ValueError(f"posterior: that of the priors {names[0]} is expected, not of {names[1]}")
     probs = posterior.log_probs[:, -1].exp() if isinstance(posterior, Posterior) else torch.as_tensor(posterior)
     probs = probs.double().cpu()
     if probs.shape != (len(state), len(named)):
@@ -183,6 +185,7 @@ def forecast(
     targets = torch.as_tensor(targets, device=state.device)
     if targets.dim() != state.dim() or targets.shape[1:] != state.shape[1:]:
         raise ValueError(f"targets: states of shape {['S', *state.shape[1:]]} are expected, not {list(targets.shape)}")
+    world.check_state(targets)
     generator = generator_on(generator, state.device)
     shares = []
     for prior in named.values():
@@ -209,9 +212,13 @@ def _named(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:
     return named
 
 
-def _observed(plans: Plans | Tensor, context: Tensor | None, prior: Prior) -> Plans:
+def _observed(plans: Plans | Tensor, context: Tensor | None, priors: dict[str, Prior]) -> Plans:
     """The plans that were observed, without an end symbol."""
     if not isinstance(plans, Plans):
+        first, prior = next(iter(priors.items()))
+        for name, other in priors.items():  # the same numbers are given to all
+            names = learned_names(prior), learned_names(other)
+            check_same_names("action_names", *names, name, first, "give the actions as Plans with names")
         known = prior.num_actions - (prior.end is not None)
         return Plans(torch.as_tensor(plans), known, context=context)
     if context is not None:

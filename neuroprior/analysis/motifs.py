@@ -13,6 +13,7 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior.analysis.comparison import units
 from neuroprior.analysis.flat import FlatPlans, ranks
+from neuroprior.analysis.statistics import holm
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 
@@ -295,11 +296,7 @@ def _listed(found: list[_Tested], tests: int, top: int | None) -> list[Motif]:
     """The first `top` of all, in the order that `motifs` promises."""
     columns = list(zip(*found, strict=True))[1:]
     count, expected, low, high, p_value = (torch.cat(values).cpu().numpy() for values in columns)
-    corrected = np.empty_like(p_value)
-    order = np.argsort(p_value, kind="stable")
-    # Holm's procedure; the tests that are not listed have the largest p-values.
-    steps = p_value[order] * (tests - np.arange(len(order)))
-    corrected[order] = np.minimum(np.maximum.accumulate(steps), 1)
+    corrected = holm(p_value, tests)
     over, clear = count > expected, corrected <= LEVEL
     # In large data many p-values are 0; the deviance of a Poisson count orders them still.
     deviance = xlogy(count, count / expected) - (count - expected)

@@ -282,7 +282,7 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
     return Difference(ratio, ratio - half, ratio + half, float(2 * special.stdtr(units - 1, -abs(ratio) / error)))
 
 
-def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def holm(p_values: ArrayLike, tests: int | None = None) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """P-values corrected for the number of tests: Holm's step-down Bonferroni procedure (Holm 1979, section 3).
 
     The tests may depend on each other in any way: if all null hypotheses are true, any corrected p-value is below 0.05
@@ -290,12 +290,13 @@ def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
     Args:
         p_values: `[M]`, between 0 and 1; M may be 0.
+        tests: how many there were in all, at least M, where these are the smallest p-values; None: M.
 
     Returns:
         `[M]` float64, in the order given; each at least its own p-value and at most 1.
 
     Raises:
-        ValueError: another shape, or a value that is no probability.
+        ValueError: another shape, a value that is no probability, or fewer tests than values.
 
     Example:
         >>> holm([0.01, 0.04, 0.03]).tolist()
@@ -307,9 +308,12 @@ def holm(p_values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     wrong = np.flatnonzero(~((values >= 0) & (values <= 1)))
     if len(wrong):
         raise ValueError(f"p_values[{wrong[0]}]: a probability between 0 and 1 is expected, not {values[wrong[0]]}")
+    tests = len(values) if tests is None else tests
+    if tests < len(values):
+        raise ValueError(f"tests: at least {len(values)}, the number of p-values, is expected, not {tests}")
     order = np.argsort(values, kind="stable")
     corrected = np.empty_like(values)
-    corrected[order] = np.minimum(np.maximum.accumulate(values[order] * np.arange(len(values), 0, -1)), 1)
+    corrected[order] = np.minimum(np.maximum.accumulate(values[order] * (tests - np.arange(len(values)))), 1)
     return corrected
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_same_names, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.analysis.statistics import holm
 from neuroprior.plans import Plans
@@ -131,6 +131,8 @@ def two_sample_tests(
         raise ValueError(
             f"generated: {real.num_actions} actions are expected, as in the real plans, not {generated.num_actions}"
         )
+    names = real.action_names, generated.action_names
+    check_same_names("action_names", *names, "the generated plans", "the real ones")
     draw = generator_on(generator, "cpu")
     kinds = [
         _drawn(name, plans, max_plans, max_actions, draw) for name, plans in (("real", real), ("generated", generated))

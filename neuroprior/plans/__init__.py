@@ -18,8 +18,8 @@ from neuroprior.plans.plans import (
     check_context,
     check_patterns,
     has_patterns,
-    is_per_step,
 )
+from neuroprior.plans.sequences import is_per_step
 from neuroprior.plans.tables import Columns, Missing
 from neuroprior.plans.vector_plans import VectorPlans
 

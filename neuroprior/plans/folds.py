@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_seed, check_sizes
-from neuroprior.plans.plans import Plans, check_are_plans, is_per_step
+from neuroprior.plans.plans import Plans, check_are_plans
+from neuroprior.plans.sequences import is_per_step
 
 FEWEST_UNITS = 2
 """Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from neuroprior._checks import check_sizes
-from neuroprior.plans.plans import Plans, durations_of, is_per_step
+from neuroprior.plans.plans import Plans, durations_of
+from neuroprior.plans.sequences import is_per_step
 
 QUARTILES = 1.349
 """Standard deviations between the quartiles of a normal distribution."""

@@ -12,7 +12,7 @@ from torch.nn import functional
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.rows import check_readable, rows_of
-from neuroprior.plans.sequences import Sequences
+from neuroprior.plans.sequences import Sequences, is_per_step
 from neuroprior.plans.tables import Columns, Missing, fields_of
 
 MOST_BITS = 48
@@ -329,34 +329,6 @@ class Plans(Sequences):
         """The same plans without their context."""
         return self if self.context is None else replace(self, context=None, context_names=None)
 
-    def steps(self, first: int = 0, stop: int | None = None) -> "Plans":
-        """Actions `first` to `stop` - 1 of each plan, with what belongs to them; shorter plans have fewer, or none.
-
-        Args:
-            first: how many actions of each plan are left out at its beginning, at least 0.
-            stop: the number of the first action that is left out at the end; None: none is.
-
-        Raises:
-            ValueError: `first` is negative, or `stop` is less than `first`.
-        """
-        check_count("first", first, 0)
-        if stop is not None:
-            check_count("stop", stop, 0)
-        stop = self.max_length if stop is None else min(stop, self.max_length)
-        if stop < min(first, self.max_length):
-            raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
-
-        def cut(values: Tensor | None) -> Tensor | None:
-            return None if values is None else values[:, first:stop]
-
-        return replace(
-            self,
-            actions=self.actions[:, first:stop],
-            lengths=None if self.lengths is None else (self.lengths - first).clamp(0, max(stop - first, 0)),
-            context=cut(self.context) if is_per_step(self.context) else self.context,
-            durations=cut(self.durations),
-        )
-
 
 def check_are_plans(plans: object) -> None:
     """Raise ValueError for what is not `Plans`."""
@@ -434,23 +406,6 @@ def durations_of(plans: Plans) -> Tensor:
             "durations: these plans have none; give Plans(durations=), or a file with start and stop times"
         )
     return plans.durations
-
-
-def is_per_step(context: Tensor | None) -> bool:
-    """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
-
-    The patterns `[N, F]` of one state each look like indices per step: callers that expect patterns check for these
-    first.
-
-    Example:
-        >>> (
-        ...     is_per_step(torch.zeros(4, 5, dtype=torch.long)),
-        ...     is_per_step(torch.zeros(4, dtype=torch.long)),
-        ...     is_per_step(None),
-        ... )
-        (True, False, False)
-    """
-    return context is not None and (context.dim() == 3 or (is_integer(context) and context.dim() == 2))
 
 
 def has_patterns(context: Tensor | None) -> bool:

@@ -2,13 +2,14 @@
 
 import hashlib
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from numbers import Real
 from typing import Self
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import is_number
+from neuroprior._checks import check_count, is_integer, is_number
 from neuroprior._random import generator_on
 
 
@@ -56,9 +57,28 @@ class Sequences(ABC):
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The plans at `index` (a slice, integers or a bool mask)."""
 
-    @abstractmethod
     def steps(self, first: int = 0, stop: int | None = None) -> Self:
-        """Actions `first` to `stop` - 1 of each plan, with what belongs to them."""
+        """Actions `first` to `stop` - 1 of each plan, with what belongs to them; shorter plans have fewer, or none.
+
+        Args:
+            first: how many actions of each plan are left out at its beginning, at least 0.
+            stop: the number of the first action that is left out at the end; None: none is.
+
+        Raises:
+            ValueError: `first` is negative, or `stop` is less than `first`.
+        """
+        check_count("first", first, 0)
+        if stop is not None:
+            check_count("stop", stop, 0)
+        stop = self.max_length if stop is None else min(stop, self.max_length)
+        if stop < min(first, self.max_length):
+            raise ValueError(f"stop: at least {first}, the first action, is expected, not {stop}")
+        each = ["actions", "durations", *(["context"] if is_per_step(self.context) else [])]
+        parts = {name: getattr(self, name, None) for name in each}
+        cut = {name: values[:, first:stop] for name, values in parts.items() if values is not None}
+        if self.lengths is not None:
+            cut["lengths"] = (self.lengths - first).clamp(0, max(stop - first, 0))
+        return replace(self, **cut)  # type: ignore[type-var]
 
     def split(self, validation: float = 0.1, generator: torch.Generator | None = None) -> tuple[Self, Self]:
         """Split at random into plans for training and plans for validation; groups stay together.
@@ -90,6 +110,23 @@ class Sequences(ABC):
         chosen[order[:held_out]] = True
         index = chosen[unit].to(self.actions.device)
         return self[~index], self[index]
+
+
+def is_per_step(context: Tensor | None) -> bool:
+    """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
+
+    The patterns `[N, F]` of one state each look like indices per step: callers that expect patterns check for these
+    first.
+
+    Example:
+        >>> (
+        ...     is_per_step(torch.zeros(4, 5, dtype=torch.long)),
+        ...     is_per_step(torch.zeros(4, dtype=torch.long)),
+        ...     is_per_step(None),
+        ... )
+        (True, False, False)
+    """
+    return context is not None and (context.dim() == 3 or (is_integer(context) and context.dim() == 2))
 
 
 def check_validation(share: object) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from neuroprior._checks import is_number
 from neuroprior.plans.columns import (
     Column,
     Floats,
@@ -311,7 +312,7 @@ def fields_of(
     """
     if missing not in MISSING:
         raise ValueError(f"missing: one of {', '.join(MISSING)} is expected, not {missing!r}")
-    if max_gap is not None and (not isinstance(max_gap, int | float) or not 0 <= max_gap < np.inf):
+    if max_gap is not None and (not is_number(max_gap) or not 0 <= max_gap < np.inf):
         raise ValueError(f"max_gap: a time of at least 0 is expected, not {max_gap!r}")
     if not isinstance(merge_repeats, bool | np.bool_):
         raise ValueError(f"merge_repeats: True or False is expected, not {merge_repeats!r}")

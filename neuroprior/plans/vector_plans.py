@@ -134,23 +134,6 @@ class VectorPlans(Sequences):
         """The same plans without their context."""
         return self if self.context is None else replace(self, context=None)
 
-    def steps(self, first: int = 0, stop: int | None = None) -> "VectorPlans":
-        """Vectors `first` to `stop` - 1 of each plan, with what belongs to them; shorter plans have fewer, or none.
-
-        Raises:
-            ValueError: `first` is negative, or `stop` is less than `first`.
-        """
-        stop = self.max_length if stop is None else min(stop, self.max_length)
-        if first < 0 or stop < min(first, self.max_length):
-            raise ValueError(f"first, stop: 0 <= first <= stop is expected, not {first} and {stop}")
-        each = self.context is not None and self.context.dim() == 3
-        return replace(
-            self,
-            actions=self.actions[:, first:stop],
-            lengths=None if self.lengths is None else (self.lengths - first).clamp(0, max(stop - first, 0)),
-            context=self.context[:, first:stop] if each and self.context is not None else self.context,
-        )
-
     def windows(self, length: int) -> Tensor:
         """All windows of `length` consecutive vectors, `[M, length, D]`, plan by plan in order; M may be 0.
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_range, check_sizes, is_integer
+from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer
 from neuroprior.plans import PastDurations, Plans, check_context, check_patterns, has_patterns, is_per_step
 from neuroprior.priors.saved import SavedModule
 from neuroprior.sampling import ancestral as sampling
@@ -281,12 +281,8 @@ class Prior(SavedModule):
     def _check_scored(self, plans: Plans) -> None:
         self._check_actions(plans)
         for what in ("action_names", "context_names"):
-            own, names = getattr(self, what), getattr(plans, what)
-            if None not in (own, names) and tuple(own) != tuple(names):
-                raise ValueError(
-                    f"{what}: {', '.join(names)} in the plans, {', '.join(own)} in this prior; number them alike"
-                    " (neuroprior.priors.match_plans)"
-                )
+            remedy = "number them alike (neuroprior.priors.match_plans)"
+            check_same_names(what, getattr(self, what), getattr(plans, what), "the plans", "this prior", remedy)
         self.check_context_of(plans)
 
     def sample(

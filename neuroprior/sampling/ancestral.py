@@ -5,7 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_range, is_integer
+from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior._random import generator_on
 from neuroprior._threads import share
 from neuroprior.plans import is_per_step
@@ -245,14 +245,9 @@ def _begun(row: Tensor, draw: Draw, shared: bool, *tensors: Tensor) -> tuple[Pre
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
-    for name, number in (("num_plans", num_plans), ("length", length)):
-        if not isinstance(number, int) or isinstance(number, bool):
-            raise ValueError(f"{name}: an integer is expected, not {number!r}")
-    if num_plans < 0 or length < 0 or batch_size < 1:
-        raise ValueError(
-            "num_plans and length must not be negative and batch_size at least 1,"
-            f" not {num_plans}, {length} and {batch_size}"
-        )
+    check_count("num_plans", num_plans, 0)
+    check_count("length", length, 0)
+    check_sizes(batch_size=batch_size)
     check_temperature(temperature)
 
 

@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from neuroprior._checks import is_integer
+from neuroprior._checks import check_same_names, is_integer
 from neuroprior._threads import one_thread
 from neuroprior.plans import is_per_step
 from neuroprior.sampling.draws import after_end
@@ -182,6 +182,10 @@ def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
         raise ValueError(
             f"prior: it has {prior.num_actions} actions, and the world {world.num_actions}; as many are expected"
         )
+    check_same_names(
+        "action_names", getattr(prior, "action_names", None), world.action_names, "the world", "the prior",
+        "number them alike, or learn from plans without names",
+    )  # fmt: skip
 
 
 def legal_logits(world: World, state: Tensor, logits: Tensor) -> Tensor:

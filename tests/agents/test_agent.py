@@ -395,6 +395,8 @@ def test_damaged_checkpoints(tmp_path):
         ({"retention": 0.0}, "retention"),
         ({"learn_every": "12"}, "learn_every"),
         ({"training": {"max_steps": 5}}, "max_steps"),
+        ({"min_score": float("nan")}, "min_score: a number is expected, not nan"),
+        ({"min_score": "a"}, "min_score: a number is expected, not 'a'"),
         ({"prior": MarkovPrior(3, 1)}, "3 actions, and the world 4"),
     ],
 )

@@ -217,6 +217,9 @@ def test_score_of_bits_with_a_mask(group):
     mask[0, 3] = True
     with refuses("two held-out actions", "not 1"):
         score_bits("it", "actions", surprisal, plans, mask)
+    for wrong in (~plans.mask(), plans.mask().long(), plans.mask()[:1]):
+        with refuses("mask: bool", "behind the end of a plan"):
+            score_bits("it", "actions", surprisal, plans, wrong)
 
 
 def test_minus_is_paired():

@@ -185,6 +185,9 @@ def test_holm_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm(torch.tensor([0.5, 0.9, 0.3])) == pytest.approx([1, 1, 0.9])
     assert holm([]).shape == (0,)
+    assert holm([0.01, 0.005], 4) == pytest.approx([0.03, 0.02])
+    with refuses("tests: at least 2"):
+        holm([0.1, 0.2], 1)
     for wrong, words in (([0.1, 1.1], ["p_values[1]", "1.1"]), ([math.nan], ["p_values[0]"]), ([[0.1]], ["[M]"])):
         with refuses(*words):
             holm(wrong)

@@ -23,8 +23,9 @@ from neuroprior.plans.columns import (
     open_text,
 )
 from neuroprior.plans.io.assembly import assembled
-from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior.plans.plans import Plans
 from neuroprior.plans.rows import check_readable, rows_of
+from neuroprior.plans.sequences import is_per_step
 from neuroprior.plans.tables import Columns, fields_of
 
 ROWS_AT_ONCE = 2**10

@@ -29,7 +29,8 @@ from neuroprior.plans.columns import (
     padded,
 )
 from neuroprior.plans.io.assembly import assembled, renamed
-from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior.plans.plans import Plans
+from neuroprior.plans.sequences import is_per_step
 
 HEADER = ("num_actions", "action_names", "context_names", "group_names", "condition_names", "end")
 LARGEST_FLOAT = float(np.finfo(np.float32).max)

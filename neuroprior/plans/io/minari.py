@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
-from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior.plans.plans import Plans
+from neuroprior.plans.sequences import is_per_step
 
 OURS = "neuroprior"
 """Key of a dataset's metadata under which stands what Minari has no place for."""

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from neuroprior.plans.columns import LARGEST_INTEGER, Integers, check_names
 from neuroprior.plans.io.assembly import assembled
-from neuroprior.plans.plans import Plans, is_per_step
+from neuroprior.plans.plans import Plans
+from neuroprior.plans.sequences import is_per_step
 
 
 def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observations: str | None = "context") -> Plans:

@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_share
+from neuroprior._checks import check_same_names, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
@@ -71,6 +71,11 @@ class MixturePrior(Prior):
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")
+        for name in ("action_names", "context_names"):
+            known = [e for e in made if getattr(e, name) is not None]
+            for expert in known:
+                names = getattr(known[0], name), getattr(expert, name)
+                check_same_names(name, *names, type(expert).__name__, type(known[0]).__name__, "fit them alike")
         given = {(num_contexts, context_size)} - {(None, None)}
         contexts = given | {(e.num_contexts, e.context_size) for e in made if e.takes_context} or {(None, None)}
         if len(contexts) > 1:

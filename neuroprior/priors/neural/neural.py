@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
+from neuroprior._checks import check_count, check_memory, check_same_names, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.prior import Prior
@@ -278,6 +278,9 @@ class NeuralPrior(Prior):
         Raises:
             ValueError: plans that this prior cannot learn from, or too few of them.
         """
+        if isinstance(plans, Plans):
+            names = self.action_names, plans.action_names
+            check_same_names("action_names", *names, "the plans", "those that this prior has learned from")
         plans = self.training_plans(plans)
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:

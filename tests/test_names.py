@@ -1,0 +1,73 @@
+"""Where two things name their actions, they have to name them alike: numbers that mean other actions are refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from neuroprior import GRUPrior, MarkovPrior, Plans, UniformPrior
+from neuroprior.agents.replay import Replay
+from neuroprior.analysis import forecast, infer, two_sample_tests
+from neuroprior.priors import MixturePrior
+from neuroprior.sampling import sample_in_world
+from neuroprior.worlds import gridworld
+
+WORLD = gridworld(4, 4, edges="torus", seed=0)
+NAMES = WORLD.action_names
+assert NAMES is not None
+PLANS = Plans(torch.randint(4, (20, 6), generator=torch.Generator().manual_seed(0)), 4, action_names=NAMES)
+OTHERS = replace(PLANS, action_names=NAMES[::-1])
+UNNAMED = replace(PLANS, action_names=None)
+SHORT = {"max_steps": 2, "progress": False}
+
+
+def learned(plans: Plans) -> MarkovPrior:
+    return MarkovPrior(4, 0).fit(plans)
+
+
+def stored(plans: Plans) -> None:
+    replay = Replay(1.0)
+    replay.add(PLANS)
+    replay.add(plans)
+
+
+USES = {
+    "scored": lambda plans: learned(PLANS).log_prob(plans),
+    "in a world": lambda plans: sample_in_world(learned(plans), WORLD, torch.tensor([0]), 2, 3),
+    "compared": lambda plans: two_sample_tests(PLANS, plans, permutations=9),
+    "stored": stored,
+    "mixed": lambda plans: MixturePrior(4, [learned(PLANS), UniformPrior(4), learned(plans)]),
+    "inferred from numbers": lambda plans: infer([learned(PLANS), learned(plans)], PLANS.actions),
+    "learned further": lambda plans: GRUPrior(4, 4).fit(PLANS, **SHORT).fit(plans, **SHORT),
+}
+
+
+@pytest.mark.parametrize("use", USES)
+def test_other_names_are_refused(use):
+    with pytest.raises(ValueError, match=r"^action_names: .+ in .+, .+ in .+; "):
+        USES[use](OTHERS)
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("plans", [PLANS, UNNAMED], ids=["the same", "none"])
+def test_the_same_names_and_none_are_taken(use, plans):
+    USES[use](plans)
+
+
+def test_named_plans_are_matched_to_each_intention():
+    """As if both had learned from the same numbers."""
+    one, other = learned(PLANS), learned(replace(PLANS, actions=3 - PLANS.actions, action_names=NAMES[::-1]))
+    found = infer([one, other], PLANS)
+    assert found.log_probs[:, -1].exp().allclose(torch.full((20, 2), 0.5, dtype=torch.double))
+
+
+def test_a_forecast_is_of_the_priors_that_were_inferred():
+    priors = {"a": learned(PLANS), "b": UniformPrior(4)}
+    posterior = infer(priors, PLANS[:2])
+    state, targets = torch.tensor([0, 5]), torch.tensor([1])
+    assert forecast(priors, WORLD, state, posterior, 2, 5, targets=targets).shape == (2, 1)
+    with pytest.raises(ValueError, match=r"^posterior: that of the priors b, a is expected, not of a, b"):
+        forecast(dict(reversed(priors.items())), WORLD, state, posterior, 2, 5, targets=targets)
+    for wrong in (16, -1):
+        with pytest.raises(ValueError, match=f"{wrong} is out of range"):
+            forecast(priors, WORLD, state, posterior, 2, 5, targets=torch.tensor([wrong]))
