@@ -13,7 +13,7 @@ COMMANDS = {
     "plans": Command("neuroprior.report.command:plans", "a report on a file of plans (also: neuroprior report)"),
     "mice": Command("eval.mice.command:mice", "whether priors learned from mice in a labyrinth help a planner"),
     "compare": Command("eval.compare.command:compare", "priors, or planners, compared in many worlds at equal budget"),
-    "grow": Command("eval.compare.curriculum:grow", "what priors gain from the horizon curriculum"),
+    "curriculum": Command("eval.compare.curriculum:curriculum", "what priors gain from the horizon curriculum"),
     "depth": Command("eval.compare.depth:depth", "how deep to plan"),
     "search": Command("eval.compare.search:search", "what helps a planner that samples"),
     "live": Command("eval.live.command:live", "priors that learn online while the world changes"),

@@ -1,4 +1,4 @@
-"""`python -m eval grow`: what priors gain from the horizon curriculum, in which they learn from ever longer plans."""
+"""`python -m eval curriculum`: what priors gain from learning in rounds from ever longer plans."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -21,7 +21,7 @@ PRIOR = ["world", "prior", "context"]
 NAMES = {"prior": "prior", "context": "context"}
 
 
-def grow(
+def curriculum(
     worlds: Sequence[WorldName] = tuple(TASKS),
     lengths: Sequence[PositiveInt] | None = None,
     seeds: PositiveInt = 5,
@@ -34,7 +34,7 @@ def grow(
     seed: runs.Seed = 0,
     processes: PositiveInt | None = None,
     dask: str | None = None,
-    out: str = "runs/grow",
+    out: str = "runs/curriculum",
 ) -> None:
     """How much do priors gain by planning with them, learning from those plans, and planning longer?
 
@@ -69,7 +69,9 @@ def grow(
             raise ValueError(f"lengths: more than {depth} is expected first: in {world} all plans of {depth} are tried")
     how = (tuple(kinds), tuple(context), len(longer) or ROUNDS, steps, starts, training_starts, seed)
     settings = Settings((num_plans,), *how, lengths=longer)
-    runs.run_experiment("grow", curriculum_run, curriculum_document, settings, worlds, seeds, out, processes, dask)
+    runs.run_experiment(
+        "curriculum", curriculum_run, curriculum_document, settings, worlds, seeds, out, processes, dask
+    )
 
 
 def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], command: str) -> Document:
@@ -98,7 +100,7 @@ def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
         Section("Tables", tables=tables),
     ]
     gains = gains.merge(gaps[[*PRIOR, "p_value", "p_holm"]], "left", PRIOR)
-    frames = {"grow": rows, "gains": gains, "across": across}
+    frames = {"curriculum": rows, "gains": gains, "across": across}
     return Document(
         "Horizon curriculum",
         lead,
@@ -107,7 +109,7 @@ def curriculum_document(results: Sequence[Mapping[str, Any]], settings: Mapping[
         settings,
         command,
         {"words": [lead]},
-        keys={"grow": "rows"},
+        keys={"curriculum": "rows"},
         former_names=runs.FORMER_NAMES,
     )
 

@@ -22,11 +22,11 @@ HOURS = {
     "modes": "0.2+",
     "options": "0.2",
     "intentions": "0.1",
-    "control": "4.5",
+    "control": "4.5+",
     "macro-actions": "2",
     "agents": "0.5",
     "quality": "1.3",
-    "speed": "0.3",
+    "speed": "0.8+",
 }
 """By page: the hours that it states, on one or two cores; + where it states them for some of its commands only."""
 

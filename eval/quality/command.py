@@ -112,8 +112,8 @@ def sources(generator: torch.Generator) -> list[Source]:
         Source("order 3, 4 actions", table(1, 3, 4), 3),
         Source("order 6, 2 actions", table(1, 6, 2), 6),
         Source(f"repeats at distance {LAG}", torch.full((1, 1, 4), 0.25, dtype=torch.double), 0, lag=LAG),
-        Source("order 1, context a plan", table(CONTEXTS, 1, 4), 1, "plan"),
-        Source("order 1, context a step", table(CONTEXTS, 1, 4), 1, "step"),
+        Source("order 1, initial context", table(CONTEXTS, 1, 4), 1, "plan"),
+        Source("order 1, per-step context", table(CONTEXTS, 1, 4), 1, "step"),
     ]
 
 

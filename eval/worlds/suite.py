@@ -1,4 +1,4 @@
-"""The worlds of `python -m eval compare`, `depth` and `grow`: what is optimised, observed and learned from in each.
+"""The worlds of `python -m eval compare`, `depth` and `curriculum`: what is optimised and observed in each.
 
 To add a world, add a `Task` to `TASKS` below. Its `worlds` makes three worlds for a seed, mostly with a function of
 `eval.worlds.splits`. A world that is no `TabularWorld` also needs its optimum in `best_score`.

@@ -1,4 +1,4 @@
-"""`python -m eval compare` and `grow`: their options, and what is done with them; runs are made up."""
+"""`python -m eval compare` and `curriculum`: their options, and what is done with them; runs are made up."""
 
 import csv
 import json
@@ -43,7 +43,7 @@ BAD = [
     (["--worlds", "grid", "--context", "initial"], "context: grid offers no context"),
     (["--seed", str(2**41)], "seed"),
 ]
-GROW_BAD = [
+CURRICULUM_BAD = [
     (["--lengths", "4", "4"], "lengths: each longer than the one before is expected, not 4 4"),
     (["--lengths", "0", "4"], "lengths"),
     (["--lengths", "2", "4"], "lengths: more than"),
@@ -127,7 +127,7 @@ def test_priors_that_do_not_fit_are_refused_before_anything_is_done(tmp_path, ca
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "says"), [("compare", *bad) for bad in BAD] + [("grow", *bad) for bad in GROW_BAD]
+    ("name", "options", "says"), [("compare", *bad) for bad in BAD] + [("curriculum", *bad) for bad in CURRICULUM_BAD]
 )
 def test_bad_options_are_one_line(name, options, says, tmp_path, capsys):
     assert main([name, *options, "--out", str(tmp_path / "out")]) == 2
@@ -143,7 +143,7 @@ def test_empty_lists_are_refused(name, tmp_path):
         compare(out=str(tmp_path), **{name: []})
 
 
-@pytest.mark.parametrize("name", ["compare", "grow"])
+@pytest.mark.parametrize("name", ["compare", "curriculum"])
 def test_help(name, capsys):
     with pytest.raises(SystemExit) as ended:
         main([name, "--help"])
@@ -153,14 +153,14 @@ def test_help(name, capsys):
         assert f"--{option}" in said
 
 
-def test_grow_writes_curves(tmp_path):
+def test_curriculum_writes_curves(tmp_path):
     options = ["--worlds", "maze", "grid", "--lengths", "6", "8", "--seeds", "3", "--num-plans", "64"]
-    assert main(["grow", *options, "--processes", "1", "--out", str(tmp_path)]) == 0
+    assert main(["curriculum", *options, "--processes", "1", "--out", str(tmp_path)]) == 0
     found = results(tmp_path)
     assert found["settings"]["rounds"] == 2
     assert found["settings"]["lengths"] == [6, 8]
     assert len(found["rows"]) == 2 * 2 * 3 * 2  # worlds, priors, rounds from 0, lengths
-    with open(tmp_path / "grow.csv") as file:
+    with open(tmp_path / "curriculum.csv") as file:
         assert [float(row["oracle_share"]) for row in csv.DictReader(file)] == [
             r["oracle_share"] for r in found["rows"]
         ]
@@ -168,5 +168,8 @@ def test_grow_writes_curves(tmp_path):
     assert not re.search(FROM_ELSEWHERE, html)
     assert html.count("<svg") >= 2
     # Without lengths the world has its own, of which there are no more than this.
-    assert main(["grow", "--worlds", "maze", "--seeds", "1", "--processes", "1", "--out", str(tmp_path / "own")]) == 0
+    assert (
+        main(["curriculum", "--worlds", "maze", "--seeds", "1", "--processes", "1", "--out", str(tmp_path / "own")])
+        == 0
+    )
     assert results(tmp_path / "own")["settings"]["rounds"] == curriculum.ROUNDS

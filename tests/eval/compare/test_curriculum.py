@@ -1,4 +1,4 @@
-"""`python -m eval grow`: gains that are known, views of rounds and lengths, figures; options in one line."""
+"""`python -m eval curriculum`: gains that are known, views of rounds and lengths, figures; options in one line."""
 
 import warnings
 
@@ -132,7 +132,7 @@ def test_nothing_to_draw():
     ],
 )
 def test_bad_options_are_one_line(given, word, tmp_path, capsys):
-    assert main(["grow", "--worlds", "grid", *given, "--out", str(tmp_path / "out")]) == 2
+    assert main(["curriculum", "--worlds", "grid", *given, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert word in error
     assert error.count("\n") == 1
