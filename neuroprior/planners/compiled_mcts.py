@@ -688,7 +688,7 @@ def policy_of(prior: Any, world: TabularWorld, temperature: float) -> Policy:
         row = prior._row(node, torch.arange(number).repeat(len(after))).view(len(after), number)
         logits, context = prior.log_probs, observed.long()
     elif isinstance(prior, GRUPrior):
-        network = prior.tables()
+        network = prior.arrays()
         if prior.takes_context:
             inputs = torch.nn.functional.pad(observed.float().view(len(observed), -1), (1, 0))  # without actions
             by_context = prior.context_gates(inputs)

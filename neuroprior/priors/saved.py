@@ -5,7 +5,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 
 class SavedModule(nn.Module, ABC):
@@ -13,6 +14,9 @@ class SavedModule(nn.Module, ABC):
 
     known: ClassVar[dict[str, type["SavedModule"]]] = {}
     """Every subclass by name; `load` finds a folder's class here."""
+
+    tables: tuple[str, ...] = ()
+    """Buffers whose sizes depend on what was learned, so that they are taken from the file."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -34,6 +38,19 @@ class SavedModule(nn.Module, ABC):
         Raises:
             ValueError: a value is not one that this module could have learned.
         """
+
+    def tables_fit(self) -> bool:
+        """Whether the `tables` are those of a module of this kind; checks what was read from a file."""
+        return True
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        for name in self.tables:
+            if prefix + name in state_dict:
+                device = getattr(self, name).device
+                self.register_buffer(name, torch.empty_like(state_dict[prefix + name], device=device))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        if not self.tables_fit():
+            raise RuntimeError(f"the tables of a {type(self).__name__} do not fit one another")
 
     def __repr__(self) -> str:
         """The class with its constructor's arguments; priors made of priors show these in the same way."""

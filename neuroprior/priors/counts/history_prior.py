@@ -150,16 +150,6 @@ class HistoryPrior(Prior):
             node = self.parent[node]
         return row
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        # The tables' sizes depend on what was learned, so they are taken from the file.
-        for name in self.tables:
-            if prefix + name in state_dict:
-                value = state_dict[prefix + name]
-                self.register_buffer(name, torch.empty_like(value, device=self.device))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        if not self.tables_fit():
-            raise RuntimeError(f"the tables of a {type(self).__name__} do not fit one another")
-
     def tables_fit(self) -> bool:
         """Whether the tables are those of a prior of this kind; checks what was read from a file."""
         nodes, rows, contexts = len(self.next_node), len(self.log_probs), self.num_contexts or 1

@@ -137,12 +137,12 @@ class GRUPrior(NeuralPrior):
         line = torch.cat([recent.long(), action[:, None], action.new_empty(number, steps)], 1)
         hidden = hidden.unflatten(1, (self.num_layers, size))
         arrays = (x.detach().contiguous().numpy() for x in (given, hidden, line, uniform))
-        fast.draw_to_the_end(fast.Network(*self.tables()), *arrays, float(temperature))
+        fast.draw_to_the_end(fast.Network(*self.arrays()), *arrays, float(temperature))
         return line[:, self.lags :]
 
     @property
     def is_plain(self) -> bool:
-        """Whether its predictions can be computed from `tables`: no module is replaced or hooked."""
+        """Whether its predictions can be computed from `arrays`: no module is replaced or hooked."""
         made = type(self) is GRUPrior and self.window != 0
         whole = made and (type(self.embedding), type(self.gru), type(self.head)) == (Embedding, nn.GRU, nn.Linear)
         return whole and not any(part._forward_hooks or part._forward_pre_hooks for part in self.modules())
@@ -151,7 +151,7 @@ class GRUPrior(NeuralPrior):
         """What the contexts of `inputs [N, D]` add to the gates of the first layer: `[N, 3 * hidden_size]`."""
         return self.embedding.of_context(inputs[:, None])[:, 0] @ self.gru.all_weights[0][0].T
 
-    def tables(self) -> tuple[Any, ...]:
+    def arrays(self) -> tuple[Any, ...]:
         """The parts of `neuroprior.priors.neural.compiled_gru.Network`: weights, and what actions add to the gates."""
         size, embedding = self.hidden_size, self.embedding
         inputs, recurrent, biases, own = (torch.stack(part) for part in zip(*self.gru.all_weights, strict=True))

@@ -132,6 +132,8 @@ class PatternNetwork(LogLinearPrior):
         2
     """
 
+    tables = (*PatternPrior.tables, "embeddings")
+
     embeddings: Tensor
     layers: Tensor
     biases: Tensor

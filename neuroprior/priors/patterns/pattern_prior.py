@@ -74,6 +74,8 @@ class PatternPrior(Prior):
         ValueError: an argument is out of range.
     """
 
+    tables: tuple[str, ...] = ("patterns", "weights")
+
     patterns: Tensor
     weights: Tensor
     after: Tensor
@@ -157,16 +159,6 @@ class PatternPrior(Prior):
         """Take over tables, by name, numpy arrays or tensors."""
         for name, values in tables.items():
             self.register_buffer(name, torch.as_tensor(values).to(self.device))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        # The tables' sizes depend on what was learned, so they are taken from the file.
-        for name in ("patterns", "weights", "embeddings"):
-            if prefix + name in state_dict and hasattr(self, name):
-                value = state_dict[prefix + name]
-                self.register_buffer(name, torch.empty_like(value, device=self.device))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        if not self.tables_fit():
-            raise RuntimeError(f"the tables of a {type(self).__name__} do not fit one another")
 
     def tables_fit(self) -> bool:
         """Whether the tables are those of a prior of this kind; checks what was read from a file."""

@@ -80,14 +80,14 @@ class VectorNetwork(VectorPrior):
         self,
         action_low: Any,
         action_high: Any,
-        context_size: int | None,
-        width: int,
-        num_layers: int,
-        num_components: int,
-        lags: int,
-        coupled: bool,
-        dropout: float,
-        seed: int,
+        context_size: int | None = None,
+        width: int = 64,
+        num_layers: int = 1,
+        num_components: int = 5,
+        lags: int = 1,
+        coupled: bool = False,
+        dropout: float = 0.1,
+        seed: int = 0,
     ) -> None:
         super().__init__(action_low, action_high, context_size)
         check_sizes(width=width, num_layers=num_layers, num_components=num_components, lags=lags)
@@ -341,23 +341,6 @@ class VectorGRU(VectorNetwork):
         >>> prior.sample(3, 5).shape
         torch.Size([1, 3, 5, 1])
     """
-
-    def __init__(
-        self,
-        action_low: Any,
-        action_high: Any,
-        context_size: int | None = None,
-        width: int = 64,
-        num_layers: int = 1,
-        num_components: int = 5,
-        lags: int = 1,
-        coupled: bool = False,
-        dropout: float = 0.1,
-        seed: int = 0,
-    ) -> None:
-        super().__init__(
-            action_low, action_high, context_size, width, num_layers, num_components, lags, coupled, dropout, seed
-        )
 
     def build(self) -> None:
         self.gru = nn.GRU(self.width, self.width, self.num_layers, batch_first=True)
