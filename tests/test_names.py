@@ -1,5 +1,6 @@
 """Where two things name their actions, they have to name them alike: numbers that mean other actions are refused."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -8,12 +9,14 @@ import torch
 from neuroprior import GRUPrior, MarkovPrior, Plans, UniformPrior
 from neuroprior.agents.replay import Replay
 from neuroprior.analysis import forecast, infer, two_sample_tests
-from neuroprior.priors import MixturePrior
+from neuroprior.planners.continuous import ShootingPlanner, control
+from neuroprior.plans import VectorPlans
+from neuroprior.priors import DiscretisedPrior, MixturePrior, NoisePrior, VectorGRU, VectorPrior
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import gridworld
+from neuroprior.worlds import DoubleIntegrator, gridworld
 
 WORLD = gridworld(4, 4, edges="torus", seed=0)
-NAMES = WORLD.action_names
+NAMES, ENDS = WORLD.action_names, ([-1.0, -1.0], [1.0, 1.0])
 assert NAMES is not None
 PLANS = Plans(torch.randint(4, (20, 6), generator=torch.Generator().manual_seed(0)), 4, action_names=NAMES)
 OTHERS = replace(PLANS, action_names=NAMES[::-1])
@@ -52,6 +55,53 @@ def test_other_names_are_refused(use):
 @pytest.mark.parametrize("plans", [PLANS, UNNAMED], ids=["the same", "none"])
 def test_the_same_names_and_none_are_taken(use, plans):
     USES[use](plans)
+
+
+HIP, KNEE = ("hip", "knee"), ("knee", "hip")
+MOVES = VectorPlans(torch.rand(6, 20, 2, generator=torch.Generator().manual_seed(0)), *ENDS, action_names=HIP)
+SWAPPED = replace(MOVES, action_names=KNEE)
+
+
+class Arm(DoubleIntegrator):
+    """Both of whose actions have names."""
+
+    action_names = KNEE
+
+
+def moved(prior: VectorPrior) -> None:
+    world = Arm()
+    control(ShootingPlanner(3, 4, prior=prior), world, world.reset(1, torch.Generator().manual_seed(0)), 2)
+
+
+VECTOR_USES = {
+    "scored": lambda plans: NoisePrior(*ENDS).fit(MOVES).log_prob(plans),
+    "read back": lambda plans: again(NoisePrior(*ENDS).fit(MOVES)).log_prob(plans),
+    "tokens": lambda plans: DiscretisedPrior(*ENDS, num_bins=3).fit(MOVES).log_prob(plans),
+    "learned further": lambda plans: VectorGRU(*ENDS, width=4).fit(MOVES, **SHORT).fit(plans, **SHORT),
+    "validated": lambda plans: VectorGRU(*ENDS, width=4).fit(MOVES, validation=plans, **SHORT),
+}
+
+
+def again(prior: VectorPrior) -> VectorPrior:
+    made = type(prior)(**prior.config)
+    made.load_state_dict(prior.state_dict())
+    made.restore(json.loads(json.dumps(prior.learned)))
+    return made
+
+
+@pytest.mark.parametrize("use", VECTOR_USES)
+def test_other_names_of_dimensions_are_refused(use):
+    with pytest.raises(ValueError, match=r"^action_names: knee, hip in the plans, hip, knee in this prior; "):
+        VECTOR_USES[use](SWAPPED)
+    for plans in (MOVES, replace(MOVES, action_names=None)):
+        VECTOR_USES[use](plans)
+
+
+def test_priors_of_vectors_learn_anew_from_other_names_and_move_only_their_own_world():
+    prior = NoisePrior(*ENDS).fit(MOVES)
+    with pytest.raises(ValueError, match=r"^action_names: knee, hip in the world, hip, knee in the prior; "):
+        moved(prior)
+    moved(prior.fit(SWAPPED))
 
 
 def test_named_plans_are_matched_to_each_intention():

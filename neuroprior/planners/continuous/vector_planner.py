@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple, TypedDict
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_share, check_sizes
+from neuroprior._checks import check_same_names, check_share, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.plans.vector_plans import same_bounds
@@ -175,6 +175,7 @@ class VectorPlanner(ABC):
                 own, there = getattr(self.prior, name), getattr(world, name).to(self.prior.device)
                 if not same_bounds(own, there, 2 * self.prior.half_range):
                     raise ValueError(f"prior: its {name} is {own.tolist()}, the world's {there.tolist()}")
+            check_same_names("action_names", self.prior.action_names, world.action_names, "the world", "the prior")
         if memory is None:
             observed = world.observe(state)
             past = torch.zeros(len(state), 0, size, device=state.device)

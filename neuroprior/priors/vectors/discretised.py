@@ -75,9 +75,10 @@ class DiscretisedPrior(VectorPrior):
 
     @property
     def learned(self) -> dict[str, Any]:
-        return {"edges": self._learned, "tokens": self.tokens.learned}
+        return super().learned | {"edges": self._learned, "tokens": self.tokens.learned}
 
     def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
         self._learned = bool(learned["edges"])
         self.tokens.restore(learned["tokens"])
 
@@ -88,12 +89,12 @@ class DiscretisedPrior(VectorPrior):
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Learn the bins, unless they are learned, and the prior over tokens; see `VectorPrior.fit` and its `fit`."""
         self.check_settings(settings)
-        plans = self.training_plans(plans)
+        plans = self.training_plans(plans, anew=not self._learned)
         if not self._learned:
             self._edges.copy_(self._quantiles(plans.actions[plans.mask()]))
             self._learned = True
         if isinstance(settings.get("validation"), VectorPlans):
-            settings = settings | {"validation": self._plans(self.training_plans(settings["validation"]))}
+            settings = settings | {"validation": self._plans(self.training_plans(settings["validation"], anew=False))}
         self.tokens.fit(self._plans(plans), generator=generator, **settings)
         return self
 

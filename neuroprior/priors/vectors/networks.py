@@ -126,9 +126,10 @@ class VectorNetwork(VectorPrior):
 
     @property
     def learned(self) -> dict[str, Any]:
-        return {"memory": self.memory}
+        return super().learned | {"memory": self.memory}
 
     def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
         memory = learned["memory"]
         if memory is not None:
             check_sizes(memory=memory)
@@ -311,9 +312,9 @@ class VectorNetwork(VectorPrior):
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
         how = Settings(**(DEFAULTS | settings))
+        plans = self.training_plans(plans, anew=self.memory is None)
         if isinstance(how.validation, VectorPlans):
-            how = replace(how, validation=self.training_plans(how.validation))
-        plans = self.training_plans(plans)
+            how = replace(how, validation=self.training_plans(how.validation, anew=False))
         if how.max_steps is None:
             how = replace(how, max_steps=min(max(int(plans.mask().sum()) // VECTORS_A_STEP, FEWEST), MOST))
         if self.memory is None and plans.context is not None:

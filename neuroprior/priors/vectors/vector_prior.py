@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_same_names, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.plans.vector_plans import VectorPlans, as_floats, check_widths, same_bounds
 from neuroprior.priors.saved import SavedModule
@@ -152,6 +152,9 @@ class VectorPrior(SavedModule):
         ValueError: an argument is out of range.
     """
 
+    action_names: tuple[str, ...] | None
+    """Names of the D dimensions, as they were in the plans that it learned from, or None."""
+
     memory: int | None = None
     """How many of the last vectors predictions depend on, at most; None if on all."""
 
@@ -169,6 +172,7 @@ class VectorPrior(SavedModule):
 
     def __init__(self, action_low: Any, action_high: Any, context_size: int | None = None) -> None:
         super().__init__()
+        self.action_names = None
         low, high = as_floats("action_low", action_low).clone(), as_floats("action_high", action_high).clone()
         if low.dim() != 1 or low.shape != high.shape or not len(low):
             raise ValueError(
@@ -220,6 +224,15 @@ class VectorPrior(SavedModule):
         """The constructor's arguments that make a prior like this one (JSON values); subclasses add their own."""
         sizes = {"action_low": self.action_low.tolist(), "action_high": self.action_high.tolist()}
         return sizes | ({} if self.context_size is None else {"context_size": self.context_size})
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        return super().learned | {"action_names": None if self.action_names is None else list(self.action_names)}
+
+    def restore(self, learned: dict[str, Any]) -> None:
+        super().restore(learned)
+        names = learned.get("action_names")  # which older files do not have
+        self.action_names = None if names is None else tuple(map(str, names))
 
     @abstractmethod
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Forecast, Tensor]:
@@ -375,24 +388,33 @@ class VectorPrior(SavedModule):
             )
 
     def check_plans(self, plans: VectorPlans) -> None:
-        """Raise ValueError unless `plans` have this prior's bounds and its kind of context."""
+        """Raise ValueError unless `plans` have this prior's names and bounds, and its kind of context."""
         if not isinstance(plans, VectorPlans):
             raise ValueError(f"plans: VectorPlans are expected, not {type(plans).__name__}")
         for name in ("action_low", "action_high"):
             own, theirs = getattr(self, name).cpu(), getattr(plans, name).cpu()
             if not same_bounds(own, theirs, 2 * self.half_range.cpu()):
                 raise ValueError(f"{name}: {theirs.tolist()} in the plans, {own.tolist()} in this prior")
+        check_same_names("action_names", self.action_names, plans.action_names, "the plans", "this prior")
         self.check_context(plans.context, len(plans))
 
-    def training_plans(self, plans: VectorPlans) -> VectorPlans:
+    def training_plans(self, plans: VectorPlans, anew: bool = True) -> VectorPlans:
         """`plans` that this prior can learn from, at least one with a vector; without context if it takes none.
+
+        Args:
+            plans: whose names this prior keeps.
+            anew: whether what it learned before, from plans that may have other names, is forgotten.
 
         Raises:
             ValueError: these are not `VectorPlans` with this prior's bounds and context, or have no vector.
         """
         if isinstance(plans, VectorPlans) and not self.takes_context:
             plans = plans.without_context()
+        if anew:
+            self.action_names = None
         self.check_plans(plans)
+        if plans.action_names is not None:
+            self.action_names = tuple(plans.action_names)
         if not plans.mask().any():
             raise ValueError("plans: none has a vector to learn from")
         return plans[plans.mask().any(1)]
