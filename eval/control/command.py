@@ -100,16 +100,16 @@ def control_experiment(
         raise ValueError('priors: "none", the plain planner, is needed to compare with')
     for task in (*tasks, *([] if animation is None else [animation])):
         check_there(task)
-    numbers = tuple(map(int, sorted(budgets)))
+    numbers = tuple(sorted(budgets))
     settings = ControlSettings(
         numbers,
-        tuple(sorted(set(map(int, plain_budgets)) - set(numbers))),
-        int(steps),
-        int(training_runs),
-        int(training_budget),
-        int(tuning_budget),
-        int(tuning_seeds),
-        int(seed),
+        tuple(sorted(set(plain_budgets) - set(numbers))),
+        steps,
+        training_runs,
+        training_budget,
+        tuning_budget,
+        tuning_seeds,
+        seed,
     )
 
     def done(what: str, work: Callable[..., Any], jobs: Sequence[Any], **files: Any) -> list[Any]:

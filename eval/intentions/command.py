@@ -67,8 +67,8 @@ def intentions(
             raise ValueError(f"{name}: integers from {low} to {high} are expected, not {wrong[0]}")
     if LABYRINTH in worlds and seeds > BLOCKS:
         raise ValueError(f"seeds: in the {LABYRINTH} at most {BLOCKS}, the blocks of sequences, not {seeds}")
-    numbers, times, later = (tuple(map(int, sorted(given))) for given in (num_plans, observed, ahead))
-    settings = IntentionSettings(int(goals), numbers, int(agents), times, later, float(temperature), int(seed))
+    numbers, times, later = (tuple(sorted(given)) for given in (num_plans, observed, ahead))
+    settings = IntentionSettings(goals, numbers, agents, times, later, temperature, seed)
     how = worlds, seeds, out, processes, dask
     document = runs.run_experiment("intentions", intentions_run, intentions_document, settings, *how)
     write_figures(Path(out), document.figures)

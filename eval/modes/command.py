@@ -58,8 +58,8 @@ def modes(
         out: folder for the report and for finished fits.
     """
     runs.check_distinct(modes=modes, orders=orders)
-    settings, plans = ModeSettings(int(restarts), int(seed)), read_plans(DATA)
-    jobs = [Job(int(number), int(order), fold) for order, number, fold in product(orders, modes, range(FOLDS + 1))]
+    settings, plans = ModeSettings(restarts, seed), read_plans(DATA)
+    jobs = [Job(number, order, fold) for order, number, fold in product(orders, modes, range(FOLDS + 1))]
     run = JobRun(
         partial(fit_and_infer, settings=settings),
         Path(out) / "fits",

@@ -88,9 +88,8 @@ def puzzles(
     check_distinct(priors=priors)
     files = [str(given or default) for given, default in zip((train, test), FILES[world], strict=True)]
     guided = world == "tiles" if guided is None else guided
-    numbers = {"num_train": int(num_train), "budget": int(budget), "sweeps": int(sweeps), "seed": int(seed)}
-    of_test = None if num_test is None else int(num_test)
-    settings = Settings(world=world, train=files[0], test=files[1], num_test=of_test, guided=guided, **numbers)
+    numbers = {"num_train": num_train, "budget": budget, "sweeps": sweeps, "seed": seed}
+    settings = Settings(world=world, train=files[0], test=files[1], num_test=num_test, guided=guided, **numbers)
     both = problems_of(settings)
     digests = [sha256(Path(file).read_bytes()).hexdigest() for file in files]
     asked = asdict(settings) | {"digests": digests}
