@@ -11,7 +11,7 @@ from neuroprior.agents.replay import Replay
 from neuroprior.analysis import forecast, infer, two_sample_tests
 from neuroprior.planners.continuous import ShootingPlanner, control
 from neuroprior.plans import VectorPlans
-from neuroprior.priors import DiscretisedPrior, MixturePrior, NoisePrior, VectorGRU, VectorPrior
+from neuroprior.priors import DiscretisedPrior, MixturePrior, NoisePrior, SemiMarkovPrior, VectorGRU, VectorPrior
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import DoubleIntegrator, gridworld
 
@@ -28,6 +28,10 @@ def learned(plans: Plans) -> MarkovPrior:
     return MarkovPrior(4, 0).fit(plans)
 
 
+def timed(plans: Plans) -> Plans:
+    return replace(plans, durations=1.0 + plans.actions)
+
+
 def stored(plans: Plans) -> None:
     replay = Replay(1.0)
     replay.add(PLANS)
@@ -41,6 +45,7 @@ USES = {
     "stored": stored,
     "mixed": lambda plans: MixturePrior(4, [learned(PLANS), UniformPrior(4), learned(plans)]),
     "inferred from numbers": lambda plans: infer([learned(PLANS), learned(plans)], PLANS.actions),
+    "timed": lambda plans: SemiMarkovPrior(4).fit(timed(PLANS)).duration_log_prob(timed(plans)),
     "learned further": lambda plans: GRUPrior(4, 4).fit(PLANS, **SHORT).fit(plans, **SHORT),
 }
 

@@ -7,6 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_same_names
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts import MarkovPrior
@@ -132,6 +133,7 @@ class SemiMarkovPrior(Prior):
         Raises:
             ValueError: plans of other actions, or without durations.
         """
+        check_same_names("action_names", self.action_names, plans.action_names, "the plans", "this prior")
         return self.durations.log_prob(plans).sum(-1)
 
     def sample_plans(
