@@ -88,9 +88,12 @@ def check_same_names(
         where, whose: what has the found names, and what the expected ones.
         remedy: the end of the message.
     """
-    if own is not None and given is not None and tuple(own) != tuple(given):
+    if own is None or given is None:
+        return
+    expected, found = (tuple(map(str, names)) for names in (own, given))
+    if expected != found:
         remedy = remedy or "number them alike"
-        raise ValueError(f"{name}: {', '.join(given)} in {where}, {', '.join(own)} in {whose}; {remedy}")
+        raise ValueError(f"{name}: {', '.join(found)} in {where}, {', '.join(expected)} in {whose}; {remedy}")
 
 
 def check_level(level: object) -> None:

@@ -6,12 +6,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, UniformPrior
-from neuroprior.agents.replay import Replay
+from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
+from neuroprior.agents import Agent, Replay
 from neuroprior.analysis import forecast, infer, two_sample_tests
 from neuroprior.planners.continuous import ShootingPlanner, control
 from neuroprior.plans import VectorPlans
-from neuroprior.priors import DiscretisedPrior, MixturePrior, NoisePrior, SemiMarkovPrior, VectorGRU, VectorPrior
+from neuroprior.priors import (
+    DiscretisedPrior,
+    MixturePrior,
+    NoisePrior,
+    SemiMarkovPrior,
+    StackedPrior,
+    VectorGRU,
+    VectorPrior,
+)
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import DoubleIntegrator, gridworld
 
@@ -34,8 +42,16 @@ def timed(plans: Plans) -> Plans:
 
 def stored(plans: Plans) -> None:
     replay = Replay(1.0)
-    replay.add(PLANS)
-    replay.add(plans)
+    for some in (PLANS, UNNAMED, plans):
+        replay.add(some)
+
+
+def mixture(plans: Plans) -> MixturePrior:
+    return MixturePrior(4, [UniformPrior(4), learned(plans)])
+
+
+def chains(*others: Prior) -> MixturePrior:
+    return MixturePrior(4, [MarkovPrior(4, 0), MarkovPrior(4, 1), *others])
 
 
 USES = {
@@ -44,7 +60,19 @@ USES = {
     "compared": lambda plans: two_sample_tests(PLANS, plans, permutations=9),
     "stored": stored,
     "mixed": lambda plans: MixturePrior(4, [learned(PLANS), UniformPrior(4), learned(plans)]),
-    "inferred from numbers": lambda plans: infer([learned(PLANS), learned(plans)], PLANS.actions),
+    "mixed in a world": lambda plans: sample_in_world(mixture(plans), WORLD, torch.tensor([0]), 2, 3),
+    "of a mixture": lambda plans: mixture(PLANS).log_prob(plans),
+    "validating a mixture": lambda plans: chains().fit(PLANS, validation=plans),
+    "inferred from numbers": lambda plans: infer([UniformPrior(4), learned(PLANS), learned(plans)], PLANS.actions),
+    "of an agent": lambda plans: Agent(WORLD, SamplingPlanner(UniformPrior(4), 2, 2), learned(plans), replan_every=2),
+    "learned and validated further": lambda plans: (
+        GRUPrior(4, 4).fit(PLANS, **SHORT).fit(plans, **SHORT, validation=plans)
+    ),
+    "learned further without names": lambda plans: (
+        GRUPrior(4, 4).fit(PLANS, **SHORT).fit(UNNAMED, **SHORT).fit(plans, **SHORT)
+    ),
+    "stacked further": lambda plans: StackedPrior(4, 4).fit(PLANS, **SHORT).fit(plans, **SHORT),
+    "mixed further": lambda plans: chains(GRUPrior(4, 4)).fit(PLANS, **SHORT).fit(plans, **SHORT),
     "timed": lambda plans: SemiMarkovPrior(4).fit(timed(PLANS)).duration_log_prob(timed(plans)),
     "learned further": lambda plans: GRUPrior(4, 4).fit(PLANS, **SHORT).fit(plans, **SHORT),
 }
@@ -52,7 +80,7 @@ USES = {
 
 @pytest.mark.parametrize("use", USES)
 def test_other_names_are_refused(use):
-    with pytest.raises(ValueError, match=r"^action_names: .+ in .+, .+ in .+; "):
+    with pytest.raises(ValueError, match=r"^(validation: )?action_names: .+ in .+, .+ in .+; "):
         USES[use](OTHERS)
 
 
@@ -107,6 +135,19 @@ def test_priors_of_vectors_learn_anew_from_other_names_and_move_only_their_own_w
     with pytest.raises(ValueError, match=r"^action_names: knee, hip in the world, hip, knee in the prior; "):
         moved(prior)
     moved(prior.fit(SWAPPED))
+
+
+def test_a_refused_fit_keeps_what_was_learned():
+    stacked, noise = StackedPrior(4, 4).fit(PLANS, **SHORT), NoisePrior(*ENDS).fit(MOVES)
+    with pytest.raises(ValueError, match=r"^action_names: "):
+        stacked.fit(OTHERS, **SHORT)
+    with pytest.raises(ValueError, match=r"^action_high: "):
+        noise.fit(replace(SWAPPED, action_high=torch.full((2,), 2.0)))
+    assert stacked.action_names == tuple(NAMES)
+    assert noise.action_names == HIP
+    first = GRUPrior(4, 4)
+    with pytest.raises(ValueError, match=r"^validation: its action_names are not those of the plans"):
+        first.fit(PLANS, validation=OTHERS, **SHORT)
 
 
 def test_named_plans_are_matched_to_each_intention():

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes, is_number
+from neuroprior._checks import check_memory, check_same_names, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
@@ -88,6 +88,7 @@ class Agent:
             raise ValueError(
                 f"prior: it has {prior.num_actions} actions, and the world {world.num_actions}; as many are expected"
             )
+        check_same_names("action_names", prior.action_names, world.action_names, "the world", "the prior")
         if min_score is not None and (not is_number(min_score) or min_score != min_score):
             raise ValueError(f"min_score: a number is expected, not {min_score!r}")
         self.generator = generator_on(generator, prior.device)

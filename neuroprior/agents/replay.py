@@ -69,7 +69,8 @@ class Replay:
         if before.context is not None and plans.context is not None:
             context = torch.cat([before.context, plans.context])
         actions = torch.cat([before.actions, plans.actions])
-        self.plans = Plans(actions, plans.num_actions, lengths, plans.action_names, context)
+        known = before.action_names if plans.action_names is None else plans.action_names
+        self.plans = Plans(actions, plans.num_actions, lengths, known, context)
 
     def tensors(self) -> dict[str, Tensor]:
         """The stored plans as tensors by name, for files."""

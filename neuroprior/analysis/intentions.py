@@ -215,10 +215,11 @@ def _named(priors: Mapping[str, Prior] | Sequence[Prior]) -> dict[str, Prior]:
 def _observed(plans: Plans | Tensor, context: Tensor | None, priors: dict[str, Prior]) -> Plans:
     """The plans that were observed, without an end symbol."""
     if not isinstance(plans, Plans):
-        first, prior = next(iter(priors.items()))
-        for name, other in priors.items():  # the same numbers are given to all
-            names = learned_names(prior), learned_names(other)
-            check_same_names("action_names", *names, name, first, "give the actions as Plans with names")
+        prior = next(iter(priors.values()))
+        named = {name: names for name, one in priors.items() if (names := learned_names(one)) is not None}
+        first = next(iter(named), "")
+        for name, names in named.items():  # the same numbers are given to all
+            check_same_names("action_names", named[first], names, name, first, "give the actions as Plans with names")
         known = prior.num_actions - (prior.end is not None)
         return Plans(torch.as_tensor(plans), known, context=context)
     if context is not None:

@@ -557,7 +557,7 @@ def _search_all(
     discounts = np.empty(0)
     if planner.objective == "return":
         discounts = (planner.discount ** torch.arange(length, dtype=torch.float64)).numpy()
-    threads = threads if batch * size >= SHARED and on_one_thread(size, actions) else 1
+    threads = threads if batch * layers * size >= SHARED and on_one_thread(size, actions) else 1
     each = -(-batch // threads)
     descent = Descent(
         np.empty(batch, np.int64), np.empty((batch, length), np.int64), np.empty((batch, length), np.int64),

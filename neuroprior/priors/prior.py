@@ -367,6 +367,18 @@ class Prior(SavedModule):
             self.context_names = tuple(plans.context_names)
         return plans
 
+    def validation_plans(self, plans: Plans) -> Plans:
+        """As `training_plans`, of plans that it does not learn from: it keeps nothing of them.
+
+        Raises:
+            ValueError: another number of actions, or a context of another kind than this prior takes.
+        """
+        kept = self.end, self.action_names, self.context_names, self.context_per
+        try:
+            return self.training_plans(plans)
+        finally:
+            self.end, self.action_names, self.context_names, self.context_per = kept
+
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Raise ValueError unless `fit` takes all of these settings."""
         known = self.fit_settings

@@ -71,16 +71,18 @@ class MixturePrior(Prior):
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")
-        for name in ("action_names", "context_names"):
-            known = [e for e in made if getattr(e, name) is not None]
-            for expert in known:
-                names = getattr(known[0], name), getattr(expert, name)
-                check_same_names(name, *names, type(expert).__name__, type(known[0]).__name__, "fit them alike")
+        named = {f"experts[{number}]": e for number, e in enumerate(made) if e.action_names is not None}
+        first = next(iter(named), "")
+        for where, expert in named.items():
+            names = named[first].action_names, expert.action_names
+            check_same_names("action_names", *names, where, first, "fit them to plans whose actions are numbered alike")
         given = {(num_contexts, context_size)} - {(None, None)}
         contexts = given | {(e.num_contexts, e.context_size) for e in made if e.takes_context} or {(None, None)}
         if len(contexts) > 1:
             raise ValueError(f"experts: those with a context must have the same, not {sorted(map(str, contexts))}")
         super().__init__(num_actions, *contexts.pop())
+        if named:
+            self.action_names, self.end = named[first].action_names, named[first].end
         self.experts = nn.ModuleList(made)
         self.share = float(share)
         self.register_buffer("first", torch.full((len(made),), 1 / len(made)).log())
@@ -245,9 +247,11 @@ def divided(plans: Plans, validation: Plans | float | None, generator: torch.Gen
     Groups stay together where there are so many that few actions are lost.
 
     Raises:
-        ValueError: there are too few plans.
+        ValueError: there are too few plans, or the validation plans have other names.
     """
     if isinstance(validation, Plans):
+        names = plans.action_names, validation.action_names
+        check_same_names("validation: action_names", *names, "these plans", "those that are learned from")
         return plans, validation
     plans = plans[plans.mask().any(1)]
     if validation is None:

@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_same_names, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
@@ -156,7 +156,10 @@ class StackedPrior(Prior):
         """
         self.check_settings(settings)
         held_out = settings.get("validation")
-        held_out = self.training_plans(held_out) if isinstance(held_out, Plans) else None
+        if self.mixer.has_learned and isinstance(plans, Plans):
+            names = self.action_names, plans.action_names
+            check_same_names("action_names", *names, "the plans", "this prior, which learns further")
+        held_out = self.validation_plans(held_out) if isinstance(held_out, Plans) else None
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
         learned = plans[plans.mask().any(1)]

@@ -150,7 +150,7 @@ def draw_to_the_end(
 
     Args:
         network: the network.
-        given: float32 `[N, 3 H]`: what is added to the gates at each step; no rows: nothing.
+        given: float32 `[N, 3 H]`: what is added to the gates of the first layer at each step; no rows: nothing.
         hidden: `[N, K, H]`: before the last action is read.
         line: int64 `[N, before + T]`: the actions up to the last one, A + 1 where there was none; gets the drawn ones.
         uniform: float32 `[T, N]`: what they are drawn with.

@@ -117,7 +117,7 @@ class GRUPrior(NeuralPrior):
 
         Args:
             action: integers `[N]`, the last ones.
-            state: `[N, D + H]`, before these.
+            state: `[N, D + K H + lags - 1]`, of K layers, before these.
             uniform: `[T, N]`: what the next T actions are drawn with.
             temperature: divides the logits.
 

@@ -153,6 +153,11 @@ class NeuralPrior(Prior):
             if None in self._given:
                 self._make(Sizes(*sizes))
 
+    @property
+    def has_learned(self) -> bool:
+        """Whether it was fitted before, so that to fit it again goes on from its weights."""
+        return self._sized
+
     def sizes_for(self, plans: Plans) -> Sizes:
         """What is chosen for plans to learn from, where it was not given."""
         return Sizes.of(plans)
@@ -264,9 +269,9 @@ class NeuralPrior(Prior):
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
         how = Settings(**settings)
-        if isinstance(how.validation, Plans):
-            how = replace(how, validation=self.training_plans(how.validation))
         plans = self.prepare(plans, how.window)
+        if isinstance(how.validation, Plans):
+            how = replace(how, validation=self.validation_plans(how.validation))
         train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
         return self
 
@@ -278,10 +283,12 @@ class NeuralPrior(Prior):
         Raises:
             ValueError: plans that this prior cannot learn from, or too few of them.
         """
+        known = self.action_names if self.has_learned else None
         if isinstance(plans, Plans):
-            names = self.action_names, plans.action_names
-            check_same_names("action_names", *names, "the plans", "those that this prior has learned from")
+            check_same_names("action_names", known, plans.action_names, "the plans", "this prior, which learns further")
         plans = self.training_plans(plans)
+        if self.action_names is None:
+            self.action_names = known
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:
             self._make(self.sizes_for(plans))

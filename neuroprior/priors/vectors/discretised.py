@@ -83,18 +83,22 @@ class DiscretisedPrior(VectorPrior):
         self.tokens.restore(learned["tokens"])
 
     @property
+    def learns_anew(self) -> bool:
+        return not self._learned
+
+    @property
     def fit_settings(self) -> tuple[str, ...]:
         return self.tokens.fit_settings
 
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Learn the bins, unless they are learned, and the prior over tokens; see `VectorPrior.fit` and its `fit`."""
         self.check_settings(settings)
-        plans = self.training_plans(plans, anew=not self._learned)
+        plans = self.training_plans(plans)
         if not self._learned:
             self._edges.copy_(self._quantiles(plans.actions[plans.mask()]))
             self._learned = True
         if isinstance(settings.get("validation"), VectorPlans):
-            settings = settings | {"validation": self._plans(self.training_plans(settings["validation"], anew=False))}
+            settings = settings | {"validation": self._plans(self.training_plans(settings["validation"]))}
         self.tokens.fit(self._plans(plans), generator=generator, **settings)
         return self
 

@@ -135,6 +135,10 @@ class VectorNetwork(VectorPrior):
             check_sizes(memory=memory)
         self.memory = memory
 
+    @property
+    def learns_anew(self) -> bool:
+        return self.memory is None
+
     @abstractmethod
     def build(self) -> None:
         """Make the layers."""
@@ -312,9 +316,7 @@ class VectorNetwork(VectorPrior):
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
         how = Settings(**(DEFAULTS | settings))
-        plans = self.training_plans(plans, anew=self.memory is None)
-        if isinstance(how.validation, VectorPlans):
-            how = replace(how, validation=self.training_plans(how.validation, anew=False))
+        plans = self.training_plans(plans)
         if how.max_steps is None:
             how = replace(how, max_steps=min(max(int(plans.mask().sum()) // VECTORS_A_STEP, FEWEST), MOST))
         if self.memory is None and plans.context is not None:
@@ -323,6 +325,8 @@ class VectorNetwork(VectorPrior):
             self._mean.copy_(features.mean(0))
             self._std.copy_(torch.where(spread > 1e-6 * (1 + features.abs().amax(0)), spread, 1))
         self.memory = min(how.window, int(plans.mask().sum(1).max()))
+        if isinstance(how.validation, VectorPlans):
+            how = replace(how, validation=self.training_plans(how.validation))
         train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
         return self
 

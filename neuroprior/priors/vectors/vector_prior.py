@@ -398,25 +398,32 @@ class VectorPrior(SavedModule):
         check_same_names("action_names", self.action_names, plans.action_names, "the plans", "this prior")
         self.check_context(plans.context, len(plans))
 
-    def training_plans(self, plans: VectorPlans, anew: bool = True) -> VectorPlans:
+    @property
+    def learns_anew(self) -> bool:
+        """Whether `fit` forgets what was learned before, so that the plans may have other names."""
+        return True
+
+    def training_plans(self, plans: VectorPlans) -> VectorPlans:
         """`plans` that this prior can learn from, at least one with a vector; without context if it takes none.
 
-        Args:
-            plans: whose names this prior keeps.
-            anew: whether what it learned before, from plans that may have other names, is forgotten.
+        It keeps their names.
 
         Raises:
             ValueError: these are not `VectorPlans` with this prior's bounds and context, or have no vector.
         """
         if isinstance(plans, VectorPlans) and not self.takes_context:
             plans = plans.without_context()
-        if anew:
-            self.action_names = None
-        self.check_plans(plans)
+        known = self.action_names
+        self.action_names = None if self.learns_anew else known
+        try:
+            self.check_plans(plans)
+            if not plans.mask().any():
+                raise ValueError("plans: none has a vector to learn from")
+        except ValueError:
+            self.action_names = known
+            raise
         if plans.action_names is not None:
-            self.action_names = tuple(plans.action_names)
-        if not plans.mask().any():
-            raise ValueError("plans: none has a vector to learn from")
+            self.action_names = tuple(map(str, plans.action_names))
         return plans[plans.mask().any(1)]
 
     @property
