@@ -127,7 +127,14 @@ def test_bad_tiles_are_refused(tile_size, num_tilings):
         tile_approximation(torch.zeros(1, 9), PLACES, tile_size, num_tilings)
 
 
-@pytest.mark.parametrize("name", ["hidden_size", "steps", "learning_rate"])
-def test_bad_networks_are_refused(name):
-    with pytest.raises(ValueError, match=f"^{name}: a positive, finite number is expected, not 0"):
+@pytest.mark.parametrize(
+    ("name", "wanted"),
+    [
+        ("hidden_size", "an integer of at least 1"),
+        ("steps", "an integer of at least 1"),
+        ("learning_rate", "a positive, finite number"),
+    ],
+)
+def test_bad_networks_are_refused(name, wanted):
+    with pytest.raises(ValueError, match=f"^{name}: {wanted} is expected, not 0"):
         network_approximation(torch.zeros(1, 9), PLACES, **{name: 0})

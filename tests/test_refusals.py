@@ -39,7 +39,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "groups of others": (lambda: vectors(group=torch.tensor([1])), "group"),
     "a name for names": (lambda: vectors(action_names="torque"), "action_names: a list"),
     "context of others": (lambda: vectors(context=torch.zeros(5, 2)), "context"),
-    "steps before the first": (lambda: vectors().steps(-1), "0 <= first"),
+    "steps before the first": (lambda: vectors().steps(-1), "first: an integer of at least 0 is expected, not -1"),
     "lengths that are words": (lambda: vectors(lengths=["long", "short"]), "lengths: integers"),
     "plans that are none": (lambda: write_vector_plans(Plans(ZEROS, 1), "x.npz"), "VectorPlans"),
     "vectors in CSV": (lambda: write_vector_plans(vectors(), "x.csv"), ".npz"),
