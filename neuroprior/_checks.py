@@ -1,7 +1,7 @@
 """Checks of arguments, each of which names the argument that is wrong."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from numbers import Real
 from typing import TypeGuard
@@ -94,6 +94,19 @@ def check_same_names(
     if expected != found:
         remedy = remedy or "number them alike"
         raise ValueError(f"{name}: {', '.join(found)} in {where}, {', '.join(expected)} in {whose}; {remedy}")
+
+
+def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str) -> None:
+    """Raise ValueError unless all that have names of actions have the same ones; see `check_same_names`.
+
+    Args:
+        named: the names of each, by what has them.
+        remedy: the end of the message.
+    """
+    known = {where: names for where, names in named.items() if names is not None}
+    first = next(iter(known), "")
+    for where, names in known.items():
+        check_same_names("action_names", known[first], names, where, first, remedy)
 
 
 def check_level(level: object) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_same_names, check_sizes, is_number
+from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
@@ -14,6 +14,7 @@ from neuroprior.planners.execution import Change, executed_steps, follow, join_e
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior
+from neuroprior.sampling.stepping import check_actions
 from neuroprior.worlds.world import World
 
 
@@ -84,11 +85,7 @@ class Agent:
             raise ValueError(f"plan_length: a multiple of replan_every = {replan_every} is expected, not {plan_length}")
         if learn_every is not None and learn_every % plan_length:
             raise ValueError(f"learn_every: a multiple of plan_length = {plan_length} is expected, not {learn_every}")
-        if prior.num_actions != world.num_actions:
-            raise ValueError(
-                f"prior: it has {prior.num_actions} actions, and the world {world.num_actions}; as many are expected"
-            )
-        check_same_names("action_names", prior.action_names, world.action_names, "the world", "the prior")
+        check_actions(prior, world)
         if min_score is not None and (not is_number(min_score) or min_score != min_score):
             raise ValueError(f"min_score: a number is expected, not {min_score!r}")
         self.generator = generator_on(generator, prior.device)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_same_names, check_share, check_sizes, is_number
+from neuroprior._checks import check_alike_named, check_share, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.matching import learned_names, match_plans
@@ -216,10 +216,9 @@ def _observed(plans: Plans | Tensor, context: Tensor | None, priors: dict[str, P
     """The plans that were observed, without an end symbol."""
     if not isinstance(plans, Plans):
         prior = next(iter(priors.values()))
-        named = {name: names for name, one in priors.items() if (names := learned_names(one)) is not None}
-        first = next(iter(named), "")
-        for name, names in named.items():  # the same numbers are given to all
-            check_same_names("action_names", named[first], names, name, first, "give the actions as Plans with names")
+        # The same numbers are given to all.
+        names = {name: learned_names(one) for name, one in priors.items()}
+        check_alike_named(names, "give the actions as Plans with names")
         known = prior.num_actions - (prior.end is not None)
         return Plans(torch.as_tensor(plans), known, context=context)
     if context is not None:

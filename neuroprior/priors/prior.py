@@ -346,18 +346,26 @@ class Prior(SavedModule):
                 f" not {str(context.dtype).removeprefix('torch.')} of shape {list(context.shape)}"
             )
 
+    @property
+    def learns_anew(self) -> bool:
+        """Whether `fit` forgets what was learned before, so that the plans may have other names."""
+        return True
+
     def training_plans(self, plans: Plans | Tensor) -> Plans:
         """`plans` as `Plans` that this prior can learn from; keeps their names, end and kind of context.
 
         A prior without context ignores that of the plans.
 
         Raises:
-            ValueError: another number of actions, or a context of another kind than this prior takes.
+            ValueError: another number of actions, other names than those from which it learns further, or a context of
+                another kind than this prior takes.
         """
         plans = self._as_plans(plans)
         self._check_actions(plans)
+        known = None if self.learns_anew else self.action_names
+        check_same_names("action_names", known, plans.action_names, "the plans", "this prior, which learns further")
         self.end = plans.end
-        self.action_names = None if plans.action_names is None else tuple(plans.action_names)
+        self.action_names = known if plans.action_names is None else tuple(plans.action_names)
         self.context_names = None
         if not self.takes_context:
             return plans.without_context()
@@ -374,6 +382,7 @@ class Prior(SavedModule):
             ValueError: another number of actions, or a context of another kind than this prior takes.
         """
         kept = self.end, self.action_names, self.context_names, self.context_per
+        self.action_names = None  # they are compared with those of the plans that are learned from
         try:
             return self.training_plans(plans)
         finally:

@@ -178,6 +178,11 @@ def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
         raise ValueError(
             "prior: it samples an end symbol, which is no action of the world; fit it to plans without one"
         )
+    check_actions(prior, world)
+
+
+def check_actions(prior: Steppable, world: World) -> None:
+    """Raise ValueError unless a prior has as many actions as a world, and no other names for them."""
     if prior.num_actions != world.num_actions:
         raise ValueError(
             f"prior: it has {prior.num_actions} actions, and the world {world.num_actions}; as many are expected"

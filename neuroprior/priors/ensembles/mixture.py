@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_same_names, check_share
+from neuroprior._checks import check_alike_named, check_same_names, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.ensembles.packing import pack, unpack
@@ -71,18 +71,16 @@ class MixturePrior(Prior):
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")
-        named = {f"experts[{number}]": e for number, e in enumerate(made) if e.action_names is not None}
-        first = next(iter(named), "")
-        for where, expert in named.items():
-            names = named[first].action_names, expert.action_names
-            check_same_names("action_names", *names, where, first, "fit them to plans whose actions are numbered alike")
+        names = {f"experts[{number}]": e.action_names for number, e in enumerate(made)}
+        check_alike_named(names, "fit them to plans whose actions are numbered alike")
         given = {(num_contexts, context_size)} - {(None, None)}
         contexts = given | {(e.num_contexts, e.context_size) for e in made if e.takes_context} or {(None, None)}
         if len(contexts) > 1:
             raise ValueError(f"experts: those with a context must have the same, not {sorted(map(str, contexts))}")
         super().__init__(num_actions, *contexts.pop())
-        if named:
-            self.action_names, self.end = named[first].action_names, named[first].end
+        named = next((e for e in made if e.action_names is not None), None)
+        if named is not None:
+            self.action_names, self.end = named.action_names, named.end
         self.experts = nn.ModuleList(made)
         self.share = float(share)
         self.register_buffer("first", torch.full((len(made),), 1 / len(made)).log())

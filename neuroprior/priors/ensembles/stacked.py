@@ -7,7 +7,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_memory, check_same_names, check_sizes
+from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
@@ -141,6 +141,10 @@ class StackedPrior(Prior):
     def fit_settings(self) -> tuple[str, ...]:
         return self.mixer.fit_settings
 
+    @property
+    def learns_anew(self) -> bool:
+        return self.mixer.learns_anew
+
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Fit the experts by counting and the network with Lightning; returns self.
 
@@ -156,9 +160,6 @@ class StackedPrior(Prior):
         """
         self.check_settings(settings)
         held_out = settings.get("validation")
-        if self.mixer.has_learned and isinstance(plans, Plans):
-            names = self.action_names, plans.action_names
-            check_same_names("action_names", *names, "the plans", "this prior, which learns further")
         held_out = self.validation_plans(held_out) if isinstance(held_out, Plans) else None
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_count, check_memory, check_same_names, check_seed, check_sizes, is_number
+from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.prior import Prior
@@ -154,9 +154,8 @@ class NeuralPrior(Prior):
                 self._make(Sizes(*sizes))
 
     @property
-    def has_learned(self) -> bool:
-        """Whether it was fitted before, so that to fit it again goes on from its weights."""
-        return self._sized
+    def learns_anew(self) -> bool:
+        return not self._sized
 
     def sizes_for(self, plans: Plans) -> Sizes:
         """What is chosen for plans to learn from, where it was not given."""
@@ -283,12 +282,7 @@ class NeuralPrior(Prior):
         Raises:
             ValueError: plans that this prior cannot learn from, or too few of them.
         """
-        known = self.action_names if self.has_learned else None
-        if isinstance(plans, Plans):
-            check_same_names("action_names", known, plans.action_names, "the plans", "this prior, which learns further")
         plans = self.training_plans(plans)
-        if self.action_names is None:
-            self.action_names = known
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:
             self._make(self.sizes_for(plans))
