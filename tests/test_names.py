@@ -167,3 +167,12 @@ def test_a_forecast_is_of_the_priors_that_were_inferred():
     for wrong in (16, -1):
         with pytest.raises(ValueError, match=f"{wrong} is out of range"):
             forecast(priors, WORLD, state, posterior, 2, 5, targets=torch.tensor([wrong]))
+
+
+def test_a_fit_that_is_refused_leaves_a_network_free_to_learn_other_plans():
+    wrong = Plans(torch.zeros(3, 4, dtype=torch.long), 5)
+    prior = GRUPrior(4)
+    for plans, how in ((PLANS, {"validation": wrong}), (PLANS[:0], {})):
+        with pytest.raises(ValueError, match=r"plans|actions"):
+            prior.fit(plans, **SHORT, **how)
+    assert prior.fit(OTHERS, **SHORT).action_names == OTHERS.action_names

@@ -133,7 +133,7 @@ def make_trainer(
         folder: of checkpoints and logs.
         max_steps: gradient steps at most (rounded up to whole epochs); the learning rate falls to 0 over them. None:
             on the command line by the number of plans, see `Settings`; else 1,000.
-        patience: steps without lower validation bits after which training stops (rounded up to whole epochs). None: 0.4
+        patience: steps without lower validation bits after which training stops (rounded up to whole epochs). None: 0.3
             of all steps.
         validate_every: steps between two validations, as in `PlansModule.steps`.
         accelerator: "cpu", "gpu", or "auto".

@@ -197,7 +197,7 @@ def test_training_is_as_long_as_the_plans_are_many():
     """Fifty passes, but 1,000 to 4,000 steps, 1,000 where plans are short; patience is a share; what is given stays."""
     chosen = [Settings().for_passes(steps, 33) for steps in (2, 20, 40, 200)]
     assert [how.max_steps for how in chosen] == [1000, 1000, 2000, 4000]
-    assert [how.patience for how in chosen] == [400, 400, 800, 1600]
+    assert [how.patience for how in chosen] == [300, 300, 600, 1200]
     assert [Settings().for_passes(steps, 32).max_steps for steps in (2, 200)] == [1000, 1000]
     assert Settings(max_steps=30, patience=7).for_passes(200, 500) == Settings(max_steps=30, patience=7)
     assert [Settings().batches_of(length) for length in (4, 32, 64, 500)] == [64, 64, 32, 16]

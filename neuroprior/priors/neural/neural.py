@@ -268,9 +268,9 @@ class NeuralPrior(Prior):
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
         how = Settings(**settings)
-        plans = self.prepare(plans, how.window)
         if isinstance(how.validation, Plans):
             how = replace(how, validation=self.validation_plans(how.validation))
+        plans = self.prepare(plans, how.window)
         train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
         return self
 
@@ -286,10 +286,10 @@ class NeuralPrior(Prior):
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:
             self._make(self.sizes_for(plans))
-        self._sized = True
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
             raise ValueError("plans: at least two plans with an action are needed to train a neural prior")
+        self._sized = True
         longest = int(lengths.max())
         self.set_training_window(window if longest > window else None)
         if longest <= window and self._given_window is None:
