@@ -15,8 +15,9 @@ plans of at most `SHORT` actions, from which more steps learn hardly more.
 """
 
 PATIENCE = 0.3
-"""Share of the steps without improvement after which training stops. In short and long plans, text, mice and vectors
-the weights that are kept are those that more patience keeps; with .2 a few trainings stop too early."""
+"""Share of the steps without improvement after which training stops. More patience seldom finds better weights (with .4
+a GRU takes .0006 nats less per move on the labyrinth's five folds, and a tenth more time); with .2 some short plans are
+learned worse."""
 
 ACTIONS_A_STEP, LEAST_BATCH, MOST_BATCH = 2048, 16, 64
 """Actions that a step learns from, about, where the size of batches is not given, and the bounds of that size."""
