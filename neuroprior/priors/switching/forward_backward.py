@@ -22,7 +22,7 @@ ROWS = 1024
 
 TINY = 1e-300
 
-COMPILE_FROM = 2**16
+COMPILE_FROM = 2**9
 """Elements of `steps` from which the compiled loop is taken: loading it pays for no fewer."""
 
 
