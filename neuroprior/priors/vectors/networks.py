@@ -12,10 +12,12 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, check_seed, check_sizes, is_number
 from neuroprior._compiled import compiled
 from neuroprior._random import draw_seed, generator_on
+from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.neural.gru import gru_step
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.neural.transformer import Block
+from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
 
 LEAST_STD = 1e-3
@@ -24,8 +26,14 @@ LEAST_STD = 1e-3
 FIRST_STD = 0.15
 """Standard deviation of each component before training, as a share of the range."""
 
-FIRST_SPREAD = 0.1
-"""Standard deviation of the components' means before training, as a share of the range, so that they come to differ."""
+FIRST_SPREAD = 0.5
+"""Standard deviation of the components' means before training, so that they differ, as a share of the mixture's."""
+
+LONGEST = 16
+"""Vectors that the autoregression sees with which a training begins, at most: more take long to fit."""
+
+TINY = 1e-9
+"""Instead of 0, where a number is divided by."""
 
 DEFAULTS = {"window": 64, "learning_rate": 3e-3}
 """Settings of a training, where they are not given."""
@@ -43,8 +51,9 @@ class VectorNetwork(VectorPrior):
 
     At each step the network reads the last `lags` vectors, scaled by the bounds to -1..1, and the features of the state
     where it takes them, standardised by the mean and standard deviation in the first plans that it learned from. The
-    means of all components have a common part that is linear in these inputs (a vector autoregression); the rest of
-    the means, the weights and the standard deviations are the network's.
+    means of all components have a common part that is linear in these inputs; the rest of the means, the weights and
+    the standard deviations are the network's. Training begins with the linear part and the standard deviations of an
+    `AutoregressivePrior` of order `lags` (at most 16): from few vectors a network learns little that is better.
 
     Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
     state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
@@ -115,7 +124,7 @@ class VectorNetwork(VectorPrior):
             with torch.no_grad():
                 self.head.weight.mul_(0.3)
                 _, means, stds = self._parts(self.head.bias)
-                means.normal_(0, 2 * FIRST_SPREAD)
+                means.normal_(0, 2 * FIRST_STD * FIRST_SPREAD)
                 stds.fill_(log(2 * FIRST_STD))
         self.to(self.device).eval()
 
@@ -300,7 +309,9 @@ class VectorNetwork(VectorPrior):
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Train with Lightning until the likelihood of held-out plans no longer rises; returns self.
 
-        A prior that has learned before is trained further from its present weights.
+        A prior that has learned before is trained further from its present weights. In one that learns for the first
+        time, and holds out a share of the plans, the autoregression in its linear part is fitted to all plans in the
+        end.
 
         Args:
             plans: see `VectorPrior.fit`; at least two (two groups), or one of at least two vectors, cut in time.
@@ -315,20 +326,61 @@ class VectorNetwork(VectorPrior):
         self.check_settings(settings)
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
 
-        how = Settings(**(DEFAULTS | settings))
+        how, first = Settings(**(DEFAULTS | settings)), self.learns_anew
         plans = self.training_plans(plans)
+        self.memory = min(how.window, int(plans.mask().sum(1).max()))
         if how.max_steps is None:
             how = replace(how, max_steps=min(max(int(plans.mask().sum()) // VECTORS_A_STEP, FEWEST), MOST))
-        if self.memory is None and plans.context is not None:
-            features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
-            spread = features.std(0, correction=0)
-            self._mean.copy_(features.mean(0))
-            self._std.copy_(torch.where(spread > 1e-6 * (1 + features.abs().amax(0)), spread, 1))
-        self.memory = min(how.window, int(plans.mask().sum(1).max()))
-        if isinstance(how.validation, VectorPlans):
-            how = replace(how, validation=self.training_plans(how.validation))
-        train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
+        seed = draw_seed(generator_on(generator, "cpu"))
+        learning, validation = plans, how.validation
+        if isinstance(validation, VectorPlans):
+            validation = self.training_plans(validation)
+        elif not isinstance(validation, Sequences):
+            learning, validation = plans.split(validation, torch.Generator().manual_seed(seed))
+        chain = self._chain(learning, seed) if first else None
+        if chain is not None:
+            if plans.context is not None:
+                features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
+                spread = features.std(0, correction=0)
+                self._mean.copy_(features.mean(0))
+                self._std.copy_(torch.where(spread > 1e-6 * (1 + features.abs().amax(0)), spread, 1))
+            self._begin(chain)
+        train(self, learning, replace(how, validation=validation), seed)
+        if chain is not None and learning is not plans:
+            self._add(self._chain(plans, seed), chain)
         return self
+
+    def _chain(self, plans: VectorPlans, seed: int) -> AutoregressivePrior:
+        """An autoregression that sees the same last vectors as the linear part of the means, at most `LONGEST`."""
+        order = min(self.lags, LONGEST)
+        chain = AutoregressivePrior(self.action_low, self.action_high, order).to(plans.actions.device)
+        return chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed)).to(self.device)
+
+    @torch.no_grad()
+    def _begin(self, chain: AutoregressivePrior) -> None:
+        """Take over the linear part and the standard deviations of an autoregression, before the first training."""
+        _, means, stds = self._parts(self.head.bias)
+        std, spread = chain.std[-1], FIRST_SPREAD if self.num_components > 1 else 0.0
+        means.sub_(means.mean(0))
+        means.mul_(spread * std / means.std(0, correction=0).clamp(min=TINY))
+        stds.copy_((std * (1 - spread**2) ** 0.5).log().expand_as(stds))  # all components together spread by `std`
+        self._parts(self.head.weight.T)[1].mul_(std / (2 * FIRST_STD))
+        self._add(chain)
+
+    @torch.no_grad()
+    def _add(self, chain: AutoregressivePrior, instead_of: AutoregressivePrior | None = None) -> None:
+        """Add the linear part of an autoregression to that of the means, and take away that of another one."""
+        size, order = self.action_size, min(self.lags, LONGEST)
+        recent = slice((self.lags - order) * self.entry_size, self.lags * self.entry_size)
+        for sign, each in ((1, chain), (-1, instead_of)):
+            if each is None:
+                continue
+            weights = functional.pad(each.weights[-1].unflatten(0, (order, size)), (0, 0, 0, 1))
+            weights[-1, -1] = each.offset[-1] - each.offset[0]  # where there is a last vector
+            self.linear.weight[:, recent] += sign * weights.flatten(0, 1).T
+            self._parts(self.head.bias)[1].add_(each.offset[0], alpha=sign)
+            if self.coupling is not None:
+                self.coupling.add_(each.coupling[-1], alpha=sign)
 
 
 class VectorGRU(VectorNetwork):

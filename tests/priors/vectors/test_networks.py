@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors import load, save
-from neuroprior.priors.vectors import VectorGRU, VectorPrior, VectorTransformer
+from neuroprior.priors.vectors import AutoregressivePrior, VectorGRU, VectorPrior, VectorTransformer
 from neuroprior.testing.chi_square import chi_square
 
 KINDS = [VectorGRU, VectorTransformer]
@@ -193,3 +193,21 @@ def test_two_modes_are_learned_and_features_are_used(kind):
     truth = -0.5 * log(2 * pi * e * 0.05**2) - log(2)
     assert truth - 0.1 < nats[0] < truth + 0.1
     assert nats[1] < -0.5 * log(2 * pi * e * 0.5**2) + 0.1  # one Gaussian has the spread of both modes
+
+
+@pytest.mark.parametrize("lags", [1, 2, 20])
+def test_what_has_learned_nothing_predicts_as_an_autoregression_of_all_plans(kind, lags):
+    """In training it begins with that of the plans which are not held out; here these are half of them."""
+    data, test = autoregression(40, 30, 1), autoregression(50, 60, 2)
+    data.actions[20:] += 1.0
+    chain = AutoregressivePrior([-4], [4], min(lags, 16)).fit(data, generator=rng())
+    prior = kind([-4], [4], width=8, num_components=3, lags=lags, dropout=0.0)
+    prior.fit(data, generator=rng(), progress=False, max_steps=1, learning_rate=1e-9, validation=0.5)
+    with torch.no_grad():
+        prior.head.weight.zero_()  # what a network adds that was not trained
+        first, ahead = (each[0].mean.mean(1) for each in (prior.start(1), prior.read(test.actions)))
+        nats = [float(each.action_log_probs(data)[:, 16:].mean()) for each in (prior, chain)]
+    assert first.allclose(chain.start(1)[0].mean[:, 0], atol=1e-4)  # the mean of all first vectors
+    gap = ahead - chain.read(test.actions)[0].mean[:, 0]
+    assert gap.abs().mean() < 0.02  # a fifth of the noise: the ridge is chosen on other plans
+    assert nats[0] > nats[1] - 0.1
