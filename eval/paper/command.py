@@ -99,7 +99,7 @@ def _first(settings: PaperSettings, console: Console, folder: Path) -> dict[str,
         "95 %\ninterval": _interval(),
         "paper,\n%": _percent("paper"),
         "mean\nreward": "mean_reward:.4f",
-        "normalised\nscore": "oracle_share:.4f",
+        "normalised\nscore, %": _percent("oracle_share", ".2f"),
         "optimal,\n%": _percent("at_oracle"),
         "steps": "model_steps:,",
     }
