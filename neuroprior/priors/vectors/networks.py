@@ -18,6 +18,7 @@ from neuroprior.priors.neural.gru import gru_step
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.neural.transformer import Block
 from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
+from neuroprior.priors.vectors.linear_gaussian import mean_nats
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
 
 LEAST_STD = 1e-3
@@ -31,6 +32,9 @@ FIRST_SPREAD = 0.5
 
 LONGEST = 16
 """Vectors that the autoregression sees with which a training begins, at most: more take long to fit."""
+
+WORSE = 0.1
+"""Nats per vector of the plans learned from that fitting the autoregression to all of them may cost, at most."""
 
 TINY = 1e-9
 """Instead of 0, where a number is divided by."""
@@ -311,7 +315,7 @@ class VectorNetwork(VectorPrior):
 
         A prior that has learned before is trained further from its present weights. In one that learns for the first
         time, and holds out a share of the plans, the autoregression in its linear part is fitted to all plans in the
-        end.
+        end, unless these become clearly less likely by that.
 
         Args:
             plans: see `VectorPrior.fit`; at least two (two groups), or one of at least two vectors, cut in time.
@@ -325,18 +329,25 @@ class VectorNetwork(VectorPrior):
         """
         self.check_settings(settings)
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
+        from neuroprior.training.trainer import check_alike
 
         how, first = Settings(**(DEFAULTS | settings)), self.learns_anew
+        known, memory = self.action_names, self.memory
         plans = self.training_plans(plans)
-        self.memory = min(how.window, int(plans.mask().sum(1).max()))
         if how.max_steps is None:
             how = replace(how, max_steps=min(max(int(plans.mask().sum()) // VECTORS_A_STEP, FEWEST), MOST))
         seed = draw_seed(generator_on(generator, "cpu"))
         learning, validation = plans, how.validation
-        if isinstance(validation, VectorPlans):
-            validation = self.training_plans(validation)
-        elif not isinstance(validation, Sequences):
-            learning, validation = plans.split(validation, torch.Generator().manual_seed(seed))
+        self.memory = min(how.window, int(plans.mask().sum(1).max()))
+        try:
+            if not isinstance(validation, Sequences):
+                learning, validation = plans.split(validation, torch.Generator().manual_seed(seed))
+            elif isinstance(validation, VectorPlans):
+                validation = self.training_plans(validation)
+            check_alike(learning, validation)
+        except ValueError:
+            self.action_names, self.memory = known, memory  # what is refused is not learned from
+            raise
         chain = self._chain(learning, seed) if first else None
         if chain is not None:
             if plans.context is not None:
@@ -347,8 +358,16 @@ class VectorNetwork(VectorPrior):
             self._begin(chain)
         train(self, learning, replace(how, validation=validation), seed)
         if chain is not None and learning is not plans:
+            weights = {name: value.clone() for name, value in self.state_dict().items()}
+            before = self._mean_nats(plans)
             self._add(self._chain(plans, seed), chain)
+            if self._mean_nats(plans) < before - WORSE:  # a chain of too few vectors, or one that training corrected
+                self.load_state_dict(weights)
         return self
+
+    @torch.no_grad()
+    def _mean_nats(self, plans: VectorPlans) -> float:
+        return mean_nats(self, plans)
 
     def _chain(self, plans: VectorPlans, seed: int) -> AutoregressivePrior:
         """An autoregression that sees the same last vectors as the linear part of the means, at most `LONGEST`."""

@@ -207,7 +207,41 @@ def test_what_has_learned_nothing_predicts_as_an_autoregression_of_all_plans(kin
         prior.head.weight.zero_()  # what a network adds that was not trained
         first, ahead = (each[0].mean.mean(1) for each in (prior.start(1), prior.read(test.actions)))
         nats = [float(each.action_log_probs(data)[:, 16:].mean()) for each in (prior, chain)]
-    assert first.allclose(chain.start(1)[0].mean[:, 0], atol=1e-4)  # the mean of all first vectors
+    assert first.allclose(chain.start(1)[0].mean[:, 0], atol=1e-4)  # where nothing is known yet
     gap = ahead - chain.read(test.actions)[0].mean[:, 0]
     assert gap.abs().mean() < 0.02  # a fifth of the noise: the ridge is chosen on other plans
     assert nats[0] > nats[1] - 0.1
+
+
+def test_a_refused_fit_is_not_learned_from(kind):
+    """The next one learns as the first of a new network does: from its own autoregression and features."""
+    data = plans(context_size=1)
+    wrong = (plans(), VectorPlans(data.actions, LOW - 1, HIGH, context=data.context), 2.0)
+    prior = kind(LOW, HIGH, 1, width=8)
+    for validation in wrong:
+        with pytest.raises(ValueError, match=r"context|action_low|validation"):
+            prior.fit(data, validation=validation, **HOW)
+    with pytest.raises(ValueError, match="plans"):
+        prior.fit(data[:1].steps(0, 1), **HOW)
+    fresh = kind(LOW, HIGH, 1, width=8).fit(data, generator=rng(), **HOW)
+    again = prior.fit(data, generator=rng(), **HOW)
+    assert all(a.equal(b) for a, b in zip(fresh.state_dict().values(), again.state_dict().values(), strict=True))
+
+
+def test_an_autoregression_of_too_few_vectors_is_not_taken_over():
+    """The one plan that is longer than the lags is held out, and ends far from all else."""
+    actions = 0.1 * torch.randn(10, 4, 1, generator=rng(1))
+    actions[0, 3] = 0.9
+    data = VectorPlans(actions, [-1.0], [1.0], torch.tensor([4] + [3] * 9))
+    test = VectorPlans(0.1 * torch.randn(50, 4, 1, generator=rng(9)), [-1.0], [1.0])
+    for seed in (39, 57):
+        prior = VectorGRU([-1], [1], lags=3, seed=seed).fit(data, generator=rng(seed), progress=False)
+        with torch.no_grad():
+            assert float(prior.log_prob(test).mean()) / 4 > 0.6  # the noise has .88; with that autoregression -48
+
+
+def test_learning_further_goes_on_from_the_present_weights(kind):
+    prior = kind(LOW, HIGH, width=8).fit(plans(), generator=rng(), **HOW)
+    before = {name: weight.clone() for name, weight in prior.state_dict().items()}
+    prior.fit(plans(), generator=rng(1), **HOW | {"learning_rate": 1e-9})
+    assert all(weight.allclose(before[name], atol=1e-6) for name, weight in prior.state_dict().items())
