@@ -213,6 +213,7 @@ def held_out_split(plans: VectorPlans, generator: torch.Generator) -> tuple[Vect
     return plans.split(HELD_OUT, generator)
 
 
+@torch.no_grad()
 def mean_nats(prior: VectorPrior, plans: VectorPlans) -> float:
     """The mean log-density of a vector of `plans`, nats; -inf where it is not a number."""
     total = float(prior.action_log_probs(plans).double().sum() / plans.mask().sum().clamp(min=1))

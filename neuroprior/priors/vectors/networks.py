@@ -31,7 +31,7 @@ FIRST_SPREAD = 0.5
 """Standard deviation of the components' means before training, so that they differ, as a share of the mixture's."""
 
 LONGEST = 16
-"""Vectors that the autoregression sees with which a training begins, at most: more take long to fit."""
+"""Order of the autoregression with which a training begins, at most: a higher one takes long to fit."""
 
 WORSE = 0.1
 """Nats per vector of the plans learned from that fitting the autoregression to all of them may cost, at most."""
@@ -348,31 +348,28 @@ class VectorNetwork(VectorPrior):
         except ValueError:
             self.action_names, self.memory = known, memory  # what is refused is not learned from
             raise
+        if first and plans.context is not None:
+            features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
+            spread = features.std(0, correction=0)
+            self._mean.copy_(features.mean(0))
+            self._std.copy_(torch.where(spread > 1e-6 * (1 + features.abs().amax(0)), spread, 1))
         chain = self._chain(learning, seed) if first else None
         if chain is not None:
-            if plans.context is not None:
-                features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
-                spread = features.std(0, correction=0)
-                self._mean.copy_(features.mean(0))
-                self._std.copy_(torch.where(spread > 1e-6 * (1 + features.abs().amax(0)), spread, 1))
             self._begin(chain)
         train(self, learning, replace(how, validation=validation), seed)
         if chain is not None and learning is not plans:
             weights = {name: value.clone() for name, value in self.state_dict().items()}
-            before = self._mean_nats(plans)
-            self._add(self._chain(plans, seed), chain)
-            if self._mean_nats(plans) < before - WORSE:  # a chain of too few vectors, or one that training corrected
+            before = mean_nats(self, plans)
+            self._add(self._chain(plans, seed))
+            self._add(chain, -1.0)
+            if mean_nats(self, plans) < before - WORSE:  # a chain of too few vectors, or one that training corrected
                 self.load_state_dict(weights)
         return self
 
-    @torch.no_grad()
-    def _mean_nats(self, plans: VectorPlans) -> float:
-        return mean_nats(self, plans)
-
     def _chain(self, plans: VectorPlans, seed: int) -> AutoregressivePrior:
-        """An autoregression that sees the same last vectors as the linear part of the means, at most `LONGEST`."""
-        order = min(self.lags, LONGEST)
-        chain = AutoregressivePrior(self.action_low, self.action_high, order).to(plans.actions.device)
+        """An autoregression on the last vectors that the linear part of the means is given, at most `LONGEST`."""
+        chain = AutoregressivePrior(self.action_low, self.action_high, min(self.lags, LONGEST))
+        chain.to(plans.actions.device)
         return chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed)).to(self.device)
 
     @torch.no_grad()
@@ -387,19 +384,15 @@ class VectorNetwork(VectorPrior):
         self._add(chain)
 
     @torch.no_grad()
-    def _add(self, chain: AutoregressivePrior, instead_of: AutoregressivePrior | None = None) -> None:
-        """Add the linear part of an autoregression to that of the means, and take away that of another one."""
-        size, order = self.action_size, min(self.lags, LONGEST)
-        recent = slice((self.lags - order) * self.entry_size, self.lags * self.entry_size)
-        for sign, each in ((1, chain), (-1, instead_of)):
-            if each is None:
-                continue
-            weights = functional.pad(each.weights[-1].unflatten(0, (order, size)), (0, 0, 0, 1))
-            weights[-1, -1] = each.offset[-1] - each.offset[0]  # where there is a last vector
-            self.linear.weight[:, recent] += sign * weights.flatten(0, 1).T
-            self._parts(self.head.bias)[1].add_(each.offset[0], alpha=sign)
-            if self.coupling is not None:
-                self.coupling.add_(each.coupling[-1], alpha=sign)
+    def _add(self, chain: AutoregressivePrior, sign: float = 1.0) -> None:
+        """Add the linear part of an autoregression to that of the means; with -1 take it away."""
+        weights = functional.pad(chain.weights[-1].unflatten(0, (-1, self.action_size)), (0, 0, 0, 1))
+        weights[-1, -1] = chain.offset[-1] - chain.offset[0]  # where there is a last vector
+        recent = slice((self.lags - len(weights)) * self.entry_size, self.lags * self.entry_size)
+        self.linear.weight[:, recent] += sign * weights.flatten(0, 1).T
+        self._parts(self.head.bias)[1].add_(chain.offset[0], alpha=sign)
+        if self.coupling is not None:
+            self.coupling.add_(chain.coupling[-1], alpha=sign)
 
 
 class VectorGRU(VectorNetwork):
