@@ -30,9 +30,6 @@ FIRST_STD = 0.15
 FIRST_SPREAD = 0.5
 """Standard deviation of the components' means before training, so that they differ, as a share of the mixture's."""
 
-LONGEST = 16
-"""Order of the autoregression with which a training begins, at most: a higher one takes long to fit."""
-
 WORSE = 0.1
 """Nats per vector of the plans learned from that fitting the autoregression to all of them may cost, at most."""
 
@@ -57,7 +54,7 @@ class VectorNetwork(VectorPrior):
     where it takes them, standardised by the mean and standard deviation in the first plans that it learned from. The
     means of all components have a common part that is linear in these inputs; the rest of the means, the weights and
     the standard deviations are the network's. Training begins with the linear part and the standard deviations of an
-    `AutoregressivePrior` of order `lags` (at most 16): from few vectors a network learns little that is better.
+    `AutoregressivePrior` of at most `lags` vectors: from few vectors a network learns little that is better.
 
     Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
     state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
@@ -360,27 +357,31 @@ class VectorNetwork(VectorPrior):
         if chain is not None and learning is not plans:
             weights = {name: value.clone() for name, value in self.state_dict().items()}
             before = mean_nats(self, plans)
-            self._add(self._chain(plans, seed))
+            self._add(self._chain(plans, seed, chain.memory))
             self._add(chain, -1.0)
             if mean_nats(self, plans) < before - WORSE:  # a chain of too few vectors, or one that training corrected
                 self.load_state_dict(weights)
         return self
 
-    def _chain(self, plans: VectorPlans, seed: int) -> AutoregressivePrior:
-        """An autoregression on the last vectors that the linear part of the means is given, at most `LONGEST`."""
-        chain = AutoregressivePrior(self.action_low, self.action_high, min(self.lags, LONGEST))
-        chain.to(plans.actions.device)
+    def _chain(self, plans: VectorPlans, seed: int, order: int | None = None) -> AutoregressivePrior:
+        """An autoregression on last vectors that the network is given; None: of the order that fits best."""
+        chain = AutoregressivePrior(self.action_low, self.action_high, order).to(plans.actions.device)
+        chain.orders = tuple(order for order in chain.orders if order <= self.lags)
         return chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed)).to(self.device)
 
     @torch.no_grad()
     def _begin(self, chain: AutoregressivePrior) -> None:
         """Take over the linear part and the standard deviations of an autoregression, before the first training."""
         _, means, stds = self._parts(self.head.bias)
-        std, spread = chain.std[-1], FIRST_SPREAD if self.num_components > 1 else 0.0
-        means.sub_(means.mean(0))
-        means.mul_(spread * std / means.std(0, correction=0).clamp(min=TINY))
-        stds.copy_((std * (1 - spread**2) ** 0.5).log().expand_as(stds))  # all components together spread by `std`
-        self._parts(self.head.weight.T)[1].mul_(std / (2 * FIRST_STD))
+        share = FIRST_SPREAD if self.num_components > 1 else 0.0
+        eye = torch.eye(self.action_size, device=chain.std.device)
+        root = torch.linalg.inv(eye - chain.coupling[-1]) * chain.std[-1]  # of the covariance
+        if self.coupling is None:
+            root = root.norm(dim=1).diag()  # each dimension's own spread, not what the others leave of it
+        means.copy_((means - means.mean(0)) / means.std(0, correction=0).clamp(min=TINY) @ (share * root.T))
+        stds.copy_((root.diagonal() * (1 - share**2) ** 0.5).log().expand_as(stds))
+        weights = self._parts(self.head.weight.T)[1]
+        weights.copy_(weights @ (root.T / (2 * FIRST_STD)))
         self._add(chain)
 
     @torch.no_grad()

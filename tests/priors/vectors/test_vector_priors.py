@@ -1,7 +1,7 @@
 """Priors over vectors: the conformance suite, closed forms, and sources whose parameters are known."""
 
 from dataclasses import replace
-from math import erf, log, pi, sqrt
+from math import e, erf, log, pi, sqrt
 
 import pytest
 import torch
@@ -251,6 +251,19 @@ def test_constant_plans_and_a_single_vector_can_be_learned():
     for name in KINDS:
         if name != "stored windows":
             assert KINDS[name](-torch.ones(2), torch.ones(2)).fit(single).log_prob(single).isfinite().all()
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_what_few_windows_do_not_show_is_not_taken_for_impossible(size):
+    """One plan of six vectors among single ones: one window of order 5, and three of order 3."""
+    low, high = torch.full((size,), -1.0), torch.ones(size)
+    actions = 0.1 * torch.randn(60, 6, size, generator=torch.Generator().manual_seed(1))
+    data = VectorPlans(actions, low, high, torch.tensor([6] + [1] * 59))
+    test = VectorPlans(0.1 * torch.randn(50, 6, size, generator=torch.Generator().manual_seed(2)), low, high)
+    noise = -0.5 * log(2 * pi * e * 0.1**2)
+    for order in (3, 5):
+        prior = AutoregressivePrior(low, high, order).fit(data, generator=torch.Generator().manual_seed(0))
+        assert float(prior.log_prob(test).mean()) / (6 * size) > noise - 0.2
 
 
 @pytest.mark.parametrize(
