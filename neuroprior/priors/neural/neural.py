@@ -266,10 +266,13 @@ class NeuralPrior(Prior):
         """
         self.check_settings(settings)
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
+        from neuroprior.training.trainer import check_alike
 
         how = Settings(**settings)
-        if isinstance(how.validation, Plans):
-            how = replace(how, validation=self.validation_plans(how.validation))
+        if isinstance(how.validation, Plans):  # refused before anything is kept of the plans
+            validation = self.validation_plans(how.validation)
+            check_alike(self.validation_plans(self._as_plans(plans)), validation)
+            how = replace(how, validation=validation)
         plans = self.prepare(plans, how.window)
         train(self, plans, how, draw_seed(generator_on(generator, "cpu")))
         return self

@@ -1,6 +1,7 @@
 """Neural priors: fitting, the exact divergence from a known source, reproducibility, and what is refused."""
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -134,6 +135,20 @@ def test_plans_of_one_action(kind):
 def test_refuses_too_few_plans(kind, plans):
     with refuses("plans"):
         small(kind).fit(plans, **QUICK)
+
+
+@BOTH
+def test_a_refused_fit_is_not_learned_from(kind):
+    """The next one learns as the first of a new network does, with sizes of its own."""
+    plans = Plans(torch.randint(3, (40, 6), generator=seeded(0)), 3, action_names=("a", "b", "c"))
+    others = {"action_names": replace(plans, action_names=("b", "a", "c")), "3": Plans(plans.actions, 4), "2.0": 2.0}
+    prior = kind(3)
+    for word, validation in others.items():
+        with refuses(word):
+            prior.fit(plans, validation=validation, **QUICK)
+    assert prior.action_names is None
+    fresh = kind(3).fit(plans, generator=seeded(1), **QUICK)
+    assert weights(prior.fit(plans, generator=seeded(1), **QUICK)).equal(weights(fresh))
 
 
 @BOTH
