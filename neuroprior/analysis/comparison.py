@@ -1,5 +1,6 @@
 """Priors compared on held-out plans: bits per action with intervals, and count-based baselines."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from math import inf, log, log2
@@ -26,12 +27,14 @@ class Score:
         inputs: what it predicts from, "actions" or "actions and context".
         bits: `[G]`, float64: the negative log2-likelihood of each independent unit.
         actions: `[G]`, float64: the number of actions in each unit.
+        digest: of the actions that were scored; scores of others are not compared.
     """
 
     model: str
     inputs: str
     bits: Tensor
     actions: Tensor
+    digest: str = ""
 
     def bits_per_action(self) -> Difference:
         """Bits per action with its 95 % interval over units."""
@@ -43,7 +46,7 @@ class Score:
         Raises:
             ValueError: the two were not scored on the same plans.
         """
-        if not self.actions.equal(other.actions):
+        if self.digest != other.digest or not self.actions.equal(other.actions):
             raise ValueError(f"{self.model}, {other.model}: scores on the same plans are expected, and these are not")
         return ratio_difference(self.bits - other.bits, self.actions)
 
@@ -100,7 +103,10 @@ def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor
     if size < FEWEST_UNITS:
         raise ValueError(f"plans: at least two held-out actions are needed for a comparison, not {int(mask.sum())}")
     totals = torch.zeros(size, dtype=torch.double).index_add_(0, unit, bits[mask].double())
-    return Score(model, inputs, totals, unit.bincount(minlength=size).double())
+    scored = hashlib.sha256()
+    for part in (within.sum(1), plans.actions.cpu()[within].long(), mask[within]):
+        scored.update(part.numpy().tobytes())
+    return Score(model, inputs, totals, unit.bincount(minlength=size).double(), scored.hexdigest())
 
 
 def action_bits(prior: Prior, plans: Plans) -> Tensor:

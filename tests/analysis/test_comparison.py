@@ -229,7 +229,8 @@ def test_minus_is_paired():
     assert gap == ratio_difference(markov.bits - uniform.bits, uniform.actions)
     assert gap.mean == pytest.approx(markov.bits_per_action().mean - uniform.bits_per_action().mean)
     assert markov.minus(markov) == (0, 0, 0, 1)
-    for other in (held_out()[:9], held_out(group=torch.arange(12) // 4), held_out().with_end()):
+    others = replace(plans, actions=(plans.actions + 1) % 3)  # of equal lengths
+    for other in (held_out()[:9], held_out(group=torch.arange(12) // 4), held_out().with_end(), others):
         one = score("other", UniformPrior(other.num_actions), other)
         with refuses("MarkovPrior, UniformPrior", "scores on the same plans"):
             markov.minus(replace(one, model="UniformPrior"))
