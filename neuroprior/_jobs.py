@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -296,19 +296,27 @@ def _digest(module: str) -> str:
         if source is None:
             continue
         found[name] = source.read_bytes()
-        for node in ast.walk(ast.parse(found[name])):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "compiled":
-                names = [str(one.value) for one in node.args if isinstance(one, ast.Constant)]
-            new = {each for each in names if each.split(".")[0] in PACKAGES} - met
-            todo += new
-            met |= new
+        new = {each for each in _imported(found[name]) if each.split(".")[0] in PACKAGES} - met
+        todo += new
+        met |= new
     digest = hashlib.sha256()
     for name in sorted(found):
         digest.update(name.encode() + b"\0" + found[name] + b"\0")
     return digest.hexdigest()
+
+
+@cache
+def _imported(source: bytes) -> frozenset[str]:
+    """The names that a source imports, found once for all code that has it: to parse takes longer than to read."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "compiled":
+            found |= {str(one.value) for one in node.args if isinstance(one, ast.Constant)}
+    return frozenset(found)
 
 
 def _source(module: str) -> Path | None:

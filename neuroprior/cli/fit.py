@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 import yaml
-from jsonargparse import ArgumentError
+from jsonargparse import ArgumentError, class_from_function
 from jsonargparse.typing import PositiveInt
 from lightning import Trainer
 from lightning.fabric.utilities.exceptions import MisconfigurationException
@@ -69,6 +69,9 @@ EFFORT = "--model.prior.effort"
 STEPS = "--max_steps"
 """`--trainer.max_steps`, as other commands call it."""
 
+MadeTrainer = class_from_function(make_trainer)
+"""Made once: Lightning would make it twice for each run, and look through the whole stack of calls for it."""
+
 NETWORKS_ALONE = {"devices": 1, "num_nodes": 1, "precision": "32-true", "accumulate_grad_batches": 1, "max_time": None}
 """Options of the trainer, with their defaults, that do not reach the networks inside other priors."""
 
@@ -101,7 +104,7 @@ class FitCLI(LightningCLI):
             PriorModel,
             PlansData,
             save_config_callback=None,
-            trainer_class=make_trainer,
+            trainer_class=MadeTrainer,
             seed_everything_default=0,
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,

@@ -155,11 +155,11 @@ def _check_samples(prior: VectorPrior, plans: VectorPlans, num_plans: int, gener
             forecast = forecast.repeat_interleave(rows)
             _check_uniform(_ranks(prior, forecast, vectors[:, 0], generator), "vector 0, dimension 1")
             continue
-        forecast, state = forecast.repeat_interleave(rows), state.repeat_interleave(rows, 0)
-        for t in range(length):
+        _check_uniform(_first_ranks(prior, forecast, vectors[:, 0, 0], generator), "vector 0")
+        state = state.repeat_interleave(rows, 0)
+        for t in range(1, length):
+            forecast, state = prior.step(vectors[:, t - 1], state)
             _check_uniform(_ranks(prior, forecast, vectors[:, t], generator), f"vector {t}")
-            if t + 1 < length:
-                forecast, state = prior.step(vectors[:, t], state)
 
 
 def _check_uniform(ranks: Tensor, what: str) -> None:
@@ -175,6 +175,13 @@ def _ranks(prior: VectorPrior, forecast: Forecast, vectors: Tensor, generator: t
     points = torch.cat([before, grid.repeat(len(vectors))[:, None]], 1).to(vectors)
     density = forecast.repeat_interleave(len(grid)).log_prob(points).exp().view(len(vectors), -1).cpu()
     return _ranks_on(grid, density, vectors[:, -1].cpu(), generator)
+
+
+def _first_ranks(prior: VectorPrior, forecast: Forecast, first: Tensor, generator: torch.Generator) -> Tensor:
+    """`[N]`: the probability of less than `first [N]`, the only number of vectors, in a forecast of one row."""
+    grid = _grid(prior, 0)
+    density = forecast.repeat_interleave(len(grid)).log_prob(grid[:, None].to(first)).exp().cpu()
+    return _ranks_on(grid, density.expand(len(first), -1), first.cpu(), generator)
 
 
 def _marginal_ranks(prior: VectorPrior, forecast: Forecast, first: Tensor, generator: torch.Generator) -> Tensor:

@@ -1,7 +1,7 @@
 """The 2 x 2 x 2 cube: 3,674,160 states, six or nine moves, and the exact distance of each state from the solved one."""
 
 import itertools
-from functools import cached_property
+from functools import cache
 from typing import Literal
 
 import torch
@@ -123,20 +123,9 @@ class PocketCube(World):
         check_range("state", state, NUM_STATES, "states of the cube")
         return self._distances[state].long()
 
-    @cached_property
+    @property
     def _distances(self) -> Tensor:
-        """uint8 `[3674160]`: breadth-first search from the solved state, all states of a depth at a time."""
-        unknown = 255
-        distances = torch.full((NUM_STATES,), unknown, dtype=torch.uint8, device=self.device)
-        distances[0] = 0
-        frontier, depth = torch.zeros(1, dtype=torch.long, device=self.device), 0
-        while len(frontier):
-            depth += 1
-            for action in range(self.num_actions):  # one at a time: the largest frontier has 1,887,748 states
-                after = self._after(frontier, torch.full_like(frontier, action))
-                distances[after[distances[after] == unknown]] = depth
-            frontier = (distances == depth).nonzero()[:, 0]
-        return distances
+        return _all_distances(self.turns, self.device)
 
     def observe(self, state: Tensor) -> Tensor:
         """float32 `[N, 70]`: which cubie is in each of the seven places (one-hot, 49), and its twist (one-hot, 21)."""
@@ -210,3 +199,22 @@ def _all_orientations() -> Tensor:
 def _orientation_number(twists: Tensor) -> Tensor:
     """The row `[N]` of `twists [N, 7]` among all orientations."""
     return (twists[:, :6] * torch.tensor([243, 81, 27, 9, 3, 1])).sum(-1)
+
+
+@cache
+def _all_distances(turns: Literal["half", "quarter"], device: torch.device) -> Tensor:
+    """uint8 `[3674160]`: breadth-first search from the solved state, all states of a depth at a time.
+
+    Once for all cubes of a process: the search takes seconds.
+    """
+    world, unknown = PocketCube(turns, 0).to(device), 255
+    distances = torch.full((NUM_STATES,), unknown, dtype=torch.uint8, device=device)
+    distances[0] = 0
+    frontier, depth = torch.zeros(1, dtype=torch.long, device=device), 0
+    while len(frontier):
+        depth += 1
+        for action in range(world.num_actions):  # one at a time: the largest frontier has 1,887,748 states
+            after = world._after(frontier, torch.full_like(frontier, action))
+            distances[after[distances[after] == unknown]] = depth
+        frontier = (distances == depth).nonzero()[:, 0]
+    return distances

@@ -103,7 +103,6 @@ def test_distances(turns, known):
     assert ((left - here[:, None]).abs() <= 1).all()
     assert world.distance(state.view(2, -1)).shape == (2, 1000)
     absorbing = cube(turns, reward="distance", absorbing=True)
-    absorbing._distances = world._distances  # that are searched for once
     after, lost = absorbing.step(torch.cat([state[:5], torch.tensor([0])]), torch.arange(6))
     assert after[-1] == 0
     assert lost.tolist() == [*(-world.distance(after[:5])).tolist(), 0]

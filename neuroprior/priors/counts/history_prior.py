@@ -87,11 +87,11 @@ class HistoryPrior(Prior):
 
     def _walk(self, actions: Tensor, node: Tensor) -> Tensor:
         """The node before each action, `[N, L]`, from `node [N]` on."""
-        nodes, follow = torch.empty_like(actions), self.next_node.view(-1)
-        for t in range(actions.shape[1]):
-            nodes[:, t] = node
-            node = follow[node * self.num_actions + actions[:, t]].long()
-        return nodes
+        follow, nodes = self.next_node.view(-1), actions.new_empty(actions.shape[1], len(actions))
+        for action, before in zip(actions.unbind(1), nodes, strict=True):  # of one step each
+            before.copy_(node)
+            node = follow.index_select(0, (node * self.num_actions).add_(action)).long()
+        return nodes.t().contiguous()
 
     def fit(self, plans: Plans | Tensor, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Count anew; returns self.

@@ -139,6 +139,8 @@ def back_off_probs(
         root = _pooled(counts, contexts, root, rule, smoothing)
     table = torch.empty(len(counts.row_code) + 1, num_actions, device=root.device)
     table[-1:] = root.clamp(min=1e-300).log()
+    if not len(counts.row_code):  # of a prior that has not learned yet
+        return table
     parent = parent_rows(tree, counts, contexts)
     discounts, known, ends = torch.zeros(3), -1, level_bounds(tree, counts, contexts)
     for level, first, until in row_blocks(tree, counts, contexts, num_actions):

@@ -92,6 +92,13 @@ class Windows:
         self.radius = max(
             max(-row, -column, row + height - 1, column + width - 1) for row, column, height, width in self.windows
         )
+        # In the square around the mover, the cells of each window from its first; before them one that adds nothing.
+        side, most = 2 * self.radius + 1, max(height * width for _, _, height, width in self.windows)
+        self._cells = torch.full((most, len(self.windows)), side**2)
+        for k, (row, column, height, width) in enumerate(self.windows):
+            first = (self.radius + row) * side + self.radius + column
+            own = first + torch.arange(height)[:, None] * side + torch.arange(width)
+            self._cells[most - height * width :, k] = own.flatten()
 
     def codes(self, kinds: Tensor, row: Tensor, column: Tensor) -> Tensor:
         """The patterns around the mover.
@@ -103,19 +110,14 @@ class Windows:
         Returns:
             int32 `[N, F]`.
         """
-        reach, number = self.radius, len(kinds)
-        around = torch.arange(2 * reach + 1, device=kinds.device)
-        padded = torch.nn.functional.pad(kinds.long(), (reach,) * 4, value=self.outside)
+        reach, device = self.radius, kinds.device
+        around, each = torch.arange(2 * reach + 1, device=device), torch.arange(len(kinds), device=device)
+        padded = torch.nn.functional.pad(kinds.int(), (reach,) * 4, value=self.outside)
         rows, columns = row[:, None] + around, column[:, None] + around
-        square = padded[torch.arange(number, device=kinds.device)[:, None, None], rows[:, :, None], columns[:, None, :]]
-        out = torch.empty(number, len(self.windows), dtype=torch.int32, device=kinds.device)
-        strips: dict[int, Tensor] = {1: square}
-        for wide in range(2, max(window[3] for window in self.windows) + 1):
-            shorter = strips[wide - 1]
-            strips[wide] = shorter[..., :-1] * self.base + square[..., wide - 1 :]
-        for k, (y, x, height, width) in enumerate(self.windows):
-            code = torch.zeros(number, dtype=torch.long, device=kinds.device)
-            for i in range(height):
-                code = code * self.base**width + strips[width][:, y + reach + i, x + reach]
-            out[:, k] = self.offsets[k] + code
-        return out
+        square = padded[each[:, None, None], rows[:, :, None], columns[:, None, :]].flatten(1)
+        square = torch.nn.functional.pad(square, (0, 1))  # and a cell of kind 0
+        first, *others = self._cells.to(device)
+        out = square.index_select(1, first)
+        for cells in others:
+            out.mul_(self.base).add_(square.index_select(1, cells))
+        return out.add_(self.offsets.to(device, torch.int32))
