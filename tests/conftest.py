@@ -15,9 +15,13 @@ settings.load_profile("same")
 
 
 def pytest_collection_finish() -> None:
-    """What is loaded stays: to look through it for garbage again and again takes a tenth of the time."""
+    """What is loaded stays: to look through it for garbage again and again takes a tenth of the time.
+
+    So does what tests load later; hence garbage is looked for less often than usual.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
 
 
 def _blank(figure: Figure, file: Any, *, format: str | None = None, **how: Any) -> None:

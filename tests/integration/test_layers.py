@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import networkx
@@ -36,6 +37,7 @@ def imports(path: Path, modules: set[str]) -> set[str]:
     return found & modules
 
 
+@cache
 def graph() -> "networkx.DiGraph[str]":
     modules = sources()
     edges = {name: imports(path, set(modules)) - {name} for name, path in modules.items()}

@@ -13,6 +13,9 @@ from neuroprior.priors import SwitchingNetwork, SwitchingPrior
 from neuroprior.testing import check_prior
 from tests.support.sources import refuses, seeded
 
+SHORT = {"restarts": 1, "max_iterations": 10}
+"""Of a prior that may be any: what is asked of it does not depend on how well it has learned."""
+
 STICKY = torch.tensor([[0.9, 0.1], [0.2, 0.8]], dtype=torch.double)
 """Transitions of the source of two modes."""
 
@@ -40,13 +43,12 @@ def enumerated(prior, plans):
     """Of each plan its likelihood, the probabilities of the mode of each action, and the best path: over all paths."""
     rows, cells = prior.cells(plans.actions, plans.context)
     num, length = plans.actions.shape
-    paths = list(itertools.product(range(prior.num_modes), repeat=length))
-    joint = torch.ones(num, len(paths), dtype=torch.double)
-    for number, path in enumerate(paths):
-        for t, mode in enumerate(path):
-            before = prior.first[mode] if t == 0 else prior.transitions[cells[:, t], path[t - 1], mode]
-            joint[:, number] *= before * prior.log_probs[rows[:, t], mode, plans.actions[:, t].long()].double().exp()
-    where = torch.tensor(paths)
+    where = torch.tensor(list(itertools.product(range(prior.num_modes), repeat=length)))
+    joint, each = torch.ones(num, len(where), dtype=torch.double), torch.arange(num)[:, None]
+    for t, mode in enumerate(where.T):
+        before = prior.first[mode] if t == 0 else prior.transitions[cells[:, t]][each, where[:, t - 1], mode]
+        log_probs = prior.log_probs[rows[:, t]][each, mode, plans.actions[:, t].long()[:, None]]
+        joint *= before * log_probs.double().exp()
     smoothed = torch.stack([(joint[:, :, None] * (where == k)).sum(1) for k in range(prior.num_modes)], -1)
     return joint.sum(1), smoothed / joint.sum(1)[:, None, None], where[joint.argmax(1)]
 
@@ -54,7 +56,7 @@ def enumerated(prior, plans):
 @pytest.mark.parametrize(("contexts", "order"), [(None, 0), (None, 1), (4, 0), (4, 2)])
 def test_inference_equals_enumeration(contexts, order):
     plans = some_plans(contexts=contexts)
-    prior = SwitchingPrior(3, 3, order, contexts, smoothing=0.5).fit(plans, generator=seeded(0))
+    prior = SwitchingPrior(3, 3, order, contexts, smoothing=0.5, **SHORT).fit(plans, generator=seeded(0))
     some = plans[:8]
     likelihood, smoothed, path = enumerated(prior, some)
     torch.testing.assert_close(prior.log_prob(some).double(), likelihood.log(), atol=2e-6, rtol=0)
@@ -160,7 +162,7 @@ def test_em_never_lowers_the_likelihood():
 
 def test_long_sequences_are_inferred_in_chunks_as_in_steps():
     actions = switching_source(2, 700)[0]
-    prior = SwitchingPrior(3, 2).fit(actions, generator=seeded(0))
+    prior = SwitchingPrior(3, 2, **SHORT).fit(actions, generator=seeded(0))
     logits, state = prior.start(2)
     found = []
     for t in range(700):
@@ -237,7 +239,9 @@ def test_groups_are_not_divided_between_folds():
     actions = switching_source(20, 30)[0]
     one, two = (Plans(actions, 3, group=torch.arange(20) % number) for number in (1, 2))
     fitted = [
-        SwitchingPrior(3, 2, folds=folds).fit(plans, generator=seeded(0)) for plans in (one, two) for folds in (1, 4)
+        SwitchingPrior(3, 2, folds=folds, **SHORT).fit(plans, generator=seeded(0))
+        for plans in (one, two)
+        for folds in (1, 4)
     ]
     assert fitted[0].log_probs.equal(fitted[1].log_probs)  # one group is one fold
     assert not fitted[2].log_probs.allclose(fitted[3].log_probs, atol=1e-4)
@@ -272,7 +276,7 @@ def test_actions_beyond_the_end_say_nothing():
     actions, lengths = switching_source(30, 20)[0], torch.randint(1, 21, (30,), generator=seeded(0))
     plans = Plans(actions, 3, lengths=lengths)
     other = replace(plans, actions=torch.where(plans.mask(), actions, 2 - actions))
-    one, two = (SwitchingPrior(3, 2).fit(some, generator=seeded(0)) for some in (plans, other))
+    one, two = (SwitchingPrior(3, 2, **SHORT).fit(some, generator=seeded(0)) for some in (plans, other))
     assert one.transitions.equal(two.transitions)
     torch.testing.assert_close(one.log_prob(plans), two.log_prob(other))
     cut = one.posterior(actions[:1, : int(lengths[0])]).smoothed
@@ -283,7 +287,7 @@ def test_actions_beyond_the_end_say_nothing():
 def test_the_most_probable_path_ends_with_the_plan(contexts):
     # Beyond the end a path would have gained by being in a mode that lasts.
     plans = some_plans(contexts=contexts)
-    prior = SwitchingPrior(3, 2, 1, contexts, smoothing=0.5).fit(plans, generator=seeded(0))
+    prior = SwitchingPrior(3, 2, 1, contexts, smoothing=0.5, **SHORT).fit(plans, generator=seeded(0))
     prior.transitions[:] = STICKY.flip(0, 1)
     lengths = torch.arange(40) % 6 + 1
     path = prior.posterior(replace(plans, lengths=lengths)).path
@@ -315,9 +319,9 @@ def test_counting_anew_keeps_the_modes():
 def test_going_on_from_nothing_begins():
     # Modes that are all alike would remain so.
     plans = Plans(switching_source(10, 30)[0], 3)
-    fitted = SwitchingPrior(3, 2).fit(plans, generator=seeded(0)).log_probs
-    assert SwitchingPrior(3, 2).fit(plans, generator=seeded(0), warm_start=True).log_probs.equal(fitted)
-    assert SwitchingPrior(3, 2).recount(plans).log_probs.equal(fitted)
+    fitted = SwitchingPrior(3, 2, **SHORT).fit(plans, generator=seeded(0)).log_probs
+    assert SwitchingPrior(3, 2, **SHORT).fit(plans, generator=seeded(0), warm_start=True).log_probs.equal(fitted)
+    assert SwitchingPrior(3, 2, **SHORT).recount(plans).log_probs.equal(fitted)
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (4, 0)])

@@ -58,7 +58,7 @@ def test_conformance_between_any_bounds(kind, bounds):
     """A mass at a bound is one in scores as in samples, wherever the bounds are: rounding must not move it beside."""
     plans = source(*bounds)
     prior = CLOSED[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded())
-    check_prior(prior, length=3, num_plans=1000)
+    check_prior(prior, length=3, num_plans=400)
 
 
 @pytest.mark.parametrize("kind", CLOSED)

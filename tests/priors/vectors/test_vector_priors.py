@@ -60,7 +60,7 @@ def test_conformance(kind, fitted, size):
     prior = KINDS[kind](LOW[:size], HIGH[:size])
     if fitted:
         prior.fit(source(low=LOW[:size], high=HIGH[:size]), generator=seeded())
-    check_prior(prior, num_plans=2000)
+    check_prior(prior, num_plans=600)
 
 
 @pytest.mark.parametrize(
