@@ -1,6 +1,7 @@
 """Chains of modes from expected counts, interpolated with shorter histories and with all modes together."""
 
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,6 +30,7 @@ class ModeChains:
         self.parent = parent_rows(tree, counts, self.contexts)
         self.kinds = torch.bincount(counts.row, minlength=len(counts.row_code)).double()
         self.code = counts.row * num_actions + counts.action
+        self._known: dict[int, list[_Block]] = {}
         ends = torch.tensor(level_bounds(tree, counts, self.contexts), device=counts.row.device)
         levels = torch.searchsorted(counts.row, ends).tolist()
         # Of the entries of each level but the first, the longest histories first, those of their shorter histories.
@@ -62,19 +64,28 @@ class ModeChains:
             kinds = (first.sum(0) > 0).sum()[None]
             whole[-1] = self._blend(first.sum(0), whole[-1], kinds)
             own[-1] = self._blend(first, whole[-1].expand(modes, -1), kinds)
-        for _, first_row, until in row_blocks(self.tree, counts, self.contexts, self.num_actions * modes):
-            here, above, n = (
-                slice(first_row, until),
-                self.parent[first_row:until],
-                self._dense(first_row, until, expected),
-            )
-            kinds = self.kinds[here, None]
-            whole[here] = self._blend(n.sum(1), whole[above], kinds)
-            # With nothing but the place to go by, what all modes do there says more than what the mode does elsewhere.
-            share = torch.where(above == number, 1.0, self.sharing)[:, None, None].to(n)
-            base = (1 - share) * own[above] + share * whole[here, None]
-            own[here] = self._blend(n, base, kinds[:, None])
+        for block in self._blocks(modes):
+            here, above, n = block.rows, block.above, block.dense(expected)
+            whole[here] = self._blend(n.sum(1), whole[above], block.kinds)
+            base = (1 - block.share) * own[above] + block.share * whole[here, None]
+            own[here] = self._blend(n, base, block.kinds[:, None])
         return own.clamp(min=1e-300).log()
+
+    def _blocks(self, modes: int) -> list["_Block"]:
+        """The blocks of rows for a number of modes; found once, as EM goes through them in each iteration."""
+        if modes not in self._known:
+            number, found = len(self.counts.row_code), []
+            for _, first, until in row_blocks(self.tree, self.counts, self.contexts, self.num_actions * modes):
+                above = self.parent[first:until]
+                # With nothing but the place to go by, what all modes do there says more than what the mode does
+                # elsewhere.
+                share = torch.where(above == number, 1.0, self.sharing)[:, None, None].double()
+                entries, row, action = self._entries(first, until)
+                kinds = self.kinds[first:until, None]
+                size = until - first, self.num_actions
+                found.append(_Block(slice(first, until), entries, row, action, size, above, share, kinds))
+            self._known[modes] = found
+        return self._known[modes]
 
     def _blend(self, n: Tensor, base: Tensor, kinds: Tensor) -> Tensor:
         """Probabilities `[..., A]` from counts and what they are interpolated with; `kinds [..., 1]` of actions."""
@@ -85,7 +96,33 @@ class ModeChains:
 
     def _dense(self, first: int, until: int, expected: Tensor) -> Tensor:
         """The expected counts of some rows, `[until - first, K, A]`."""
-        at, end = torch.searchsorted(self.counts.row, torch.tensor([first, until], device=expected.device)).tolist()
-        table = expected.new_zeros(until - first, expected.shape[1], self.num_actions)
-        table[self.counts.row[at:end] - first, :, self.counts.action[at:end]] = expected[at:end].clamp(min=0)
-        return table
+        return _dense(expected, *self._entries(first, until), (until - first, self.num_actions))
+
+    def _entries(self, first: int, until: int) -> tuple[slice, Tensor, Tensor]:
+        """The entries of some rows, with their rows, counted from `first`, and actions."""
+        ends = torch.tensor([first, until], device=self.counts.row.device)
+        at, end = torch.searchsorted(self.counts.row, ends).tolist()
+        return slice(at, end), self.counts.row[at:end] - first, self.counts.action[at:end]
+
+
+class _Block(NamedTuple):
+    """R rows that are computed together, with what does not depend on the expected counts."""
+
+    rows: slice
+    entries: slice
+    row: Tensor
+    action: Tensor
+    size: tuple[int, int]
+    above: Tensor  # [R]: the rows of the shorter histories
+    share: Tensor  # [R, 1, 1]: how much of what all modes do counts for each
+    kinds: Tensor  # [R, 1]
+
+    def dense(self, expected: Tensor) -> Tensor:
+        """The expected counts `[R, K, A]`."""
+        return _dense(expected, self.entries, self.row, self.action, self.size)
+
+
+def _dense(expected: Tensor, entries: slice, row: Tensor, action: Tensor, size: tuple[int, int]) -> Tensor:
+    table = expected.new_zeros(size[0], expected.shape[1], size[1])
+    table[row, :, action] = expected[entries].clamp(min=0)
+    return table

@@ -400,6 +400,7 @@ class _Part(NamedTuple):
     """Plans of one fold that are inferred together, with the row, the cell and the entry of each action, `[n, L]`."""
 
     fold: int
+    mask: Tensor | None  # [n, L]: the actions; None: there is nothing beyond the ends
     plans: Plans
     rows: Tensor
     cells: Tensor
@@ -423,7 +424,8 @@ class _Learner:
                 part = plans[indices]
                 rows, cells = prior.cells(part.actions, part.context)
                 entries = self.chains.entries(rows.flatten(), part.actions.long().flatten()).view(rows.shape)
-                self.parts.append(_Part(number, part, rows, cells, entries, indices))
+                mask = None if bool(part.mask().all()) else part.mask()
+                self.parts.append(_Part(number, mask, part, rows, cells, entries, indices))
 
     def random_start(self, generator: torch.Generator) -> Modes:
         """Modes in random segments."""
@@ -487,7 +489,7 @@ class _Learner:
             inferred = smooth(prior.first, *prior._inputs(part.plans, part.rows, part.cells))
             self._count(found, part, inferred.smoothed)
             self._count_moves(totals, part, inferred.moved)
-            log_likelihood += float(inferred.log_likelihood[part.plans.mask()].sum())
+            log_likelihood += float(_known(inferred.log_likelihood, part.mask).sum())
         return self._maximised(found, totals), log_likelihood / self.count
 
     def take(self, modes: Modes) -> None:
@@ -512,13 +514,14 @@ class _Learner:
 
     def _count(self, modes: Modes, part: _Part, smoothed: Tensor) -> None:
         """Add the modes `[n, L, K * D]` of a part to `first` and `expected`."""
-        mask = part.plans.mask()
-        modes.first.add_(smoothed[mask[:, 0], 0].sum(0))
-        modes.expected[part.fold].index_add_(0, part.entries[mask], self.prior._summed(smoothed)[mask])
+        started = smoothed[:, 0].contiguous() if part.mask is None else smoothed[part.mask[:, 0], 0]
+        modes.first.add_(started.sum(0))
+        known = _known(part.entries, part.mask), _known(self.prior._summed(smoothed), part.mask)
+        modes.expected[part.fold].index_add_(0, *known)
 
     def _count_moves(self, totals: Tensor, part: _Part, moved: Tensor) -> None:
-        mask = part.plans.mask()[:, 1:]
-        totals.index_add_(0, part.cells[:, 1:][mask], moved[mask])
+        mask = None if part.mask is None else part.mask[:, 1:]
+        totals.index_add_(0, _known(part.cells[:, 1:], mask), _known(moved, mask))
 
     def _maximised(self, modes: Modes, totals: Tensor) -> Modes:
         """The probabilities of the first modes and of the transitions, from expected numbers."""
@@ -539,6 +542,11 @@ class _Learner:
         everywhere = counts.sum(0) + prior.stay * torch.eye(prior.num_modes, dtype=counts.dtype, device=counts.device)
         everywhere = _rows(everywhere)
         return Modes(first / first.sum(), _rows(counts + prior.smoothing * everywhere), modes.expected)
+
+
+def _known(values: Tensor, mask: Tensor | None) -> Tensor:
+    """What `values [n, L, ...]` are where `mask [n, L]` is true, one after the other; None: all of them."""
+    return values.flatten(0, 1) if mask is None else values[mask]
 
 
 def _rows(counts: Tensor) -> Tensor:
