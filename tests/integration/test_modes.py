@@ -106,13 +106,13 @@ def test_the_report_refuses_modes_that_cannot_be(given):
 
 def test_the_modes_of_a_single_long_plan_are_described_over_its_course():
     """Parts serve to choose among numbers of modes; occupancy is over the plan, which begins in one mode alone."""
-    mode = (torch.arange(800) // 20) % 2
-    mode[:160] = 0
-    wild = torch.rand(800, generator=seeded(1)) < 0.2
-    actions = torch.where(wild, torch.randint(3, (800,), generator=seeded(2)), mode)
+    mode = (torch.arange(500) // 20) % 2
+    mode[:100] = 0
+    wild = torch.rand(500, generator=seeded(1)) < 0.2
+    actions = torch.where(wild, torch.randint(3, (500,), generator=seeded(2)), mode)
     made = report(Plans(actions[None], 3), modes=[2], skip=30, **QUICK)  # more than a part has
-    assert len(made.frames["mode_actions"]) == 800
-    assert made.frames["mode_actions"]["step"].max() == 799
+    assert len(made.frames["mode_actions"]) == 500
+    assert made.frames["mode_actions"]["step"].max() == 499
     occupancy = made.frames["mode_occupancy"]
     first = occupancy[occupancy["part"] == 1].set_index("mode")["share"]
     assert first.max() > 0.9
