@@ -102,7 +102,7 @@ def by_hand(model: str, learned: Plans, held: Plans, seed: int, contexts: int | 
     [
         ("nothing", False, 0),
         ("index a plan", True, 0),
-        ("index a step", False, 2),
+        ("index a step", True, 2),
     ],
 )
 def test_scores_are_those_of_fits_by_hand(kind, grouped, skip, tmp_path):
