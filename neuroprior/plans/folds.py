@@ -7,7 +7,8 @@ from torch import Tensor
 
 from neuroprior._checks import check_seed, check_sizes
 from neuroprior.plans.plans import Plans, check_are_plans
-from neuroprior.plans.sequences import is_per_step
+from neuroprior.plans.sequences import Sequences, is_per_step
+from neuroprior.plans.vector_plans import VectorPlans
 
 FEWEST_UNITS = 2
 """Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""
@@ -27,14 +28,14 @@ def divisible(plans: Plans) -> Plans:
     return replace(plans, group=None, group_names=None) if few else plans
 
 
-def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:
+def folds(plans: Sequences, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:
     """Cross-validation over independent units: each action is held out once.
 
     Where there are two or more groups these are divided into folds, else plans are. A single plan is not cut; see
     `in_parts`.
 
     Args:
-        plans: N of them.
+        plans: N of them, of actions or of vectors.
         number: of folds, at least 2 and at most the number of groups (of plans, where there are no two groups).
         seed: of the random division into folds.
 
@@ -49,7 +50,8 @@ def folds(plans: Plans, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor
         >>> [(len(training), len(held_out)) for training, held_out in folds(plans, 3)]
         [(4, 2), (4, 2), (4, 2)]
     """
-    check_are_plans(plans)
+    if not isinstance(plans, VectorPlans):
+        check_are_plans(plans)
     grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
     unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
     unit = torch.arange(len(plans)) if unit is None else unit

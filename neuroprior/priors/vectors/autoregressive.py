@@ -1,11 +1,14 @@
 """Vector autoregressions: the Markov chains of continuous actions."""
 
+from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count
+from neuroprior._random import draw_seed
+from neuroprior.plans.folds import folds
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
@@ -14,6 +17,16 @@ from neuroprior.priors.vectors.linear_gaussian import (
     mean_nats,
     moments_or_white,
 )
+
+SHARES = (1.0, 0.3, 0.1, 0.0)
+"""Shares by which what different dimensions have in common is reduced: with few vectors it is mostly chance. Held-out
+likelihood chooses; where it does not tell, it is the first."""
+
+FOLDS, MOST_IN_FOLDS = 5, 2000
+"""Parts that are held out in turn, of so many vectors at most: one part alone would say too little."""
+
+MANY = 20
+"""Windows for each number in one from which nothing is reduced."""
 
 RIDGES = (1e-5, 1e-3, 1e-1)
 """Added to the variances of the past, as shares of the mean variance; held-out likelihood chooses."""
@@ -25,8 +38,8 @@ class AutoregressivePrior(LinearGaussianPrior):
     Args:
         action_low, action_high: D numbers each: the bounds.
         order: p, vectors that predictions depend on; None: the one of `orders` that predicts held-out plans best. The
-            ridge is always chosen so. Where there are no more windows of p + 1 vectors than numbers in one, white
-            noise makes up for those that are missing.
+            ridge is always chosen so and, with few vectors, how much of the covariances between dimensions is taken
+            over.
 
     Raises:
         ValueError: an argument is out of range.
@@ -54,32 +67,37 @@ class AutoregressivePrior(LinearGaussianPrior):
 
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         orders = self.orders if self.order is None else (self.order,)
-        learning, held_out = held_out_split(plans, generator)
-        scores: dict[tuple[int, float], float] = {}
+        parts = self._parts(plans, generator)
+        total = sum(int(held_out.mask().sum()) for _, held_out in parts)
+        scores: dict[tuple[int, float, float], float] = {}
         for order in orders:
-            windows = self.scaled(learning.windows(order + 1))
-            if scores and len(windows) <= (order + 1) * self.action_size:
+            numbers = (order + 1) * self.action_size
+            of_parts = [self.scaled(learning.windows(order + 1)) for learning, _ in parts]
+            fewest = min(map(len, of_parts))
+            if scores and fewest <= numbers:
                 break
-            moments = _moments(windows, self.scaled(learning.actions)[learning.mask()], order)
-            for ridge in RIDGES:
-                self.set_window(*moments, ridge)
-                scores[order, ridge] = mean_nats(self, held_out)
-        order, ridge = best_of(scores)
+            few = self.action_size > 1 and fewest < MANY * numbers
+            for share, ridge in product(SHARES if few else SHARES[-1:], RIDGES):
+                scores[order, share, ridge] = 0.0
+                for (learning, held_out), some in zip(parts, of_parts, strict=True):
+                    mean, covariance = moments_or_white(some, self.scaled(learning.actions)[learning.mask()], order)
+                    self.set_window(mean, self._apart(covariance, share), ridge)
+                    scores[order, share, ridge] += mean_nats(self, held_out) * int(held_out.mask().sum()) / total
+        order, share, ridge = best_of(scores)
         windows = self.scaled(plans.windows(order + 1))
-        self.set_window(*_moments(windows, self.scaled(plans.actions)[plans.mask()], order), ridge)
+        mean, covariance = moments_or_white(windows, self.scaled(plans.actions)[plans.mask()], order)
+        self.set_window(mean, self._apart(covariance, share), ridge)
 
+    def _parts(self, plans: VectorPlans, generator: torch.Generator) -> list[tuple[VectorPlans, VectorPlans]]:
+        """Plans to learn from and plans to choose on: of few vectors all are held out once, part by part."""
+        plans = plans[plans.mask().any(1)]
+        units = len(plans) if plans.group is None else len(plans.group.unique())
+        if units < 2 or int(plans.mask().sum()) > MOST_IN_FOLDS:
+            return [held_out_split(plans, generator)]
+        found = folds(plans, min(units, FOLDS), draw_seed(generator))
+        return [(plans[learned], plans[left_out]) for learned, left_out in found]
 
-def _moments(windows: Tensor, values: Tensor, order: int) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of windows `[M, order + 1, D]`, from at least as many as have a covariance of full rank.
-
-    Those that are missing are made up for by white noise that spreads as each dimension of `values [S, D]` does:
-    without it, what a few windows do not show would be taken for impossible.
-    """
-    mean, covariance = moments_or_white(windows, values, order)
-    missing = windows.shape[1] * windows.shape[2] + 1 - len(windows)
-    if missing <= 0:
-        return mean, covariance
-    white, variances = (each.repeat(order + 1) for each in (values.double().mean(0), values.double().var(0, False)))
-    share, apart = missing / (missing + len(windows)), white - mean
-    mixed = torch.lerp(covariance, variances.diag(), share) + share * (1 - share) * apart.outer(apart)
-    return torch.lerp(mean, white, share), mixed
+    def _apart(self, covariance: Tensor, share: float) -> Tensor:
+        """The covariance of windows with that share of what different dimensions have in common taken away."""
+        dimension = torch.arange(len(covariance), device=covariance.device) % self.action_size
+        return torch.where(dimension[:, None] == dimension, covariance, (1 - share) * covariance)

@@ -3,6 +3,7 @@
 import sys
 from abc import abstractmethod
 from collections.abc import Hashable, Mapping
+from dataclasses import replace
 from typing import Any, Self, TypeVar
 
 import torch
@@ -210,7 +211,16 @@ def held_out_split(plans: VectorPlans, generator: torch.Generator) -> tuple[Vect
         cut = max(round(plans.max_length * (1 - HELD_OUT)), 1)
         first, last = plans.steps(0, cut), plans.steps(cut)
         return (first, last) if last.mask().any() else (plans, plans)
-    return plans.split(HELD_OUT, generator)
+    learning, held_out = plans.split(HELD_OUT, generator)
+    lengths = plans.mask().sum(1)
+    if int(held_out.mask().sum()) < HELD_OUT / 2 * int(lengths.sum()):
+        # Short plans say little: the end of the longest is held out.
+        longest = int(lengths.argmax())
+        cut = int(lengths[longest]) - max(round(HELD_OUT * int(lengths[longest])), 1)
+        held_out = plans[longest : longest + 1].steps(cut)
+        lengths[longest] = cut
+        learning = replace(plans, lengths=lengths)
+    return learning, held_out
 
 
 @torch.no_grad()
@@ -234,9 +244,20 @@ def window_moments(windows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def moments_or_white(windows: Tensor, values: Tensor, memory: int) -> tuple[Tensor, Tensor]:
-    """Of windows `[M, memory + 1, D]`; where there is none, those of white noise like `values [S, D]`."""
-    if len(windows):
-        return window_moments(windows)
-    mean, covariance = window_moments(values[:, None])
-    eye = torch.eye(memory + 1, dtype=torch.double, device=values.device)
-    return mean.repeat(memory + 1), torch.kron(eye, covariance)
+    """Mean and covariance of windows `[M, memory + 1, D]`; where there is none, those of white noise like `values`.
+
+    Of no more windows than vectors in one, white noise that spreads as each dimension of `values [S, D]` does makes up
+    for those that are missing: without it, what a few windows do not show would be taken for impossible.
+    """
+    if not len(windows):
+        mean, covariance = window_moments(values[:, None])
+        eye = torch.eye(memory + 1, dtype=torch.double, device=values.device)
+        return mean.repeat(memory + 1), torch.kron(eye, covariance)
+    mean, covariance = window_moments(windows)
+    missing = memory + 2 - len(windows)
+    if missing <= 0:
+        return mean, covariance
+    white, variances = values.double().mean(0).repeat(memory + 1), values.double().var(0, correction=0)
+    share, apart = missing / (missing + len(windows)), white - mean
+    mixed = torch.lerp(covariance, variances.repeat(memory + 1).diag(), share)
+    return torch.lerp(mean, white, share), mixed + share * (1 - share) * apart.outer(apart)

@@ -379,7 +379,8 @@ class VectorNetwork(VectorPrior):
         if self.coupling is None:
             root = root.norm(dim=1).diag()  # each dimension's own spread, not what the others leave of it
         means.copy_((means - means.mean(0)) / means.std(0, correction=0).clamp(min=TINY) @ (share * root.T))
-        stds.copy_((root.diagonal() * (1 - share**2) ** 0.5).log().expand_as(stds))
+        own = root.diagonal() * (1 - share**2) ** 0.5 - 2 * LEAST_STD
+        stds.copy_(own.clamp(min=LEAST_STD).log().expand_as(stds))
         weights = self._parts(self.head.weight.T)[1]
         weights.copy_(weights @ (root.T / (2 * FIRST_STD)))
         self._add(chain)

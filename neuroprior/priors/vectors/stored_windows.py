@@ -115,7 +115,9 @@ class StoredWindows(VectorPrior):
                 self._store(plans, self.max_windows)
                 return self
             self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH))
-            held_out = held_out[: max(MOST_CHOSEN_ON // held_out.max_length, 1)].steps(0, MOST_CHOSEN_ON)
+            lengths, order = held_out.mask().sum(1).sort(descending=True, stable=True)
+            enough = max(int((lengths.cumsum(0) <= MOST_CHOSEN_ON).sum()), 1)
+            held_out = held_out[order[:enough]].steps(0, MOST_CHOSEN_ON)
             bandwidths = (self._given["bandwidth"],) if self._given["bandwidth"] else BANDWIDTHS
             noises = (self._given["noise"],) if self._given["noise"] else NOISES
             scores = {}
