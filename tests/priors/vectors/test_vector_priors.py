@@ -253,6 +253,50 @@ def test_constant_plans_and_a_single_vector_can_be_learned():
             assert KINDS[name](-torch.ones(2), torch.ones(2)).fit(single).log_prob(single).isfinite().all()
 
 
+def slow_noise(num: int, length: int, size: int, seed: int) -> VectorPlans:
+    """Independent dimensions, each x[t] = .9 x[t - 1] + noise, of standard deviation .3."""
+    noise = 0.3 * torch.randn(num, length, size, generator=torch.Generator().manual_seed(seed))
+    line = [noise[:, 0]]
+    for t in range(1, length):
+        line.append(0.9 * line[-1] + sqrt(1 - 0.9**2) * noise[:, t])
+    return VectorPlans(torch.stack(line, 1), torch.full((size,), -2.0), torch.full((size,), 2.0))
+
+
+def nats_of_noise(plans: VectorPlans, test: VectorPlans) -> float:
+    """Nats per vector under independent Gaussians with the means and variances of some plans."""
+    values, held_out = plans.actions[plans.mask()], test.actions[test.mask()]
+    law = torch.distributions.Normal(values.mean(0), values.std(0, correction=0))
+    return float(law.log_prob(held_out).sum(1).mean())
+
+
+@pytest.mark.parametrize(("num", "length"), [(1, 42), (3, 50), (20, 5)])
+def test_many_dimensions_are_learned_from_few_vectors(num, length):
+    """Of 20 dimensions 40 to 150 vectors say nothing reliable of the 400 covariances between them."""
+    data, test = slow_noise(num, length, 20, 1), slow_noise(10, 40, 20, 2)
+    prior = AutoregressivePrior(data.action_low, data.action_high).fit(data, generator=seeded())
+    nats = float(prior.log_prob(test).sum()) / 400
+    own = -0.5 * log(2 * pi * e * 0.3**2 * (1 - 0.9**2)) * 20  # of each dimension's own chain
+    assert max(own - 6, nats_of_noise(data, test) + 10) < nats < own
+
+
+@pytest.mark.parametrize("length", [5, 20, 21])
+def test_windows_as_long_as_the_only_plan(length):
+    for seed in range(3):
+        data, test = slow_noise(1, length, 1, seed), slow_noise(20, length, 1, seed + 10)
+        prior = WindowSynergies([-2.0], [2.0]).fit(data, generator=seeded())
+        nats = float(prior.log_prob(test).sum()) / (20 * length)
+        assert nats > nats_of_noise(data, test) * 1.5 - 3  # white noise of five vectors may be far from the source, too
+
+
+def test_stored_windows_are_chosen_on_more_than_single_vectors():
+    data, test = slow_noise(32, 300, 2, 1), slow_noise(10, 100, 2, 2)
+    data = VectorPlans(data.actions, data.action_low, data.action_high, torch.tensor([300, 300] + [1] * 30))
+    for seed in range(4):
+        generator = torch.Generator().manual_seed(seed)
+        prior = StoredWindows(data.action_low, data.action_high).fit(data, generator=generator)
+        assert float(prior.log_prob(test).sum()) / 1000 > nats_of_noise(data, test)
+
+
 @pytest.mark.parametrize("size", [1, 3])
 def test_what_few_windows_do_not_show_is_not_taken_for_impossible(size):
     """One plan of six vectors among single ones: one window of order 5, and three of order 3."""
