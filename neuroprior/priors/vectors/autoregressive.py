@@ -77,12 +77,14 @@ class AutoregressivePrior(LinearGaussianPrior):
             if scores and fewest <= numbers:
                 break
             few = self.action_size > 1 and fewest < MANY * numbers
-            for share, ridge in product(SHARES if few else SHARES[-1:], RIDGES):
-                scores[order, share, ridge] = 0.0
-                for (learning, held_out), some in zip(parts, of_parts, strict=True):
-                    mean, covariance = moments_or_white(some, self.scaled(learning.actions)[learning.mask()], order)
+            tried = list(product(SHARES if few else SHARES[-1:], RIDGES))
+            scores |= {(order, *each): 0.0 for each in tried}
+            for (learning, held_out), windows in zip(parts, of_parts, strict=True):
+                mean, covariance = moments_or_white(windows, self.scaled(learning.actions)[learning.mask()], order)
+                weight = int(held_out.mask().sum()) / total
+                for share, ridge in tried:
                     self.set_window(mean, self._apart(covariance, share), ridge)
-                    scores[order, share, ridge] += mean_nats(self, held_out) * int(held_out.mask().sum()) / total
+                    scores[order, share, ridge] += weight * mean_nats(self, held_out)
         order, share, ridge = best_of(scores)
         windows = self.scaled(plans.windows(order + 1))
         mean, covariance = moments_or_white(windows, self.scaled(plans.actions)[plans.mask()], order)
