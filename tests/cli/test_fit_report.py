@@ -110,7 +110,7 @@ def test_folds_are_those_of_the_seed(with_context, tmp_path, monkeypatch):
         learned = plans[training]
         due["trained"][held_out] = action_bits(MarkovPrior(3, 2, 0.5).fit(learned), plans[held_out]).float()
         parts = learned.split(0.4, seeded(4000 + fold))
-        one = next(one for one in baselines(*parts, contexts) if one.model == "markov-1")
+        (one,) = (one for one in baselines(*parts, contexts) if one.model == "markov-1")
         due["markov-1"][held_out] = action_bits(one.prior.fit(learned), plans[held_out]).float()
         takes.append(one.prior.takes_context)
     for name, bits in due.items():

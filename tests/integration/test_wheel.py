@@ -72,6 +72,7 @@ def test_the_five_commands(installed: Path, tmp_path: Path) -> None:
     """In one process, as libraries load for seconds; the next test runs the program itself."""
     example(str(tmp_path / "expected.csv"))
     events = pd.read_csv(tmp_path / "expected.csv")
+    assert events["animal"].nunique() == 12
     events[events["animal"].isin(events["animal"].unique()[:3])].to_csv(tmp_path / "few.csv", index=False)
     study = ["few.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
     quick = ["--trainer.max_steps", "20", "--trainer.accelerator", "cpu", "--data.folds", "1"]

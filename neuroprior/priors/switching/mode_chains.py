@@ -60,12 +60,14 @@ class ModeChains:
         own = expected.new_full((number + 1, modes, self.num_actions), 1 / self.num_actions)
         whole = own[:, 0].clone()  # of all modes together
         if self.pooled:
-            first = self._dense(0, int(torch.searchsorted(counts.row_code, self.contexts)), expected).sum(0)
+            until = int(torch.searchsorted(counts.row_code, self.contexts))
+            first = _dense(expected, *self._entries(0, until), (until, self.num_actions)).sum(0)
             kinds = (first.sum(0) > 0).sum()[None]
             whole[-1] = self._blend(first.sum(0), whole[-1], kinds)
             own[-1] = self._blend(first, whole[-1].expand(modes, -1), kinds)
         for block in self._blocks(modes):
-            here, above, n = block.rows, block.above, block.dense(expected)
+            here, above = block.rows, block.above
+            n = _dense(expected, block.entries, block.row, block.action, block.size)
             whole[here] = self._blend(n.sum(1), whole[above], block.kinds)
             base = (1 - block.share) * own[above] + block.share * whole[here, None]
             own[here] = self._blend(n, base, block.kinds[:, None])
@@ -94,10 +96,6 @@ class ModeChains:
         # Where a fold is left out, rounding leaves counts that are hardly 0.
         return torch.where(total > 1e-9, (n + weight * base) / total.clamp(min=1e-9), base)
 
-    def _dense(self, first: int, until: int, expected: Tensor) -> Tensor:
-        """The expected counts of some rows, `[until - first, K, A]`."""
-        return _dense(expected, *self._entries(first, until), (until - first, self.num_actions))
-
     def _entries(self, first: int, until: int) -> tuple[slice, Tensor, Tensor]:
         """The entries of some rows, with their rows, counted from `first`, and actions."""
         ends = torch.tensor([first, until], device=self.counts.row.device)
@@ -117,12 +115,9 @@ class _Block(NamedTuple):
     share: Tensor  # [R, 1, 1]: how much of what all modes do counts for each
     kinds: Tensor  # [R, 1]
 
-    def dense(self, expected: Tensor) -> Tensor:
-        """The expected counts `[R, K, A]`."""
-        return _dense(expected, self.entries, self.row, self.action, self.size)
-
 
 def _dense(expected: Tensor, entries: slice, row: Tensor, action: Tensor, size: tuple[int, int]) -> Tensor:
+    """The expected counts `[R, K, A]` of the rows and actions of some entries; `size` is R and A."""
     table = expected.new_zeros(size[0], expected.shape[1], size[1])
     table[row, :, action] = expected[entries].clamp(min=0)
     return table

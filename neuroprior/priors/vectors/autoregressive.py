@@ -20,7 +20,7 @@ from neuroprior.priors.vectors.linear_gaussian import (
 
 SHARES = (1.0, 0.3, 0.1, 0.0)
 """Shares by which what different dimensions have in common is reduced: with few vectors it is mostly chance. Held-out
-likelihood chooses; where it does not tell, it is the first."""
+likelihood chooses; of equals it takes the first."""
 
 FOLDS, MOST_IN_FOLDS = 5, 500
 """Parts that are held out in turn, of so many vectors at most: one part alone would say too little."""

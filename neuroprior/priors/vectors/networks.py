@@ -366,7 +366,7 @@ class VectorNetwork(VectorPrior):
     def _chain(self, plans: VectorPlans, seed: int, order: int | None = None) -> AutoregressivePrior:
         """An autoregression on last vectors that the network is given; None: of the order that fits best."""
         chain = AutoregressivePrior(self.action_low, self.action_high, order).to(plans.actions.device)
-        chain.orders = tuple(order for order in chain.orders if order <= self.lags)
+        chain.orders = tuple(each for each in chain.orders if each <= self.lags)
         return chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed)).to(self.device)
 
     @torch.no_grad()

@@ -93,8 +93,8 @@ COMPONENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Numbers of components that are tried."""
 
 SHRINKAGES = (0.3, 1e-1, 1e-2, 1e-4)
-"""Shares of white noise in the covariance of windows that are tried: the fewer plans, the more helps. Where held-out
-plans do not tell, it is the first."""
+"""Shares of white noise in the covariance of windows that are tried: the fewer plans, the more helps. Held-out
+likelihood chooses; of equals it takes the first."""
 
 
 class StepSynergies(LinearGaussianPrior):

@@ -267,7 +267,7 @@ def test_an_autoregression_of_too_few_vectors_is_not_taken_over():
         prior = VectorGRU([-1], [1], seed=seed).fit(data, generator=rng(seed), progress=False)
         with torch.no_grad():
             nats = float(prior.log_prob(test).mean()) / 2
-        assert nats > 0.5  # the noise has .88; with that autoregression -6.4 and -2.0
+        assert nats > 0.6  # the noise has .88; with that autoregression -6.4 and -2.0
 
 
 def test_learning_further_goes_on_from_the_present_weights(kind):
