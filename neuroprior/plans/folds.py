@@ -1,6 +1,7 @@
 """Cross-validation: plans divided so that each is held out once."""
 
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -16,16 +17,22 @@ FEWEST_UNITS = 2
 BLOCKS = 40
 """Parts into which a single plan is cut, so that there are units for intervals and folds."""
 
+AnyPlans = TypeVar("AnyPlans", bound=Sequences)
 
-def divisible(plans: Plans) -> Plans:
+
+def divisible(plans: AnyPlans) -> AnyPlans:
     """The same plans, without their group if they have fewer than two groups, so that they can be split.
+
+    Args:
+        plans: of actions or of vectors.
 
     Example:
         >>> divisible(Plans(torch.zeros(1, 1000, dtype=torch.long), 2)).actions.shape
         torch.Size([1, 1000])
     """
     few = plans.group is None or len(plans.group.unique()) < FEWEST_UNITS
-    return replace(plans, group=None, group_names=None) if few else plans
+    names: dict[str, None] = {"group_names": None} if isinstance(plans, Plans) else {}
+    return replace(plans, group=None, **names) if few else plans  # type: ignore[type-var]
 
 
 def folds(plans: Sequences, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:

@@ -103,6 +103,7 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, uniform: Tensor,
     coupling = np.zeros((size, size), np.float32)
     if prior.coupling is not None:
         coupling = np.tril(prior.coupling.detach().numpy(), -1) * (bounds[1][:, None] / bounds[1])
+    first_log_std = prior.first_log_std.detach().numpy()
     vectors = noise.new_empty(noise.shape)
     _recurrent(
         vectors.numpy(),
@@ -119,6 +120,7 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, uniform: Tensor,
         head,
         head_bias,
         direct,
+        first_log_std,
         coupling,
         bounds,
         prior.num_components,
@@ -166,6 +168,7 @@ def _recurrent(
     head: Array,
     head_bias: Array,
     direct: Array,
+    first_log_std: Array,
     coupling: Array,
     bounds: Array,
     num: int,
@@ -214,7 +217,7 @@ def _recurrent(
                 value = _dot(_dot(head_bias[row], head[row], top), direct[d], inputs[n])
                 mean[d] = centre[d] + half[d] * value
                 row += num * size
-                log_std = _dot(head_bias[row], head[row], top)
+                log_std = _dot(head_bias[row], head[row], top) + (one - inputs[n, recent - 1]) * first_log_std[d]
                 std = np.exp(min(max(log_std, np.float32(-9)), np.float32(3))) + least_std
                 value = mean[d] + half[d] * std * noise[n, t, d]
                 for j in range(d):

@@ -12,6 +12,7 @@ from torch import Tensor
 from neuroprior._checks import check_count
 from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
+from neuroprior.plans.folds import divisible
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
@@ -201,22 +202,26 @@ def _lifted(rest: Tensor) -> Tensor:
     return lifted
 
 
-def held_out_split(plans: VectorPlans, generator: torch.Generator) -> tuple[VectorPlans, VectorPlans]:
-    """Plans to learn from and plans to choose on; where there is a single vector, it is both."""
-    units = len(plans) if plans.group is None else len(plans.group.unique())
-    if units < 2 and int(plans.mask().sum()) < 2:
-        return plans, plans
-    if units < 2:
-        # One group, or one plan: what was executed last is held out.
-        cut = max(round(plans.max_length * (1 - HELD_OUT)), 1)
-        first, last = plans.steps(0, cut), plans.steps(cut)
-        return (first, last) if last.mask().any() else (plans, plans)
-    learning, held_out = plans.split(HELD_OUT, generator)
+def held_out_split(
+    plans: VectorPlans, generator: torch.Generator, share: float = HELD_OUT
+) -> tuple[VectorPlans, VectorPlans]:
+    """Plans to learn from and plans to choose on; where there is a single vector, it is both.
+
+    Groups stay together, unless there is one alone. Where plans are so unequal that about that share of them has hardly
+    any of the vectors, or nearly all, the end of the longest is held out instead.
+
+    Raises:
+        ValueError: `share` is not between 0 and 1.
+    """
+    plans = divisible(plans[plans.mask().any(1)])
     lengths = plans.mask().sum(1)
-    if int(held_out.mask().sum()) < HELD_OUT / 2 * int(lengths.sum()):
-        # Short plans say little: the end of the longest is held out.
+    total = int(lengths.sum())
+    if total < 2:
+        return plans, plans
+    learning, held_out = plans.split(share, generator)
+    if not share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
         longest = int(lengths.argmax())
-        cut = int(lengths[longest]) - max(round(HELD_OUT * int(lengths[longest])), 1)
+        cut = int(lengths[longest]) - max(round(share * int(lengths[longest])), 1)
         held_out = plans[longest : longest + 1].steps(cut)
         lengths[longest] = cut
         learning = replace(plans, lengths=lengths)

@@ -18,7 +18,7 @@ from neuroprior.priors.neural.gru import gru_step
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.neural.transformer import Block
 from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
-from neuroprior.priors.vectors.linear_gaussian import mean_nats
+from neuroprior.priors.vectors.linear_gaussian import held_out_split, mean_nats
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
 
 LEAST_STD = 1e-3
@@ -53,8 +53,9 @@ class VectorNetwork(VectorPrior):
     At each step the network reads the last `lags` vectors, scaled by the bounds to -1..1, and the features of the state
     where it takes them, standardised by the mean and standard deviation in the first plans that it learned from. The
     means of all components have a common part that is linear in these inputs; the rest of the means, the weights and
-    the standard deviations are the network's. Training begins with the linear part and the standard deviations of an
-    `AutoregressivePrior` of at most `lags` vectors: from few vectors a network learns little that is better.
+    the standard deviations are the network's; those of a plan's first vector have factors of their own. Training begins
+    with the linear part and the standard deviations of an `AutoregressivePrior` of at most `lags` vectors: from
+    few vectors a network learns little that is better.
 
     Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
     state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
@@ -114,6 +115,7 @@ class VectorNetwork(VectorPrior):
         self.register_buffer("_mean", torch.zeros(features))
         self.register_buffer("_std", torch.ones(features))
         self.coupling = nn.Parameter(torch.zeros(size, size)) if coupled else None
+        self.first_log_std = nn.Parameter(torch.zeros(size))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.inputs = nn.Linear(self.input_size, width)
@@ -144,6 +146,10 @@ class VectorNetwork(VectorPrior):
         if memory is not None:
             check_sizes(memory=memory)
         self.memory = memory
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        state_dict.setdefault(f"{prefix}first_log_std", torch.zeros(self.action_size))  # which older files do not have
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def learns_anew(self) -> bool:
@@ -299,6 +305,8 @@ class VectorNetwork(VectorPrior):
         weights, means, stds = self._parts(self.head(self.drop(out)))
         half = self.half_range
         mean = self.middle + half * (means + self.linear(inputs)[:, None])
+        no_last = 1 - inputs[:, self.lags * self.entry_size - 1, None, None]
+        stds = stds + no_last * self.first_log_std
         std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
         coupling = None if self.coupling is None else self.coupling.tril(-1) * (half[:, None] / half)
         return GaussianForecast(mean, std, self.action_low, self.action_high, weights, coupling)
@@ -315,8 +323,9 @@ class VectorNetwork(VectorPrior):
         end, unless these become clearly less likely by that.
 
         Args:
-            plans: see `VectorPrior.fit`; at least two (two groups), or one of at least two vectors, cut in time.
-            generator: draws the held-out plans, the order of training and dropout.
+            plans: see `VectorPrior.fit`; at least two vectors.
+            generator: draws the held-out plans, the order of training and dropout. Of very unequal plans the end of the
+                longest is held out.
             settings: fields of `neuroprior.training.Settings`; what is not given is as in `DEFAULTS`, or as there.
                 `max_steps` None is one step for `VECTORS_A_STEP` vectors, from `FEWEST` to `MOST`.
 
@@ -338,7 +347,9 @@ class VectorNetwork(VectorPrior):
         self.memory = min(how.window, int(plans.mask().sum(1).max()))
         try:
             if not isinstance(validation, Sequences):
-                learning, validation = plans.split(validation, torch.Generator().manual_seed(seed))
+                learning, validation = held_out_split(plans, torch.Generator().manual_seed(seed), validation)
+                if learning is validation:
+                    raise ValueError("plans: at least two vectors are expected, one to be held out")
             elif isinstance(validation, VectorPlans):
                 validation = self.training_plans(validation)
             check_alike(learning, validation)
@@ -375,9 +386,13 @@ class VectorNetwork(VectorPrior):
         _, means, stds = self._parts(self.head.bias)
         share = FIRST_SPREAD if self.num_components > 1 else 0.0
         eye = torch.eye(self.action_size, device=chain.std.device)
-        root = torch.linalg.inv(eye - chain.coupling[-1]) * chain.std[-1]  # of the covariance
+        # Roots of the covariances of the first vector, and of those whose past is known.
+        first, root = (torch.linalg.inv(eye - chain.coupling[h]) * chain.std[h] for h in (0, -1))
         if self.coupling is None:
             root = root.norm(dim=1).diag()  # each dimension's own spread, not what the others leave of it
+        else:
+            first = (eye - chain.coupling[-1]) @ first  # what the same coupling leaves of the first vector's
+        self.first_log_std.copy_((first.norm(dim=1) / root.diagonal()).log())
         means.copy_((means - means.mean(0)) / means.std(0, correction=0).clamp(min=TINY) @ (share * root.T))
         own = root.diagonal() * (1 - share**2) ** 0.5 - 2 * LEAST_STD
         stds.copy_(own.clamp(min=LEAST_STD).log().expand_as(stds))

@@ -8,7 +8,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.plans.vector_plans import VectorPlans
-from neuroprior.priors.vectors.linear_gaussian import best_of, held_out_split, mean_nats
+from neuroprior.priors.vectors.linear_gaussian import LEAST_STD, best_of, held_out_split, mean_nats
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
 BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -19,6 +19,11 @@ NOISES = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 BANDWIDTH, NOISE = 0.2, 0.1
 """The bandwidth and the noise before `fit`, and where no plans can be held out to choose them on."""
+
+EXTENT = 8
+"""Distances are in units of half the range, or of so many standard deviations of the stored vectors if that is less:
+what is tried would be too coarse for vectors that take up a small part of the range.
+"""
 
 MOST_CHOSEN_WITH, MOST_CHOSEN_ON = 1_000, 500
 """The most stored windows with which, and the most held-out vectors on which, bandwidths are chosen; in the end all
@@ -33,7 +38,8 @@ class StoredWindows(VectorPrior):
     the present past: with probability proportional to exp(-d / (2 bandwidth ** 2)), d the sum of squared differences
     over the last `match` vectors. It is followed with independent Gaussian noise, and then the next one is chosen. As
     which segment is being followed is not known, a vector's density is that of a mixture, weighted by how well each
-    segment predicted the vectors since it began. All distances are in units of half the range.
+    segment predicted the vectors since it began. Distances are in units of half the range, or of eight standard
+    deviations of the stored vectors where that is less.
 
     `read` begins a new segment after the past. `state` is `[N, 2 + match * D + M]`: vectors known, place in the
     segment, the last vectors, and the log-weights of M stored segments.
@@ -59,6 +65,9 @@ class StoredWindows(VectorPrior):
 
     segments: Tensor
 
+    extent: Tensor
+    """The unit of distances, in halves of the range: `EXTENT` standard deviations of stored vectors, at most 1."""
+
     def __init__(
         self,
         action_low: Any,
@@ -82,6 +91,7 @@ class StoredWindows(VectorPrior):
         self.memory = match
         # Before anything is learned, one segment in the middle of the range.
         self.register_buffer("segments", torch.zeros(1, match + horizon, self.action_size))
+        self.register_buffer("extent", torch.tensor(1.0))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -103,6 +113,10 @@ class StoredWindows(VectorPrior):
         if not (0 < self.bandwidth < float("inf") and 0 < self.noise < float("inf")):
             raise ValueError(f"bandwidth, noise: numbers above 0 are expected, not {self.bandwidth}, {self.noise}")
         self.register_buffer("segments", torch.zeros(shape, device=self.device))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        state_dict.setdefault(f"{prefix}extent", torch.tensor(1.0))  # which older files do not have
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         self.check_settings(settings)
@@ -139,6 +153,8 @@ class StoredWindows(VectorPrior):
         if len(windows) > most:
             windows = windows[torch.linspace(0, len(windows) - 1, most).round().long()]
         self.register_buffer("segments", self.scaled(windows).to(self.device))
+        std = self.segments.var((0, 1), correction=0).mean().sqrt()
+        self.extent = (EXTENT * std).clamp(LEAST_STD, 1)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         empty = torch.zeros(batch_size, 2 + self.match * self.action_size, device=self.device)
@@ -154,7 +170,7 @@ class StoredWindows(VectorPrior):
             return self._begin(torch.cat([head, past], 1))
         ones = torch.ones(self.action_size, device=self.device)
         due = self.segments[:, self.match + place]
-        nats = censored_log_prob(value[:, None], due, self.noise * ones, -ones, ones).sum(-1)
+        nats = censored_log_prob(value[:, None], due, self.noise * self.extent * ones, -ones, ones).sum(-1)
         weights = (state[:, 2 + size :] + nats).log_softmax(-1)
         return self._forecast(torch.cat([head, past, weights], 1), place + 1)
 
@@ -180,12 +196,14 @@ class StoredWindows(VectorPrior):
         own = past[:, (self.match - known) * size :]
         stored = self.segments[:, self.match - known : self.match].flatten(1)
         distances = own.square().sum(-1)[:, None] + stored.square().sum(-1) - 2 * own @ stored.T
-        return (-distances / (2 * self.bandwidth**2)).log_softmax(-1)
+        return (-distances / (2 * (self.bandwidth * self.extent) ** 2)).log_softmax(-1)
 
     def _forecast(self, state: Tensor, place: int) -> tuple[GaussianForecast, Tensor]:
         mean = self.unscaled(self.segments[:, self.match + place]).expand(len(state), -1, -1)
         weights = state[:, 2 + self.match * self.action_size :]
-        return GaussianForecast(mean, self.noise * self.half_range, self.action_low, self.action_high, weights), state
+        return GaussianForecast(
+            mean, self.noise * self.extent * self.half_range, self.action_low, self.action_high, weights
+        ), state
 
     def continuations(
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
@@ -200,7 +218,7 @@ class StoredWindows(VectorPrior):
             steps = min(self.horizon, length - at)
             mean = self.segments[chosen, self.match : self.match + steps]
             noise = torch.randn(mean.shape, generator=generator, device=mean.device)
-            parts.append((mean + self.noise * noise).clamp(-1, 1))
+            parts.append((mean + self.noise * self.extent * noise).clamp(-1, 1))
             if at + steps < length:
                 last = last.repeat_interleave(times, 0)
                 last = torch.cat([last, parts[-1].flatten(1)], 1)[:, steps * self.action_size :]

@@ -242,6 +242,47 @@ def test_it_begins_with_the_spread_that_it_can_describe(kind, coupled):
     assert -entropy - 0.25 < nats < -entropy + 0.1  # the components' means differ, which costs some
 
 
+def slow_noise(num: int, length: int, seed: int) -> Tensor:
+    """Two slow dimensions `[num, length, 2]`: a vector is known well where the one before it is."""
+    noise = torch.randn(num, length, 2, generator=rng(seed))
+    line = [0.3 * noise[:, 0]]
+    for t in range(1, length):
+        line.append(0.97 * line[-1] + 0.3 * (1 - 0.97**2) ** 0.5 * noise[:, t])
+    return torch.stack(line, 1).clamp(-1, 1)
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_it_begins_with_a_spread_of_the_first_vector(kind, coupled):
+    low, high = [-1.0, -1.0], [1.0, 1.0]
+    data, test = (VectorPlans(slow_noise(num, 50, seed), low, high) for num, seed in ((40, 1), (200, 2)))
+    prior = kind(low, high, width=8, coupled=coupled).fit(data, generator=rng(), **NEXT_TO_NOTHING)
+    with torch.no_grad():
+        found, chain = (p.action_log_probs(test) for p in (prior, AutoregressivePrior(low, high).fit(data)))
+    assert (found[:, 0] - chain[:, 0]).mean().abs() < 0.15  # with the spread of later vectors it loses 10
+    assert (found[:, 1:] - chain[:, 1:]).mean().abs() < 0.3  # an untrained transformer's weights cost .22
+
+
+def test_of_a_long_plan_and_single_vectors_the_long_one_is_learned_from_and_validated_on(kind):
+    """Whichever plans chance would hold out."""
+    low, high = [-1.0, -1.0], [1.0, 1.0]
+    actions = torch.zeros(6, 600, 2)
+    actions[:1], actions[1:, :1] = slow_noise(1, 600, 1), slow_noise(5, 1, 2)
+    data = VectorPlans(actions, low, high, torch.tensor([600] + [1] * 5))
+    test = VectorPlans(slow_noise(50, 50, 3), low, high)
+    for seed in range(3):
+        prior = kind(low, high, width=8, seed=seed)
+        prior.fit(data, generator=rng(seed), progress=False, max_steps=40)
+        with torch.no_grad():
+            assert prior.action_log_probs(test)[:, 1:].mean() > 2.2  # the noise has 2.4
+
+
+def test_plans_of_a_single_group_are_learned_from(kind):
+    data = plans()
+    in_one = VectorPlans(data.actions, LOW, HIGH, data.lengths, group=torch.zeros(len(data), dtype=torch.long))
+    one, each = (kind(LOW, HIGH, width=8).fit(some, generator=rng(), **HOW) for some in (in_one, data))
+    assert one.log_prob(data).equal(each.log_prob(data))
+
+
 def test_a_refused_fit_is_not_learned_from(kind):
     """The next one learns as the first of a new network does: from its own autoregression and features."""
     data = plans(context_size=1)

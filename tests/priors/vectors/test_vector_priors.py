@@ -386,3 +386,15 @@ def test_shorter_plans_are_learned_from():
     forecast, _ = prior.start(1)
     assert float(forecast.mean) == pytest.approx(float(all_of_them.mean()))
     assert float(forecast.std) == pytest.approx(float(all_of_them.std(correction=0)), rel=1e-4)
+
+
+def test_stored_windows_describe_vectors_in_a_small_part_of_the_range_as_well():
+    """A hundredth as wide, a vector of two dimensions has 2 log 100 more nats."""
+    low, high = (-1.0, -1.0), (1.0, 1.0)
+    nats = []
+    for part in (1.0, 0.1, 0.01):
+        data, test = (0.3 * part * source(num, 60, low, high, seed).actions for num, seed in ((20, 1), (30, 2)))
+        prior = StoredWindows(low, high, horizon=10).fit(VectorPlans(data, low, high), generator=seeded(0))
+        found = prior.action_log_probs(VectorPlans(test, low, high))
+        nats.append(float(found.mean()) + 2 * log(part))
+    assert min(nats[1:]) > nats[0] - 0.2
