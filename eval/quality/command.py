@@ -195,7 +195,7 @@ def _fit(source: Source, name: str, training: Plans, test: Plans, true: Tensor, 
 def _fit_long(given: Sequences, name: str, seed: int) -> dict[str, Any]:
     generator, began = torch.Generator().manual_seed(seed), time.perf_counter()
     if name == MARKOV:
-        chain = best_chain(*given.training.split(generator=generator), None)
+        chain = best_chain([given.training.split(generator=generator)], None)
         assert chain is not None
         prior: Prior = chain.fit(given.training)
     else:

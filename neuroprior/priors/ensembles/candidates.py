@@ -1,6 +1,6 @@
 """The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from math import inf
 from typing import Any, Literal
@@ -8,7 +8,8 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._random import draw_seed
-from neuroprior.plans import Plans
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
+from neuroprior.plans.plans import Plans
 from neuroprior.priors.counts import BACKOFFS_TRIED, ContextTreePrior, MarkovPrior, TooLargeError, chains
 from neuroprior.priors.ensembles.stacked import StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
@@ -29,6 +30,9 @@ NETWORKS: dict[Effort, tuple[Callable[..., Prior], ...]] = {
 
 ORDERS = range(7)
 """Orders of the Markov chains that are tried: the best is an expert, and all are baselines in comparisons."""
+
+FOLDS, ENOUGH = 5, 1000
+"""Where fewer than `ENOUGH` actions are held out, what counts is chosen on the others as well, in so many parts."""
 
 DEPTH = 10
 """Depth of the context trees among experts and baselines."""
@@ -52,7 +56,7 @@ def fitted_experts(
 
     Args:
         learned: plans to learn from.
-        held_out: plans on which orders of chains are chosen, and networks are stopped.
+        held_out: plans on which orders of chains are chosen (see `counting_parts`), and networks are stopped.
         contexts: `num_contexts` or `context_size`, as experts take it that can, or none.
         effort: which networks are trained.
         generator: draws their initial weights and the order of training.
@@ -82,10 +86,10 @@ def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterat
         held_out: plans on which the orders and back-offs of chains are chosen.
         contexts: `num_contexts`, for priors that take an index and as many that do not; features cannot be counted.
     """
-    num_contexts = contexts.get("num_contexts")
+    num_contexts, parts = contexts.get("num_contexts"), counting_parts(learned, held_out)
     yield UniformPrior(learned.num_actions).fit(learned)
     for number in [None] if num_contexts is None else [None, num_contexts]:
-        found = best_chain(learned, held_out, number)
+        found = best_chain(parts, number)
         if found is not None:
             yield found
         try:
@@ -94,23 +98,41 @@ def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterat
             continue
 
 
+def counting_parts(learned: Plans, held_out: Plans) -> list[tuple[Plans, Plans]]:
+    """Plans to count in and plans to forecast from that: these two, and if the second are few, parts of the first.
+
+    A chain is chosen of many, and a few plans say little of which is best.
+    """
+    parts = [(learned, held_out)]
+    if int(held_out.mask().sum()) >= ENOUGH:
+        return parts
+    plans = divisible(learned[learned.mask().any(1)])
+    if len(plans) == 1:
+        plans = in_parts(plans, min(FOLDS, int(plans.mask().sum())))
+    units = len(plans) if plans.group is None else len(plans.group.unique())
+    if units < FEWEST_UNITS:
+        return parts
+    return parts + [(plans[rest], plans[left_out]) for rest, left_out in folds(plans, min(FOLDS, units))]
+
+
 @torch.no_grad()
-def best_chain(learned: Plans, held_out: Plans, num_contexts: int | None) -> MarkovPrior | None:
+def best_chain(parts: Sequence[tuple[Plans, Plans]], num_contexts: int | None) -> MarkovPrior | None:
     """The Markov chain, of `ORDERS` and all back-offs, under which held-out plans are likeliest; None: all too large.
 
     Args:
-        learned: plans to count in.
-        held_out: plans to choose on.
+        parts: plans to count in and those to choose on, each pair of them; the chain returned has counted in the first.
         num_contexts: of the chain's context, or None.
     """
     best: tuple[float, MarkovPrior | None] = (inf, None)
-    plain = held_out.without_context()
+    held_out = [plans if num_contexts is not None else plans.without_context() for _, plans in parts]
     try:
         for order in ORDERS:
-            for prior in chains(learned, order, num_contexts):
-                loss = -float(prior.log_prob(held_out if prior.takes_context else plain).sum())
+            every = zip(*(chains(learned, order, num_contexts) for learned, _ in parts), strict=True)
+            for priors in every:
+                each = zip(priors, held_out, strict=True)
+                loss = -sum(float(prior.log_prob(plans).sum()) for prior, plans in each)
                 if loss < best[0]:
-                    best = (loss, prior)
+                    best = (loss, priors[0])
     except TooLargeError:
         pass  # those of higher order are larger still
     return best[1]

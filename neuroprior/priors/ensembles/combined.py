@@ -1,6 +1,7 @@
 """The combined prior: experts of every kind, weighted so that it is hardly ever behind the best of them."""
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.priors.counts import TooLargeError
-from neuroprior.priors.ensembles.candidates import Effort, check_effort, fitted_experts, number_tried
+from neuroprior.priors.ensembles.candidates import Effort, check_effort, counting_parts, fitted_experts, number_tried
 from neuroprior.priors.ensembles.mixture import (
     MixturePrior,
     after,
@@ -38,8 +39,16 @@ LARGEST_SPARE = 2**22
 NUMBERS = 2**22
 """The most numbers of forecasts from which the powers of the pool are learned."""
 
-RIDGE = 1.0
-"""Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean."""
+RIDGE, RIDGE_OF_FEW = 1.0, 5.0
+"""Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean; where few plans are
+held out, from that which it has where experts that count are combined on all plans.
+"""
+
+GAIN = 6.0
+"""Nats in all by which few held-out plans have to be likelier for a network to be kept."""
+
+MOST_NUMBERS = 2**25
+"""The most numbers of forecasts of plans that are not held out."""
 
 STEPS, TRACKING_STEPS = 100, 5
 """Steps of expectation maximisation, which learns the initial weights; of the fixed share for each share tried."""
@@ -63,9 +72,11 @@ class CombinedPrior(MixturePrior):
     Their weights follow Bayes' rule, from initial weights that are learned on held-out plans. None of these is below
     1 / K, where K forecasts were tried: on every sequence whatever, the negative log-likelihood is at most log K above
     that of the best of those that are kept (Cesa-Bianchi and Lugosi 2006, section 9.2). An expert is left out where
-    held-out plans are predicted as well without it. In other worlds than those of the plans it may be the better one:
-    so chains and context trees whose tables are small are kept aside, in `spare`, for planners that try
-    (`neuroprior.planners.best_sampling`).
+    held-out plans are predicted as well without it. Where fewer than a thousand actions are held out, chains and trees
+    are chosen and combined on all plans, each fifth of which is forecast from the others, and a network is kept only
+    where the held-out plans are clearly likelier with it. In other worlds than those of the plans an expert that was
+    left out may be the better one: so chains and context trees whose tables are small are kept aside, in `spare`, for
+    planners that try (`neuroprior.planners.best_sampling`).
 
     Args:
         num_actions: A.
@@ -214,11 +225,11 @@ class CombinedPrior(MixturePrior):
             contexts = {name: size for name, size in sizes.items() if size is not None}
             made = fitted_experts(learned, held_out, contexts, self.effort, generator, settings)
             self.experts = nn.ModuleList(made).to(self.device)
-        self.learn_weights(held_out, None if self.given else number_tried(self._experts()))
+        self.learn_weights(held_out, None if self.given else number_tried(self._experts()), learned)
         return self.recount(plans)
 
     @torch.no_grad()
-    def learn_weights(self, plans: Plans, tried: int | None = None) -> None:
+    def learn_weights(self, plans: Plans, tried: int | None = None, learned: Plans | None = None) -> None:
         """Learn from plans that the experts did not learn from which of them are kept, and how they are combined.
 
         Those that were kept aside before, in `spare`, are tried again.
@@ -226,15 +237,13 @@ class CombinedPrior(MixturePrior):
         Args:
             plans: held-out plans.
             tried: how many experts there were, where these are the best of more; None: these.
+            learned: the plans that the experts learned from. Where few are held out, experts that count are chosen and
+                combined on these as well, part by part, and networks are kept only if they are clearly better.
         """
         experts = list(self.alternatives)
-        actions, mask, plain = plans.actions, plans.mask(), plans.without_context()
-        forecasts = [
-            torch.cat([log_probs for _, log_probs in e.forecasts(plans if e.takes_context else plain)]) for e in experts
-        ]
-        held_out = HeldOut(torch.stack(forecasts, 2), actions, mask, (tried or len(forecasts)) + 2)
-        kept, powers = held_out.choose([sum(weight.numel() for weight in e.parameters()) for e in experts])
-        members = with_pool(held_out.forecasts[:, :, kept], powers)
+        held_out, kept, powers = chosen_on(plans, learned, experts, (tried or len(experts)) + 2)
+        actions, mask = held_out.actions, held_out.mask
+        members = with_pool(held_out.forecasts, powers)
         taken = taken_of(members, actions).masked_fill(~mask[..., None], 0)
         early = slice(0, MOST_STEPS)
         tracking, share = learned_weights(taken[:, early], mask[:, early], TRACKING_STEPS)
@@ -283,8 +292,57 @@ class CombinedPrior(MixturePrior):
 def _can_be_spare(expert: Prior) -> bool:
     """Whether an expert that was left out may still propose: it counts, in a small table; uniform plans are shared."""
     numbers = sum(values.numel() for values in expert.buffers())
-    trained = bool(expert.fit_settings) or any(True for _ in expert.parameters())
-    return not trained and numbers <= LARGEST_SPARE and not isinstance(expert, UniformPrior)
+    return _counts(expert) and numbers <= LARGEST_SPARE and not isinstance(expert, UniformPrior)
+
+
+def _counts(expert: Prior) -> bool:
+    """Whether an expert is not trained: it takes little time to count anew."""
+    return not expert.fit_settings and not any(True for _ in expert.parameters())
+
+
+def chosen_on(
+    plans: Plans, learned: Plans | None, experts: Sequence[Prior], tried: int
+) -> tuple["HeldOut", list[int], Tensor]:
+    """Which experts are kept, see `CombinedPrior.learn_weights`.
+
+    Returns:
+        What the K experts kept forecast for the plans on which they were chosen; their numbers; their powers `[K]`.
+    """
+    costs = [sum(weight.numel() for weight in e.parameters()) for e in experts]
+    counting = [number for number, e in enumerate(experts) if _counts(e)]
+    forecasts = _forecasts(experts, plans)
+    held_out = HeldOut(forecasts, plans.actions, plans.mask(), tried)
+    parts = [] if learned is None or not counting else counting_parts(learned, plans)
+    if len(parts) < 2 or sum(part.actions.numel() for _, part in parts) * forecasts[0, 0].numel() > MOST_NUMBERS:
+        kept, powers = held_out.choose(costs)
+        return held_out.of(kept), kept, powers
+    found = [(forecasts[:, :, counting], plans.actions, held_out.mask)]
+    for rest, left_out in parts[1:]:
+        counted = [deepcopy(experts[number]).fit(rest) for number in counting]
+        found.append((_forecasts(counted, left_out), left_out.actions, left_out.mask()))
+    every, actions, mask = map(_joined, zip(*found, strict=True))
+    known = HeldOut(every, actions, mask, tried)
+    best, powers = known.choose([costs[number] for number in counting])
+    chosen = [counting[number] for number in best]
+    both = chosen + [number for number in range(len(experts)) if number not in counting]
+    few = held_out.of(both, torch.cat([powers, powers.new_zeros(len(both) - len(chosen))]))
+    kept, new_powers = few.choose([costs[number] for number in both], len(chosen))
+    if len(kept) == len(chosen):
+        return known.of(best), chosen, powers
+    return few.of(kept), [both[number] for number in kept], new_powers
+
+
+def _forecasts(experts: Sequence[Prior], plans: Plans) -> Tensor:
+    """`[N, L, E, A]`, the log-probabilities of all experts."""
+    plain = plans.without_context()
+    each = [e.forecasts(plans if e.takes_context else plain) for e in experts]
+    return torch.stack([torch.cat([log_probs for _, log_probs in parts]) for parts in each], 2)
+
+
+def _joined(values: Sequence[Tensor]) -> Tensor:
+    """Tensors `[N_i, L_i, ...]` as one, `[sum of N_i, max of L_i, ...]`, filled up with zeros."""
+    longest = max(each.shape[1] for each in values)
+    return torch.cat([torch.cat([v, v.new_zeros(len(v), longest - v.shape[1], *v.shape[2:])], 1) for v in values])
 
 
 class HeldOut:
@@ -295,19 +353,29 @@ class HeldOut:
         actions: `[N, L]`.
         mask: `[N, L]` bool: the actions that count.
         tried: how many forecasts, of experts, the pool and the fixed share, there were to choose from.
+        anchor: `[E]`, float64: the powers of the pool that are chosen where these plans say nothing; None: those of the
+            geometric mean.
     """
 
-    def __init__(self, forecasts: Tensor, actions: Tensor, mask: Tensor, tried: int) -> None:
-        self.forecasts, self.actions, self.mask, self.tried = forecasts, actions, mask, tried
+    def __init__(
+        self, forecasts: Tensor, actions: Tensor, mask: Tensor, tried: int, anchor: Tensor | None = None
+    ) -> None:
+        self.forecasts, self.actions, self.mask, self.tried, self.anchor = forecasts, actions, mask, tried, anchor
         self.taken = taken_of(forecasts, actions).masked_fill(~mask[..., None], 0)
         self.count = max(int(mask.sum()), 1)
-        self.tolerance = max(TOLERANCE, IN_ALL / self.count)
+        self.tolerance = max(TOLERANCE, (IN_ALL if anchor is None else GAIN) / self.count)
         # Some actions, evenly spread, are enough for a few powers.
         every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
         self.sample = forecasts[mask][::every].double().clamp(min=LEAST)
         self.sample_actions = actions[mask][::every].long()
 
-    def choose(self, costs: Sequence[int]) -> tuple[list[int], Tensor]:
+    def of(self, kept: list[int], anchor: Tensor | None = None) -> "HeldOut":
+        """The same of some experts, whose anchor is this one's, or `anchor`."""
+        if anchor is None and self.anchor is not None:
+            anchor = self.anchor[kept]
+        return HeldOut(self.forecasts[:, :, kept], self.actions, self.mask, self.tried, anchor)
+
+    def choose(self, costs: Sequence[int], fixed: int = 0) -> tuple[list[int], Tensor]:
         """The experts that are kept, and their powers `[K]`, float64, in the pool.
 
         One expert after the other is left out: the dearest of those without which no more than the tolerance is lost.
@@ -315,12 +383,13 @@ class HeldOut:
         Args:
             costs: of each expert, such as its number of weights. (Seconds differ from run to run, and so would what is
                 chosen.)
+            fixed: the first so many are kept.
         """
         kept = list(range(len(costs)))
         powers, best = self.combined(kept)
         while len(kept) > 1:
             found = []
-            for out in kept:
+            for out in kept[fixed:]:
                 rest = [number for number in kept if number != out]
                 rest_powers, loss = self.combined(rest)
                 best = min(best, loss)
@@ -334,16 +403,20 @@ class HeldOut:
 
     def combined(self, kept: list[int]) -> tuple[Tensor, float]:
         """The powers of some experts in their pool, and the loss of the mixture of these and the pool."""
-        powers = self.powers(self.sample[:, kept])
+        powers = self.powers(self.sample[:, kept], None if self.anchor is None else self.anchor[kept])
         pooled = with_pool(self.forecasts[:, :, kept], powers)[:, :, -1:]
         taken = taken_of(pooled, self.actions).masked_fill(~self.mask[..., None], 0)
         return powers, self.loss(torch.cat([self.taken[:, :, kept], taken], 2))
 
-    def powers(self, forecasts: Tensor) -> Tensor:
-        """The powers `[K]` of the pool under which some actions are likeliest, of `forecasts [M, K, A]`."""
+    def powers(self, forecasts: Tensor, anchor: Tensor | None = None) -> Tensor:
+        """The powers `[K]` of the pool under which some actions are likeliest, of `forecasts [M, K, A]`.
+
+        It costs to be far from the `anchor [K]`; see there.
+        """
         from scipy.optimize import minimize  # takes a second to import: only where it is needed
 
-        size = forecasts.shape[1]
+        size, ridge = forecasts.shape[1], RIDGE if anchor is None else RIDGE_OF_FEW
+        first = torch.full((size,), 1 / size, dtype=torch.double) if anchor is None else anchor.cpu()
 
         def loss(values: np.ndarray[Any, Any]) -> tuple[float, np.ndarray[Any, Any]]:
             now = torch.tensor(values, device=forecasts.device)
@@ -352,10 +425,10 @@ class HeldOut:
             # The gradient: what was forecast of the action taken, less what the pool expects.
             chosen = forecasts.gather(2, self.sample_actions[:, None, None].expand(-1, size, 1))[..., 0].sum(0)
             slope = torch.einsum("mka,ma->k", forecasts, log_probs.exp()) - chosen
-            away = now - 1 / size
-            return float(RIDGE * (away**2).sum() - taken), (slope + 2 * RIDGE * away).cpu().numpy()
+            away = now - first.to(now)
+            return float(ridge * (away**2).sum() - taken), (slope + 2 * ridge * away).cpu().numpy()
 
-        found = minimize(loss, np.full(size, 1 / size), jac=True, method="L-BFGS-B", bounds=[(0, None)] * size)
+        found = minimize(loss, first.numpy(), jac=True, method="L-BFGS-B", bounds=[(0, None)] * size)
         return torch.tensor(found.x, device=forecasts.device)
 
     def loss(self, taken: Tensor) -> float:

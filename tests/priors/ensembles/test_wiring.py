@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, Prior, StackedPrior, UniformPrior
-from neuroprior.priors.counts import HistoryPrior
+from neuroprior.priors.counts import HistoryPrior, chains
 from neuroprior.priors.ensembles import stacked
-from neuroprior.priors.ensembles.candidates import NETWORKS, best_chain, fitted_experts
+from neuroprior.priors.ensembles.candidates import NETWORKS, ORDERS, best_chain, counting_parts, fitted_experts
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.priors.ensembles.mixture import SHARES, divided
 from neuroprior.priors.ensembles.packing import DIGITS, pack, unpack
@@ -77,9 +77,68 @@ def test_of_chains_whose_tables_fit_the_best_is_found(monkeypatch):
     steps = torch.multinomial(torch.tensor([0.1, 0.7, 0.2]), 2000, True, generator=seeded(0)).view(100, 20)
     plans = Plans(steps.cumsum(1) % A, A)
     monkeypatch.setattr(HistoryPrior, "max_table_bytes", 200)
-    found = best_chain(plans[:80], plans[80:], None)
+    found = best_chain([(plans[:80], plans[80:])], None)
     assert found is not None
     assert found.order == 1
+
+
+def test_a_chain_is_the_best_of_all_parts_together():
+    """One part speaks for an order of 2 or more, another for order 0: the larger one decides."""
+    runs, noise = torch.arange(24).view(4, 6) // 2 % 2, torch.randint(2, (400, 6), generator=seeded(0))
+    orders = []
+    for num in (1, 390):
+        parts = [(Plans(runs, 2), Plans(runs, 2)), (Plans(noise[:10], 2), Plans(noise[10 : 10 + num], 2))]
+        tried = [[chain for o in ORDERS for chain in chains(counted, o)] for counted, _ in parts]
+        losses = [
+            [-float(chain.log_prob(part[1]).sum()) for chain in made] for made, part in zip(tried, parts, strict=True)
+        ]
+        best = min(range(len(losses[0])), key=lambda n: losses[0][n] + losses[1][n])
+        found = best_chain(parts, None)
+        assert found is not None
+        assert found.log_probs.equal(tried[0][best].log_probs)  # it has counted in the first
+        orders.append(found.order)
+    assert orders[0] >= 2
+    assert orders[1] == 0
+
+
+@pytest.mark.parametrize("shape", [(40, 6), (1, 240)])
+def test_where_few_are_held_out_all_others_are_forecast_part_by_part(shape):
+    grouped = {"group": torch.arange(40) % 8} if shape[0] > 1 else {}
+    learned = Plans(torch.randint(A, shape, generator=seeded(0)), A, **grouped)
+    few, many = some_plans(10, 6), some_plans(200, 6)
+    assert [tuple(map(len, part)) for part in counting_parts(learned, many)] == [(shape[0], 200)]
+    first, *parts = counting_parts(learned, few)
+    assert first == (learned, few)
+    assert len(parts) == 5
+    assert sum(int(left_out.mask().sum()) for _, left_out in parts) == 240
+    for rest, left_out in parts:
+        assert int(rest.mask().sum()) + int(left_out.mask().sum()) == 240
+        if grouped:
+            assert not set(rest.group.tolist()) & set(left_out.group.tolist())
+    assert len(counting_parts(learned[:0], few)) == 1
+    assert len(counting_parts(Plans(torch.zeros(1, 1, dtype=torch.long), A), few)) == 1
+
+
+class Trained(MarkovPrior):
+    """Independent actions; it counts as trained, and has learned elsewhere."""
+
+    fit_settings = ("validation",)
+
+
+@pytest.mark.parametrize(("num", "kept"), [(2, False), (40, True)])
+def test_of_few_plans_a_network_has_to_be_clearly_better(num, kept):
+    """It gains about .3 nats an action: on ten actions by chance, on two hundred not."""
+    actions = drawn([0.7, 0.2, 0.1], 200, 5)
+    learned, held_out = Plans(actions[100:], A), Plans(actions[:num], A)
+    counted = MarkovPrior(A, 0, 1e6).fit(learned)  # of much smoothing: nearly uniform
+    trained = Trained(A, 0, 1e-9).fit(actions)
+    prior = CombinedPrior(A, [counted, trained])
+    prior.learn_weights(held_out, learned=learned)
+    assert (trained in prior.experts) == kept
+    assert counted in prior.experts
+    alone = CombinedPrior(A, [counted, trained])
+    alone.learn_weights(held_out)  # without the plans that were learned from it is taken whenever it seems better
+    assert trained in alone.experts
 
 
 def test_groups_stay_together_where_they_are_many():
