@@ -1,6 +1,7 @@
 """The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from math import inf
 from typing import Any, Literal
@@ -8,7 +9,7 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._random import draw_seed
-from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
+from neuroprior.plans.folds import divisible, folds, in_parts
 from neuroprior.plans.plans import Plans
 from neuroprior.priors.counts import BACKOFFS_TRIED, ContextTreePrior, MarkovPrior, TooLargeError, chains
 from neuroprior.priors.ensembles.stacked import StackedPrior
@@ -31,8 +32,13 @@ NETWORKS: dict[Effort, tuple[Callable[..., Prior], ...]] = {
 ORDERS = range(7)
 """Orders of the Markov chains that are tried: the best is an expert, and all are baselines in comparisons."""
 
-FOLDS, ENOUGH = 5, 1000
-"""Where fewer than `ENOUGH` actions are held out, what counts is chosen on the others as well, in so many parts."""
+FOLDS, ENOUGH, MOST = 5, 1000, 20_000
+"""Where fewer than `ENOUGH` actions are held out, what counts is chosen on the others as well, in so many parts, if
+these are at most `MOST`.
+"""
+
+LEAST_REST = 0.4
+"""The share of all actions that is left to count in, at least, where a part is held out."""
 
 DEPTH = 10
 """Depth of the context trees among experts and baselines."""
@@ -101,18 +107,21 @@ def counted(learned: Plans, held_out: Plans, contexts: dict[str, int]) -> Iterat
 def counting_parts(learned: Plans, held_out: Plans) -> list[tuple[Plans, Plans]]:
     """Plans to count in and plans to forecast from that: these two, and if the second are few, parts of the first.
 
-    A chain is chosen of many, and a few plans say little of which is best.
+    A chain is chosen of many, and a few plans say little of which is best. Groups stay together where they are so equal
+    that enough is left to count in.
     """
-    parts = [(learned, held_out)]
-    if int(held_out.mask().sum()) >= ENOUGH:
-        return parts
+    given, total = [(learned, held_out)], int(learned.mask().sum())
+    if int(held_out.mask().sum()) >= ENOUGH or not 1 < total <= MOST:
+        return given
     plans = divisible(learned[learned.mask().any(1)])
     if len(plans) == 1:
-        plans = in_parts(plans, min(FOLDS, int(plans.mask().sum())))
-    units = len(plans) if plans.group is None else len(plans.group.unique())
-    if units < FEWEST_UNITS:
-        return parts
-    return parts + [(plans[rest], plans[left_out]) for rest, left_out in folds(plans, min(FOLDS, units))]
+        plans = in_parts(plans, min(FOLDS, total))
+    for some in (plans, replace(plans, group=None, group_names=None)):
+        units = len(some) if some.group is None else len(some.group.unique())
+        parts = [(some[rest], some[left_out]) for rest, left_out in folds(some, min(FOLDS, units))]
+        if min(int(rest.mask().sum()) for rest, _ in parts) >= LEAST_REST * total:
+            return given + parts
+    return given
 
 
 @torch.no_grad()
@@ -127,12 +136,12 @@ def best_chain(parts: Sequence[tuple[Plans, Plans]], num_contexts: int | None) -
     held_out = [plans if num_contexts is not None else plans.without_context() for _, plans in parts]
     try:
         for order in ORDERS:
-            every = zip(*(chains(learned, order, num_contexts) for learned, _ in parts), strict=True)
-            for priors in every:
-                each = zip(priors, held_out, strict=True)
-                loss = -sum(float(prior.log_prob(plans).sum()) for prior, plans in each)
-                if loss < best[0]:
-                    best = (loss, priors[0])
+            losses = [0.0] * len(BACKOFFS_TRIED)
+            for part in reversed(range(len(parts))):
+                for number, prior in enumerate(chains(parts[part][0], order, num_contexts)):
+                    losses[number] -= float(prior.log_prob(held_out[part]).sum())
+                    if part == 0 and losses[number] < best[0]:
+                        best = (losses[number], prior)
     except TooLargeError:
         pass  # those of higher order are larger still
     return best[1]

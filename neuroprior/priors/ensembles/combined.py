@@ -39,12 +39,13 @@ LARGEST_SPARE = 2**22
 NUMBERS = 2**22
 """The most numbers of forecasts from which the powers of the pool are learned."""
 
-RIDGE, RIDGE_OF_FEW = 1.0, 5.0
-"""Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean; where few plans are
-held out, from that which it has where experts that count are combined on all plans.
-"""
+RIDGE = 1.0
+"""Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean."""
 
-GAIN = 6.0
+RIDGE_OF_FEW = 5.0
+"""The same where few plans are held out; the powers then begin as those of experts that count on all plans."""
+
+GAIN = 2.0
 """Nats in all by which few held-out plans have to be likelier for a network to be kept."""
 
 MOST_NUMBERS = 2**25
@@ -72,11 +73,11 @@ class CombinedPrior(MixturePrior):
     Their weights follow Bayes' rule, from initial weights that are learned on held-out plans. None of these is below
     1 / K, where K forecasts were tried: on every sequence whatever, the negative log-likelihood is at most log K above
     that of the best of those that are kept (Cesa-Bianchi and Lugosi 2006, section 9.2). An expert is left out where
-    held-out plans are predicted as well without it. Where fewer than a thousand actions are held out, chains and trees
-    are chosen and combined on all plans, each fifth of which is forecast from the others, and a network is kept only
-    where the held-out plans are clearly likelier with it. In other worlds than those of the plans an expert that was
-    left out may be the better one: so chains and context trees whose tables are small are kept aside, in `spare`, for
-    planners that try (`neuroprior.planners.best_sampling`).
+    held-out plans are predicted as well without it. Where no experts are given and fewer than a thousand actions are
+    held out, chains and trees are chosen and combined on all plans, most of them forecast part by part from the others,
+    and a network is kept only where the held-out plans are clearly likelier with it. In other worlds than those of the
+    plans an expert that was left out may be the better one: so chains and context trees whose tables are small are kept
+    aside, in `spare`, for planners that try (`neuroprior.planners.best_sampling`).
 
     Args:
         num_actions: A.
@@ -225,7 +226,10 @@ class CombinedPrior(MixturePrior):
             contexts = {name: size for name, size in sizes.items() if size is not None}
             made = fitted_experts(learned, held_out, contexts, self.effort, generator, settings)
             self.experts = nn.ModuleList(made).to(self.device)
-        self.learn_weights(held_out, None if self.given else number_tried(self._experts()), learned)
+        if self.given:
+            self.learn_weights(held_out)
+        else:
+            self.learn_weights(held_out, number_tried(self._experts()), learned)
         return self.recount(plans)
 
     @torch.no_grad()
@@ -237,8 +241,9 @@ class CombinedPrior(MixturePrior):
         Args:
             plans: held-out plans.
             tried: how many experts there were, where these are the best of more; None: these.
-            learned: the plans that the experts learned from. Where few are held out, experts that count are chosen and
-                combined on these as well, part by part, and networks are kept only if they are clearly better.
+            learned: the plans that the experts learned from. Where few are held out, experts that count are combined
+                on these as well, part by part, fitted anew to the others; and those that are trained are kept only if
+                they are clearly better. None: all are chosen on the held-out plans alone.
         """
         experts = list(self.alternatives)
         held_out, kept, powers = chosen_on(plans, learned, experts, (tried or len(experts)) + 2)

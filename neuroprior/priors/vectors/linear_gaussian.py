@@ -13,6 +13,7 @@ from neuroprior._checks import check_count
 from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
 from neuroprior.plans.folds import divisible
+from neuroprior.plans.sequences import check_validation
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
@@ -207,25 +208,28 @@ def held_out_split(
 ) -> tuple[VectorPlans, VectorPlans]:
     """Plans to learn from and plans to choose on; where there is a single vector, it is both.
 
-    Groups stay together, unless there is one alone. Where plans are so unequal that about that share of them has hardly
-    any of the vectors, or nearly all, the end of the longest is held out instead.
+    Groups stay together, unless they are so unequal that a share of them is no such share of the vectors. Where the
+    plans are, the end of the longest is held out instead.
 
     Raises:
         ValueError: `share` is not between 0 and 1.
     """
+    check_validation(share)
     plans = divisible(plans[plans.mask().any(1)])
     lengths = plans.mask().sum(1)
-    total = int(lengths.sum())
+    total, longest = int(lengths.sum()), int(lengths.max()) if len(lengths) else 0
     if total < 2:
         return plans, plans
-    learning, held_out = plans.split(share, generator)
-    if not share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
-        longest = int(lengths.argmax())
-        cut = int(lengths[longest]) - max(round(share * int(lengths[longest])), 1)
-        held_out = plans[longest : longest + 1].steps(cut)
-        lengths[longest] = cut
-        learning = replace(plans, lengths=lengths)
-    return learning, held_out
+    for some in (plans,) if plans.group is None else (plans, replace(plans, group=None)):
+        learning, held_out = some.split(share, generator)
+        if share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
+            return learning, held_out
+    cut = longest - max(min(round(share * total), longest // 2), 1)
+    if longest - cut < share / 2 * total:
+        return learning, held_out
+    row = int(lengths.argmax())
+    lengths[row] = cut
+    return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut)
 
 
 @torch.no_grad()

@@ -154,7 +154,7 @@ class StoredWindows(VectorPrior):
             windows = windows[torch.linspace(0, len(windows) - 1, most).round().long()]
         self.register_buffer("segments", self.scaled(windows).to(self.device))
         std = self.segments.var((0, 1), correction=0).mean().sqrt()
-        self.extent = (EXTENT * std).clamp(LEAST_STD, 1)
+        self.extent = (EXTENT * std).clamp(LEAST_STD / NOISES[0], 1)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         empty = torch.zeros(batch_size, 2 + self.match * self.action_size, device=self.device)

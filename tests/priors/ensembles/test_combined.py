@@ -367,9 +367,32 @@ def test_of_few_plans_it_is_hardly_behind_the_best_of_its_experts():
         plans, test = Plans(actions[:100], 4), Plans(actions[100:], 4)
         prior = neuroprior.fit(plans, effort="fast", generator=seeded(seed), progress=False, max_steps=60)
         assert isinstance(prior, CombinedPrior)
-        found, *alone = (-float(one.log_prob(test).mean()) / 8 for one in (prior, *prior.alternatives))
+        others = [MarkovPrior(4, order).fit(plans) for order in (1, 2, 3)] + [ContextTreePrior(4, 10).fit(plans)]
+        found, *alone = (-float(one.log_prob(test).mean()) / 8 for one in (prior, *prior.alternatives, *others))
         behind.append(found - min(alone))
     assert sum(behind) / 3 < 0.01
+
+
+def test_of_few_plans_a_network_that_is_better_is_kept():
+    """Each plan follows one of three chains: a network finds out which, a chain does not."""
+    with torch.random.fork_rng():
+        torch.manual_seed(7)
+        probs = torch.distributions.Dirichlet(torch.full((4,), 0.2)).sample((3, 4))
+
+    def drawn_from_three(num: int, seed: int) -> Plans:
+        which = torch.randint(3, (num,), generator=seeded(seed))
+        actions = torch.zeros(num, 40, dtype=torch.long)
+        for t in range(1, 40):
+            now = probs[which, actions[:, t - 1]]
+            actions[:, t] = torch.multinomial(now, 1, generator=seeded(100 * seed + t))[:, 0]
+        return Plans(actions, 4)
+
+    plans, test = drawn_from_three(50, 1), drawn_from_three(300, 2)
+    prior = neuroprior.fit(plans, effort="fast", generator=seeded(1), progress=False, max_steps=150)
+    assert isinstance(prior, CombinedPrior)
+    assert any(isinstance(expert, GRUPrior) for expert in prior.experts)
+    found, counted = (float(one.log_prob(test).mean()) / 40 for one in (prior, ContextTreePrior(4, 10).fit(plans)))
+    assert found > counted + 0.02
 
 
 @pytest.mark.parametrize(

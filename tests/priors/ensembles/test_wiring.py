@@ -119,6 +119,28 @@ def test_where_few_are_held_out_all_others_are_forecast_part_by_part(shape):
     assert len(counting_parts(Plans(torch.zeros(1, 1, dtype=torch.long), A), few)) == 1
 
 
+@pytest.mark.parametrize(
+    ("lengths", "groups", "parts"),
+    [
+        ([200, 4], None, 1),  # what is left to count in without the long plan is next to nothing
+        ([200, 4, 4, 4], None, 1),
+        ([10] * 30, [0] * 28 + [1, 2], 6),  # the groups are taken apart
+        ([10] * 30, [0] * 10 + [1] * 10 + [2] * 10, 4),
+        ([10] * 3000, None, 1),  # enough are held out of so many, or too few by intent
+    ],
+)
+def test_no_part_is_forecast_from_next_to_nothing(lengths, groups, parts):
+    shape = (len(lengths), max(lengths))
+    group = None if groups is None else torch.tensor(groups)
+    plans = Plans(torch.zeros(shape, dtype=torch.long), A, torch.tensor(lengths), group=group)
+    found = counting_parts(plans, some_plans(10))
+    assert len(found) == parts
+    for rest, left_out in found[1:]:
+        assert int(rest.mask().sum()) >= 0.4 * sum(lengths)
+        if groups is not None and len(set(groups[:28])) > 1:
+            assert not set(rest.group.tolist()) & set(left_out.group.tolist())
+
+
 class Trained(MarkovPrior):
     """Independent actions; it counts as trained, and has learned elsewhere."""
 

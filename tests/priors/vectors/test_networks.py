@@ -10,6 +10,7 @@ from torch import Tensor
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors import load, save
 from neuroprior.priors.vectors import AutoregressivePrior, VectorGRU, VectorPrior, VectorTransformer
+from neuroprior.priors.vectors.linear_gaussian import held_out_split
 from neuroprior.testing.chi_square import chi_square
 
 KINDS = [VectorGRU, VectorTransformer]
@@ -274,6 +275,16 @@ def test_of_a_long_plan_and_single_vectors_the_long_one_is_learned_from_and_vali
         prior.fit(data, generator=rng(seed), progress=False, max_steps=40)
         with torch.no_grad():
             assert prior.action_log_probs(test)[:, 1:].mean() > 2.2  # the noise has 2.4
+
+
+def test_a_fair_share_is_held_out_of_unequal_groups_of_many_plans(kind):
+    """In one of two groups are most plans: these are divided, as no share of the groups is one of the vectors."""
+    group = (torch.arange(60) >= 45).long()
+    data = VectorPlans(torch.rand(60, 5, 1, generator=rng(1)) - 0.5, [-1.0], [1.0], group=group)
+    for seed in range(4):
+        learned, held_out = held_out_split(data, rng(seed), 0.1)
+        assert (int(learned.mask().sum()), int(held_out.mask().sum())) == (270, 30)
+    kind([-1.0], [1.0], width=8).fit(data, generator=rng(), **HOW)
 
 
 def test_plans_of_a_single_group_are_learned_from(kind):
