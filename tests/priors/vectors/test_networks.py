@@ -278,12 +278,11 @@ def test_of_a_long_plan_and_single_vectors_the_long_one_is_learned_from_and_vali
 
 
 def test_a_fair_share_is_held_out_of_unequal_groups_of_many_plans(kind):
-    """In one of two groups are most plans: these are divided, as no share of the groups is one of the vectors."""
+    """In one of two groups are most plans: it is not held out for the other."""
     group = (torch.arange(60) >= 45).long()
     data = VectorPlans(torch.rand(60, 5, 1, generator=rng(1)) - 0.5, [-1.0], [1.0], group=group)
-    for seed in range(4):
-        learned, held_out = held_out_split(data, rng(seed), 0.1)
-        assert (int(learned.mask().sum()), int(held_out.mask().sum())) == (270, 30)
+    found = [[int(part.mask().sum()) for part in held_out_split(data, rng(seed), 0.1)] for seed in range(8)]
+    assert {*map(tuple, found)} == {(225, 75), (270, 30)}  # the smaller group, or where it is the larger one, plans
     kind([-1.0], [1.0], width=8).fit(data, generator=rng(), **HOW)
 
 
