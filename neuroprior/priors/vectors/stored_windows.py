@@ -20,7 +20,7 @@ NOISES = (0.02, 0.05, 0.1, 0.2, 0.4)
 BANDWIDTH, NOISE = 0.2, 0.1
 """The bandwidth and the noise before `fit`, and where no plans can be held out to choose them on."""
 
-EXTENT = 8
+EXTENT = 32
 """Distances are in units of half the range, or of so many standard deviations of the stored vectors if that is less:
 what is tried would be too coarse for vectors that take up a small part of the range.
 """
@@ -38,7 +38,7 @@ class StoredWindows(VectorPrior):
     the present past: with probability proportional to exp(-d / (2 bandwidth ** 2)), d the sum of squared differences
     over the last `match` vectors. It is followed with independent Gaussian noise, and then the next one is chosen. As
     which segment is being followed is not known, a vector's density is that of a mixture, weighted by how well each
-    segment predicted the vectors since it began. Distances are in units of half the range, or of eight standard
+    segment predicted the vectors since it began. Distances are in units of half the range, or of 32 standard
     deviations of the stored vectors where that is less.
 
     `read` begins a new segment after the past. `state` is `[N, 2 + match * D + M]`: vectors known, place in the
