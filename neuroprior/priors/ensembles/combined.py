@@ -43,7 +43,9 @@ RIDGE = 1.0
 """Nats that it costs when a power of the pool is 1 away from that of the experts' geometric mean."""
 
 RIDGE_OF_FEW = 5.0
-"""The same where few plans are held out; the powers then begin as those of experts that count on all plans."""
+"""The same where few plans are held out, for the distance from the powers that experts which count have without
+networks, on all plans.
+"""
 
 GAIN = 2.0
 """Nats in all by which few held-out plans have to be likelier for a network to be kept."""
@@ -416,7 +418,7 @@ class HeldOut:
     def powers(self, forecasts: Tensor, anchor: Tensor | None = None) -> Tensor:
         """The powers `[K]` of the pool under which some actions are likeliest, of `forecasts [M, K, A]`.
 
-        It costs to be far from the `anchor [K]`; see there.
+        With a price for their distance from the `anchor [K]`; None: from those of the geometric mean.
         """
         from scipy.optimize import minimize  # takes a second to import: only where it is needed
 

@@ -388,6 +388,24 @@ def test_shorter_plans_are_learned_from():
     assert float(forecast.std) == pytest.approx(float(all_of_them.std(correction=0)), rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("make", "lacks"),
+    [
+        (lambda: VectorGRU(LOW, HIGH, width=4), "first_log_std"),
+        (lambda: VectorTransformer(LOW, HIGH, width=8), "first_log_std"),
+        (lambda: StoredWindows(LOW, HIGH), "extent"),
+    ],
+)
+def test_files_of_earlier_versions_are_read_as_they_were_meant(make, lacks):
+    """What they lack had no effect then."""
+    prior, other = make(), make()
+    weights = prior.state_dict()
+    assert lacks in weights
+    other.load_state_dict({name: value for name, value in weights.items() if name != lacks})
+    plans = source(3, 9)
+    assert other.log_prob(plans).equal(prior.log_prob(plans))
+
+
 def test_stored_windows_describe_vectors_in_a_small_part_of_the_range_as_well():
     """A hundredth as wide, a vector of two dimensions has 2 log 100 more nats."""
     low, high = (-1.0, -1.0), (1.0, 1.0)
