@@ -66,7 +66,7 @@ class StoredWindows(VectorPrior):
     segments: Tensor
 
     extent: Tensor
-    """The unit of distances, in halves of the range: `EXTENT` standard deviations of stored vectors, at most 1."""
+    """The unit of distances as a share of half the range. At most 1, see `EXTENT`."""
 
     def __init__(
         self,
