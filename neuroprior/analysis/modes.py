@@ -14,7 +14,7 @@ from neuroprior._checks import check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.plans.folds import divisible, folds
+from neuroprior.plans.folds import divisible, folds, num_units
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.fitting import make_prior
@@ -124,7 +124,7 @@ def choose_modes(
     given = plans if use_context and "num_contexts" in context_arguments(plans) else plans.without_context()
     generator = generator_on(generator, "cpu")
     if number_of_folds is None:
-        number_of_folds = min(FOLDS, len(given) if given.group is None else len(given.group.unique()))
+        number_of_folds = min(FOLDS, num_units(given))
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)
     if mask is not None and (mask.dtype != torch.bool or mask.shape != given.actions.shape):
         shape = list(given.actions.shape)

@@ -30,9 +30,18 @@ def divisible(plans: AnyPlans) -> AnyPlans:
         >>> divisible(Plans(torch.zeros(1, 1000, dtype=torch.long), 2)).actions.shape
         torch.Size([1, 1000])
     """
-    few = plans.group is None or len(plans.group.unique()) < FEWEST_UNITS
+    return plans if plans.group is not None and num_units(plans) >= FEWEST_UNITS else ungrouped(plans)
+
+
+def ungrouped(plans: AnyPlans) -> AnyPlans:
+    """The same plans without their group."""
     names: dict[str, None] = {"group_names": None} if isinstance(plans, Plans) else {}
-    return replace(plans, group=None, **names) if few else plans  # type: ignore[type-var]
+    return replace(plans, group=None, **names)  # type: ignore[type-var]
+
+
+def num_units(plans: Sequences) -> int:
+    """The number of groups, or of plans where there are none."""
+    return len(plans) if plans.group is None else len(plans.group.unique())
 
 
 def folds(plans: Sequences, number: int, seed: int = 0) -> list[tuple[Tensor, Tensor]]:

@@ -18,6 +18,9 @@ class SavedModule(nn.Module, ABC):
     tables: tuple[str, ...] = ()
     """Buffers whose sizes depend on what was learned, so that they are taken from the file."""
 
+    later: ClassVar[Mapping[str, float]] = {}
+    """Tensors that files of earlier versions lack, and the number in all of their places that then had no effect."""
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         SavedModule.known[cls.__name__] = cls
@@ -48,6 +51,8 @@ class SavedModule(nn.Module, ABC):
             if prefix + name in state_dict:
                 device = getattr(self, name).device
                 self.register_buffer(name, torch.empty_like(state_dict[prefix + name], device=device))
+        for name, value in self.later.items():
+            state_dict.setdefault(prefix + name, torch.full_like(getattr(self, name), value))
         super()._load_from_state_dict(state_dict, prefix, *args)
         if not self.tables_fit():
             raise RuntimeError(f"the tables of a {type(self).__name__} do not fit one another")

@@ -10,7 +10,7 @@ from torch.nn import functional
 from neuroprior._checks import check_range, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
 from neuroprior.plans.plans import durations_of
 from neuroprior.priors.durations.laws import (
     LAW_NAMES,
@@ -350,7 +350,7 @@ class DurationModel(nn.Module):
 def _parts(plans: Plans, known: Tensor) -> Tensor:
     """`[N, L]`: the part of the plans that each duration is held out with."""
     plans = divisible(plans)
-    units = len(plans) if plans.group is None else len(plans.group.unique())
+    units = num_units(plans)
     part = torch.zeros(plans.actions.shape, dtype=torch.long, device=known.device)
     if units < FEWEST_UNITS:
         place = known.flatten().cumsum(0).view(known.shape) - 1

@@ -1,7 +1,6 @@
 """The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from math import inf
 from typing import Any, Literal
@@ -9,7 +8,7 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._random import draw_seed
-from neuroprior.plans.folds import divisible, folds, in_parts
+from neuroprior.plans.folds import divisible, folds, in_parts, num_units, ungrouped
 from neuroprior.plans.plans import Plans
 from neuroprior.priors.counts import BACKOFFS_TRIED, ContextTreePrior, MarkovPrior, TooLargeError, chains
 from neuroprior.priors.ensembles.stacked import StackedPrior
@@ -116,9 +115,9 @@ def counting_parts(learned: Plans, held_out: Plans) -> list[tuple[Plans, Plans]]
     plans = divisible(learned[learned.mask().any(1)])
     if len(plans) == 1:
         plans = in_parts(plans, min(FOLDS, total))
-    for some in (plans, replace(plans, group=None, group_names=None)):
-        units = len(some) if some.group is None else len(some.group.unique())
-        parts = [(some[rest], some[left_out]) for rest, left_out in folds(some, min(FOLDS, units))]
+    for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
+        divisions = folds(some, min(FOLDS, num_units(some)))
+        parts = [(some[rest], some[left_out]) for rest, left_out in divisions]
         if min(int(rest.mask().sum()) for rest, _ in parts) >= LEAST_REST * total:
             return given + parts
     return given
@@ -137,7 +136,7 @@ def best_chain(parts: Sequence[tuple[Plans, Plans]], num_contexts: int | None) -
     try:
         for order in ORDERS:
             losses = [0.0] * len(BACKOFFS_TRIED)
-            for part in reversed(range(len(parts))):
+            for part in reversed(range(len(parts))):  # the first pair last: of chains it has counted one is kept
                 for number, prior in enumerate(chains(parts[part][0], order, num_contexts)):
                     losses[number] -= float(prior.log_prob(held_out[part]).sum())
                     if part == 0 and losses[number] < best[0]:

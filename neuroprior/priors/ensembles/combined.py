@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -372,9 +373,17 @@ class HeldOut:
         self.count = max(int(mask.sum()), 1)
         self.tolerance = max(TOLERANCE, (IN_ALL if anchor is None else GAIN) / self.count)
         # Some actions, evenly spread, are enough for a few powers.
-        every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
-        self.sample = forecasts[mask][::every].double().clamp(min=LEAST)
-        self.sample_actions = actions[mask][::every].long()
+        self.every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
+
+    @cached_property
+    def sample(self) -> Tensor:
+        """`[M, E, A]`, float64: the log-probabilities at some of the actions that count."""
+        return self.forecasts[self.mask][:: self.every].double().clamp(min=LEAST)
+
+    @cached_property
+    def sample_actions(self) -> Tensor:
+        """`[M]`: these actions."""
+        return self.actions[self.mask][:: self.every].long()
 
     def of(self, kept: list[int], anchor: Tensor | None = None) -> "HeldOut":
         """The same of some experts, whose anchor is this one's, or `anchor`."""

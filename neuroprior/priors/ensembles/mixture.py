@@ -1,7 +1,6 @@
 """The mixture of priors: experts weighted by how well they have predicted the plan so far."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor, nn
 from neuroprior._checks import check_alike_named, check_same_names, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
+from neuroprior.plans.folds import ungrouped
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.prior import Prior, as_prior, described, taken_of
@@ -255,7 +255,7 @@ def divided(plans: Plans, validation: Plans | float | None, generator: torch.Gen
     if validation is None:
         validation = min(MOST, max(LARGEST / max(int(plans.mask().sum()), 1), LEAST))
     if plans.group is not None and 1 / len(plans.group.unique()) > 2 * validation:
-        plans = replace(plans, group=None, group_names=None)
+        plans = ungrouped(plans)
     return plans.split(validation, generator)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from neuroprior._checks import check_memory, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts, num_units
 from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.neural.gru import gru_sequence
@@ -197,7 +197,7 @@ class StackedPrior(Prior):
 
     def _forecasts(self, plans: Plans, generator: torch.Generator) -> Tensor:
         """`[N, L, E, A]`: log-probabilities of experts that did not learn from the plan they predict."""
-        units = len(plans) if plans.group is None else len(plans.group.unique())
+        units = num_units(plans)
         shape = (*plans.actions.shape, len(self.experts), self.num_actions)
         out = torch.zeros(shape, device=plans.actions.device)
         with torch.no_grad():

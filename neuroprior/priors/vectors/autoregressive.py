@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_count
 from neuroprior._random import draw_seed
-from neuroprior.plans.folds import divisible, folds
+from neuroprior.plans.folds import divisible, folds, num_units
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
@@ -93,7 +93,7 @@ class AutoregressivePrior(LinearGaussianPrior):
     def _parts(self, plans: VectorPlans, generator: torch.Generator) -> list[tuple[VectorPlans, VectorPlans]]:
         """Plans to learn from and plans to choose on: of few vectors all are held out once, part by part."""
         plans = divisible(plans[plans.mask().any(1)])
-        units = len(plans) if plans.group is None else len(plans.group.unique())
+        units = num_units(plans)
         if units < 2 or int(plans.mask().sum()) > MOST_IN_FOLDS:
             return [held_out_split(plans, generator)]
         found = folds(plans, min(units, FOLDS), draw_seed(generator))

@@ -12,7 +12,7 @@ from torch import Tensor
 from neuroprior._checks import check_count
 from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
-from neuroprior.plans.folds import divisible
+from neuroprior.plans.folds import divisible, ungrouped
 from neuroprior.plans.sequences import check_validation
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
@@ -220,7 +220,7 @@ def held_out_split(
     total, longest = int(lengths.sum()), int(lengths.max()) if len(lengths) else 0
     if total < 2:
         return plans, plans
-    for some in (plans,) if plans.group is None else (plans, replace(plans, group=None)):
+    for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
         learning, held_out = some.split(share, generator)
         if share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
             return learning, held_out

@@ -1,9 +1,10 @@
 """Neural priors over vectors: a GRU and a transformer that predict the next vector as a mixture of Gaussians."""
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 from math import log
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -84,6 +85,8 @@ class VectorNetwork(VectorPrior):
         ValueError: an argument is out of range.
     """
 
+    later: ClassVar[Mapping[str, float]] = {"first_log_std": 0.0}
+
     _mean: Tensor
     _std: Tensor
 
@@ -146,10 +149,6 @@ class VectorNetwork(VectorPrior):
         if memory is not None:
             check_sizes(memory=memory)
         self.memory = memory
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        state_dict.setdefault(f"{prefix}first_log_std", torch.zeros(self.action_size))  # which older files do not have
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def learns_anew(self) -> bool:

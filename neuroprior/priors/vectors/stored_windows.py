@@ -1,6 +1,7 @@
 """Stored windows: a plan continues as the stored plans did whose past was nearest to its own."""
 
-from typing import Any, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -63,6 +64,8 @@ class StoredWindows(VectorPrior):
         torch.Size([1, 3, 20, 1])
     """
 
+    later: ClassVar[Mapping[str, float]] = {"extent": 1.0}
+
     segments: Tensor
 
     extent: Tensor
@@ -113,10 +116,6 @@ class StoredWindows(VectorPrior):
         if not (0 < self.bandwidth < float("inf") and 0 < self.noise < float("inf")):
             raise ValueError(f"bandwidth, noise: numbers above 0 are expected, not {self.bandwidth}, {self.noise}")
         self.register_buffer("segments", torch.zeros(shape, device=self.device))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
-        state_dict.setdefault(f"{prefix}extent", torch.tensor(1.0))  # which older files do not have
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         self.check_settings(settings)
