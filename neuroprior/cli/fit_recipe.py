@@ -11,6 +11,7 @@ import yaml
 
 from neuroprior.planners import Planner, collect
 from neuroprior.plans import Columns, Missing, PastDurations, Plans, read_plans
+from neuroprior.plans.folds import num_units, ungrouped
 from neuroprior.priors import Prior
 from neuroprior.priors.fitting import make_prior
 from neuroprior.priors.prior import context_arguments
@@ -204,14 +205,11 @@ class PriorModel(PriorModule):
 
 def _in_parts(plans: Plans) -> Plans:
     """Plans that can be split in three; a single group is dropped, so that its plans can be split."""
-    if plans.group is None:
-        units, what = len(plans), "plans"
-        if units == 1:
-            units, what = int(plans.mask().sum()), "actions"
-    else:
-        units, what = len(plans.group.unique()), "groups"
-        if units == 1:
-            return _in_parts(replace(plans, group=None, group_names=None))
+    units, what = num_units(plans), _what(plans)
+    if units == 1:
+        if plans.group is not None:
+            return _in_parts(ungrouped(plans))
+        units, what = int(plans.mask().sum()), "actions"
     if units < PARTS:
         raise ValueError(
             f"data: {units} {what} cannot be split in three, to learn from, for validation and held out;"
@@ -220,13 +218,18 @@ def _in_parts(plans: Plans) -> Plans:
     return plans
 
 
+def _what(plans: Plans) -> str:
+    """What `num_units` counts."""
+    return "plans" if plans.group is None else "groups"
+
+
 def _folds(plans: Plans, wanted: int | None) -> int:
     """How many folds; 1: a share of the plans is held out."""
-    units, what = (len(plans), "plans") if plans.group is None else (len(plans.group.unique()), "groups")
+    units = num_units(plans)
     if wanted is None:
         return min(FOLDS, units) if plans.group is not None and units < FEW_GROUPS else 1
     if not 1 <= wanted <= units:
-        raise ValueError(f"data.folds: from 1 to the number of {what}, {units}, is expected, not {wanted}")
+        raise ValueError(f"data.folds: from 1 to the number of {_what(plans)}, {units}, is expected, not {wanted}")
     return wanted
 
 

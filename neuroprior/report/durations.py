@@ -12,6 +12,7 @@ from torch import Tensor
 from neuroprior.analysis.comparison import Score, score_bits, unit_name
 from neuroprior.analysis.statistics import ENOUGH_UNITS, ratio_difference
 from neuroprior.plans import BLOCKS, FEWEST_UNITS, Plans, divisible, folds, in_parts
+from neuroprior.plans.folds import num_units
 from neuroprior.plans.plans import durations_of
 from neuroprior.priors import DurationModel, MarkovPrior
 from neuroprior.priors.counts.markov import blend
@@ -104,7 +105,7 @@ def duration_section(found: Evaluation) -> Part | None:
 def _parts(plans: Plans, known: Tensor) -> Iterator[tuple[Plans, Tensor]]:
     """The training plans, and the numbers of the held-out ones, of each fold whose training plans have durations."""
     plans = divisible(plans)
-    number = len(plans) if plans.group is None else len(plans.group.unique())
+    number = num_units(plans)
     for training, held_out in folds(plans, min(FOLDS, number)) if number >= FEWEST_UNITS else []:
         if bool(((durations_of(plans) > 0) & known)[training].any()):
             yield plans[training], held_out

@@ -14,7 +14,7 @@ from neuroprior._version import __version__
 from neuroprior.analysis import Reliability, pieces, reliability
 from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits, units
 from neuroprior.plans import PastDurations, Plans, is_per_step
-from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles import candidates
@@ -208,7 +208,7 @@ def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         return {}
     held_out = pieces(late, reach + 1, MOST_PIECES, generator)
     short = pieces(learned, reach + 1, MOST_PIECES * 5, generator)
-    if held_out.group is None or len(held_out.group.unique()) < FEWEST_UNITS:
+    if held_out.group is None or num_units(held_out) < FEWEST_UNITS:
         return {}
     if kind == "gru-lags":
         name, neural = "gru", GRUPrior(learned.num_actions, seed=seed, **sizes)

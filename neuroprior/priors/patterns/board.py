@@ -11,6 +11,7 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans.folds import num_units
 from neuroprior.priors.patterns.minibatches import train
 from neuroprior.priors.prior import Prior
 
@@ -113,14 +114,13 @@ class BoardNetwork(Prior):
         learning_rate, share = settings.get("learning_rate", 1e-3), settings.get("validation", VALIDATION)
         if not is_number(learning_rate) or not 0 < learning_rate < inf:
             raise ValueError(f"learning_rate: a finite number above 0 is expected, not {learning_rate}")
-        units = len(plans) if plans.group is None else len(plans.group.unique())
         training, held_out = plans, None
         if isinstance(share, Plans):
             from neuroprior.training.trainer import check_alike  # loads Lightning, which takes seconds
 
             check_alike(plans, share)
             held_out = share
-        elif share is not None and units > 1:
+        elif share is not None and num_units(plans) > 1:
             training, held_out = plans.split(share, generator)
         self._begin(generator)
         boards, actions = _boards(training)
