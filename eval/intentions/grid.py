@@ -14,7 +14,7 @@ from neuroprior import MarkovPrior, Plans, Prior, TabularWorld
 from neuroprior._random import draw_seed
 from neuroprior.analysis import forecast, infer
 from neuroprior.analysis.calibration import reliability
-from neuroprior.priors.counts.markov import chains
+from neuroprior.priors.counts import Chains
 from neuroprior.values import value_iteration
 from neuroprior.worlds import four_rooms, maze
 from neuroprior.worlds.grid import GridWorld
@@ -183,8 +183,10 @@ def learned(
         own, best = closed if contexts else closed.without_context(), []
         for k in range(settings.goals):
             counted, others = (own[(taught.goal == k) & part] for part in (some & ~held_out, held_out))
-            tried = [prior for order in ORDERS[kind] for prior in chains(counted, order, contexts)]
-            best.append(tried[int(torch.stack([prior.log_prob(others).sum() for prior in tried]).argmax())])
+            tried = [Chains(counted, order, contexts) for order in ORDERS[kind]]
+            likelihoods = torch.stack([chains.log_likelihood(others) for chains in tried])
+            order, number = divmod(int(likelihoods.argmax()), likelihoods.shape[1])
+            best.append(tried[order].chain(number))
         posterior = infer(best, closed[held_out]).log_probs
         power = Agents(taught.goal[held_out], taught.length[held_out]).best_scale(posterior, settings.observed)
         yield Key(kind, number), [prior.fit(own[(taught.goal == k) & some]) for k, prior in enumerate(best)], power

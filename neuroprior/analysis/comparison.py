@@ -2,7 +2,8 @@
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from math import inf, log, log2
 
 import torch
@@ -14,7 +15,7 @@ from neuroprior.plans.columns import never_occur
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import ContextTreePrior, Prior, UniformPrior
-from neuroprior.priors.counts import TooLargeError, chains
+from neuroprior.priors.counts import Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS
 
 
@@ -230,22 +231,30 @@ def baselines(
     for order in ORDERS:
         if progress is not None:
             progress(f"markov-{order}")
-        yield _best(f"markov-{order}", _chains(training, order, contexts), validation)
+        yield _best_chain(training, order, contexts, validation)
     if progress is not None:
         progress("context tree")
     trees = (ContextTreePrior(training.num_actions, DEPTH, num_contexts=num) for num in contexts)
     yield _best("context tree", ((f"depth {DEPTH}", tree.fit(training)) for tree in trees), validation)
 
 
-def _chains(training: Plans, order: int, contexts: list[int | None]) -> Iterator[tuple[str, Prior]]:
-    """Markov chains of an order with every back-off."""
-    for num_contexts in contexts:
-        for prior in chains(training, order, num_contexts):
-            yield f"{prior.backoff} {prior.smoothing:g}", prior
+def _best_chain(training: Plans, order: int, contexts: list[int | None], validation: Plans) -> Baseline:
+    """Of Markov chains of an order with every back-off the one with the highest likelihood of `validation`."""
+    best, actions = Baseline(f"markov-{order}", "too large", None, inf), int(validation.mask().sum())
+    # Those that take a context come last and are the largest: where they are too large, what was found before stands.
+    with suppress(TooLargeError):
+        for num_contexts in contexts:
+            chains = Chains(training, order, num_contexts)
+            found = chains.log_likelihood(validation)
+            bits = -float(found.max()) / log(2) / max(actions, 1)
+            if bits < best.validation_bits:
+                prior = chains.chain(int(found.argmax()))
+                best = replace(best, how=f"{prior.backoff} {prior.smoothing:g}", prior=prior, validation_bits=bits)
+    return best
 
 
 def _best(model: str, made: Iterable[tuple[str, Prior]], validation: Plans) -> Baseline:
-    """The one with the highest likelihood of `validation`; at most two are in memory at a time."""
+    """The one with the highest likelihood of `validation`."""
     best = Baseline(model, "too large", None, inf)
     try:
         for how, prior in made:

@@ -71,6 +71,25 @@ class HistoryPrior(Prior):
             each = context.long() if is_per_step(context) else context.long()[:, None].expand(plans.shape)
         return self._row(node.flatten(), each.flatten()).view(plans.shape), each
 
+    def entries(self, plans: Plans) -> Tensor:
+        """Which of the flattened `log_probs` holds for each action of `plans`: int64 `[S]`, for S actions in all.
+
+        Actions behind the one that ends a plan, which are certain, are left out.
+
+        Raises:
+            ValueError: other actions or another context than this prior's.
+        """
+        self._check_scored(plans)
+        size = max(self.actions_at_once // max(plans.max_length, 1), 1)
+        found = [torch.zeros(0, dtype=torch.long, device=self.device)]
+        for at in range(0, len(plans), size):
+            part = plans[at : at + size]
+            actions, mask = part.actions.long(), part.mask()
+            if self.end is not None:
+                mask[:, 1:] &= actions[:, :-1] != self.end
+            found.append((self._places(actions, part.context)[0] * self.num_actions + actions)[mask])
+        return torch.cat(found)
+
     def _nodes(self, actions: Tensor) -> Tensor:
         """The node before each action of `actions [N, L]`."""
         num, length = actions.shape

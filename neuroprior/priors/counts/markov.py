@@ -1,6 +1,7 @@
 """Markov priors of any order: counts of what followed the last k actions, with back-off to shorter histories."""
 
-from collections.abc import Iterator
+from itertools import groupby
+from operator import itemgetter
 from typing import Any, Literal, get_args
 
 import torch
@@ -102,7 +103,8 @@ class MarkovPrior(HistoryPrior):
         return super().config | own
 
     def estimate(self, tree: Tree, counts: Counts) -> Tensor:
-        return back_off_probs(tree, counts, self.num_contexts, self.num_actions, self.backoff, self.smoothing)
+        smoothing = torch.tensor([self.smoothing], dtype=torch.double, device=counts.row.device)
+        return back_off_log_probs(tree, counts, self.num_contexts, self.num_actions, self.backoff, smoothing)[0]
 
     def transition_matrix(self) -> Tensor:
         """`[A, A]`: the probability of each action (column) after each action (row), wherever in a plan.
@@ -115,10 +117,10 @@ class MarkovPrior(HistoryPrior):
         return self.log_probs[self.next_node[0].long()].exp()
 
 
-def back_off_probs(
-    tree: Tree, counts: Counts, num_contexts: int | None, num_actions: int, rule: Backoff, smoothing: float
+def back_off_log_probs(
+    tree: Tree, counts: Counts, num_contexts: int | None, num_actions: int, rule: Backoff, smoothing: Tensor
 ) -> Tensor:
-    """The log-probabilities of each action after each row of `counts`.
+    """The log-probabilities of each action after each row of `counts`, with one or more smoothings.
 
     Each row is interpolated with that of its parent in the tree in the same context; the empty history in a context
     with all contexts together; and these (without contexts, the empty history) with the uniform distribution.
@@ -127,18 +129,19 @@ def back_off_probs(
         tree, counts: of `count_histories`.
         num_contexts: number of contexts counted apart, or None.
         num_actions: A.
-        rule, smoothing: see `MarkovPrior`.
+        rule: see `MarkovPrior`.
+        smoothing: `[S]`, float64; see `MarkovPrior`.
 
     Returns:
-        `[R + 1, A]`, float32; the last row is that of all contexts together.
+        `[S, R + 1, A]`, float32; the last row is that of all contexts together.
     """
-    contexts = num_contexts or 1
+    contexts, each = num_contexts or 1, smoothing[:, None, None]
     values = counts.kinds if rule == "kneser-ney" else counts.count
-    root = torch.full((1, num_actions), 1 / num_actions, dtype=torch.double, device=counts.row.device)
+    root = torch.full((len(smoothing), 1, num_actions), 1 / num_actions, dtype=torch.double, device=smoothing.device)
     if num_contexts is not None:
-        root = _pooled(counts, contexts, root, rule, smoothing)
-    table = torch.empty(len(counts.row_code) + 1, num_actions, device=root.device)
-    table[-1:] = root.clamp(min=1e-300).log()
+        root = _pooled(counts, contexts, root, rule, each)
+    table = torch.empty(len(smoothing), len(counts.row_code) + 1, num_actions, device=root.device)
+    table[:, -1:] = root.clamp(min=1e-300).log()
     if not len(counts.row_code):  # of a prior that has not learned yet
         return table
     parent = parent_rows(tree, counts, contexts)
@@ -148,17 +151,20 @@ def back_off_probs(
             here = torch.searchsorted(counts.row, torch.tensor(ends[level : level + 2], device=root.device))
             discounts, known = kneser_ney_discounts(values[here[0] : here[1]]), level
         # The table holds logarithms, as a probability may be too small for float32.
-        lower = table[parent[first:until]].double().exp()
+        lower = table[:, parent[first:until]].double().exp()
         n = counts.dense(first, until, num_actions, values)
-        table[first:until] = blend(n, lower, rule, smoothing, discounts).clamp(min=1e-300).log()
+        table[:, first:until] = blend(n, lower, rule, each, discounts).clamp(min=1e-300).log()
     return table
 
 
-def blend(n: Tensor, lower: Tensor, rule: Backoff, smoothing: float, discounts: Tensor) -> Tensor:
-    """Probabilities `[..., A]` from counts `n` and those after the shorter history, `lower`: `[..., A]`, float64."""
+def blend(n: Tensor, lower: Tensor, rule: Backoff, smoothing: Tensor | float, discounts: Tensor) -> Tensor:
+    """Probabilities `[S, R, A]` from counts `n [R, A]` and those after the shorter history, `lower [S, R, A]`: float64.
+
+    `smoothing` is `[S, 1, 1]`, or a number for all.
+    """
     if rule == "kneser-ney":
         # Counts of one, of two and of more are reduced by their discounts; this mass goes to `lower`.
-        off = torch.cat([discounts.new_zeros(1), discounts * smoothing])[n.clamp(max=3).long()].minimum(n)
+        off = (torch.cat([discounts.new_zeros(1), discounts])[n.clamp(max=3).long()] * smoothing).minimum(n)
         total = n.sum(-1, keepdim=True)
         share = torch.where(total > 0, off.sum(-1, keepdim=True) / total.clamp(min=1), 1.0)
         return (n - off) / total.clamp(min=1) + share * lower
@@ -185,7 +191,7 @@ def kneser_ney_discounts(counts: Tensor) -> Tensor:
     return torch.tensor(found, dtype=torch.double, device=counts.device)
 
 
-def chains(plans: Plans, order: int, num_contexts: int | None = None) -> Iterator[MarkovPrior]:
+class Chains:
     """Markov chains of an order, one for each of `BACKOFFS_TRIED`; what they count is counted once.
 
     Args:
@@ -195,26 +201,54 @@ def chains(plans: Plans, order: int, num_contexts: int | None = None) -> Iterato
 
     Raises:
         TooLargeError: their tables would be too large.
+        ValueError: plans that a Markov chain cannot learn from.
 
     Example:
         >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
-        >>> [prior.order for prior in chains(plans, 1)]
-        [1, 1, 1, 1, 1, 1]
+        >>> chains = Chains(plans, 1)
+        >>> chains.chain(int(chains.log_likelihood(plans).argmax())).backoff
+        'kneser-ney'
     """
-    counted = None
-    for backoff, smoothing in BACKOFFS_TRIED:
-        prior = MarkovPrior(plans.num_actions, order, smoothing, num_contexts=num_contexts, backoff=backoff)
-        counted = prior.count(plans) if counted is None else counted
-        prior.training_plans(plans)
-        prior.learn(*counted)
-        yield prior
+
+    def __init__(self, plans: Plans, order: int, num_contexts: int | None = None) -> None:
+        self.plans, self.order, self.num_contexts = plans, order, num_contexts
+        self._first = MarkovPrior(plans.num_actions, order, num_contexts=num_contexts)
+        self._counted = self._first.count(plans)
+        self._first.learn(*self._counted)
+
+    def log_likelihood(self, plans: Plans) -> Tensor:
+        """That of all `plans` together under each chain, in nats, float64 on the CPU; they share where each action is.
+
+        Args:
+            plans: the context is only used by chains that take one.
+
+        Raises:
+            ValueError: other actions or another context than those of the chains.
+        """
+        entry = self._first.entries(plans if self.num_contexts is not None else plans.without_context())
+        sums = []
+        for rule, some in groupby(BACKOFFS_TRIED, key=itemgetter(0)):
+            smoothing = torch.tensor([each for _, each in some], dtype=torch.double, device=entry.device)
+            tables = back_off_log_probs(*self._counted, self.num_contexts, plans.num_actions, rule, smoothing)
+            sums += [table.flatten()[entry].double().sum() for table in tables]
+        return torch.stack(sums).cpu()
+
+    def chain(self, number: int) -> MarkovPrior:
+        """The chain with the back-off of that number."""
+        backoff, smoothing = BACKOFFS_TRIED[number]
+        made = MarkovPrior(
+            self.plans.num_actions, self.order, smoothing, num_contexts=self.num_contexts, backoff=backoff
+        )
+        made.training_plans(self.plans)
+        made.learn(*self._counted)
+        return made
 
 
-def _pooled(counts: Counts, contexts: int, lower: Tensor, rule: Backoff, smoothing: float) -> Tensor:
-    """The probabilities `[1, A]` in all contexts together."""
+def _pooled(counts: Counts, contexts: int, lower: Tensor, rule: Backoff, smoothing: Tensor) -> Tensor:
+    """The probabilities `[S, 1, A]` in all contexts together."""
     if rule != "kneser-ney":
-        n = counts.pooled(contexts, lower.shape[1], counts.count)
+        n = counts.pooled(contexts, lower.shape[-1], counts.count)
         return blend(n.double()[None], lower, rule, smoothing, lower)
     # The histories longer by one symbol are here the contexts.
-    n = counts.pooled(contexts, lower.shape[1], torch.ones_like(counts.count))
+    n = counts.pooled(contexts, lower.shape[-1], torch.ones_like(counts.count))
     return blend(n.double()[None], lower, rule, smoothing, kneser_ney_discounts(n))

@@ -10,7 +10,7 @@ import torch
 from neuroprior._random import draw_seed
 from neuroprior.plans.folds import divisible, folds, in_parts, num_units, ungrouped
 from neuroprior.plans.plans import Plans
-from neuroprior.priors.counts import BACKOFFS_TRIED, ContextTreePrior, MarkovPrior, TooLargeError, chains
+from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, ContextTreePrior, MarkovPrior, TooLargeError
 from neuroprior.priors.ensembles.stacked import StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior, construct
@@ -132,15 +132,14 @@ def best_chain(parts: Sequence[tuple[Plans, Plans]], num_contexts: int | None) -
         num_contexts: of the chain's context, or None.
     """
     best: tuple[float, MarkovPrior | None] = (inf, None)
-    held_out = [plans if num_contexts is not None else plans.without_context() for _, plans in parts]
     try:
         for order in ORDERS:
-            losses = [0.0] * len(BACKOFFS_TRIED)
-            for part in reversed(range(len(parts))):  # the first pair last: of chains it has counted one is kept
-                for number, prior in enumerate(chains(parts[part][0], order, num_contexts)):
-                    losses[number] -= float(prior.log_prob(held_out[part]).sum())
-                    if part == 0 and losses[number] < best[0]:
-                        best = (losses[number], prior)
+            loss = torch.zeros(len(BACKOFFS_TRIED), dtype=torch.double)
+            for learned, held_out in reversed(parts):  # the first pair last: one of its chains is kept
+                chains = Chains(learned, order, num_contexts)
+                loss -= chains.log_likelihood(held_out)
+            if loss.min() < best[0]:
+                best = (float(loss.min()), chains.chain(int(loss.argmin())))
     except TooLargeError:
         pass  # those of higher order are larger still
     return best[1]

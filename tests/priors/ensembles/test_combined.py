@@ -25,7 +25,7 @@ from neuroprior import (
     save,
 )
 from neuroprior.priors import SwitchingNetwork
-from neuroprior.priors.counts import BACKOFFS_TRIED, TooLargeError, chains
+from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.testing import check_prior
@@ -346,7 +346,8 @@ def test_chains_are_chosen_on_the_plans_that_are_held_out(num_contexts):
         return -float(prior.log_prob(some if prior.takes_context else some.without_context()).sum())
 
     found = best_chain([(learned, held_out)], num_contexts)
-    tried = [chain for order in ORDERS for chain in chains(learned, order, num_contexts)]
+    families = [Chains(learned, order, num_contexts) for order in ORDERS]
+    tried = [family.chain(number) for family in families for number in range(len(BACKOFFS_TRIED))]
     best = min(tried, key=lambda chain: bits(chain, held_out))
     assert (found.order, found.backoff, found.smoothing) == (best.order, best.backoff, best.smoothing)
     assert bits(found, held_out) < bits(min(tried, key=lambda chain: bits(chain, learned)), held_out) - 10
