@@ -185,8 +185,8 @@ def learned(
             counted, others = (own[(taught.goal == k) & part] for part in (some & ~held_out, held_out))
             tried = [Chains(counted, order, contexts) for order in ORDERS[kind]]
             likelihoods = torch.stack([chains.log_likelihood(others) for chains in tried])
-            order, number = divmod(int(likelihoods.argmax()), likelihoods.shape[1])
-            best.append(tried[order].chain(number))
+            order, back_off = divmod(int(likelihoods.argmax()), likelihoods.shape[1])
+            best.append(tried[order].chain(back_off))
         posterior = infer(best, closed[held_out]).log_probs
         power = Agents(taught.goal[held_out], taught.length[held_out]).best_scale(posterior, settings.observed)
         yield Key(kind, number), [prior.fit(own[(taught.goal == k) & some]) for k, prior in enumerate(best)], power

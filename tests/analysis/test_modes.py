@@ -33,7 +33,7 @@ def source(num, length, seed, modes=2, stay=0.95):
     return Plans(torch.from_numpy(np.stack(actions, 1)), 4), torch.from_numpy(np.stack(found, 1))
 
 
-@pytest.mark.parametrize("modes", [1, 2, 3])
+@pytest.mark.parametrize("modes", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_number_of_modes_is_found(modes):
     plans, _ = source(30, 80, seed=modes, modes=modes)
     numbers = [*range(1, modes + 2)]

@@ -44,10 +44,16 @@ def run(code: str, folder: Path) -> None:
         runpy.run_path("example.py", run_name="__main__")
 
 
-EXAMPLES = [(page, number) for page in PAGES if page != OWN_DATA for number in range(len(blocks(page, "python")))]
+EXAMPLES = [
+    pytest.param(page, number, id=f"{name(page)}-{number}", marks=[pytest.mark.slow] if "mctx" in block else [])
+    for page in PAGES
+    if page != OWN_DATA
+    for number, block in enumerate(blocks(page, "python"))
+]
+"""Compiling mctx's search takes longer than all else."""
 
 
-@pytest.mark.parametrize(("page", "number"), EXAMPLES, ids=[f"{name(page)}-{number}" for page, number in EXAMPLES])
+@pytest.mark.parametrize(("page", "number"), EXAMPLES)
 def test_example(page: Path, number: int, tmp_path: Path) -> None:
     try:
         run(blocks(page, "python")[number], tmp_path)

@@ -79,6 +79,7 @@ def test_the_entropy_rate_is_reached(second_order):
     }
 
 
+@pytest.mark.slow
 def test_the_combined_prior_is_as_good_as_its_experts(second_order, tmp_path):
     """It knows the chain by counts; its networks, which are scored as well, have hardly learned in 20 steps."""
     plans = markov_plans(second_order[1], 400, 30, 1)

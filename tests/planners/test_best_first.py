@@ -162,6 +162,7 @@ def check_found(world: World, state: Tensor, found: Search) -> None:
     assert world.solved(now).equal(found.solved)
 
 
+@pytest.mark.slow
 def test_no_solution_takes_more_expansions_than_its_bound() -> None:
     generator = torch.Generator().manual_seed(1)
     prior = MarkovPrior(3, 1).fit(torch.randint(3, (30, 5), generator=generator))

@@ -192,6 +192,7 @@ def test_impossible_rewards_are_no_trouble(share):
     assert torch.equal(now, decision.final_state)
 
 
+@pytest.mark.slow
 def test_rewards_are_as_precise_as_the_worlds():
     world = random_world(0)
     world = TabularWorld(world.next_state, world.reward.double() + 2**25)

@@ -181,7 +181,7 @@ def kneser_ney_discounts(counts: Tensor) -> Tensor:
     Kneser-Ney smoothing"). Where no count is 1, 2 or 3, or a discount is not between 0 and its count:
     `FALLBACK_DISCOUNTS`.
     """
-    number = [int((counts == k).sum()) for k in range(1, 5)]
+    number = counts.clamp(max=5).bincount(minlength=6)[1:5].tolist()
     if 0 in number[:3]:
         return torch.tensor(FALLBACK_DISCOUNTS, dtype=torch.double, device=counts.device)
     common = number[0] / (number[0] + 2 * number[1])

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans
+from neuroprior.priors.counts import BACKOFFS_TRIED, Chains
 from neuroprior.priors.counts.markov import BACKOFFS, FALLBACK_DISCOUNTS, blend, kneser_ney_discounts
 from tests.support.sources import distribution, seeded
 
@@ -101,3 +102,27 @@ def test_on_plans_held_out():
 def test_saved_with_the_rule():
     assert MarkovPrior(2, backoff="witten-bell").config["backoff"] == "witten-bell"
     assert MarkovPrior(2).config["backoff"] == "kneser-ney"
+
+
+@pytest.mark.parametrize("ends", [False, True])
+@pytest.mark.parametrize("num_contexts", [None, 3])
+@pytest.mark.parametrize("order", [0, 1, 3])
+def test_chains_of_an_order_are_those_fitted_one_by_one(order, num_contexts, ends):
+    generator = torch.Generator().manual_seed(order)
+    actions = torch.randint(4, (30, 8), generator=generator)
+    context = torch.randint(3, actions.shape, generator=generator)
+    lengths = torch.randint(1, 9, (30,), generator=generator)
+    plans = Plans(actions, 4, lengths=lengths, context=context)
+    plans = plans.with_end() if ends else plans
+    learned, held_out = plans[:20], plans[20:]
+    family, given = Chains(learned, order, num_contexts), held_out if num_contexts else held_out.without_context()
+    found = family.log_likelihood(held_out)
+    for number, (backoff, smoothing) in enumerate(BACKOFFS_TRIED):
+        prior = MarkovPrior(plans.num_actions, order, smoothing, num_contexts=num_contexts, backoff=backoff)
+        prior.fit(learned if num_contexts else learned.without_context())
+        assert float(found[number]) == pytest.approx(float(prior.log_prob(given).sum()), rel=1e-5)
+        chain = family.chain(number)
+        assert chain.config == prior.config
+        assert chain.log_prob(given).equal(prior.log_prob(given))
+    with pytest.raises(ValueError, match="actions are expected"):
+        family.log_likelihood(Plans(torch.zeros(1, 2, dtype=torch.long), 2, context=torch.zeros(1, dtype=torch.long)))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, Prior, StackedPrior, UniformPrior
-from neuroprior.priors.counts import HistoryPrior, chains
+from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, HistoryPrior
 from neuroprior.priors.ensembles import stacked
 from neuroprior.priors.ensembles.candidates import NETWORKS, ORDERS, best_chain, counting_parts, fitted_experts
 from neuroprior.priors.ensembles.combined import HeldOut
@@ -88,7 +88,8 @@ def test_a_chain_is_the_best_of_all_parts_together():
     orders = []
     for num in (1, 390):
         parts = [(Plans(runs, 2), Plans(runs, 2)), (Plans(noise[:10], 2), Plans(noise[10 : 10 + num], 2))]
-        tried = [[chain for o in ORDERS for chain in chains(counted, o)] for counted, _ in parts]
+        numbers = range(len(BACKOFFS_TRIED))
+        tried = [[Chains(counted, order).chain(n) for order in ORDERS for n in numbers] for counted, _ in parts]
         losses = [
             [-float(chain.log_prob(part[1]).sum()) for chain in made] for made, part in zip(tried, parts, strict=True)
         ]

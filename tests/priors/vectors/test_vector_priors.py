@@ -288,6 +288,7 @@ def test_windows_as_long_as_the_only_plan(length):
         assert nats > nats_of_noise(data, test) * 1.5 - 3  # white noise of five vectors may be far from the source, too
 
 
+@pytest.mark.slow
 def test_stored_windows_are_chosen_on_more_than_single_vectors():
     data, test = slow_noise(32, 300, 2, 1), slow_noise(10, 100, 2, 2)
     data = VectorPlans(data.actions, data.action_low, data.action_high, torch.tensor([300, 300] + [1] * 30))
@@ -406,6 +407,7 @@ def test_files_of_earlier_versions_are_read_as_they_were_meant(make, lacks):
     assert other.log_prob(plans).equal(prior.log_prob(plans))
 
 
+@pytest.mark.slow
 def test_stored_windows_describe_vectors_in_a_small_part_of_the_range_as_well():
     """A hundredth as wide, a vector of two dimensions has 2 log 100 more nats."""
     low, high = (-1.0, -1.0), (1.0, 1.0)

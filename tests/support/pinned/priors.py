@@ -36,7 +36,7 @@ from neuroprior.priors import (
     fit,
     learn_macros,
 )
-from neuroprior.priors.counts import BACKOFFS, chains
+from neuroprior.priors.counts import BACKOFFS, BACKOFFS_TRIED, Chains
 from neuroprior.priors.durations import LAW_NAMES
 from neuroprior.priors.fitting import NAMES
 from neuroprior.priors.macros import CRITERIA
@@ -94,7 +94,8 @@ def markov_chains():
             found[f"{context}, order {order}"] = of_prior(prior, plans)
     plans = behaviour()
     found["matrix"] = MarkovPrior(3, 1).fit(plans).transition_matrix()
-    found["chains"] = [[prior.config, float(prior.log_prob(plans).sum())] for prior in chains(plans, 2)]
+    chains = map(Chains(plans, 2).chain, range(len(BACKOFFS_TRIED)))
+    found["chains"] = [[prior.config, float(prior.log_prob(plans).sum())] for prior in chains]
     found["back-offs"] = {
         name: MarkovPrior(3, 2, backoff=name).fit(plans).log_prob(behaviour(seed=1)).sum() for name in BACKOFFS
     }
