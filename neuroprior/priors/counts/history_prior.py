@@ -146,8 +146,11 @@ class HistoryPrior(Prior):
 
     def learn(self, tree: Tree, counts: Counts) -> None:
         """Take over a tree and its counts."""
-        start = torch.tensor(tree.start)
-        values = (tree.next_node, tree.parent, start, counts.row_code, self.estimate(tree, counts))
+        self.hold(tree, counts, self.estimate(tree, counts))
+
+    def hold(self, tree: Tree, counts: Counts, log_probs: Tensor) -> None:
+        """Take over a tree and log-probabilities as `estimate` makes them; for `entries` alone the tree is enough."""
+        values = (tree.next_node, tree.parent, torch.tensor(tree.start), counts.row_code, log_probs)
         for name, value in zip(_TABLES, values, strict=True):
             self.register_buffer(name, value.to(self.device))
 

@@ -19,6 +19,9 @@ BACKOFFS: tuple[Backoff, ...] = get_args(Backoff)
 FALLBACK_DISCOUNTS = (0.5, 1.0, 1.5)
 """Discounts of Kneser-Ney where the counts give none: those of KenLM's option `--discount_fallback`."""
 
+SMALL = 2**20
+"""Entries of a table up to which those of all smoothings are computed together, else one after another."""
+
 BACKOFFS_TRIED: list[tuple[Backoff, float]] = [
     ("kneser-ney", 1),
     ("kneser-ney", 0.5),
@@ -214,7 +217,7 @@ class Chains:
         self.plans, self.order, self.num_contexts = plans, order, num_contexts
         self._first = MarkovPrior(plans.num_actions, order, num_contexts=num_contexts)
         self._counted = self._first.count(plans)
-        self._first.learn(*self._counted)
+        self._first.hold(*self._counted, torch.empty(0, plans.num_actions))
 
     def log_likelihood(self, plans: Plans) -> Tensor:
         """That of all `plans` together under each chain, in nats, float64 on the CPU; they share where each action is.
@@ -227,10 +230,12 @@ class Chains:
         """
         entry = self._first.entries(plans if self.num_contexts is not None else plans.without_context())
         sums = []
+        small = len(self._counted[1].row_code) * plans.num_actions <= SMALL
         for rule, some in groupby(BACKOFFS_TRIED, key=itemgetter(0)):
             smoothing = torch.tensor([each for _, each in some], dtype=torch.double, device=entry.device)
-            tables = back_off_log_probs(*self._counted, self.num_contexts, plans.num_actions, rule, smoothing)
-            sums += [table.flatten()[entry].double().sum() for table in tables]
+            for part in (smoothing,) if small else smoothing.split(1):
+                tables = back_off_log_probs(*self._counted, self.num_contexts, plans.num_actions, rule, part)
+                sums += [table.flatten()[entry].double().sum() for table in tables]
         return torch.stack(sums).cpu()
 
     def chain(self, number: int) -> MarkovPrior:
