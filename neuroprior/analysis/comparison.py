@@ -2,8 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf, log, log2
 
 import torch
@@ -231,30 +230,23 @@ def baselines(
     for order in ORDERS:
         if progress is not None:
             progress(f"markov-{order}")
-        yield _best_chain(training, order, contexts, validation)
+        yield _best(f"markov-{order}", _chains(training, order, contexts, validation), validation)
     if progress is not None:
         progress("context tree")
     trees = (ContextTreePrior(training.num_actions, DEPTH, num_contexts=num) for num in contexts)
     yield _best("context tree", ((f"depth {DEPTH}", tree.fit(training)) for tree in trees), validation)
 
 
-def _best_chain(training: Plans, order: int, contexts: list[int | None], validation: Plans) -> Baseline:
-    """Of Markov chains of an order with every back-off the one with the highest likelihood of `validation`."""
-    best, actions = Baseline(f"markov-{order}", "too large", None, inf), int(validation.mask().sum())
-    # Those that take a context come last and are the largest: where they are too large, what was found before stands.
-    with suppress(TooLargeError):
-        for num_contexts in contexts:
-            chains = Chains(training, order, num_contexts)
-            found = chains.log_likelihood(validation)
-            bits = -float(found.max()) / log(2) / max(actions, 1)
-            if bits < best.validation_bits:
-                prior = chains.chain(int(found.argmax()))
-                best = replace(best, how=f"{prior.backoff} {prior.smoothing:g}", prior=prior, validation_bits=bits)
-    return best
+def _chains(training: Plans, order: int, contexts: list[int | None], validation: Plans) -> Iterator[tuple[str, Prior]]:
+    """The Markov chain of an order, with each context, whose back-off makes `validation` likeliest."""
+    for num_contexts in contexts:
+        chains = Chains(training, order, num_contexts)
+        prior = chains.chain(int(chains.log_likelihood(validation).argmax()))
+        yield f"{prior.backoff} {prior.smoothing:g}", prior
 
 
 def _best(model: str, made: Iterable[tuple[str, Prior]], validation: Plans) -> Baseline:
-    """The one with the highest likelihood of `validation`."""
+    """The one with the highest likelihood of `validation`; at most two are in memory at a time."""
     best = Baseline(model, "too large", None, inf)
     try:
         for how, prior in made:

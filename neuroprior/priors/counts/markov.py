@@ -132,8 +132,8 @@ def back_off_log_probs(
         tree, counts: of `count_histories`.
         num_contexts: number of contexts counted apart, or None.
         num_actions: A.
-        rule: see `MarkovPrior`.
-        smoothing: `[S]`, float64; see `MarkovPrior`.
+        rule: the `backoff` of `MarkovPrior`.
+        smoothing: `[S]`, float64, each as in `MarkovPrior`.
 
     Returns:
         `[S, R + 1, A]`, float32; the last row is that of all contexts together.
