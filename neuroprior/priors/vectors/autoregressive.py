@@ -1,5 +1,6 @@
 """Vector autoregressions: the Markov chains of continuous actions."""
 
+from collections.abc import Callable
 from itertools import product
 from typing import Any
 
@@ -12,9 +13,9 @@ from neuroprior.plans.folds import divisible, folds, num_units
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
+    WindowMoments,
     best_of,
     held_out_split,
-    mean_nats,
     moments_or_white,
 )
 
@@ -72,23 +73,25 @@ class AutoregressivePrior(LinearGaussianPrior):
         scores: dict[tuple[int, float, float], float] = {}
         for order in orders:
             numbers = (order + 1) * self.action_size
-            of_parts = [self.scaled(learning.windows(order + 1)) for learning, _ in parts]
-            fewest = min(map(len, of_parts))
+            fewest = min(int((learning.mask().sum(1) - order).clamp(min=0).sum()) for learning, _ in parts)
             if scores and fewest <= numbers:
                 break
             few = self.action_size > 1 and fewest < MANY * numbers
             tried = list(product(SHARES if few else SHARES[-1:], RIDGES))
             scores |= {(order, *each): 0.0 for each in tried}
-            for (learning, held_out), windows in zip(parts, of_parts, strict=True):
-                mean, covariance = moments_or_white(windows, self.scaled(learning.actions)[learning.mask()], order)
+            for learning, held_out in parts:
                 weight = int(held_out.mask().sum()) / total
-                for share, ridge in tried:
-                    self.set_window(mean, self._apart(covariance, share), ridge)
-                    scores[order, share, ridge] += weight * mean_nats(self, held_out)
+                found = self.mean_nats_of(tried, self._moments(learning, order), held_out)
+                for each, nats in found.items():
+                    scores[order, *each] += weight * nats
         order, share, ridge = best_of(scores)
-        windows = self.scaled(plans.windows(order + 1))
-        mean, covariance = moments_or_white(windows, self.scaled(plans.actions)[plans.mask()], order)
-        self.set_window(mean, self._apart(covariance, share), ridge)
+        self.set_window(self._moments(plans, order)((share, ridge)))
+
+    def _moments(self, plans: VectorPlans, order: int) -> Callable[[tuple[float, float]], WindowMoments]:
+        """Makes the Gaussian of windows of `plans` for a share of `SHARES` and a ridge."""
+        windows, values = self.scaled(plans.windows(order + 1)), self.scaled(plans.actions)[plans.mask()]
+        mean, covariance, _ = moments_or_white(windows, values, order)
+        return lambda setting: WindowMoments(mean, self._apart(covariance, setting[0]), setting[1])
 
     def _parts(self, plans: VectorPlans, generator: torch.Generator) -> list[tuple[VectorPlans, VectorPlans]]:
         """Plans to learn from and plans to choose on: of few vectors all are held out once, part by part."""

@@ -2,12 +2,13 @@
 
 import sys
 from abc import abstractmethod
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from neuroprior._checks import check_count
 from neuroprior._compiled import compiled
@@ -23,8 +24,39 @@ LEAST_STD = 1e-3
 HELD_OUT = 0.2
 """Share of the plans (or groups) on which settings are chosen."""
 
+LARGEST = 2**21
+"""Numbers of the covariances, and of the predictions, of several settings that are computed together."""
 
 Key = TypeVar("Key", bound=Hashable)
+
+
+class WindowMoments(NamedTuple):
+    """A Gaussian over W successive vectors, the oldest first, in units of half the range from its middle."""
+
+    mean: Tensor
+    """`[W * D]`, float64."""
+
+    covariance: Tensor
+    """`[W * D, W * D]`, float64, positive semi-definite."""
+
+    ridge: float = 0.0
+    """Added to the variances of the past, as a share of their mean."""
+
+
+class LinearTables(NamedTuple):
+    """S linear predictions of the next vector; row h of each: with h vectors known, the last h of M, oldest first."""
+
+    weights: Tensor
+    """`[S, M + 1, M * D, D]`."""
+
+    offset: Tensor
+    """`[S, M + 1, D]`."""
+
+    std: Tensor
+    """`[S, M + 1, D]`."""
+
+    coupling: Tensor
+    """`[S, M + 1, D, D]`, below the diagonal: what each dimension adds to the means of those after it."""
 
 
 class LinearGaussianPrior(VectorPrior):
@@ -34,7 +66,7 @@ class LinearGaussianPrior(VectorPrior):
     half the range, from the middle of the range. `state` is the vectors read so far, at most `memory` of them,
     `[N, h, D]`.
 
-    A subclass writes `learn`, which calls `set_window`.
+    A subclass writes `learn`, which calls `set_window`, where need be with what `mean_nats_of` chose.
     """
 
     weights: Tensor
@@ -48,15 +80,9 @@ class LinearGaussianPrior(VectorPrior):
 
     def _allocate(self, memory: int) -> None:
         self.memory, size = memory, self.action_size
-        # Row h of each: with h vectors known, the last h of `memory`, oldest first.
-        shapes = {
-            "weights": (memory + 1, memory * size, size),
-            "offset": (memory + 1, size),
-            "std": (memory + 1, size),
-            "coupling": (memory + 1, size, size),
-        }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.full(shape, float(name == "std"), device=self.device))
+        shapes = ((memory * size, size), (size,), (size,), (size, size))
+        for name, shape in zip(LinearTables._fields, shapes, strict=True):
+            self.register_buffer(name, torch.full((memory + 1, *shape), float(name == "std"), device=self.device))
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -67,44 +93,35 @@ class LinearGaussianPrior(VectorPrior):
         check_count("memory", learned["memory"], 4 * self.action_size**2)
         self._allocate(learned["memory"])
 
-    def set_window(self, mean: Tensor, covariance: Tensor, ridge: float = 0.0) -> Self:
-        """Predict the last of W successive vectors from those before it, as a Gaussian over all of them has it.
+    def set_window(self, moments: WindowMoments) -> None:
+        """Predict the last of W successive vectors from those before it, as a Gaussian over all of them has it."""
+        tables = predictions([moments], self.action_size)
+        self._allocate(tables.offset.shape[1] - 1)
+        for name, rows in tables._asdict().items():
+            getattr(self, name).copy_(rows[0])
+
+    @torch.no_grad()
+    def mean_nats_of(
+        self, settings: Sequence[Key], moments: Callable[[Key], WindowMoments], plans: VectorPlans
+    ) -> dict[Key, float]:
+        """The mean log-density of a vector of `plans` for each setting, nats; -inf where it is not a number.
 
         Args:
-            mean: `[W * D]`, in units of half the range from its middle, the oldest vector first.
-            covariance: `[W * D, W * D]`, positive semi-definite.
-            ridge: added to the variances of the past, as a share of their mean.
+            settings: those to compare.
+            moments: makes the Gaussian of a setting; of equally many vectors for all.
+            plans: with at least one vector.
         """
-        size = self.action_size
-        memory = len(mean) // size - 1
-        self._allocate(memory)
-        mean, covariance = mean.double(), covariance.double()
-        last = slice(memory * size, None)
-        least = LEAST_STD**2 * torch.eye(size, dtype=torch.double, device=mean.device)
-        for h in range(memory + 1):
-            past = slice((memory - h) * size, memory * size)
-            known, cross = covariance[past, past], covariance[past, last]
-            if h:
-                level = known.diagonal().mean() * ridge + LEAST_STD**2 * 1e-3
-                weights = torch.linalg.solve(
-                    known + level * torch.eye(h * size, dtype=torch.double, device=mean.device), cross
-                )
-            else:
-                weights = cross
-            rest = covariance[last, last] - cross.T @ weights
-            if ridge:  # the mean square of what is left, which with a ridge is more than the conditional variance
-                rest = covariance[last, last] - cross.T @ weights - weights.T @ cross + weights.T @ known @ weights
-            lower = torch.linalg.cholesky((rest + rest.T) / 2 + _lifted(rest) + least)
-            std = lower.diagonal()
-            unit = lower / std
-            self.weights[h, past] = weights.to(self.weights)
-            self.offset[h] = (mean[last] - mean[past] @ weights).to(self.offset)
-            self.std[h] = std.to(self.std)
-            # x = m + unit @ (std * noise): each dimension's mean given those before it, not given their noise
-            inverse = torch.linalg.inv(unit)
-            eye = torch.eye(size, dtype=torch.double, device=mean.device)
-            self.coupling[h] = (eye - inverse).tril(-1).to(self.coupling)
-        return self
+        found: dict[Key, float] = {}
+        values, mask = self.scaled(plans.actions), plans.mask()
+        while len(found) < len(settings):
+            first = moments(settings[len(found)])
+            at_once = max(LARGEST // max(first.covariance.numel(), values.numel()), 1)
+            some = settings[len(found) : len(found) + at_once]
+            tables = predictions([first, *map(moments, some[1:])], self.action_size)
+            nats = linear_nats(tables, values, self.half_range).masked_fill(~mask, 0)
+            means = (nats.double().sum((1, 2)) / mask.sum()).nan_to_num(nan=float("-inf"), neginf=float("-inf"))
+            found |= dict(zip(some, means.tolist(), strict=True))
+        return found
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         return self._forecast(torch.zeros(batch_size, 0, self.action_size, device=self.device))
@@ -148,26 +165,8 @@ class LinearGaussianPrior(VectorPrior):
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
         self.check_plans(plans)
-        values, depth = self.scaled(plans.actions), self._depth
-        num, length, _ = values.shape
-        parts = [self._scores(values[:, t], self._means(values[:, :t], t), t) for t in range(min(depth, length))]
-        if length > depth:
-            history = (
-                values[:, : length - 1].unfold(1, depth, 1).transpose(2, 3) if depth else values[:, :, None][:, :, :0]
-            )
-            late = self._scores(values[:, depth:], self._means(history, depth), depth)
-            parts += list(late.unbind(1))
-        if not parts:
-            return torch.zeros(num, length, device=self.device)
-        return torch.stack(parts, 1).masked_fill(~plans.mask(), 0)
-
-    def _scores(self, values: Tensor, means: Tensor, h: int) -> Tensor:
-        """Nats `[...]` of scaled `values [..., D]`, in the units of the bounds."""
-        means = means + (values - means) @ self.coupling[h].T
-        ones = torch.ones_like(self.half_range)
-        each = censored_log_prob(values, means, self.std[h], -ones, ones)
-        nats: Tensor = (each - (values.abs() < 1) * self.half_range.log()).sum(-1)
-        return nats
+        tables = LinearTables(self.weights[None], self.offset[None], self.std[None], self.coupling[None])
+        return linear_nats(tables, self.scaled(plans.actions), self.half_range)[0].masked_fill(~plans.mask(), 0)
 
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         self.check_settings(settings)
@@ -196,11 +195,57 @@ def draw_linear(prior: LinearGaussianPrior, vectors: Tensor, known: int, noise: 
             now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
 
 
-def _lifted(rest: Tensor) -> Tensor:
-    """What makes a covariance that rounding left slightly indefinite positive definite."""
-    lowest = torch.linalg.eigvalsh((rest + rest.T) / 2)[0]
-    lifted: Tensor = (-lowest).clamp(min=0) * torch.eye(len(rest), dtype=rest.dtype, device=rest.device)
-    return lifted
+def predictions(moments: Sequence[WindowMoments], size: int) -> LinearTables:
+    """The next vector of `size` dimensions given those before it in a window, for each of S Gaussians over windows."""
+    mean = torch.stack([each.mean for each in moments]).double()
+    covariance = torch.stack([each.covariance for each in moments]).double()
+    ridge = torch.tensor([each.ridge for each in moments], dtype=torch.double, device=mean.device)
+    memory = mean.shape[1] // size - 1
+    last, eye = slice(memory * size, None), torch.eye(size, dtype=torch.double, device=mean.device)
+    rows = []
+    for h in range(memory + 1):
+        past = slice((memory - h) * size, memory * size)
+        known, cross, now = covariance[:, past, past], covariance[:, past, last], covariance[:, last, last]
+        level = known.diagonal(dim1=1, dim2=2).mean(1).nan_to_num() * ridge + LEAST_STD**2 * 1e-3
+        weights = torch.linalg.solve(known + torch.diag_embed(level[:, None].expand(-1, h * size)), cross)
+        # The mean square of what is left, which with a ridge is more than the conditional variance.
+        shared = cross.mT @ weights
+        rest = now - shared - shared.mT + weights.mT @ known @ weights
+        rest = (rest + rest.mT) / 2
+        # Rounding may leave it slightly indefinite.
+        lifted = (-torch.linalg.eigvalsh(rest)[:, 0]).clamp(min=0) + LEAST_STD**2
+        lower = torch.linalg.cholesky(rest + lifted[:, None, None] * eye)
+        std = lower.diagonal(dim1=1, dim2=2)
+        # x = m + unit @ (std * noise): each dimension's mean given those before it, not given their noise
+        coupling = (eye - torch.linalg.inv(lower / std[:, None])).tril(-1)
+        offset = mean[:, last] - (mean[:, None, past] @ weights)[:, 0]
+        rows.append((functional.pad(weights, (0, 0, past.start, 0)), offset, std, coupling))
+    return LinearTables(*(torch.stack(each, 1).float() for each in zip(*rows, strict=True)))
+
+
+def linear_nats(tables: LinearTables, values: Tensor, half_range: Tensor) -> Tensor:
+    """Nats `[S, N, L]`, in the units of the bounds, of scaled `values [N, L, D]`, each given those before it."""
+    num, length, size = values.shape
+    depth = tables.offset.shape[1] - 1
+    ones = torch.ones_like(half_range)
+
+    def scores(now: Tensor, history: Tensor, h: int) -> Tensor:
+        """Nats `[S, R]` of `now [R, D]` after `history [R, h * D]`."""
+        weights = tables.weights[:, h, (depth - h) * size :]
+        means = (history @ weights.transpose(0, 1).flatten(1)).unflatten(1, (len(weights), size)).transpose(0, 1)
+        means = means + tables.offset[:, None, h]
+        means = means + (now - means) @ tables.coupling[:, h].mT
+        each = censored_log_prob(now, means, tables.std[:, None, h], -ones, ones)
+        return (each - (now.abs() < 1) * half_range.log()).sum(-1)
+
+    nats = values.new_empty(len(tables.offset), num, length)
+    for t in range(min(depth, length)):
+        nats[:, :, t] = scores(values[:, t], values[:, :t].flatten(1), t)
+    if length > depth:
+        windows = values[:, : length - 1].unfold(1, depth, 1).mT if depth else values[:, :, None, :0]
+        late = scores(values[:, depth:].flatten(0, 1), windows.flatten(0, 1).flatten(1), depth)
+        nats[:, :, depth:] = late.view(len(nats), num, length - depth)
+    return nats
 
 
 def held_out_split(
@@ -244,29 +289,29 @@ def best_of(scores: Mapping[Key, float]) -> Key:
     return max(scores, key=lambda each: scores[each])
 
 
-def window_moments(windows: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean `[W * D]` and covariance `[W * D, W * D]`, in float64, of `windows [M, W, D]`, M >= 1."""
+def window_moments(windows: Tensor) -> WindowMoments:
+    """Those of `windows [M, W, D]`, M >= 1."""
     flat = windows.flatten(1).double()
     mean = flat.mean(0)
     centred = flat - mean
-    return mean, centred.T @ centred / len(flat)
+    return WindowMoments(mean, centred.T @ centred / len(flat))
 
 
-def moments_or_white(windows: Tensor, values: Tensor, memory: int) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of windows `[M, memory + 1, D]`; where there is none, those of white noise like `values`.
+def moments_or_white(windows: Tensor, values: Tensor, memory: int) -> WindowMoments:
+    """Those of windows `[M, memory + 1, D]`; where there is none, those of white noise like `values`.
 
     Of no more windows than vectors in one, white noise that spreads as each dimension of `values [S, D]` does makes up
     for those that are missing: without it, what a few windows do not show would be taken for impossible.
     """
     if not len(windows):
-        mean, covariance = window_moments(values[:, None])
+        mean, covariance, _ = window_moments(values[:, None])
         eye = torch.eye(memory + 1, dtype=torch.double, device=values.device)
-        return mean.repeat(memory + 1), torch.kron(eye, covariance)
-    mean, covariance = window_moments(windows)
+        return WindowMoments(mean.repeat(memory + 1), torch.kron(eye, covariance))
+    found = window_moments(windows)
     missing = memory + 2 - len(windows)
     if missing <= 0:
-        return mean, covariance
+        return found
     white, variances = values.double().mean(0).repeat(memory + 1), values.double().var(0, correction=0)
-    share, apart = missing / (missing + len(windows)), white - mean
-    mixed = torch.lerp(covariance, variances.repeat(memory + 1).diag(), share)
-    return torch.lerp(mean, white, share), mixed + share * (1 - share) * apart.outer(apart)
+    share, apart = missing / (missing + len(windows)), white - found.mean
+    mixed = torch.lerp(found.covariance, variances.repeat(memory + 1).diag(), share)
+    return WindowMoments(torch.lerp(found.mean, white, share), mixed + share * (1 - share) * apart.outer(apart))

@@ -1,5 +1,6 @@
 """Noise as a prior over vectors: white, or coloured as planners draw it."""
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_count
 from neuroprior.plans.vector_plans import VectorPlans
-from neuroprior.priors.vectors.linear_gaussian import LEAST_STD, LinearGaussianPrior, best_of, mean_nats
+from neuroprior.priors.vectors.linear_gaussian import LEAST_STD, LinearGaussianPrior, WindowMoments, best_of
 
 
 class NoisePrior(LinearGaussianPrior):
@@ -52,7 +53,8 @@ class NoisePrior(LinearGaussianPrior):
                 raise ValueError(f"{name}: a number {least} is expected, not {value!r}")
         self._given = {"exponent": exponent, "scale": scale, "memory": memory}
         self.exponent = exponent or 0.0
-        self._colour(self.exponent, torch.zeros(self.action_size), torch.full((self.action_size,), scale or 1.0))
+        start = torch.zeros(self.action_size), torch.full((self.action_size,), scale or 1.0)
+        self.set_window(self._moments(*start, self.exponent))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -66,7 +68,7 @@ class NoisePrior(LinearGaussianPrior):
         super().restore(learned)
         self.exponent = float(learned["exponent"])
 
-    def _colour(self, exponent: float, mean: Tensor, scale: Tensor) -> None:
+    def _moments(self, mean: Tensor, scale: Tensor, exponent: float) -> WindowMoments:
         memory = int(self._given["memory"] or 0) if exponent else 0
         lags = torch.arange(memory + 1, dtype=torch.double)
         frequency = torch.arange(1, memory + 2, dtype=torch.double) / (2 * (memory + 1))
@@ -74,17 +76,18 @@ class NoisePrior(LinearGaussianPrior):
         shape = (power[:, None] * torch.cos(2 * torch.pi * frequency[:, None] * lags)).sum(0) / power.sum()
         toeplitz = shape[(lags[:, None] - lags).abs().long()] if exponent else torch.ones(1, 1, dtype=torch.double)
         variance = torch.diag(scale.double().square())
-        self.set_window(mean.double().repeat(memory + 1), torch.kron(toeplitz.contiguous(), variance))
+        return WindowMoments(mean.double().repeat(memory + 1), torch.kron(toeplitz.contiguous(), variance))
 
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         values = self.scaled(plans.actions)[plans.mask()]
         mean, std = values.mean(0), values.std(0, correction=0).clamp(min=LEAST_STD)
         if self._given["scale"] is not None:
             mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])
+        moments = partial(self._moments, mean, std)
         if self._given["exponent"] is None:
-            scores = {}
-            for exponent in self.exponents:
-                self._colour(exponent, mean, std)
-                scores[exponent] = mean_nats(self, plans)
-            self.exponent = best_of(scores)
-        self._colour(self.exponent, mean, std)
+            coloured = [each for each in self.exponents if each]  # windows of `memory` + 1 vectors, white ones of 1
+            white = [each for each in self.exponents if not each]
+            self.exponent = best_of(
+                self.mean_nats_of(white, moments, plans) | self.mean_nats_of(coloured, moments, plans)
+            )
+        self.set_window(moments(self.exponent))

@@ -1,5 +1,7 @@
 """Synergies: actions lie near a plane of few dimensions, of windows over time or of single vectors."""
 
+from collections.abc import Callable
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -10,9 +12,9 @@ from neuroprior._checks import check_count, check_sizes
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
+    WindowMoments,
     best_of,
     held_out_split,
-    mean_nats,
     moments_or_white,
     window_moments,
 )
@@ -71,22 +73,24 @@ class WindowSynergies(LinearGaussianPrior):
         learning, held_out = held_out_split(plans, generator)
         numbers = [k for k in COMPONENTS if k < most] or [most]
         numbers = numbers if self.num_components is None else [min(self.num_components, most)]
-        mean, covariance, white = self._window_moments(learning, window)
-        scores = {}
-        for number, share in product(numbers, SHRINKAGES):
-            self.set_window(mean, torch.lerp(principal(covariance, number), white, share))
-            scores[number, share] = mean_nats(self, held_out)
-        number, share = best_of(scores)
-        mean, covariance, white = self._window_moments(plans, window)
-        self.set_window(mean, torch.lerp(principal(covariance, number), white, share))
-        self.explained = explained_shares(covariance)
+        settings = list(product(numbers, SHRINKAGES))
+        best = best_of(self.mean_nats_of(settings, self._moments(learning, window), held_out))
+        moments = self._moments(plans, window)
+        self.set_window(moments(best))
+        self.explained = explained_shares(moments((most, 0.0)).covariance)
 
-    def _window_moments(self, plans: VectorPlans, window: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean and covariance of windows, and the covariance that white noise of equal variances would have."""
+    def _moments(self, plans: VectorPlans, window: int) -> Callable[[tuple[int, float]], WindowMoments]:
+        """Makes the Gaussian of windows of `plans` for a number of components and a share of white noise."""
         values = self.scaled(plans.actions)[plans.mask()]
-        mean, covariance = moments_or_white(self.scaled(plans.windows(window)), values, window - 1)
-        variances = values.double().var(0, correction=0)
-        return mean, covariance, torch.diag(variances.repeat(window))
+        mean, covariance, _ = moments_or_white(self.scaled(plans.windows(window)), values, window - 1)
+        white = torch.diag(values.double().var(0, correction=0).repeat(window))
+        sizes, components = torch.linalg.eigh(covariance)
+
+        def moments(setting: tuple[int, float]) -> WindowMoments:
+            number, share = setting
+            return WindowMoments(mean, torch.lerp(principal(sizes, components, number), white, share))
+
+        return moments
 
 
 COMPONENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
@@ -148,20 +152,18 @@ class StepSynergies(LinearGaussianPrior):
         number = self.num_components
         if number is None:
             learning, held_out = held_out_split(plans, generator)
-            scores = {}
-            for each in range(1, self.action_size + 1):
-                self._project(learning, each)
-                scores[each] = mean_nats(self, held_out)
-            number = best_of(scores)
-        self._project(plans, number)
+            numbers = range(1, self.action_size + 1)
+            number = best_of(self.mean_nats_of(numbers, partial(self._moments, learning), held_out))
+        self.set_window(self._moments(plans, number))
+        self.explained = explained_shares(window_moments(self.scaled(plans.windows(1))).covariance)
 
-    def _project(self, plans: VectorPlans, number: int) -> None:
+    def _moments(self, plans: VectorPlans, number: int) -> WindowMoments:
+        """The Gaussian of windows of `plans` whose vectors lie near a plane of so many dimensions."""
         values = self.scaled(plans.actions)[plans.mask()]
-        covariance = window_moments(values[:, None])[1]
+        covariance = window_moments(values[:, None]).covariance
         vectors = torch.linalg.eigh(covariance)[1][:, -number:]
-        self.explained = explained_shares(covariance)
         window, size = self.order + 1, self.action_size
-        whole, joint = moments_or_white(self.scaled(plans.windows(window)), values, self.order)
+        whole, joint, _ = moments_or_white(self.scaled(plans.windows(window)), values, self.order)
         # The coordinates keep their covariance over time; what is beside the plane is white, and the same in all
         # directions.
         plane = torch.kron(torch.eye(window, dtype=torch.double), vectors @ vectors.T)
@@ -169,12 +171,16 @@ class StepSynergies(LinearGaussianPrior):
         white = torch.eye(size, dtype=torch.double) - vectors @ vectors.T
         level = beside / max(size - number, 1)
         noise = torch.kron(torch.eye(window, dtype=torch.double), level * white)
-        self.set_window(whole, plane @ joint @ plane + noise, RIDGE)
+        return WindowMoments(whole, plane @ joint @ plane + noise, RIDGE)
 
 
-def principal(covariance: Tensor, number: int) -> Tensor:
-    """`covariance [n, n]` with all but its `number` largest principal components made equal (probabilistic PCA)."""
-    values, vectors = torch.linalg.eigh(covariance)
+def principal(values: Tensor, vectors: Tensor, number: int) -> Tensor:
+    """A covariance `[n, n]` with all but its `number` largest components made equal (probabilistic PCA).
+
+    Args:
+        values, vectors: `[n]`, ascending, and `[n, n]`: its eigenvalues and eigenvectors.
+        number: components that are kept.
+    """
     values = values.clamp(min=0)
     number = min(number, len(values))
     rest = values[: len(values) - number]
