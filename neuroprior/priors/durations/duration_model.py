@@ -143,94 +143,77 @@ class DurationModel(nn.Module):
         zero = action[zeros].bincount(minlength=self.num_actions) / count.double()
         zero = torch.where(count < FEWEST, pooled, zero)
         action, after, time, fold = action[~zeros], after[~zeros], time[~zeros], fold[~zeros]
-        law, parameters, number, by_fold = self._of_actions(action, time, fold)
-        tables = [law, zero, parameters, number]
+        held = _Held(action, after, time, fold.unique(return_inverse=True)[1])
+        chosen, fits, number = self._of_actions(held)
+        law = torch.tensor([LAW_NAMES.index(name) for name in self.laws])
+        own = fits[chosen, -1, torch.arange(self.num_actions)]
+        tables = [law[chosen], zero, own, number.masked_fill(number < FEWEST, 0)]
         pair = after[:0]
-        if self.transitions:
-            pair, law, parameters, number = self._of_transitions(action, after, time, fold, law, by_fold)
-            more = [law, zero[pair // self.num_actions], parameters, number]
+        if self.transitions and len(time):
+            pair, of_transitions, parameters, number = self._of_transitions(held, chosen, fits)
+            more = [law[of_transitions], zero[pair // self.num_actions], parameters, number]
             tables = [torch.cat(both) for both in zip(tables, more, strict=True)]
         self._keep(*(table.to(self.law.device) for table in (pair, *tables)))
         return self
 
-    def _of_actions(
-        self, action: Tensor, time: Tensor, fold: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, dict[int, Tensor]]:
-        """The laws of actions: their numbers, parameters and sizes; and their parameters without each fold."""
-        size, step = self.num_actions, resolution(time)
-        number = action.bincount(minlength=size)
-        if not len(time):  # they take no time at all, or none is known: the law is never used
-            ones = torch.ones(size, MOST_PARAMETERS, dtype=torch.double)
-            return torch.zeros(size, dtype=torch.long), ones, number, {}
+    def _of_actions(self, held: "_Held") -> tuple[Tensor, Tensor, Tensor]:
+        """Laws of actions.
 
-        def fitted(some: Tensor) -> Tensor:
-            """`[K, A + 1, ...]`: of each action, and of all together, which stands for those with too few."""
-            cell = torch.cat([action[some], torch.full_like(action[some], size)])
-            found = fit_laws(Sets(time[some].log().repeat(2), cell, size + 1, step), self.laws)
-            few = cell.bincount(minlength=size + 1) < FEWEST
-            few[size] = False
-            return torch.where(few[:, None], found[:, size:], found)
-
-        score = torch.zeros(len(self.laws), size + 1, dtype=torch.double)
-        by_fold = {}
-        for part in fold.unique().tolist():
-            held_out = fold == part
-            if bool(held_out.all()):
-                break
-            by_fold[part] = fitted(~held_out)
-            for place in range(len(self.laws)):
-                for cell in (action[held_out], torch.full_like(action[held_out], size)):
-                    density = LAWS[self.laws[place]].log_density(time[held_out], by_fold[part][place, cell])
-                    score[place].index_add_(0, cell, density)
-        price = NATS_A_PARAMETER * torch.tensor([float(len(LAWS[name].names)) for name in self.laws])
-        chosen = (score - price[:, None]).argmax(0)
-        chosen = torch.where(torch.cat([number < FEWEST, torch.tensor([False])]), chosen[size], chosen)[:size]
-        parameters = fitted(torch.ones_like(fold, dtype=torch.bool))[chosen, torch.arange(size)]
-        law = torch.tensor([LAW_NAMES.index(name) for name in self.laws])[chosen]
-        return law, parameters, number.masked_fill(number < FEWEST, 0), by_fold
+        Returns:
+            The places in `laws` of those that were chosen `[A]`, the parameters of all `[K, F + 1, A, ...]` without
+            each part and of all durations, and how many durations each action has.
+        """
+        size, laws = self.num_actions, len(self.laws)
+        number = held.action.bincount(minlength=size)
+        if not len(held.time):  # actions take no time at all, or none is known: the law is never used
+            ones = torch.ones(laws, 1, size, MOST_PARAMETERS, dtype=torch.double)
+            return torch.zeros(size, dtype=torch.long), ones, number
+        # Last, all actions together, which stand for those with too few.
+        cell = torch.cat([held.action, torch.full_like(held.action, size)])
+        time, part = held.time.repeat(2), held.part.repeat(2)
+        fits, count = _fits_without_parts(time, cell, size + 1, part, self.laws)
+        few = count < FEWEST
+        few[:, size] = False
+        fits = torch.where(few[..., None], fits[:, :, size:], fits)
+        score = torch.zeros(laws, size + 1, dtype=torch.double)
+        if len(count) > 2:
+            for place, name in enumerate(self.laws):
+                score[place].index_add_(0, cell, LAWS[name].log_density(time, fits[place, part, cell]))
+        chosen = (score - self._prices()[:, None]).argmax(0)
+        return torch.where(number < FEWEST, chosen[size], chosen[:size]), fits[:, :, :size], number
 
     def _of_transitions(
-        self, action: Tensor, after: Tensor, time: Tensor, fold: Tensor, law: Tensor, by_fold: dict[int, Tensor]
+        self, held: "_Held", law_of: Tensor, of_actions: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The laws of transitions, of those actions that they predict better: pairs, numbers, parameters and sizes."""
+        """The laws of transitions, of those actions that they predict better: pairs, places, parameters and numbers."""
         size, laws = self.num_actions, len(self.laws)
-        code = action * size + after
-        pair, count = code[after >= 0].unique(return_counts=True)
+        code = held.action * size + held.after
+        pair, count = code[held.after >= 0].unique(return_counts=True)
         pair = pair[count >= FEWEST_OF_TRANSITION]
-        own = (after >= 0) & torch.isin(code, pair)
-        action, time, fold = action[own], time[own], fold[own]
-        cell, step, doing = torch.searchsorted(pair, code[own]), resolution(time), pair // size
-
-        def fitted(some: Tensor, of_action: Tensor) -> Tensor:
-            """`[K, T, ...]`; of the action, where there are too few."""
-            found = fit_laws(Sets(time[some].log(), cell[some], len(pair), step), self.laws)
-            few = cell[some].bincount(minlength=len(pair)) < FEWEST
-            return torch.where(few[:, None], of_action[:, doing], found)
-
+        own = (held.after >= 0) & torch.isin(code, pair)
+        action, time, part = held.action[own], held.time[own], held.part[own]
+        cell, doing = torch.searchsorted(pair, code[own]), pair // size
         # The law of the action comes last.
         score = torch.zeros(laws + 1, size, dtype=torch.double)
-        for part, of_action in by_fold.items():
-            out = fold == part
-            if not bool(out.any()) or bool(out.all()):
-                continue
-            each = fitted(~out, of_action)
-            for place, name in enumerate(self.laws):
-                score[place].index_add_(0, action[out], LAWS[name].log_density(time[out], each[place, cell[out]]))
-                same = out & (law[action] == LAW_NAMES.index(name))
-                density = LAWS[name].log_density(time[same], of_action[place, action[same]])
-                score[laws].index_add_(0, action[same], density)
-        prices = NATS_A_PARAMETER * torch.tensor([float(len(known.names)) for known in LAWS.values()]).double()
-        place_in_all = torch.tensor([LAW_NAMES.index(name) for name in self.laws])
+        if not len(part) or bool((part == part[0]).all()):
+            return pair[:0], pair[:0], score.new_zeros(0, MOST_PARAMETERS), pair[:0]
+        fits, count = _fits_without_parts(time, cell, len(pair), part, self.laws, of_actions.shape[1] - 1)
+        fits = torch.where((count < FEWEST)[..., None], of_actions[:, :, doing], fits)
+        for place, name in enumerate(self.laws):
+            score[place].index_add_(0, action, LAWS[name].log_density(time, fits[place, part, cell]))
+            same = law_of[action] == place
+            density = LAWS[name].log_density(time[same], of_actions[place, part[same], action[same]])
+            score[laws].index_add_(0, action[same], density)
         # The law of the action is needed in either case: for rare transitions, and at the end of a plan.
-        score[:laws] -= prices[place_in_all][:, None] * doing.bincount(minlength=size)
+        score[:laws] -= self._prices()[:, None] * doing.bincount(minlength=size)
         best, chosen = score[:laws].max(0)
         better = (best > score[laws])[doing]
-        if not bool(better.any()):
-            return pair[:0], pair[:0], score.new_zeros(0, MOST_PARAMETERS), pair[:0]
-        whole = fit_laws(Sets(time.log(), cell, len(pair), step), self.laws)
-        values = whole[chosen[doing], torch.arange(len(pair))]
-        number = cell.bincount(minlength=len(pair))
-        return pair[better], place_in_all[chosen[doing]][better], values[better], number[better]
+        places, number = chosen[doing], count[-1]
+        return pair[better], places[better], fits[places, -1, torch.arange(len(pair))][better], number[better]
+
+    def _prices(self) -> Tensor:
+        """What a law `[K]` must gain, in nats."""
+        return NATS_A_PARAMETER * torch.tensor([float(len(LAWS[name].names)) for name in self.laws]).double()
 
     def log_prob(self, plans: Plans) -> Tensor:
         """The log-density of each known duration, given its action and the next one; of a 0, its log-probability.
@@ -345,6 +328,26 @@ class DurationModel(nn.Module):
             and bool((self.pair.diff() > 0).all())
             and bool(((self.pair >= 0) & (self.pair < self.num_actions**2)).all())
         )
+
+
+class _Held(NamedTuple):
+    """Durations above 0 `[n]`, and the part that each is held out with, from 0."""
+
+    action: Tensor
+    after: Tensor  # the next action; -1: there is none
+    time: Tensor
+    part: Tensor
+
+
+def _fits_without_parts(
+    time: Tensor, cell: Tensor, cells: int, part: Tensor, laws: Sequence[LawName], parts: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """K laws `[K, F + 1, C, ...]` fitted to each cell without each of F parts, and last to all; and of how many."""
+    parts = int(part.max()) + 1 if parts is None else parts
+    without, index = (part != torch.arange(parts + 1)[:, None]).nonzero(as_tuple=True)
+    sets = Sets(time[index].log(), without * cells + cell[index], (parts + 1) * cells, resolution(time))
+    count = sets.cell.bincount(minlength=sets.number)
+    return fit_laws(sets, laws).unflatten(1, (parts + 1, cells)), count.view(parts + 1, cells)
 
 
 def _parts(plans: Plans, known: Tensor) -> Tensor:

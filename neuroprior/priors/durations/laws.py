@@ -26,6 +26,12 @@ NEWTON_STEPS, EM_STEPS = 20, 50
 MOST_VALUES = 150
 """The most values of a set that a mixture is fitted to; of more durations, means of neighbours."""
 
+CONVERGED = 1e-10
+"""Relative change of a parameter in a Newton step with which iteration ends."""
+
+AT_ONCE = 2**16
+"""Such values of several sets that are in the processor's cache together."""
+
 ROUNDED = 1 / sqrt(12)
 """Standard deviation of what is lost when numbers are rounded to the next multiple of 1."""
 
@@ -114,7 +120,9 @@ def _weibull(sets: Sets) -> Tensor:
         total = sets.sums(weight)
         first, second = sets.sums(weight * away) / total, sets.sums(weight * away.square()) / total
         step = (first - 1 / shape) / (second - first.square() + shape.square().reciprocal())
-        shape = (shape - step).maximum(shape / 2).minimum(shape * 2).minimum(most)
+        before, shape = shape, (shape - step).maximum(shape / 2).minimum(shape * 2).minimum(most)
+        if not bool(((shape - before).abs() > CONVERGED * shape).any()):
+            break
     weight = (shape[sets.cell] * (away - top[sets.cell])).exp()
     return torch.stack([shape, (center + top + sets.mean(weight).log() / shape).exp()], -1)
 
@@ -126,37 +134,46 @@ def _lognormal(sets: Sets) -> Tensor:
 def _two_lognormal(sets: Sets) -> Tensor:
     """Expectation maximisation on standardised logarithms, from two halves around their mean."""
     center, spread = sets.center()
-    value, number, cell = _condensed((sets.log - center[sets.cell]) / spread[sets.cell], sets)
-    sets, value = sets._replace(cell=cell), value[:, None]
-    powers = number[:, None, None] * torch.stack([torch.ones_like(value), value, value.square()], -1)
-    share, means = (
-        torch.full((sets.number, 2), 0.5).double(),
-        torch.tensor([[-1.0, 1.0]]).double().repeat(sets.number, 1),
-    )
-    spreads = share
+    value, number = _condensed((sets.log - center[sets.cell]) / spread[sets.cell], sets)
+    at_once = max(AT_ONCE // max(value.shape[1], 1), 1)
+    parts = zip(*(each.split(at_once) for each in (value, number, center, spread)), strict=True)
+    return torch.cat([_two_normal(sets, *part) for part in parts])
+
+
+def _two_normal(sets: Sets, value: Tensor, number: Tensor, center: Tensor, spread: Tensor) -> Tensor:
+    """The parameters `[C, 5]` from standardised values `[C, M]` that stand for `number [C, M]` durations each."""
+    center, spread = center[:, None], spread[:, None]
+    powers = torch.stack([torch.ones_like(value), value, value.square()], -1)
+    share = value.new_full((len(value), 2), 0.5)
+    spreads, means = share, value.new_tensor([-1.0, 1.0]).expand(len(value), 2)
     for _ in range(EM_STEPS):
-        joint = share.log()[cell] + _normal(value, means[cell], spreads[cell])
-        total, first, second = sets.sums(joint.softmax(-1)[..., None] * powers).unbind(-1)
+        # The logarithm of how much likelier a value is in the first part is a polynomial of the value.
+        narrow = spreads.square().reciprocal()
+        terms = [share.log() - spreads.log() - narrow * means.square() / 2, narrow * means, -narrow / 2]
+        odds = (powers @ torch.stack(terms, 1).diff(dim=2).neg())[..., 0]
+        parts = torch.stack([odds.sigmoid(), odds.neg().sigmoid()], 1) * number[:, None]
+        total, first, second = (parts @ powers).unbind(-1)
         share = (total / total.sum(-1, keepdim=True)).clamp(0.01, 0.99)
         means = first / total.clamp(min=1e-9)
         # A part that shrinks to a few durations would be infinitely likely.
-        least = (sets.least(center[:, None] + spread[:, None] * means) / spread[:, None]).clamp(min=0.05)
+        least = (sets.least(center + spread * means) / spread).clamp(min=0.05)
         spreads = (second / total.clamp(min=1e-9) - means.square()).clamp(min=0).sqrt().maximum(least)
-    means, spreads = center[:, None] + spread[:, None] * means, spread[:, None] * spreads
+    means, spreads = center + spread * means, spread * spreads
     return torch.stack([share[:, 0] / share.sum(-1), means[:, 0], spreads[:, 0], means[:, 1], spreads[:, 1]], -1)
 
 
-def _condensed(values: Tensor, sets: Sets) -> tuple[Tensor, Tensor, Tensor]:
-    """At most `MOST_VALUES` means of neighbours in each set: the means, how many values each is of, and their sets."""
+def _condensed(values: Tensor, sets: Sets) -> tuple[Tensor, Tensor]:
+    """At most `MOST_VALUES` means `[C, M]` of neighbours in each set, and how many values each is of; 0: of none."""
     order = values.argsort()
     order = order[sets.cell[order].argsort(stable=True)]
     cell = sets.cell[order]
     size = cell.bincount(minlength=sets.number)
+    most = min(int(size.max()), MOST_VALUES) if len(size) else 0
     rank = torch.arange(len(cell), device=cell.device) - (size.cumsum(0) - size)[cell]
-    place = cell * MOST_VALUES + rank * size.clamp(max=MOST_VALUES)[cell] // size[cell]
-    known, group, number = place.unique(return_inverse=True, return_counts=True)
-    sums = values.new_zeros(len(known)).index_add_(0, group, values[order])
-    return sums / number, number.to(values), known // MOST_VALUES
+    place = cell * most + rank * size.clamp(max=MOST_VALUES)[cell] // size[cell]
+    number = place.bincount(minlength=sets.number * most).to(values)
+    sums = torch.zeros_like(number).index_add_(0, place, values[order])
+    return (sums / number.clamp(min=1)).view(sets.number, most), number.view(sets.number, most)
 
 
 def _normal(value: Tensor, mean: Tensor, spread: Tensor) -> Tensor:
