@@ -12,6 +12,7 @@ from safetensors.torch import load as read_tensors
 from safetensors.torch import save as write_tensors
 
 from neuroprior._files import read_json
+from neuroprior.priors.durations.duration_model import DurationModel
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.saved import SavedModule
 from neuroprior.priors.vectors.vector_prior import VectorPrior
@@ -25,16 +26,20 @@ SPARE = 2**26
 """Numbers that a prior may hold beyond those of its file before these are read."""
 
 
-KINDS: dict[str, type] = {"actions": Prior, "vectors": VectorPrior}
+KINDS: dict[str, type] = {"actions": Prior, "vectors": VectorPrior, "durations": DurationModel}
+
+NOUNS = {"actions": "prior over actions", "vectors": "prior over vectors", "durations": "model of durations"}
 
 
 def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
-    """Save a prior to a folder, made if need be: `model.safetensors` (weights or counts) and `config.json`.
+    """Save a prior or a model of durations to a folder, made if need be.
 
-    Both files are written under temporary names and renamed when they are whole.
+    Its files are `model.safetensors` (weights or counts) and `config.json`. Both are written under temporary names and
+    renamed when they are whole.
 
     Args:
-        prior: any prior, of actions or of vectors, whose `config` gives its constructor's arguments.
+        prior: any prior, of actions or of vectors, whose `config` gives its constructor's arguments; or a
+            `DurationModel`.
         folder: where.
 
     Returns:
@@ -77,18 +82,22 @@ def load(
 def load(
     folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Literal["vectors"]
 ) -> VectorPrior: ...
+@overload
+def load(
+    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Literal["durations"]
+) -> DurationModel: ...
 def load(
     folder: str | os.PathLike[str],
     device: torch.device | str = "cpu",
     *,
-    kind: Literal["actions", "vectors"] = "actions",
-) -> Prior | VectorPrior:
-    """The prior that `save` wrote to a folder.
+    kind: Literal["actions", "vectors", "durations"] = "actions",
+) -> Prior | VectorPrior | DurationModel:
+    """What `save` wrote to a folder.
 
     Args:
         folder: where.
         device: where the prior computes then.
-        kind: what it is a prior over: numbered "actions", or "vectors".
+        kind: what it is a prior over: numbered "actions", or "vectors"; or "durations" for a `DurationModel`.
 
     Raises:
         FileNotFoundError: the folder or one of its two files is not there.
@@ -105,10 +114,12 @@ def load(
     folder = Path(folder)
     config = _read_config(folder / "config.json")
     if kind not in KINDS:
-        raise ValueError(f'kind: "actions" or "vectors" is expected, not {kind!r}')
-    if not issubclass(SavedModule.known[config["prior"]], KINDS[kind]):
-        other = next(name for name in KINDS if name != kind)
-        raise ValueError(f'{folder}: {config["prior"]} is no prior over {kind}; use load(folder, kind="{other}")')
+        raise ValueError(f'kind: "actions", "vectors" or "durations" is expected, not {kind!r}')
+    saved = SavedModule.known[config["prior"]]
+    if not issubclass(saved, KINDS[kind]):
+        own = next((name for name in KINDS if issubclass(saved, KINDS[name])), None)
+        instead = "" if own is None else f'; use load(folder, kind="{own}")'
+        raise ValueError(f"{folder}: {config['prior']} is no {NOUNS[kind]}{instead}")
     data = (folder / "model.safetensors").read_bytes()
     digest = hashlib.sha256(data).hexdigest()
     unfinished = folder / ".config.json.partial"
@@ -138,7 +149,7 @@ def load(
     if broken := [name for name, value in tensors.items() if value.is_floating_point() and bool(value.isnan().any())]:
         raise ValueError(f"{folder / 'model.safetensors'}: {broken[0]} has numbers that are NaN")
     try:
-        assert isinstance(prior, Prior | VectorPrior)
+        assert isinstance(prior, Prior | VectorPrior | DurationModel)
         return prior.to(device).eval()
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device: {str(device)!r} cannot be used here ({str(error).splitlines()[0][:200]})") from error

@@ -114,6 +114,31 @@ def test_the_last_action_of_a_plan_has_no_next_one():
         assert stats.kstest(samples[:, step], rows[key].cdf).pvalue > FALSE_ALARM
 
 
+def test_a_model_is_saved_alone(tmp_path):
+    plans = transitions()
+    model = DurationModel(3, ["gamma", "weibull"]).fit(plans)
+    again = load(save(model, tmp_path), kind="durations")
+    assert repr(again) == repr(model)
+    assert again.table() == model.table()
+    assert again.log_prob(plans).equal(model.log_prob(plans))
+    with refuses("DurationModel", "no prior over actions", 'kind="durations"'):
+        load(tmp_path)
+    save(MarkovPrior(3), tmp_path)
+    with refuses("MarkovPrior", "no model of durations", 'kind="actions"'):
+        load(tmp_path, kind="durations")
+
+
+@pytest.mark.parametrize("law", TRUE)
+def test_laws_are_chosen_as_by_fits_without_each_part(law):
+    plans = of_one_action(draw(law, 300), 10)
+    (chosen,) = DurationModel(1, list(TRUE)).fit(plans).table()
+    scores = {name: -2.0 * (1 if name == "exponential" else 2) for name in TRUE}
+    for learned, left_out in folds(plans, 5):
+        for name in scores:
+            scores[name] += float(DurationModel(1, [name]).fit(plans[learned]).log_prob(plans[left_out]).sum())
+    assert chosen.law == max(scores, key=scores.get)
+
+
 def test_unknown_durations_are_left_out():
     times = draw("gamma", 1000).view(10, 100)
     missing = torch.rand(10, 100, generator=seeded(0)) < 0.3

@@ -35,7 +35,7 @@ from neuroprior import (
 from neuroprior.analysis import mean_interval, order_selection
 from neuroprior.planners import Decision, Execution, ICEMPlanner, VectorDecision
 from neuroprior.plans import VectorPlans
-from neuroprior.priors import NoisePrior, VectorPrior
+from neuroprior.priors import DurationModel, NoisePrior, VectorPrior
 from neuroprior.testing import check_planner, check_prior, check_world
 from neuroprior.worlds import DoubleIntegrator, GridWorld, Rollout
 
@@ -136,6 +136,7 @@ def vectors(folder: Path) -> None:
     prior = NoisePrior([-1.0], [1.0], exponent=None).fit(given)
     assert_type(prior, NoisePrior)
     assert_type(load(save(prior, folder / "noise"), kind="vectors"), VectorPrior)
+    assert_type(load(folder / "durations", kind="durations"), DurationModel)
     decision = ICEMPlanner(length=3, num_plans=4).plan(world, world.reset(2))
     assert_type(decision, VectorDecision)
 

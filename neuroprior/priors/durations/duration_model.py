@@ -1,10 +1,10 @@
 """How long actions take: for each action, or each action and the next one, a law chosen by held-out likelihood."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from neuroprior._checks import check_range, check_sizes
@@ -23,6 +23,7 @@ from neuroprior.priors.durations.laws import (
     resolution,
 )
 from neuroprior.priors.prior import as_actions
+from neuroprior.priors.saved import SavedModule
 
 FEWEST = 10
 """The fewest known durations above 0 with which an action has a law of its own."""
@@ -40,8 +41,6 @@ exponential durations, the exponential law was chosen for 45 without this, and f
 FOLDS = 5
 """Parts of the plans, of which each is held out once."""
 
-_TABLES = ("pair", "law", "zero", "values", "number")
-
 
 class DurationLaw(NamedTuple):
     """The law of the durations of an action."""
@@ -54,7 +53,7 @@ class DurationLaw(NamedTuple):
     number: int  # known durations above 0 that it was fitted to; 0: too few, it is that of all actions together
 
 
-class DurationModel(nn.Module):
+class DurationModel(SavedModule):
     """The distribution of how long each action takes, given the actions: the dwell times of a semi-Markov process.
 
     Each action has a probability that it takes no time at all (point events), the share of such durations among the
@@ -83,6 +82,8 @@ class DurationModel(nn.Module):
         2
     """
 
+    tables = ("pair", "law", "zero", "values", "number")
+
     pair: Tensor  # int64 [T], ascending: action * A + next action, of the laws of transitions
     law: Tensor  # int64 [A + T]: its number in LAW_NAMES
     zero: Tensor  # float64 [A + T]
@@ -100,12 +101,12 @@ class DurationModel(nn.Module):
         ones = torch.ones(num_actions, MOST_PARAMETERS, dtype=torch.double)
         self._keep(whole[:0], whole, ones[:, 0] * 0, ones, whole)
 
-    def __repr__(self) -> str:
-        """The constructor's call."""
-        return f"DurationModel({self.num_actions}, laws={list(self.laws)}, transitions={self.transitions})"
+    @property
+    def config(self) -> dict[str, Any]:
+        return {"num_actions": self.num_actions, "laws": list(self.laws), "transitions": self.transitions}
 
     def _keep(self, *tables: Tensor) -> None:
-        for name, table in zip(_TABLES, tables, strict=True):
+        for name, table in zip(self.tables, tables, strict=True):
             self.register_buffer(name, table)
 
     def table(self) -> list[DurationLaw]:
@@ -306,17 +307,7 @@ class DurationModel(nn.Module):
         if durations:
             durations_of(plans)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
-        # How many transitions have a law of their own was learned, so sizes are taken from the file.
-        for name in _TABLES:
-            if prefix + name in state_dict:
-                self.register_buffer(name, torch.empty_like(state_dict[prefix + name], device=self.law.device))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-        if not self._tables_fit():
-            raise RuntimeError("the tables of a DurationModel do not fit one another")
-
-    def _tables_fit(self) -> bool:
-        """Whether the tables are those of such a model; checks what was read from a file."""
+    def tables_fit(self) -> bool:
         rows = self.num_actions + len(self.pair)
         return (
             self.pair.dim() == 1

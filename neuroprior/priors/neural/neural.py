@@ -1,8 +1,9 @@
 """The base of the neural priors: inputs, the window beyond the training length, and fitting."""
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
+from neuroprior.priors.neural.features import UNSCALED, Standardise
 from neuroprior.priors.prior import Prior
 
 CONTEXT_SPREAD = 0.03
@@ -94,6 +96,8 @@ class NeuralPrior(Prior):
     Raises:
         ValueError: an argument is out of range.
     """
+
+    later: ClassVar[Mapping[str, float]] = {f"embedding.scale.{name}": value for name, value in UNSCALED.items()}
 
     actions_at_once = 2**18
     shares_steps = True
@@ -289,6 +293,11 @@ class NeuralPrior(Prior):
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:
             self._make(self.sizes_for(plans))
+        if not self._sized and self.context_size is not None and plans.context is not None:
+            features = plans.context[plans.mask()] if plans.context.dim() == 3 else plans.context
+            for module in self.modules():
+                if isinstance(module, Standardise) and len(features):
+                    module.learn(features)
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
             raise ValueError("plans: at least two plans with an action are needed to train a neural prior")
@@ -333,7 +342,7 @@ class Embedding(nn.Module):
 
     Each vector is the sum of an embedding of the previous action, of the context, and of a causal convolution over the
     last `lags` actions, each embedded in `LAG_WIDTH` numbers: what depends on the k-th last action can be read off
-    directly, without recurrence or attention.
+    directly, without recurrence or attention. Features are standardised first; see `Standardise`.
     """
 
     def __init__(
@@ -350,6 +359,7 @@ class Embedding(nn.Module):
         self.mix = nn.Conv1d(LAG_WIDTH, width, lags, bias=False) if lags > 1 else None
         self.index = None if num_contexts is None else context_embedding(num_contexts, width)
         self.features = None if context_size is None else nn.Linear(context_size, width)
+        self.scale = None if context_size is None else Standardise(context_size)
 
     def forward(self, inputs: Tensor, recent: Tensor | None, window: int | None = None) -> tuple[Tensor, Tensor]:
         """The vectors, and the last `lags` - 1 actions.
@@ -383,9 +393,12 @@ class Embedding(nn.Module):
 
     def of_context(self, inputs: Tensor) -> Tensor:
         """What the contexts of `inputs [N, T, D]` add to their vectors: `[N, T, width]`."""
-        made: nn.Module | None = self.features if self.index is None else self.index
-        assert made is not None
-        given: Tensor = made(inputs[..., 1:] if self.index is None else inputs[..., 1].long())
+        if self.index is not None:
+            given: Tensor = self.index(inputs[..., 1].long())
+        else:
+            assert self.features is not None
+            assert self.scale is not None
+            given = self.features(self.scale(inputs[..., 1:]))
         return given
 
     def of_past(self, window: int | None) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from neuroprior._compiled import compiled
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.vector_plans import VectorPlans
+from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.neural.gru import gru_step
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.neural.transformer import Block
@@ -52,7 +53,7 @@ class VectorNetwork(VectorPrior):
     """A network that predicts the next vector as a mixture of K censored Gaussians (Bishop 1994).
 
     At each step the network reads the last `lags` vectors, scaled by the bounds to -1..1, and the features of the state
-    where it takes them, standardised by the mean and standard deviation in the first plans that it learned from. The
+    where it takes them, standardised; see `neuroprior.priors.neural.features.Standardise`. The
     means of all components have a common part that is linear in these inputs; the rest of the means, the weights and
     the standard deviations are the network's; those of a plan's first vector have factors of their own. Training begins
     with the linear part and the standard deviations of an `AutoregressivePrior` of at most `lags` vectors: from
@@ -85,10 +86,8 @@ class VectorNetwork(VectorPrior):
         ValueError: an argument is out of range.
     """
 
-    later: ClassVar[Mapping[str, float]] = {"first_log_std": 0.0}
-
-    _mean: Tensor
-    _std: Tensor
+    later: ClassVar[Mapping[str, float]] = {"first_log_std": 0.0, "features.most": torch.inf}
+    renamed: ClassVar[Mapping[str, str]] = {"_mean": "features.mean", "_std": "features.std"}
 
     def __init__(
         self,
@@ -115,8 +114,7 @@ class VectorNetwork(VectorPrior):
         self.entry_size = size + 1
         self.input_size = lags * self.entry_size + features
         check_memory(4 * width * self.input_size, width=width, lags=lags)
-        self.register_buffer("_mean", torch.zeros(features))
-        self.register_buffer("_std", torch.ones(features))
+        self.features = Standardise(features)
         self.coupling = nn.Parameter(torch.zeros(size, size)) if coupled else None
         self.first_log_std = nn.Parameter(torch.zeros(size))
         with torch.random.fork_rng(devices=[]):
@@ -271,7 +269,7 @@ class VectorNetwork(VectorPrior):
 
     def _features(self, context: Tensor | None) -> Tensor | None:
         """Standardised features."""
-        return None if context is None else (context - self._mean) / self._std
+        return None if context is None else self.features(context)
 
     def _entries(self, actions: Tensor) -> Tensor:
         """`[..., D + 1]`: vectors scaled to -1..1, and a 1; only zeros stand for no vector."""
@@ -357,9 +355,7 @@ class VectorNetwork(VectorPrior):
             raise
         if first and plans.context is not None:
             features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
-            spread = features.std(0, correction=0)
-            self._mean.copy_(features.mean(0))
-            self._std.copy_(torch.where(spread > 1e-6 * (1 + features.abs().amax(0)), spread, 1))
+            self.features.learn(features)
         chain = self._chain(learning, seed) if first else None
         if chain is not None:
             self._begin(chain)
