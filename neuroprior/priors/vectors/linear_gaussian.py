@@ -19,7 +19,12 @@ from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
 LEAST_STD = 1e-3
-"""Of half a dimension's range: the standard deviations of priors are at least so large."""
+"""Of half a dimension's range: the standard deviations of priors are at least so large, see `least_std`."""
+
+LEAST_SHARE, CONSTANT_STD = 1e-2, 1e-6
+"""The share of the standard deviation of the vectors that is enough where bounds are wide, and the standard deviation,
+of half the range, of vectors that count as constant.
+"""
 
 HELD_OUT = 0.2
 """Share of the plans (or groups) on which settings are chosen."""
@@ -195,6 +200,15 @@ def draw_linear(prior: LinearGaussianPrior, vectors: Tensor, known: int, noise: 
             now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
 
 
+def least_std(std: Tensor) -> Tensor:
+    """The least standard deviations of predictions for vectors with these `std`, all in units of half the range.
+
+    Without them predictions could be infinitely likely. Where bounds are wide, `LEAST_STD` is more than the vectors
+    vary by, so that a share of what they vary by is taken. Constant dimensions have `LEAST_STD`.
+    """
+    return torch.where(std > CONSTANT_STD, LEAST_SHARE * std, torch.inf).clamp(max=LEAST_STD)
+
+
 def predictions(moments: Sequence[WindowMoments], size: int) -> LinearTables:
     """The next vector of `size` dimensions given those before it in a window, for each of S Gaussians over windows."""
     mean = torch.stack([each.mean for each in moments]).double()
@@ -202,19 +216,21 @@ def predictions(moments: Sequence[WindowMoments], size: int) -> LinearTables:
     ridge = torch.tensor([each.ridge for each in moments], dtype=torch.double, device=mean.device)
     memory = mean.shape[1] // size - 1
     last, eye = slice(memory * size, None), torch.eye(size, dtype=torch.double, device=mean.device)
+    least = least_std(covariance[:, last, last].diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()).square()
     rows = []
     for h in range(memory + 1):
         past = slice((memory - h) * size, memory * size)
         known, cross, now = covariance[:, past, past], covariance[:, past, last], covariance[:, last, last]
-        level = known.diagonal(dim1=1, dim2=2).mean(1).nan_to_num() * ridge + LEAST_STD**2 * 1e-3
-        weights = torch.linalg.solve(known + torch.diag_embed(level[:, None].expand(-1, h * size)), cross)
+        level = known.diagonal(dim1=1, dim2=2).mean(1, keepdim=True).nan_to_num() * ridge[:, None]
+        level = level + 1e-3 * least.repeat(1, h)
+        weights = torch.linalg.solve(known + torch.diag_embed(level), cross)
         # The mean square of what is left, which with a ridge is more than the conditional variance.
         shared = cross.mT @ weights
         rest = now - shared - shared.mT + weights.mT @ known @ weights
         rest = (rest + rest.mT) / 2
         # Rounding may leave it slightly indefinite.
-        lifted = (-torch.linalg.eigvalsh(rest)[:, 0]).clamp(min=0) + LEAST_STD**2
-        lower = torch.linalg.cholesky(rest + lifted[:, None, None] * eye)
+        lifted = (-torch.linalg.eigvalsh(rest)[:, :1]).clamp(min=0) + least
+        lower = torch.linalg.cholesky(rest + torch.diag_embed(lifted))
         std = lower.diagonal(dim1=1, dim2=2)
         # x = m + unit @ (std * noise): each dimension's mean given those before it, not given their noise
         coupling = (eye - torch.linalg.inv(lower / std[:, None])).tril(-1)

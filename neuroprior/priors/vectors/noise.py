@@ -8,7 +8,13 @@ from torch import Tensor
 
 from neuroprior._checks import check_count
 from neuroprior.plans.vector_plans import VectorPlans
-from neuroprior.priors.vectors.linear_gaussian import LEAST_STD, LinearGaussianPrior, WindowMoments, best_of
+from neuroprior.priors.vectors.linear_gaussian import (
+    CONSTANT_STD,
+    LEAST_STD,
+    LinearGaussianPrior,
+    WindowMoments,
+    best_of,
+)
 
 
 class NoisePrior(LinearGaussianPrior):
@@ -80,7 +86,8 @@ class NoisePrior(LinearGaussianPrior):
 
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         values = self.scaled(plans.actions)[plans.mask()]
-        mean, std = values.mean(0), values.std(0, correction=0).clamp(min=LEAST_STD)
+        mean, std = values.mean(0), values.std(0, correction=0)
+        std = torch.where(std > CONSTANT_STD, std, LEAST_STD)
         if self._given["scale"] is not None:
             mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])
         moments = partial(self._moments, mean, std)

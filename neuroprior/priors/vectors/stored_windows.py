@@ -1,6 +1,7 @@
 """Stored windows: a plan continues as the stored plans did whose past was nearest to its own."""
 
 from collections.abc import Mapping
+from itertools import product
 from typing import Any, ClassVar, Self
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.plans.vector_plans import VectorPlans
-from neuroprior.priors.vectors.linear_gaussian import LEAST_STD, best_of, held_out_split, mean_nats
+from neuroprior.priors.vectors.linear_gaussian import best_of, held_out_split, least_std, mean_nats
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
 BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -40,7 +41,8 @@ class StoredWindows(VectorPrior):
     over the last `match` vectors. It is followed with independent Gaussian noise, and then the next one is chosen. As
     which segment is being followed is not known, a vector's density is that of a mixture, weighted by how well each
     segment predicted the vectors since it began. Distances are in units of half the range, or of 32 standard
-    deviations of the stored vectors where that is less.
+    deviations of the stored vectors where that is less; in the same units in all dimensions, or in proportion to the
+    standard deviation of each, whichever predicts held-out plans better.
 
     `read` begins a new segment after the past. `state` is `[N, 2 + match * D + M]`: vectors known, place in the
     segment, the last vectors, and the log-weights of M stored segments.
@@ -65,11 +67,12 @@ class StoredWindows(VectorPrior):
     """
 
     later: ClassVar[Mapping[str, float]] = {"extent": 1.0}
+    tables = ("extent",)
 
     segments: Tensor
 
     extent: Tensor
-    """The unit of distances as a share of half the range. At most 1, see `EXTENT`."""
+    """`[D]`, or `[]` in files of earlier versions: the units of distances as shares of half the range."""
 
     def __init__(
         self,
@@ -94,7 +97,7 @@ class StoredWindows(VectorPrior):
         self.memory = match
         # Before anything is learned, one segment in the middle of the range.
         self.register_buffer("segments", torch.zeros(1, match + horizon, self.action_size))
-        self.register_buffer("extent", torch.tensor(1.0))
+        self.register_buffer("extent", torch.ones(self.action_size))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -117,6 +120,9 @@ class StoredWindows(VectorPrior):
             raise ValueError(f"bandwidth, noise: numbers above 0 are expected, not {self.bandwidth}, {self.noise}")
         self.register_buffer("segments", torch.zeros(shape, device=self.device))
 
+    def tables_fit(self) -> bool:
+        return self.extent.shape in ((), (self.action_size,)) and bool((self.extent > 0).all())
+
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         self.check_settings(settings)
         plans = self.training_plans(plans)
@@ -125,23 +131,26 @@ class StoredWindows(VectorPrior):
             if not len(learning.windows(self.match + self.horizon)):
                 # Too few to hold any out: on those that are stored the least noise would look best.
                 self.bandwidth, self.noise = self._given["bandwidth"] or BANDWIDTH, self._given["noise"] or NOISE
-                self._store(plans, self.max_windows)
+                self._store(plans, self.max_windows, True)
                 return self
-            self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH))
             lengths, order = held_out.mask().sum(1).sort(descending=True, stable=True)
             enough = max(int((lengths.cumsum(0) <= MOST_CHOSEN_ON).sum()), 1)
             held_out = held_out[order[:enough]].steps(0, MOST_CHOSEN_ON)
             bandwidths = (self._given["bandwidth"],) if self._given["bandwidth"] else BANDWIDTHS
             noises = (self._given["noise"],) if self._given["noise"] else NOISES
             scores = {}
-            for self.bandwidth in bandwidths:
-                for self.noise in noises:
-                    scores[self.bandwidth, self.noise] = mean_nats(self, held_out)
-            self.bandwidth, self.noise = best_of(scores)
-        self._store(plans, self.max_windows)
+            for own in (False, True):
+                self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH), own)
+                for self.bandwidth, self.noise in product(bandwidths, noises):
+                    scores[self.bandwidth, self.noise, own] = mean_nats(self, held_out)
+            self.bandwidth, self.noise, own = best_of(scores)
+        else:
+            own = True
+        self._store(plans, self.max_windows, own)
         return self
 
-    def _store(self, plans: VectorPlans, most: int) -> None:
+    def _store(self, plans: VectorPlans, most: int, own: bool) -> None:
+        """Store the windows; with `own`, the units of distances are in proportion to the spread of each dimension."""
         size = self.match + self.horizon
         windows = plans.windows(size)
         if not len(windows):
@@ -152,8 +161,11 @@ class StoredWindows(VectorPrior):
         if len(windows) > most:
             windows = windows[torch.linspace(0, len(windows) - 1, most).round().long()]
         self.register_buffer("segments", self.scaled(windows).to(self.device))
-        std = self.segments.var((0, 1), correction=0).mean().sqrt()
-        self.extent = (EXTENT * std).clamp(LEAST_STD / NOISES[0], 1)
+        variance = self.segments.var((0, 1), correction=0)
+        std, stds = variance.mean().sqrt(), variance.sqrt()
+        extent = (EXTENT * std).maximum(least_std(std) / NOISES[0]).clamp(max=1)
+        in_proportion = (extent * stds / std).maximum(least_std(stds) / NOISES[0])
+        self.extent = in_proportion if own and std > 0 else extent.expand(self.action_size).contiguous()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         empty = torch.zeros(batch_size, 2 + self.match * self.action_size, device=self.device)
@@ -191,11 +203,13 @@ class StoredWindows(VectorPrior):
 
     def _matches(self, past: Tensor, known: int) -> Tensor:
         """The log-weights `[N, M]` of segments after `past [N, match * D]`, of which the last `known` vectors count."""
-        size = self.action_size
-        own = past[:, (self.match - known) * size :]
-        stored = self.segments[:, self.match - known : self.match].flatten(1)
+        own, stored = (
+            # From one of the vectors: dimensions that hardly vary would be lost in rounding.
+            ((vectors[:, self.match - known :] - self.segments[0, 0]) / (self.bandwidth * self.extent)).flatten(1)
+            for vectors in (past.unflatten(1, (self.match, self.action_size)), self.segments[:, : self.match])
+        )
         distances = own.square().sum(-1)[:, None] + stored.square().sum(-1) - 2 * own @ stored.T
-        return (-distances / (2 * (self.bandwidth * self.extent) ** 2)).log_softmax(-1)
+        return (-distances / 2).log_softmax(-1)
 
     def _forecast(self, state: Tensor, place: int) -> tuple[GaussianForecast, Tensor]:
         mean = self.unscaled(self.segments[:, self.match + place]).expand(len(state), -1, -1)
