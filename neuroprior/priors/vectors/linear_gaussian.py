@@ -4,6 +4,7 @@ import sys
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
+from math import log, pi
 from typing import Any, NamedTuple, Self, TypeVar
 
 import torch
@@ -28,6 +29,9 @@ of half the range, of vectors that count as constant.
 
 HELD_OUT = 0.2
 """Share of the plans (or groups) on which settings are chosen."""
+
+FEW_AT_BOUNDS, CENSORED_STEPS = 0.005, 50
+"""The share of vectors at the bounds of a dimension up to which they count as they are, and steps of EM for more."""
 
 LARGEST = 2**21
 """Numbers of the covariances, and of the predictions, of several settings that are computed together."""
@@ -306,11 +310,42 @@ def best_of(scores: Mapping[Key, float]) -> Key:
 
 
 def window_moments(windows: Tensor) -> WindowMoments:
-    """Those of `windows [M, W, D]`, M >= 1."""
-    flat = windows.flatten(1).double()
+    """Those of `windows [M, W, D]`, M >= 1, where a last vector at a bound counts as what may lie beyond it."""
+    past, (last, variance) = windows[:, :-1].flatten(1).double(), beyond_bounds(windows)
+    flat = torch.cat([past, last], 1)
     mean = flat.mean(0)
     centred = flat - mean
-    return WindowMoments(mean, centred.T @ centred / len(flat))
+    covariance = centred.T @ centred / len(flat)
+    covariance.diagonal()[past.shape[1] :] += variance
+    return WindowMoments(mean, covariance)
+
+
+def beyond_bounds(windows: Tensor) -> tuple[Tensor, Tensor]:
+    """What the last vectors of `windows [M, W, D]` would be without bounds, in a linear regression on those before.
+
+    Expectation maximisation for censored regression (Amemiya 1984, Tobit models: a survey, section 4).
+
+    Returns:
+        Their expectations `[M, D]`, of values inside the bounds these values, and the mean of their variances `[D]`.
+    """
+    given, last = windows[:, :-1].flatten(1).double(), windows[:, -1].double()
+    at, side = last.abs() >= 1, last.sign()
+    variance = torch.zeros_like(last)
+    if float(at.double().mean(0).max()) < FEW_AT_BOUNDS:
+        return last, variance[0] * 0
+    given = given - given.mean(0)
+    known = given.T @ given / len(given)
+    known.diagonal().add_(known.diagonal().mean().nan_to_num() * 1e-3 + 1e-9)
+    value = last
+    for _ in range(CENSORED_STEPS):
+        middle = value.mean(0)
+        mean = middle + given @ torch.linalg.solve(known, given.T @ (value - middle) / len(given))
+        std = ((value - mean).square() + variance).mean(0).sqrt().clamp(min=LEAST_STD)
+        away = (1 - side * mean) / std
+        rate = (-away.square() / 2 - torch.special.log_ndtr(-away) - log(2 * pi) / 2).exp()
+        value = torch.where(at, mean + side * std * rate, last)
+        variance = torch.where(at, std.square() * (1 + away * rate - rate.square()).clamp(min=0), 0.0)
+    return value, variance.mean(0)
 
 
 def moments_or_white(windows: Tensor, values: Tensor, memory: int) -> WindowMoments:

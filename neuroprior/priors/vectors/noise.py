@@ -14,6 +14,7 @@ from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
     WindowMoments,
     best_of,
+    window_moments,
 )
 
 
@@ -86,7 +87,8 @@ class NoisePrior(LinearGaussianPrior):
 
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         values = self.scaled(plans.actions)[plans.mask()]
-        mean, std = values.mean(0), values.std(0, correction=0)
+        mean, covariance, _ = window_moments(values[:, None])
+        std = covariance.diagonal().sqrt()
         std = torch.where(std > CONSTANT_STD, std, LEAST_STD)
         if self._given["scale"] is not None:
             mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])

@@ -143,7 +143,8 @@ class StoredWindows(VectorPrior):
                 self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH), own)
                 for self.bandwidth, self.noise in product(bandwidths, noises):
                     scores[self.bandwidth, self.noise, own] = mean_nats(self, held_out)
-            self.bandwidth, self.noise, own = best_of(scores)
+                self.bandwidth, self.noise, own = best_of(scores)
+                bandwidths = (self.bandwidth,)
         else:
             own = True
         self._store(plans, self.max_windows, own)

@@ -45,7 +45,7 @@ def test_linear_priors(make, length, monkeypatch):
     fast, slow = drawn(prior, pasts(length), monkeypatch)
     torch.testing.assert_close(fast, slow, atol=1e-5, rtol=1e-5)
     assert (slow == HIGH).any()
-    assert slow.std(1).amin() > 0
+    assert slow.std(1).amax(-1).amin() > 0  # not in all dimensions: a step may be at a bound in all plans
 
 
 @pytest.mark.parametrize("length", [0, 1, 7])
