@@ -24,6 +24,9 @@ PARTS, LEAST_ACTIONS = 3, 2
 FEW_GROUPS, FOLDS = 15, 5
 """Groups below which the comparison is a cross-validation, as a tenth of them would be one; and its folds."""
 
+LONG = 100
+"""Actions in each of two plans (or groups) that are enough: validation takes the end of one (or some of the plans)."""
+
 MOST_INDICES = 2**20
 """Actions or contexts beyond which indices are taken for names that look like numbers."""
 
@@ -147,7 +150,8 @@ class PlansData(PlansModule):
         if self.folds == 1:
             rest, self.held_out = self.plans.split(held_out, generator)
             share = validation / (1 - held_out)
-        self.learned_from, self.chosen_on = rest.split(share, generator)
+        two = num_units(self.plans) == 2 and rest is self.plans
+        self.learned_from, self.chosen_on = (_split_two if two else Plans.split)(rest, share, generator)
         for name, part in (("validation", self.chosen_on), ("held_out", self.held_out)):
             if int(part.mask().sum()) < LEAST_ACTIONS:
                 raise ValueError(
@@ -194,9 +198,10 @@ class PriorModel(PriorModule):
         except TypeError as error:
             if "unexpected keyword" not in str(error) or data.plans.context is None:
                 raise
+            wanted = "context_size, for features" if "context_size" in str(error) else "num_contexts, for indices"
             raise ValueError(
-                "model.prior: it cannot take the context of these plans; use --model.use_context false, or another"
-                f" prior ({error})"
+                f"model.prior: it cannot take the context of these plans (it has no {wanted}); use --model.use_context"
+                " false, or another prior"
             ) from error
         if made.takes_context:
             made.past_durations = data.past_durations
@@ -204,18 +209,36 @@ class PriorModel(PriorModule):
 
 
 def _in_parts(plans: Plans) -> Plans:
-    """Plans that can be split in three; a single group is dropped, so that its plans can be split."""
+    """Plans that can be split in three, or in two folds; a single group is dropped, so that its plans can be split."""
     units, what = num_units(plans), _what(plans)
     if units == 1:
         if plans.group is not None:
             return _in_parts(ungrouped(plans))
         units, what = int(plans.mask().sum()), "actions"
-    if units < PARTS:
+    if units < PARTS and not (units == 2 and _fewest_actions(plans) >= LONG):
+        long = f", or 2 of at least {LONG} actions" if what != "actions" else ""
         raise ValueError(
             f"data: {units} {what} cannot be split in three, to learn from, for validation and held out;"
-            f" at least {PARTS} {what} are needed"
+            f" at least {PARTS} {what} are needed{long}"
         )
     return plans
+
+
+def _fewest_actions(plans: Plans) -> int:
+    """Actions of the group with the fewest, or of the plan where there are no groups."""
+    unit = torch.arange(len(plans)) if plans.group is None else plans.group.unique(return_inverse=True)[1].cpu()
+    return int(unit.bincount(plans.mask().sum(1).cpu()).min())
+
+
+def _split_two(plans: Plans, share: float, generator: torch.Generator) -> tuple[Plans, Plans]:
+    """Two plans or groups, to learn from and for validation: one of them would be half, so that less is held out."""
+    if len(plans) > 2:
+        return ungrouped(plans).split(share, generator)
+    lengths = plans.mask().sum(1)
+    row, longest = int(lengths.argmax()), int(lengths.max())
+    cut = longest - max(min(round(share * int(lengths.sum())), longest // 2), 1)
+    lengths[row] = cut
+    return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut, longest)
 
 
 def _what(plans: Plans) -> str:
@@ -227,7 +250,8 @@ def _folds(plans: Plans, wanted: int | None) -> int:
     """How many folds; 1: a share of the plans is held out."""
     units = num_units(plans)
     if wanted is None:
-        return min(FOLDS, units) if plans.group is not None and units < FEW_GROUPS else 1
+        few = units == 2 or (plans.group is not None and units < FEW_GROUPS)
+        return min(FOLDS, units) if few else 1
     if not 1 <= wanted <= units:
         raise ValueError(f"data.folds: from 1 to the number of {_what(plans)}, {units}, is expected, not {wanted}")
     return wanted

@@ -43,7 +43,8 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
     """
     if not isinstance(prior, Prior):
         raise ValueError(
-            f"prior: a fitted prior is expected (neuroprior.load gives that of a folder), not {type(prior).__name__}"
+            "prior: a fitted prior of numbered actions is expected (neuroprior.load gives that of a folder), not"
+            f" {type(prior).__name__}"
         )
     with torch.no_grad():
         log_probs = prior.action_log_probs(match_plans(plans, prior))

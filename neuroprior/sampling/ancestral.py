@@ -67,6 +67,11 @@ def sample(
         torch.Size([3, 5])
     """
     _check(num_plans, length, temperature, batch_size)
+    if not hasattr(prior, "num_actions"):
+        raise ValueError(
+            f"prior: one over numbered actions is expected, not {type(prior).__name__}; priors over vectors have a"
+            " method sample of their own"
+        )
     # Memory of the plans, and of the uniform numbers with which some are drawn together.
     each = action_dtype(prior.num_actions).itemsize
     check_memory((each * num_plans + 4 * min(num_plans, batch_size)) * length, num_plans=num_plans, length=length)

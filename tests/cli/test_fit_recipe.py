@@ -140,3 +140,22 @@ def test_collected_plans_have_the_context_that_was_asked_for():
         assert (None if own is None else tuple(own.shape)) == shape
     with refuses("either --data.file, or both"):
         PlansData(world=world)
+
+
+def test_two_long_plans_are_folds_and_the_end_of_the_longer_is_for_validation(data_of):
+    actions = torch.arange(2 * 300).view(2, 300) % 7
+    data = data_of(Plans(actions, 7, torch.tensor([200, 300])))
+    assert data.folds == 2
+    assert data.held_out.mask().sum() == 500
+    assert data.learned_from.mask().sum(1).tolist() == [200, 250]
+    assert data.chosen_on.actions[0, :50].equal(data.plans.actions[1, 250:])
+    assert data.chosen_on.mask().sum() == 50
+    with refuses("2 plans cannot be split in three", "3 plans", "2 of at least 100 actions"):
+        data_of(Plans(actions, 7, torch.tensor([99, 300])))
+
+
+def test_of_two_groups_some_plans_are_for_validation(data_of):
+    plans = Plans(torch.arange(40 * 10).view(40, 10) % 7, 7, group=torch.arange(40) % 2)
+    data = data_of(plans)
+    assert data.folds == 2
+    assert [len(part) for part in (data.learned_from, data.chosen_on, data.held_out)] == [36, 4, 40]

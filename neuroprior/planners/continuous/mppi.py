@@ -117,7 +117,9 @@ class MPPIPlanner(VectorPlanner):
             raise ValueError("score: finite numbers are expected, of which MPPI makes weights; a score is infinite")
         less = score - score.amax(1, keepdim=True)
         if self.normalise:
-            spread = (score - score.mean(1, keepdim=True)).square().mean(1, keepdim=True).sqrt()
-            # Equally good candidates have equal weights.
+            # Equally good candidates have equal weights; squares of what is far from 1 would be infinite, or 0.
+            widest = less.abs().amax(1, keepdim=True)
+            less = less / torch.where(widest > 0, widest, 1)
+            spread = less.std(1, correction=0, keepdim=True)
             less = less / torch.where(spread > 0, spread, 1)
         return less / self.temperature
