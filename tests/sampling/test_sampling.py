@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, TransformerPrior, UniformPrior, World, sample
+from neuroprior.priors import NoisePrior
 from neuroprior.sampling import ancestral, sample_in_world, stepping
 from neuroprior.sampling.draws import Draw
 from tests.support.sources import (
@@ -499,3 +500,8 @@ def test_nothing_is_drawn_from_logits_that_are_none(method, wrong):
 
     with pytest.raises(ValueError, match="prior: its logits are NaN or infinite, or -inf for all"):
         sample(Wrong(3), 1000, 4, generator=seeded(0), method=method)
+
+
+def test_a_prior_over_vectors_is_refused():
+    with refuses("prior", "numbered actions", "NoisePrior", "method sample"):
+        sample(NoisePrior([-1.0], [1.0]), 2, 3)

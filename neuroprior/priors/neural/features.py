@@ -6,7 +6,7 @@ from torch import Tensor, nn
 MOST = 10.0
 """Standard deviations beyond which a feature counts as so far away: a network knows nothing of what lies there."""
 
-GROSS = 5.0
+GROSS = 20.0
 """How many times as large as the robust one a standard deviation is that is due to a few values far away."""
 
 QUARTILES_APART = 1.349

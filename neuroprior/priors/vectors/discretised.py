@@ -95,6 +95,7 @@ class DiscretisedPrior(VectorPrior):
         self.check_settings(settings)
         plans = self.training_plans(plans)
         if not self._learned:
+            self.warn_if_coarse(plans)
             self._edges.copy_(self._quantiles(plans.actions[plans.mask()]))
             self._learned = True
         if isinstance(settings.get("validation"), VectorPlans):

@@ -337,6 +337,8 @@ class VectorNetwork(VectorPrior):
         how, first = Settings(**(DEFAULTS | settings)), self.learns_anew
         known, memory = self.action_names, self.memory
         plans = self.training_plans(plans)
+        if first:
+            self.warn_if_coarse(plans)
         if how.max_steps is None:
             how = replace(how, max_steps=min(max(int(plans.mask().sum()) // VECTORS_A_STEP, FEWEST), MOST))
         seed = draw_seed(generator_on(generator, "cpu"))

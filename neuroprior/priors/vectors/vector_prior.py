@@ -1,5 +1,6 @@
 """The interface of a prior over vectors in time, and what it predicts: a distribution over the next vector."""
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
 from math import log, pi
@@ -13,6 +14,9 @@ from neuroprior._random import generator_on
 from neuroprior.plans.vector_plans import VectorPlans, as_floats, check_widths, same_bounds
 from neuroprior.priors.saved import SavedModule
 from neuroprior.worlds.continuous.continuous_world import check_vectors
+
+COARSE = 0.02
+"""Standard deviations of less than this, in units of half the range, are lost in networks and in bins."""
 
 INNERMOST = 1 - 2**-24
 """The largest float32 number below 1."""
@@ -425,6 +429,19 @@ class VectorPrior(SavedModule):
         if plans.action_names is not None:
             self.action_names = tuple(map(str, plans.action_names))
         return plans[plans.mask().any(1)]
+
+    def warn_if_coarse(self, plans: VectorPlans) -> None:
+        """Warn where the bounds of a dimension are so wide that what vectors do in it is lost to this prior."""
+        std = self.scaled(plans.actions)[plans.mask()].std(0, correction=0)
+        coarse = ((std > 0) & (std < COARSE)).nonzero()[:, 0].tolist()
+        if coarse:
+            d = coarse[0]
+            warnings.warn(
+                f"dimension {d} has a standard deviation of {float(std[d] * self.half_range[d]):.2g} between bounds"
+                f" {float(self.action_low[d]):.4g} and {float(self.action_high[d]):.4g}, of which {type(self).__name__}"
+                " learns little; give plans and prior narrower bounds",
+                stacklevel=3,
+            )
 
     @property
     def fit_settings(self) -> tuple[str, ...]:

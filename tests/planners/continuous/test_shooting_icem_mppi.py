@@ -276,3 +276,18 @@ def test_the_noise_has_its_spectrum(length, beta):
     assert ((mean - wanted).abs() < 6 * (error + error[1] * wanted / wanted[1])).all()
     if beta:
         assert noise.var(1, correction=0).mean() == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e-12, 1e20, 1e30])
+def test_mppi_weighs_candidates_by_rewards_of_any_size(scale):
+    class Scaled(Cart):
+        def step(self, state, action, generator=None):
+            state, reward = super().step(state, action, generator)
+            return state, reward * self.scale
+
+    decisions = []
+    for size in (1.0, scale):
+        world = Scaled()
+        world.scale = size
+        decisions.append(MPPIPlanner(3, 8).plan(world, world.reset(4, seeded(1)), seeded(0)).plan)
+    assert torch.allclose(*decisions, atol=1e-4)

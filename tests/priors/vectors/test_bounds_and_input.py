@@ -27,6 +27,7 @@ CLOSED = {
     "step synergies": lambda low, high: StepSynergies(low, high),
     "stored windows": lambda low, high: StoredWindows(low, high, 2, 4, max_windows=6),
 }
+WIDE = CLOSED | {"stored windows": lambda low, high: StoredWindows(low, high, 2, 10)}
 KINDS = CLOSED | {
     "discretised": lambda low, high: DiscretisedPrior(low, high, 6),
     "gru": lambda low, high: VectorGRU(low, high, width=8),
@@ -174,3 +175,65 @@ def test_stored_windows_where_too_few_plans_can_be_held_out(num):
         prior = StoredWindows([-1.0], [1.0]).fit(few, generator=seeded(seed))
         assert len(prior.segments) == 3
         assert prior.log_prob(few).isfinite().all()
+
+
+def walk(num, seed, scale=0.05, dims=2, rho=0.8):
+    """An autoregression of order 1, kept between -1 and 1."""
+    noise, rows = scale * torch.randn(num, 60, dims, generator=seeded(seed)), [torch.zeros(num, dims)]
+    for t in range(1, 60):
+        rows.append((rho * rows[-1] + noise[:, t]).clamp(-1, 1))
+    return torch.stack(rows, 1)
+
+
+@pytest.mark.parametrize("kind", WIDE)
+def test_wide_bounds_make_no_difference(kind):
+    """Bounds of simulators are sometimes far wider than what is done."""
+    values, found, spread = walk(20, 0), [], []
+    for most in (10.0, 1000.0):
+        plans = VectorPlans(values, [-most] * 2, [most] * 2)
+        prior = WIDE[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded())
+        found.append(float(prior.log_prob(plans).mean()))
+        spread.append(float(prior.sample(2000, 20, generator=seeded(1)).std()))
+    assert found[1] == pytest.approx(found[0], abs=0.1)
+    assert spread[1] == pytest.approx(spread[0], rel=1e-3)
+    assert spread[0] == pytest.approx(float(values.std()), rel=0.3)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda *bounds: VectorGRU(*bounds, width=4), lambda *bounds: DiscretisedPrior(*bounds, num_bins=4)]
+)
+def test_priors_that_wide_bounds_make_coarse_say_so(make):
+    plans = VectorPlans(walk(6, 0), [-1.0, -100.0], [1.0, 100.0])
+    how = {} if isinstance(make([-1.0], [1.0]), DiscretisedPrior) else {"max_steps": 2, "progress": False}
+    with pytest.warns(UserWarning, match=r"dimension 1 .* narrower bounds"):
+        make(plans.action_low, plans.action_high).fit(plans, generator=seeded(), **how)
+
+
+def test_stored_windows_are_followed_in_each_dimension_as_closely_as_it_varies():
+    values = torch.cat([walk(20, 0, 0.25, 1, 0.9), walk(20, 1, 0.01, 1, 0.9), torch.full((20, 60, 1), 0.25)], 2)
+    prior = StoredWindows([-1.0] * 3, [1.0] * 3).fit(VectorPlans(values, [-1.0] * 3, [1.0] * 3), generator=seeded())
+    own, drawn = values.std((0, 1)), prior.sample(500, 60, generator=seeded(1))[0].std((0, 1))
+    assert drawn[:2].tolist() == pytest.approx(own[:2].tolist(), rel=0.4)
+    assert drawn[2] < 0.02
+
+
+@pytest.mark.parametrize("kind", [NoisePrior, AutoregressivePrior, StepSynergies])
+def test_vectors_beyond_the_bounds_count_as_such(kind):
+    """The censored Gaussian with standard deviation 2: five standard errors of 20,000 draws are about .1."""
+    values = (2 * torch.randn(400, 50, 1, generator=seeded(0)) + 0.5).clamp(-1, 1)
+    plans = VectorPlans(values, [-1.0], [1.0])
+    prior = kind([-1.0], [1.0]).fit(plans, generator=seeded())
+    forecast, _ = prior.read(torch.zeros(1, 3, 1))
+    assert float(forecast.mean) == pytest.approx(0.5, abs=0.1)
+    assert float(forecast.std) == pytest.approx(2.0, abs=0.1)
+    drawn = prior.sample(20_000, 1, generator=seeded(1))
+    assert float((drawn == 1).float().mean()) == pytest.approx(float((values == 1).float().mean()), abs=0.025)
+
+
+def test_a_censored_autoregression_is_recovered():
+    plans = VectorPlans(walk(400, 0, 1.0, 1), [-1.0], [1.0])
+    prior = AutoregressivePrior([-1.0], [1.0], order=1).fit(plans, generator=seeded())
+    ends, means = torch.tensor([[[-1.0]], [[0.0]], [[1.0]]]), [-0.8, 0.0, 0.8]
+    forecast, _ = prior.read(ends)
+    assert forecast.mean.flatten().tolist() == pytest.approx(means, abs=0.06)
+    assert float(forecast.std.mean()) == pytest.approx(1.0, abs=0.05)
