@@ -120,6 +120,6 @@ class MPPIPlanner(VectorPlanner):
             # Equally good candidates have equal weights; squares of what is far from 1 would be infinite, or 0.
             widest = less.abs().amax(1, keepdim=True)
             less = less / torch.where(widest > 0, widest, 1)
-            spread = less.std(1, correction=0, keepdim=True)
+            spread = (less - less.mean(1, keepdim=True)).square().mean(1, keepdim=True).sqrt()
             less = less / torch.where(spread > 0, spread, 1)
         return less / self.temperature
