@@ -204,7 +204,12 @@ class VectorPlanner(ABC):
             return torch.zeros(len(state), 0, self.length, world.action_size, device=state.device)
         context = None
         if self.prior.takes_context:
-            context = torch.cat([memory.observations, world.observe(state)[:, None]], 1)
+            observed = world.observe(state)
+            if observed.shape[1:] != (self.prior.context_size,):
+                raise ValueError(
+                    f"prior: it takes {self.prior.context_size} features, the world shows {list(observed.shape[1:])}"
+                )
+            context = torch.cat([memory.observations, observed[:, None]], 1)
         noise = self.prior_as == "noise"
         drawn = self.prior.sample(number * (1 + noise), self.length, context, past=memory.past, generator=generator)
         drawn = drawn.to(state.device)

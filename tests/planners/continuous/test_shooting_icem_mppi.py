@@ -291,3 +291,11 @@ def test_mppi_weighs_candidates_by_rewards_of_any_size(scale):
         world.scale = size
         decisions.append(MPPIPlanner(3, 8).plan(world, world.reset(4, seeded(1)), seeded(0)).plan)
     assert torch.allclose(*decisions, atol=1e-4)
+
+
+@pytest.mark.parametrize("make", [ICEMPlanner, MPPIPlanner, ShootingPlanner])
+def test_a_prior_that_takes_other_features_is_refused(make):
+    world = Cart()  # shows three numbers
+    planner = make(3, 8, prior=drift(world, context_size=2), prior_share=0.5)
+    with refuses("prior", "2 features", "[3]"):
+        planner.plan(world, world.reset(2))
