@@ -15,6 +15,25 @@ def is_integer(values: Tensor) -> bool:
     return not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
 
 
+LOST = 0.05
+"""Share of the standard deviation of a feature that may be lost in single precision."""
+
+
+def check_single_precision(name: str, features: Tensor) -> None:
+    """Raise ValueError where `features [..., C]` vary by so little, far from 0, that float32 does not hold it."""
+    if features.dtype != torch.float64 or not features.numel():
+        return
+    values = features.flatten(0, -2)
+    std, largest = values.std(0, correction=0), values.abs().amax(0)
+    lost = ((values - values.float()).abs().amax(0) > LOST * std) & (std > 1e-13 * largest)
+    if lost.any():
+        c = int(lost.int().argmax())
+        raise ValueError(
+            f"{name}: feature {c + 1} of {len(lost)} is about {float(values[:, c].mean()):.4g}, where single precision"
+            " does not hold how it varies; subtract a constant from it"
+        )
+
+
 def check_range(name: str, values: Tensor, stop: int, what: str) -> None:
     """Raise ValueError unless `values` are integers from 0 to `stop` - 1; the message names the first that is not."""
     if not is_integer(values):

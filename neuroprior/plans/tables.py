@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior._checks import is_number
+from neuroprior._checks import check_single_precision, is_number
 from neuroprior.plans.columns import (
     Column,
     Floats,
@@ -606,7 +606,9 @@ def _context(table: Table, row: Integers, lengths: Integers) -> dict[str, Any]:
         else:
             return _named("context", padded(numbers, lengths, table.of), names)
     columns = [table.numbers("context", at)[row] for at in table.context]
-    features: Floats = np.stack(columns, 1).astype(np.float32)
+    whole = np.stack(columns, 1)
+    check_single_precision(f"{table.of}: context", torch.from_numpy(whole))
+    features: Floats = whole.astype(np.float32)
     wrong = np.argwhere(~np.isfinite(features))
     if wrong.size:
         raise ValueError(f"{place(int(row[wrong[0, 0]]))}: context: a finite number is expected in each column")

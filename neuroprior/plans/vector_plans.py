@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, check_share, check_sizes, is_integer
+from neuroprior._checks import check_range, check_share, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.sequences import Sequences
 
@@ -100,6 +100,8 @@ class VectorPlans(Sequences):
     def _check_context(self, num: int, length: int) -> None:
         context = as_floats("context", self.context)
         shape = tuple(context.shape)
+        if context.dim() > 1:
+            check_single_precision("context", torch.as_tensor(self.context))
         if shape[:-1] not in ((num,), (num, length)):
             raise ValueError(
                 f"context: features of shape [{num}, C] or [{num}, {length}, C] are expected, not {list(shape)}"

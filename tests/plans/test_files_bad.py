@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans import read_plans, write_plans
+from neuroprior.plans import VectorPlans, read_plans, write_plans
 from tests.support.sources import refuses
 
 ONE = Plans(torch.tensor([[0, 1]]), 2)
@@ -297,3 +297,19 @@ def assert_plans_or_one_line(path, content):
         message = str(error)
     assert str(path) in message
     assert len(message.splitlines()) == 1
+
+
+def times(start):
+    return "plan,action,context_1,context_2\n" + "".join(f"p{i // 5},{i % 3},0.1,{start + 60 * i}\n" for i in range(10))
+
+
+def test_features_that_single_precision_does_not_hold(tmp_path):
+    """Minutes as seconds since 1970, where float32 counts in steps of 128; not a constant that it rounds."""
+    (tmp_path / "a.csv").write_text(times(1.7e9))
+    with refuses("context", "feature 2 of 2", "1.7e+09", "subtract a constant"):
+        read_plans(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text(times(0))
+    assert read_plans(tmp_path / "a.csv").context.shape == (2, 5, 2)
+    context = 1.7e9 + torch.arange(10, dtype=torch.float64).view(2, 5, 1)
+    with refuses("context", "feature 1 of 1", "single precision"):
+        VectorPlans(torch.zeros(2, 5, 1), [-1.0], [1.0], context=context)
