@@ -25,7 +25,9 @@ FEW_GROUPS, FOLDS = 15, 5
 """Groups below which the comparison is a cross-validation, as a tenth of them would be one; and its folds."""
 
 LONG = 100
-"""Actions in each of two plans (or groups) that are enough: validation takes the end of one (or some of the plans)."""
+"""Two plans or groups are enough if each has so many actions; validation then takes some of the plans, or the end of
+the longest.
+"""
 
 MOST_INDICES = 2**20
 """Actions or contexts beyond which indices are taken for names that look like numbers."""
@@ -80,7 +82,7 @@ class PlansData(PlansModule):
         held_out: share of plans (or groups) for the table at the end; nothing is learned or chosen on them.
         folds: of a cross-validation over groups (over plans without groups), in place of a held-out share: the prior
             and the baselines are fitted once more for each fold, for the table alone, and the prior that is saved
-            learns from all plans. null: 5 with fewer than 15 groups, else 1, which holds out a share.
+            learns from all plans. null: 5 with fewer than 15 groups, 2 with two plans, else 1, which holds out a share.
         batch_size: plans a step (pieces of plans, where they are longer than a window); null for as many as have about
             2,048 actions.
         window: actions that a step reads of a plan; longer plans are read in windows, the hidden state carried over.
@@ -231,12 +233,18 @@ def _fewest_actions(plans: Plans) -> int:
 
 
 def _split_two(plans: Plans, share: float, generator: torch.Generator) -> tuple[Plans, Plans]:
-    """Two plans or groups, to learn from and for validation: one of them would be half, so that less is held out."""
-    if len(plans) > 2:
-        return ungrouped(plans).split(share, generator)
+    """Two plans or groups, to learn from and for validation: one of them would be half, so that less is held out.
+
+    Of many plans some are held out, unless these are no such share of the actions; else the end of the longest.
+    """
+    plans = plans[plans.mask().any(1)]
     lengths = plans.mask().sum(1)
-    row, longest = int(lengths.argmax()), int(lengths.max())
-    cut = longest - max(min(round(share * int(lengths.sum())), longest // 2), 1)
+    row, longest, total = int(lengths.argmax()), int(lengths.max()), int(lengths.sum())
+    if len(plans) > 2:
+        learned, chosen = ungrouped(plans).split(share, generator)
+        if share / 2 <= int(chosen.mask().sum()) / total <= (1 + share) / 2:
+            return learned, chosen
+    cut = longest - max(min(round(share * total), longest // 2), 1)
     lengths[row] = cut
     return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut, longest)
 

@@ -159,3 +159,12 @@ def test_of_two_groups_some_plans_are_for_validation(data_of):
     data = data_of(plans)
     assert data.folds == 2
     assert [len(part) for part in (data.learned_from, data.chosen_on, data.held_out)] == [36, 4, 40]
+
+
+def test_of_two_unequal_groups_a_share_of_the_actions_is_for_validation(data_of):
+    actions = torch.arange(3 * 2000).view(3, 2000) % 7
+    plans = Plans(actions, 7, torch.tensor([2000, 100, 3]), group=torch.tensor([0, 1, 1]))
+    for seed in range(4):
+        data = data_of(plans, seed=seed)
+        assert 100 <= data.chosen_on.mask().sum() <= 211
+        assert data.learned_from.mask().sum() + data.chosen_on.mask().sum() == 2103

@@ -115,6 +115,7 @@ class MPPIPlanner(VectorPlanner):
         """The logarithms of the weights `[B, P]`, up to a constant in each row."""
         if not score.isfinite().all():
             raise ValueError("score: finite numbers are expected, of which MPPI makes weights; a score is infinite")
+        score = score.double()  # differences of scores near the limits of float32 would be infinite
         less = score - score.amax(1, keepdim=True)
         if self.normalise:
             # Equally good candidates have equal weights; squares of what is far from 1 would be infinite, or 0.

@@ -38,6 +38,9 @@ The held-out likelihood of a law that contains the true one is often a little hi
 exponential durations, the exponential law was chosen for 45 without this, and for 59 with it.
 """
 
+AT_ONCE = 2**18
+"""Durations, each as often as there are parts without it, that laws are fitted to together: of more, part by part."""
+
 FOLDS = 5
 """Parts of the plans, of which each is held out once."""
 
@@ -335,10 +338,14 @@ def _fits_without_parts(
 ) -> tuple[Tensor, Tensor]:
     """K laws `[K, F + 1, C, ...]` fitted to each cell without each of F parts, and last to all; and of how many."""
     parts = int(part.max()) + 1 if parts is None else parts
-    without, index = (part != torch.arange(parts + 1)[:, None]).nonzero(as_tuple=True)
-    sets = Sets(time[index].log(), without * cells + cell[index], (parts + 1) * cells, resolution(time))
-    count = sets.cell.bincount(minlength=sets.number)
-    return fit_laws(sets, laws).unflatten(1, (parts + 1, cells)), count.view(parts + 1, cells)
+    step, found = resolution(time), []
+    for some in torch.arange(parts + 1).split(max(AT_ONCE // max(len(time), 1), 1)):
+        without, index = (part != some[:, None]).nonzero(as_tuple=True)
+        sets = Sets(time[index].log(), without * cells + cell[index], len(some) * cells, step)
+        count = sets.cell.bincount(minlength=sets.number).view(-1, cells)
+        found.append((fit_laws(sets, laws).unflatten(1, (len(some), cells)), count))
+    fits, counts = zip(*found, strict=True)
+    return torch.cat(fits, 1), torch.cat(counts)
 
 
 def _parts(plans: Plans, known: Tensor) -> Tensor:

@@ -6,11 +6,12 @@ from torch import Tensor, nn
 MOST = 10.0
 """Standard deviations beyond which a feature counts as so far away: a network knows nothing of what lies there."""
 
-GROSS = 20.0
-"""How many times as large as the robust one a standard deviation is that is due to a few values far away."""
+CODES = ((0.01, 5.0), (0.05, 10.0), (0.4, 50.0))
+"""Shares of values, those furthest from the median, that are taken for codes such as -9999 if all values have so many
+times the standard deviation of the rest: more than heavy tails make of it."""
 
-QUARTILES_APART = 1.349
-"""Distance of the quartiles of a Gaussian, in standard deviations."""
+VARIED = 0.1
+"""The rest must have this share of values that are not the median: else the far values are what a feature says."""
 
 CONSTANT = 1e-6
 """Of the largest value: a feature that varies less has one value, but for rounding."""
@@ -43,17 +44,25 @@ class Standardise(nn.Module):
     def learn(self, features: Tensor) -> None:
         """Take the means and standard deviations of `features [n, C]`, n > 0.
 
-        Indicators, features that are 0, 1 or -1, stay as they are. Where a few values are so far away that they make
-        most of the standard deviation, such as codes for missing numbers, median and quartiles are taken.
+        Indicators, features that are 0, 1 or -1, stay as they are. Codes for missing numbers, a few values far from
+        all others, do not count; see `CODES`.
         """
         values = features.double()
         mean, std, largest = values.mean(0), values.std(0, correction=0), values.abs().amax(0)
-        low, middle, high = values.sort(0).values[[len(values) * k // 4 for k in (1, 2, 3)]]
-        robust = (high - low) / QUARTILES_APART
-        gross = (robust > CONSTANT * torch.maximum(low.abs(), high.abs())) & (std > GROSS * robust)
-        mean, std = torch.where(gross, middle, mean), torch.where(gross, robust, std)
-        std = torch.where(gross | (std > CONSTANT * largest), std, largest.clamp(min=1))
-        indicator = ((values == 0) | (values.abs() == 1)).all(0)
+        away = (values - values.median(0).values).abs()
+        ordered, kept = away.sort(0).values, torch.ones_like(away, dtype=torch.bool)
+        for share, factor in CODES:
+            near = away <= ordered[len(values) - int(share * len(values)) - 1]
+            number = near.sum(0)
+            middle = (values * near).sum(0) / number
+            spread = (((values - middle) * near).square().sum(0) / number).sqrt()
+            varied = (near & (away > 0)).double().mean(0) >= VARIED
+            coded = varied & (std > factor * spread) & kept.all(0)
+            mean, std = torch.where(coded, middle, mean), torch.where(coded, spread, std)
+            kept = kept & (near | ~coded)
+        largest = torch.where(kept.all(0), largest, (values.abs() * kept).amax(0))
+        std = torch.where(std > CONSTANT * largest, std, largest.clamp(min=1))
+        indicator = ((values == 0) | (values.abs() == 1) | ~kept).all(0)
         self.mean.copy_(mean.masked_fill(indicator, 0))
         self.std.copy_(std.masked_fill(indicator, 1))
         self.most.fill_(MOST)

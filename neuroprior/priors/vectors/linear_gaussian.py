@@ -30,8 +30,9 @@ of half the range, of vectors that count as constant.
 HELD_OUT = 0.2
 """Share of the plans (or groups) on which settings are chosen."""
 
-FEW_AT_BOUNDS, CENSORED_STEPS = 0.005, 50
-"""The share of vectors at the bounds of a dimension up to which they count as they are, and steps of EM for more."""
+FEW_AT_BOUNDS, CENSORED_STEPS, CENSORED_CHANGE = 0.005, 50, 1e-4
+"""The share of vectors at the bounds of a dimension up to which they count as they are; for more, the most steps of EM,
+and the change of a vector with which it ends."""
 
 LARGEST = 2**21
 """Numbers of the covariances, and of the predictions, of several settings that are computed together."""
@@ -122,10 +123,11 @@ class LinearGaussianPrior(VectorPrior):
         """
         found: dict[Key, float] = {}
         values, mask = self.scaled(plans.actions), plans.mask()
-        while len(found) < len(settings):
-            first = moments(settings[len(found)])
+        rest = list(settings)
+        while rest:
+            first = moments(rest[0])
             at_once = max(LARGEST // max(first.covariance.numel(), values.numel()), 1)
-            some = settings[len(found) : len(found) + at_once]
+            some, rest = rest[:at_once], rest[at_once:]
             tables = predictions([first, *map(moments, some[1:])], self.action_size)
             nats = linear_nats(tables, values, self.half_range).masked_fill(~mask, 0)
             means = (nats.double().sum((1, 2)) / mask.sum()).nan_to_num(nan=float("-inf"), neginf=float("-inf"))
@@ -336,15 +338,17 @@ def beyond_bounds(windows: Tensor) -> tuple[Tensor, Tensor]:
     given = given - given.mean(0)
     known = given.T @ given / len(given)
     known.diagonal().add_(known.diagonal().mean().nan_to_num() * 1e-3 + 1e-9)
-    value = last
+    solved, value = torch.linalg.solve(known, given.T) / len(given), last
     for _ in range(CENSORED_STEPS):
-        middle = value.mean(0)
-        mean = middle + given @ torch.linalg.solve(known, given.T @ (value - middle) / len(given))
+        before, middle = value, value.mean(0)
+        mean = middle + given @ (solved @ (value - middle))
         std = ((value - mean).square() + variance).mean(0).sqrt().clamp(min=LEAST_STD)
         away = (1 - side * mean) / std
         rate = (-away.square() / 2 - torch.special.log_ndtr(-away) - log(2 * pi) / 2).exp()
         value = torch.where(at, mean + side * std * rate, last)
         variance = torch.where(at, std.square() * (1 + away * rate - rate.square()).clamp(min=0), 0.0)
+        if float((value - before).abs().max()) < CENSORED_CHANGE:
+            break
     return value, variance.mean(0)
 
 

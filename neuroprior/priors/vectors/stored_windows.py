@@ -42,7 +42,8 @@ class StoredWindows(VectorPrior):
     which segment is being followed is not known, a vector's density is that of a mixture, weighted by how well each
     segment predicted the vectors since it began. Distances are in units of half the range, or of 32 standard
     deviations of the stored vectors where that is less; in the same units in all dimensions, or in proportion to the
-    standard deviation of each, whichever predicts held-out plans better.
+    standard deviation of each, if that predicts held-out plans better; where bandwidth and noise are given, in the
+    same.
 
     `read` begins a new segment after the past. `state` is `[N, 2 + match * D + M]`: vectors known, place in the
     segment, the last vectors, and the log-weights of M stored segments.
@@ -52,7 +53,7 @@ class StoredWindows(VectorPrior):
         match: vectors of the past that are compared.
         horizon: vectors of a segment.
         bandwidth: of the match; None: the one that predicts held-out plans best.
-        noise: standard deviation around the stored vectors; None: chosen in the same way.
+        noise: standard deviation around the stored vectors, in these units; None: chosen in the same way.
         max_windows: segments that are stored at most; of more, as many evenly spaced ones.
 
     Raises:
@@ -131,7 +132,7 @@ class StoredWindows(VectorPrior):
             if not len(learning.windows(self.match + self.horizon)):
                 # Too few to hold any out: on those that are stored the least noise would look best.
                 self.bandwidth, self.noise = self._given["bandwidth"] or BANDWIDTH, self._given["noise"] or NOISE
-                self._store(plans, self.max_windows, True)
+                self._store(plans, self.max_windows, False)
                 return self
             lengths, order = held_out.mask().sum(1).sort(descending=True, stable=True)
             enough = max(int((lengths.cumsum(0) <= MOST_CHOSEN_ON).sum()), 1)
@@ -146,7 +147,7 @@ class StoredWindows(VectorPrior):
                 self.bandwidth, self.noise, own = best_of(scores)
                 bandwidths = (self.bandwidth,)
         else:
-            own = True
+            own = False
         self._store(plans, self.max_windows, own)
         return self
 

@@ -1,7 +1,6 @@
 """Synergies: actions lie near a plane of few dimensions, of windows over time or of single vectors."""
 
 from collections.abc import Callable
-from functools import partial
 from itertools import product
 from typing import Any
 
@@ -153,25 +152,30 @@ class StepSynergies(LinearGaussianPrior):
         if number is None:
             learning, held_out = held_out_split(plans, generator)
             numbers = range(1, self.action_size + 1)
-            number = best_of(self.mean_nats_of(numbers, partial(self._moments, learning), held_out))
-        self.set_window(self._moments(plans, number))
+            number = best_of(self.mean_nats_of(numbers, self._moments(learning), held_out))
+        self.set_window(self._moments(plans)(number))
         self.explained = explained_shares(window_moments(self.scaled(plans.windows(1))).covariance)
 
-    def _moments(self, plans: VectorPlans, number: int) -> WindowMoments:
-        """The Gaussian of windows of `plans` whose vectors lie near a plane of so many dimensions."""
+    def _moments(self, plans: VectorPlans) -> Callable[[int], WindowMoments]:
+        """Makes the Gaussian of windows of `plans` whose vectors lie near a plane of so many dimensions."""
         values = self.scaled(plans.actions)[plans.mask()]
         covariance = window_moments(values[:, None]).covariance
-        vectors = torch.linalg.eigh(covariance)[1][:, -number:]
+        components = torch.linalg.eigh(covariance)[1]
         window, size = self.order + 1, self.action_size
         whole, joint, _ = moments_or_white(self.scaled(plans.windows(window)), values, self.order)
-        # The coordinates keep their covariance over time; what is beside the plane is white, and the same in all
-        # directions.
-        plane = torch.kron(torch.eye(window, dtype=torch.double), vectors @ vectors.T)
-        beside = covariance.trace() - (vectors.T @ covariance @ vectors).trace()
-        white = torch.eye(size, dtype=torch.double) - vectors @ vectors.T
-        level = beside / max(size - number, 1)
-        noise = torch.kron(torch.eye(window, dtype=torch.double), level * white)
-        return WindowMoments(whole, plane @ joint @ plane + noise, RIDGE)
+
+        def moments(number: int) -> WindowMoments:
+            # The coordinates keep their covariance over time; what is beside the plane is white, and the same in all
+            # directions.
+            vectors = components[:, -number:]
+            plane = torch.kron(torch.eye(window, dtype=torch.double), vectors @ vectors.T)
+            beside = covariance.trace() - (vectors.T @ covariance @ vectors).trace()
+            white = torch.eye(size, dtype=torch.double) - vectors @ vectors.T
+            level = beside / max(size - number, 1)
+            noise = torch.kron(torch.eye(window, dtype=torch.double), level * white)
+            return WindowMoments(whole, plane @ joint @ plane + noise, RIDGE)
+
+        return moments
 
 
 def principal(values: Tensor, vectors: Tensor, number: int) -> Tensor:

@@ -40,14 +40,27 @@ def test_indicators_and_constants():
     assert made(values + 30)[:, 2].tolist() == pytest.approx([0.1] * 50)
 
 
-@pytest.mark.parametrize("share", [0.001, 0.03])
+@pytest.mark.parametrize("share", [0.001, 0.03, 0.3])
 def test_codes_for_missing_numbers_do_not_hide_the_others(share):
     values = torch.randn(4000, 1, generator=seeded(0))
     code = torch.rand(4000, 1, generator=seeded(1)) < share
     coded = values.masked_fill(code, -9999)
     found = learned(coded)(coded)
     assert found[code].tolist() == [-10.0] * int(code.sum())
-    assert 0.9 < found[~code].std() < 1.1
+    assert 0.9 < found[~code].std() < 3
+
+
+@pytest.mark.parametrize("code", [-99.0, -9999.0])
+@pytest.mark.parametrize("share", [0.0025, 0.03])
+def test_codes_among_numbers_that_are_mostly_0(share, code):
+    some = torch.rand(4000, 1, generator=seeded(0)) < 0.2
+    numbers = some * (1 + torch.rand(4000, 1, generator=seeded(1)))
+    coded = torch.rand(4000, 1, generator=seeded(2)) < share
+    for values in (some.float(), numbers):
+        found = learned(values.masked_fill(coded, code))(values.masked_fill(coded, code))
+        assert found[coded].tolist() == [-10.0] * int(coded.sum())
+        apart = found[some & ~coded].mean() - found[~some & ~coded].mean()
+        assert 1 <= apart < 4
 
 
 def test_heavy_tails_are_not_taken_for_codes():

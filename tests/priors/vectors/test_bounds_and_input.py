@@ -230,6 +230,43 @@ def test_vectors_beyond_the_bounds_count_as_such(kind):
     assert float((drawn == 1).float().mean()) == pytest.approx(float((values == 1).float().mean()), abs=0.025)
 
 
+@pytest.mark.parametrize(
+    ("make", "share"),
+    [(AutoregressivePrior, 0.9), (StepSynergies, 0.9), (WindowSynergies, 0.75), (KINDS["noise"], 0.5)],
+)
+def test_about_as_many_vectors_are_drawn_at_the_bounds_as_there_are(make, share):
+    values = walk(40, 0, 0.8, 2)
+    prior = make([-1.0] * 2, [1.0] * 2).fit(VectorPlans(values, [-1.0] * 2, [1.0] * 2), generator=seeded())
+    own, drawn = ((each.abs() == 1).float().mean() for each in (values, prior.sample(2000, 60, generator=seeded(1))))
+    assert share * own < drawn < 1.1 * own
+
+
+def test_constant_dimensions_do_not_change_the_others():
+    """The exponent of noise is chosen for what varies, which has its own standard deviation."""
+    values = torch.cat([0.3 * torch.randn(20, 40, 1, generator=seeded(0)), torch.full((20, 40, 5), 0.25)], 2)
+    plans = VectorPlans(values.clamp(-1, 1), [-1.0] * 6, [1.0] * 6)
+    prior = NoisePrior([-1.0] * 6, [1.0] * 6, exponent=None).fit(plans)
+    alone = NoisePrior([-1.0], [1.0], exponent=None).fit(VectorPlans(plans.actions[..., :1], [-1.0], [1.0]))
+    assert prior.exponent == alone.exponent == 0
+    std = prior.start(1)[0].std.flatten().tolist()
+    assert std == pytest.approx([*alone.start(1)[0].std.flatten().tolist(), *[1e-3] * 5], rel=1e-3)
+
+
+def test_equal_exponents_are_tried_once():
+    prior = NoisePrior([-1.0], [1.0], exponent=None)
+    prior.exponents = (0.5, 0.5, 1.0)
+    assert prior.fit(VectorPlans(walk(10, 0, 0.3, 1), [-1.0], [1.0])).exponent in (0.5, 1.0)
+
+
+@pytest.mark.parametrize("make", [AutoregressivePrior, WindowSynergies, StepSynergies, KINDS["noise"]])
+def test_settings_that_are_compared_one_by_one_are_the_same(make, monkeypatch):
+    plans = VectorPlans(walk(12, 0, 0.6, 3), [-1.0] * 3, [1.0] * 3)
+    together = make([-1.0] * 3, [1.0] * 3).fit(plans, generator=seeded())
+    monkeypatch.setattr("neuroprior.priors.vectors.linear_gaussian.LARGEST", 1)
+    alone = make([-1.0] * 3, [1.0] * 3).fit(plans, generator=seeded())
+    assert alone.log_prob(plans).equal(together.log_prob(plans))
+
+
 def test_a_censored_autoregression_is_recovered():
     plans = VectorPlans(walk(400, 0, 1.0, 1), [-1.0], [1.0])
     prior = AutoregressivePrior([-1.0], [1.0], order=1).fit(plans, generator=seeded())
