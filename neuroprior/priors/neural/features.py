@@ -16,6 +16,9 @@ VARIED = 0.1
 CONSTANT = 1e-6
 """Of the largest value: a feature that varies less has one value, but for rounding."""
 
+MOST_ROWS = 2**16
+"""Of more values, so many are drawn, always the same ones: they say enough."""
+
 UNSCALED = {"mean": 0.0, "std": 1.0, "most": torch.inf}
 """What changes nothing."""
 
@@ -47,6 +50,10 @@ class Standardise(nn.Module):
         Indicators, features that are 0, 1 or -1, stay as they are. Codes for missing numbers, a few values far from
         all others, do not count; see `CODES`.
         """
+        indicator = ((features == 0) | (features.abs() == 1)).all(0)
+        if len(features) > MOST_ROWS:
+            drawn = torch.randint(len(features), (MOST_ROWS,), generator=torch.Generator().manual_seed(0))
+            features = features[drawn.to(features.device)]
         values = features.double()
         mean, std, largest = values.mean(0), values.std(0, correction=0), values.abs().amax(0)
         away = (values - values.median(0).values).abs()
@@ -62,7 +69,8 @@ class Standardise(nn.Module):
             kept = kept & (near | ~coded)
         largest = torch.where(kept.all(0), largest, (values.abs() * kept).amax(0))
         std = torch.where(std > CONSTANT * largest, std, largest.clamp(min=1))
-        indicator = ((values == 0) | (values.abs() == 1) | ~kept).all(0)
+        coded = ~kept.all(0)
+        indicator = indicator | (coded & ((values == 0) | (values.abs() == 1) | ~kept).all(0))
         self.mean.copy_(mean.masked_fill(indicator, 0))
         self.std.copy_(std.masked_fill(indicator, 1))
         self.most.fill_(MOST)

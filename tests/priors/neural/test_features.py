@@ -29,6 +29,16 @@ def test_means_and_standard_deviations():
     assert (found.std(0) - 1).abs().max() < 1e-3
 
 
+def test_of_very_many_values_some_are_enough():
+    """An indicator is one of all values."""
+    values = torch.randn(200_000, 3, generator=seeded(0)) * 5 + 40
+    values[:, 1:] = (values[:, 1:] > 40).float()
+    values[77_777, 2] = 0.5
+    made = learned(values)
+    assert made.mean.tolist() == pytest.approx([40, 0, 0.5], abs=0.1)
+    assert made.std.tolist() == pytest.approx([5, 1, 0.5], rel=0.03)
+
+
 def test_indicators_and_constants():
     signs = torch.randint(-1, 2, (50, 1), generator=seeded(0)).float()
     rare = torch.zeros(50, 1)
