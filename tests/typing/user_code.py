@@ -136,7 +136,7 @@ def vectors(folder: Path) -> None:
     prior = NoisePrior([-1.0], [1.0], exponent=None).fit(given)
     assert_type(prior, NoisePrior)
     assert_type(load(save(prior, folder / "noise"), kind="vectors"), VectorPrior)
-    assert_type(load(folder / "durations", kind="durations"), DurationModel)
+    assert_type(load(save(DurationModel(3), folder / "durations"), kind="durations"), DurationModel)
     decision = ICEMPlanner(length=3, num_plans=4).plan(world, world.reset(2))
     assert_type(decision, VectorDecision)
 

@@ -104,6 +104,9 @@ class DurationModel(SavedModule):
         ones = torch.ones(num_actions, MOST_PARAMETERS, dtype=torch.double)
         self._keep(whole[:0], whole, ones[:, 0] * 0, ones, whole)
 
+    def __repr__(self) -> str:
+        return f"DurationModel({self.num_actions}, laws={list(self.laws)}, transitions={self.transitions})"
+
     @property
     def config(self) -> dict[str, Any]:
         return {"num_actions": self.num_actions, "laws": list(self.laws), "transitions": self.transitions}
