@@ -11,7 +11,7 @@ import yaml
 
 from neuroprior.planners import Planner, collect
 from neuroprior.plans import Columns, Missing, PastDurations, Plans, read_plans
-from neuroprior.plans.folds import num_units, ungrouped
+from neuroprior.plans.folds import longest_cut, num_units, ungrouped
 from neuroprior.priors import Prior
 from neuroprior.priors.fitting import make_prior
 from neuroprior.priors.prior import context_arguments
@@ -238,15 +238,11 @@ def _split_two(plans: Plans, share: float, generator: torch.Generator) -> tuple[
     Of many plans some are held out, unless these are no such share of the actions; else the end of the longest.
     """
     plans = plans[plans.mask().any(1)]
-    lengths = plans.mask().sum(1)
-    row, longest, total = int(lengths.argmax()), int(lengths.max()), int(lengths.sum())
     if len(plans) > 2:
         learned, chosen = ungrouped(plans).split(share, generator)
-        if share / 2 <= int(chosen.mask().sum()) / total <= (1 + share) / 2:
+        if share / 2 <= int(chosen.mask().sum()) / int(plans.mask().sum()) <= (1 + share) / 2:
             return learned, chosen
-    cut = longest - max(min(round(share * total), longest // 2), 1)
-    lengths[row] = cut
-    return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut, longest)
+    return longest_cut(plans, share)
 
 
 def _what(plans: Plans) -> str:

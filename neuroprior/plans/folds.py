@@ -39,6 +39,20 @@ def ungrouped(plans: AnyPlans) -> AnyPlans:
     return replace(plans, group=None, **names)  # type: ignore[type-var]
 
 
+def longest_cut(plans: AnyPlans, share: float) -> tuple[AnyPlans, AnyPlans]:
+    """The plans, the longest without its end, and this end: a share of all actions, at most half of that plan.
+
+    Args:
+        plans: of actions or of vectors, at least one with two or more.
+        share: between 0 and 1.
+    """
+    lengths = plans.mask().sum(1)
+    row, longest = int(lengths.argmax()), int(lengths.max())
+    cut = longest - max(min(round(share * int(lengths.sum())), longest // 2), 1)
+    lengths[row] = cut
+    return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut, longest)  # type: ignore[type-var]
+
+
 def num_units(plans: Sequences) -> int:
     """The number of groups, or of plans where there are none."""
     return len(plans) if plans.group is None else len(plans.group.unique())

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from neuroprior.plans.sequences import Sequences
+
 MOST = 10.0
 """Standard deviations beyond which a feature counts as so far away: a network knows nothing of what lies there."""
 
@@ -42,6 +44,11 @@ class Standardise(nn.Module):
         self.register_buffer("mean", torch.zeros(size))
         self.register_buffer("std", torch.ones(size))
         self.register_buffer("most", torch.tensor(torch.inf))
+
+    def learn_from(self, plans: Sequences) -> None:
+        """`learn` from the contexts of plans, those of each plan or of each step."""
+        if plans.context is not None and len(plans):
+            self.learn(plans.context if plans.context.dim() == 2 else plans.context[plans.mask()])
 
     @torch.no_grad()
     def learn(self, features: Tensor) -> None:

@@ -293,11 +293,9 @@ class NeuralPrior(Prior):
         plans = plans[plans.mask().any(1)]
         if None in self._given and not self._sized:
             self._make(self.sizes_for(plans))
-        if not self._sized and self.context_size is not None and plans.context is not None:
-            features = plans.context[plans.mask()] if plans.context.dim() == 3 else plans.context
-            for module in self.modules():
-                if isinstance(module, Standardise) and len(features):
-                    module.learn(features)
+        for module in () if self._sized else self.modules():
+            if isinstance(module, Standardise):
+                module.learn_from(plans)
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
             raise ValueError("plans: at least two plans with an action are needed to train a neural prior")

@@ -3,7 +3,6 @@
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import replace
 from math import log, pi
 from typing import Any, NamedTuple, Self, TypeVar
 
@@ -14,7 +13,7 @@ from torch.nn import functional
 from neuroprior._checks import check_count
 from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
-from neuroprior.plans.folds import divisible, ungrouped
+from neuroprior.plans.folds import divisible, longest_cut, ungrouped
 from neuroprior.plans.sequences import check_validation
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
@@ -283,20 +282,15 @@ def held_out_split(
     """
     check_validation(share)
     plans = divisible(plans[plans.mask().any(1)])
-    lengths = plans.mask().sum(1)
-    total, longest = int(lengths.sum()), int(lengths.max()) if len(lengths) else 0
+    total = int(plans.mask().sum())
     if total < 2:
         return plans, plans
     for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
         learning, held_out = some.split(share, generator)
         if share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
             return learning, held_out
-    cut = longest - max(min(round(share * total), longest // 2), 1)
-    if longest - cut < share / 2 * total:
-        return learning, held_out
-    row = int(lengths.argmax())
-    lengths[row] = cut
-    return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut)
+    rest, end = longest_cut(plans, share)
+    return (learning, held_out) if int(end.mask().sum()) < share / 2 * total else (rest, end)
 
 
 @torch.no_grad()

@@ -53,7 +53,7 @@ class VectorNetwork(VectorPrior):
     """A network that predicts the next vector as a mixture of K censored Gaussians (Bishop 1994).
 
     At each step the network reads the last `lags` vectors, scaled by the bounds to -1..1, and the features of the state
-    where it takes them, standardised; see `neuroprior.priors.neural.features.Standardise`. The
+    where it takes them, standardised (`neuroprior.priors.neural.features.Standardise`). The
     means of all components have a common part that is linear in these inputs; the rest of the means, the weights and
     the standard deviations are the network's; those of a plan's first vector have factors of their own. Training begins
     with the linear part and the standard deviations of an `AutoregressivePrior` of at most `lags` vectors: from
@@ -355,9 +355,8 @@ class VectorNetwork(VectorPrior):
         except ValueError:
             self.action_names, self.memory = known, memory  # what is refused is not learned from
             raise
-        if first and plans.context is not None:
-            features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
-            self.features.learn(features)
+        if first:
+            self.features.learn_from(plans)
         chain = self._chain(learning, seed) if first else None
         if chain is not None:
             self._begin(chain)
