@@ -77,13 +77,6 @@ class PocketCube(World):
         """Where the tables are."""
         return self._permutation_moves.device
 
-    def to(self, device: torch.device | str) -> "PocketCube":
-        """Move the tables to `device`; returns self."""
-        for name, value in list(vars(self).items()):
-            if isinstance(value, Tensor):
-                setattr(self, name, value.to(device))
-        return self
-
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`: the solved cube after `scramble` independent random moves."""
         check_count("batch_size", batch_size)

@@ -65,14 +65,6 @@ class EpisodicWorld(TabularWorld):
         self._goals = self._entered_with_reward()
         self.has_goal = bool(self._goals.any())
 
-    def to(self, device: torch.device | str) -> "EpisodicWorld":
-        super().to(device)
-        self.starts, self.ended, self._layouts, self._goals = (
-            t.to(device) for t in (self.starts, self.ended, self._layouts, self._goals)
-        )
-        self.features = None if self.features is None else self.features.to(device)
-        return self
-
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`, drawn as episodes start; uniform over reward maps."""
         check_count("batch_size", batch_size)

@@ -79,14 +79,6 @@ class GridWorld(TabularWorld):
             (~walls.view(-1)).repeat_interleave(4 if egocentric else 1).nonzero()[:, 0] if walls.any() else None
         )
 
-    def to(self, device: torch.device | str) -> "GridWorld":
-        """Move the tables to `device`; returns self."""
-        super().to(device)
-        self.walls = self.walls.to(device)
-        self._views = None if self._views is None else self._views.to(device)
-        self._free = None if self._free is None else self._free.to(device)
-        return self
-
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size]`, uniform over the squares that are no walls, headings and reward maps."""
         if self._free is None:

@@ -1,7 +1,11 @@
 """Random outcomes in tables: drawing one of the outcomes of each action in each cell."""
 
+from typing import Self
+
 import torch
 from torch import Tensor
+
+from neuroprior.worlds.world import moved
 
 SUM_TOLERANCE = 1e-6
 
@@ -35,10 +39,9 @@ class Outcomes:
         self._width = width
         self._upper = torch.nn.functional.pad(upper, (0, width - self.num_outcomes), value=1.0).view(-1)
 
-    def to(self, device: torch.device | str) -> "Outcomes":
+    def to(self, device: torch.device | str) -> Self:
         """Move the tables to `device`; returns self."""
-        self.probability, self._upper = self.probability.to(device), self._upper.to(device)
-        return self
+        return moved(self, device)
 
     @property
     def table_size(self) -> int:

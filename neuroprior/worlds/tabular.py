@@ -102,15 +102,6 @@ class TabularWorld(World):
         """Where the tables are."""
         return self.next_state.device
 
-    def to(self, device: torch.device | str) -> "TabularWorld":
-        """Move the tables to `device`; returns self."""
-        self.next_state, self.reward = self.next_state.to(device), self.reward.to(device)
-        if self.legal_table is not None:
-            self.legal_table = self.legal_table.to(device)
-        if self.outcomes is not None:
-            self.outcomes.to(device)
-        return self
-
     def state(self, cell: Tensor, reward_map: Tensor | int = 0) -> Tensor:
         """The states `[N]` of `cell [N]` under `reward_map` (an integer or `[N]`)."""
         check_range("cell", torch.as_tensor(cell), self.num_states, "cells")

@@ -1,7 +1,7 @@
 """The interface of a world: a batched simulator in which a planner tries its plans."""
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import NamedTuple, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +21,24 @@ class Rollout(NamedTuple):
     final_state: Tensor
     rewards: Tensor
     states: Tensor | None = None
+
+
+Holder = TypeVar("Holder")
+
+
+def moved(holder: Holder, device: torch.device | str) -> Holder:
+    """`holder`, whose tensors, and attributes that can be moved `to` a device, are moved to `device`."""
+    for name, value in list(vars(holder).items()):
+        if hasattr(value, "to"):
+            setattr(holder, name, value.to(device))
+    return holder
+
+
+def on_cpu(world: Holder, device: torch.device | str) -> Holder:
+    """`world`, which simulates on the CPU alone; raises ValueError where `device` is another one."""
+    if torch.device(device).type != "cpu":
+        raise ValueError(f"device: {type(world).__name__} simulates on the CPU, and cannot be moved to {device}")
+    return world
 
 
 class World(ABC):
@@ -44,6 +62,10 @@ class World(ABC):
     shares_steps: bool = False
     has_goal: bool = False
     action_names: tuple[str, ...] | None = None
+
+    def to(self, device: torch.device | str) -> Self:
+        """Move the tensors of this world to `device`, where its states then are; returns self."""
+        return moved(self, device)
 
     @abstractmethod
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:

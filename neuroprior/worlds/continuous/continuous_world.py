@@ -3,13 +3,14 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import kind_of
 from neuroprior.plans.vector_plans import check_widths
-from neuroprior.worlds.world import Rollout, join_states
+from neuroprior.worlds.world import Rollout, join_states, moved
 
 
 class ContinuousWorld(ABC):
@@ -36,6 +37,15 @@ class ContinuousWorld(ABC):
     def action_size(self) -> int:
         """The number of dimensions of an action, D."""
         return len(self.action_low)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the bounds are, and so actions and states."""
+        return self.action_low.device
+
+    def to(self, device: torch.device | str) -> Self:
+        """Move the tensors of this world to `device`, where its states then are; returns self."""
+        return moved(self, device)
 
     @abstractmethod
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:

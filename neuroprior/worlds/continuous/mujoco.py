@@ -4,14 +4,14 @@ import warnings
 from abc import abstractmethod
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior.worlds.continuous.continuous_world import ContinuousWorld, check_positive
-from neuroprior.worlds.world import Rollout
+from neuroprior.worlds.world import Rollout, on_cpu
 
 
 class MujocoWorld(ContinuousWorld):
@@ -62,6 +62,10 @@ class MujocoWorld(ContinuousWorld):
         self.action_low, self.action_high = bounds.unbind(1)
         self.action_names = tuple(self.model.joint(j).name for j in self.model.actuator_trnid[:, 0])
         self._start = torch.from_numpy(self.model.qpos0.copy())
+
+    def to(self, device: torch.device | str) -> Self:
+        """Raise ValueError for any other device than the CPU."""
+        return on_cpu(self, device)
 
     @abstractmethod
     def _rewards(self, before: Tensor, after: Tensor, action: Tensor, sensors: Tensor) -> Tensor:

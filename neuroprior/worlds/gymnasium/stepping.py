@@ -1,7 +1,7 @@
 """Any Gymnasium environment as a world: stepped by copies, or replayed from its seed where copies cannot be trusted."""
 
 from collections import OrderedDict
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from neuroprior._checks import check_count, check_range, is_integer
 from neuroprior._random import generator_on
 from neuroprior.worlds.gymnasium.environment import RUNNING, Episode, Transition, action_names, stacked
 from neuroprior.worlds.gymnasium.states import exact_copier, nondeterminism
-from neuroprior.worlds.world import Rollout, World, check_plans
+from neuroprior.worlds.world import Rollout, World, check_plans, on_cpu
 
 _SEED, _LENGTH, _ENDED, _ACTIONS = 0, 1, 2, 3
 
@@ -64,6 +64,10 @@ class SteppedWorld(World):
         self._env = env
         self._at: tuple[int, ...] = ()  # the history at whose end the environment is; () where that is not known
         self._kept: OrderedDict[tuple[int, ...], _Kept] = OrderedDict()
+
+    def to(self, device: torch.device | str) -> Self:
+        """Raise ValueError for any other device than the CPU, on which environments are stepped."""
+        return on_cpu(self, device)
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """States `[batch_size, 3 + horizon]` before the first action, with equal probability for each seed.

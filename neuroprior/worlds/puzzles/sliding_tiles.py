@@ -55,12 +55,6 @@ class SlidingTilesWorld(PuzzleWorld):
     def device(self) -> torch.device:
         return self.goal.device
 
-    def to(self, device: torch.device | str) -> "SlidingTilesWorld":
-        """Move the boards to `device`; returns self."""
-        self.goal = self.goal.to(device)
-        self.boards = None if self.boards is None else self.boards.to(device)
-        return self
-
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """Random boards of those given, or the goal after random legal moves: uint8 `[batch_size, H, W]`."""
         if self.boards is not None:

@@ -66,11 +66,6 @@ class SokobanWorld(PuzzleWorld):
     def device(self) -> torch.device:
         return self.boards.device
 
-    def to(self, device: torch.device | str) -> "SokobanWorld":
-        """Move the boards to `device`; returns self."""
-        self.boards = self.boards.to(device)
-        return self
-
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """One step; an illegal action, and any action where the level is solved, leaves the state as it is.
 
