@@ -55,6 +55,7 @@ from neuroprior.priors import (
     VectorPrior,
     VectorTransformer,
     WindowSynergies,
+    recordings,
 )
 from neuroprior.sampling import most_probable, sample_distinct, sample_in_world
 from neuroprior.testing import check_prior, check_world
@@ -105,6 +106,74 @@ def test_plans_of_a_prior(name: str) -> None:
         assert drawn.equal(prior.sample(3000, 7, method=method, generator=seeded(2)))
     assert sample_distinct(prior, 20, 5, generator=seeded(3)).plans.shape == (1, 20, 5)
     assert most_probable(prior, 20, 5)[0].device.type == DEVICE.type
+
+
+NETWORKS: dict[str, Callable[[], Any]] = {
+    "gru": lambda: GRUPrior(A, 16, 2),
+    "gru, lags": lambda: GRUPrior(A, 16, lags=4, window=2),
+    "gru, context": lambda: GRUPrior(A, 16, num_contexts=4),
+    "transformer": lambda: TransformerPrior(A, 16),
+    "transformer, window": lambda: TransformerPrior(A, 16, window=5),
+    "transformer, features": lambda: TransformerPrior(A, 16, context_size=2),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_recorded_steps_draw_what_steps_draw(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the same random numbers, but for rounding; also after weights have changed, in place or not."""
+    prior = NETWORKS[name]().to(DEVICE)
+    context = None
+    if prior.takes_context:
+        context = index(500, 1)[:, 0] if prior.num_contexts else torch.randn(500, 2, generator=seeded(4))
+
+    def agree() -> bool:
+        drawn = []
+        for worth in (1, 10**9):
+            monkeypatch.setattr(recordings, "WORTH", worth)
+            drawn.append(prior.sample(500, 40, context, generator=seeded(2), method="ancestral"))
+        return float((drawn[0] == drawn[1]).float().mean()) > 0.999
+
+    assert agree()
+    assert agree()
+    with torch.no_grad():
+        for weight in prior.parameters():
+            weight.mul_(3)
+    assert agree()
+    prior.to("cpu").to(DEVICE)
+    assert agree()
+    with torch.no_grad():
+        next(prior.parameters()).fill_(torch.nan)
+    monkeypatch.setattr(recordings, "WORTH", 1)
+    with pytest.raises(ValueError, match="logits are NaN"):
+        prior.sample(500, 40, context, method="ancestral")
+
+
+def test_recorded_steps_of_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
+    prior = VectorGRU(LOW, HIGH, width=16, lags=2).fit(vectors(), generator=seeded(0), **QUICK).to(DEVICE)
+    past = vectors().actions[:, :5]
+    drawn = []
+    for worth in (1, 10**9):
+        monkeypatch.setattr(recordings, "WORTH", worth)
+        drawn.append(prior.sample(30, 20, past=past, generator=seeded(2)))
+    torch.testing.assert_close(*drawn, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["gru", "gru, context", "transformer", "transformer, features"])
+def test_half_precision(name: str) -> None:
+    """Under autocast the log-probability of an action differs by less than .03 nats from that in single precision."""
+    prior = NETWORKS[name]().to(DEVICE)
+    context = None
+    if prior.takes_context:
+        context = index(500, 1)[:, 0] if prior.num_contexts else torch.randn(500, 2, generator=seeded(4))
+        context = context.to(DEVICE)
+    drawn = prior.sample(500, 40, context, generator=seeded(2))
+    given = Plans(drawn, A, context=context)
+    single = prior.action_log_probs(given)
+    with torch.autocast("cuda", torch.bfloat16):
+        half = prior.action_log_probs(given)
+        again = prior.sample(500, 40, context, generator=seeded(2))
+    assert float((half - single).abs().max()) < 0.03
+    assert again.shape == drawn.shape
 
 
 @pytest.mark.parametrize("name", ["markov", "gru", "transformer", "stacked", "combined", "switching"])

@@ -40,8 +40,8 @@ def bench(
 
     Args:
         parts: peers: against what a user would take in place of it; sizes: seconds and memory against size; limits: how
-            near it comes to what the machine can do; imports: the time to import it; gpu: seconds of the same jobs on a
-            CUDA GPU, where one is there.
+            near it comes to what the machine can do; imports: the time to import it; gpu: seconds of jobs on a CUDA
+            GPU, where one is there, and on the CPU beside it.
         jobs: what to measure against peers.
         repetitions: how often each job is timed, in turn with its peers.
         scale: share of each job that is done, and of the largest size; the goals are for 1.
@@ -184,8 +184,10 @@ def _limits(rows: pd.DataFrame) -> Table:
 
 
 def _gpu(rows: pd.DataFrame) -> Table:
-    columns: dict[str, Column] = {"job": "about", "seconds": "seconds:.3g", "peak MiB": _mebi("peak_bytes")}
-    return table(rows, columns, title=f"On {rows.device.iloc[0]}")
+    columns: dict[str, Column] = {"job": "about", "CPU, seconds": "cpu_seconds:.3g", "GPU, seconds": "seconds:.3g"}
+    columns |= {"ratio": _short("ratio"), "peak MiB": _mebi("peak_bytes")}
+    shown = rows.assign(ratio=rows.cpu_seconds / rows.seconds)
+    return table(shown, columns, "ratio: CPU / GPU.", f"On {rows.device.iloc[0]}, and on the CPU of the same machine")
 
 
 def _mebi(name: str) -> Column:

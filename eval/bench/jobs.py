@@ -35,8 +35,9 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-from neuroprior.planners import AStarPlanner, MPPIPlanner
-from neuroprior.priors import CombinedPrior
+from neuroprior.planners import AStarPlanner, ICEMPlanner, MPPIPlanner
+from neuroprior.planners import control as run_control
+from neuroprior.priors import CombinedPrior, VectorGRU
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS, networks
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import DoubleIntegrator, GridWorld, cube, maze, sliding_tiles
@@ -118,9 +119,10 @@ def against_peers(
 
 
 def on_device(name: str, device: torch.device, scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
-    """The row of a job on an accelerator, without peers: seconds, and bytes of the device at the peak."""
+    """The row of a job on an accelerator: seconds there and on the CPU, and bytes of the device at the peak."""
     cuda = device.type == "cuda"
     job = JOBS[name](scale)
+    alone = median_seconds(job.make(torch.device("cpu")), repetitions)
     run = job.make(device)
 
     def finished() -> None:
@@ -132,7 +134,7 @@ def on_device(name: str, device: torch.device, scale: float, repetitions: int) -
         torch.cuda.reset_peak_memory_stats(device)
     row: dict[str, Any] = {"job": name, "about": job.about}
     row |= {"device": torch.cuda.get_device_name(device) if cuda else device.type}
-    row |= {"seconds": median_seconds(finished, repetitions)}
+    row |= {"cpu_seconds": alone, "seconds": median_seconds(finished, repetitions)}
     yield row | {"peak_bytes": torch.cuda.max_memory_allocated(device) if cuda else None}
 
 
@@ -464,6 +466,19 @@ def decide(scale: float) -> Job:
     return Job(f"one decision with 256 candidates of 8 steps from {starts:,} starts", make, ())
 
 
+def decide_vectors(scale: float) -> Job:
+    """Decisions over vectors from many starts, with candidates of a network: one, and then those that follow it."""
+    starts = scaled(256, scale)
+
+    def make(device: torch.device) -> Run:
+        world = DoubleIntegrator().to(device)
+        prior = VectorGRU(world.action_low, world.action_high, width=64).to(device)
+        planner = ICEMPlanner(20, 32, prior=prior, prior_share=0.5)
+        return partial(run_control, planner, world, world.reset(starts, torch.Generator().manual_seed(0)), 5)
+
+    return Job(f"5 decisions of iCEM, 32 candidates of 20 vectors from {starts:,} starts, half of a GRU", make, ())
+
+
 def trees(policy: str, starts: int, scale: float) -> Job:
     """Tree search with the same policy and as many simulations, each of which is followed to the end of its plan."""
     world = gridworld(20, 20, "torus", num_worlds=10)
@@ -500,7 +515,7 @@ JOBS: dict[str, Callable[[float], Job]] = {
     for make in (
         *(sample_short, sample_long, sample_gru, sample_gru_two, sample_beside, sample_beside_cube),
         *(sample_combined, fit_combined, sample_markov, fit_markov, fit_tree),
-        *(evaluate, table_1, train, shoot, decide, search_tiles, control),
+        *(evaluate, table_1, train, shoot, decide, decide_vectors, search_tiles, control),
     )
 }
 """By name; each makes its job at a scale: 1 is the size of the goals."""
@@ -517,7 +532,10 @@ JOBS |= {
     for times in (2, 16)
 }
 
-ON_DEVICES = ("sample_short", "sample_long", "sample_gru", "sample_markov", "evaluate", "decide")
+ON_DEVICES = (
+    *("sample_short", "sample_long", "sample_gru", "sample_gru_two", "sample_markov", "sample_combined"),
+    *("horizon_gru_16", "horizon_transformer_16", "evaluate", "decide", "decide_vectors"),
+)
 """Jobs that can be done on other devices than the CPU."""
 
 

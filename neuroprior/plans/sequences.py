@@ -53,6 +53,13 @@ class Sequences(ABC):
             return torch.ones(self.actions.shape[:2], dtype=torch.bool, device=self.actions.device)
         return torch.arange(self.max_length, device=self.actions.device) < self.lengths[:, None]
 
+    def to(self, device: torch.device | str) -> Self:
+        """These plans with all tensors on `device`."""
+        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        if all(value is getattr(self, name) for name, value in moved.items()):
+            return self
+        return replace(self, **moved)  # type: ignore[type-var]
+
     @abstractmethod
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The plans at `index` (a slice, integers or a bool mask)."""

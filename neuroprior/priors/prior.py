@@ -261,6 +261,7 @@ class Prior(SavedModule):
             ValueError: other actions or another context than this prior's.
         """
         self._check_scored(plans)
+        plans = plans.to(self.device)
         size = max(self.actions_at_once // max(plans.max_length, 1), 1)
         for at in range(0, len(plans), size):
             part = plans[at : at + size]
@@ -270,7 +271,8 @@ class Prior(SavedModule):
             yield part, torch.log_softmax(logits, -1)
 
     def _as_plans(self, plans: Plans | Tensor) -> Plans:
-        return plans if isinstance(plans, Plans) else Plans(as_actions(plans), self.num_actions)
+        """`plans` on this prior's device."""
+        return (plans if isinstance(plans, Plans) else Plans(as_actions(plans), self.num_actions)).to(self.device)
 
     def _check_actions(self, plans: Plans) -> None:
         if plans.num_actions != self.num_actions:

@@ -48,14 +48,20 @@ class Draw:
         """
         if uniform is None:
             uniform = self.uniform((len(logits if row is None else row),), logits)
+        actions, total = self.drawn(logits, uniform, row)
+        check_possible((total > 0).all())
+        return actions
+
+    def drawn(self, logits: Tensor, uniform: Tensor, row: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As `actions`, without its check; and the sums `[K]` of the weights of all actions, see `check_possible`."""
         # Actions first: with few actions and many rows each operation is several times as fast this way round.
         cumulative = self._weights(logits.T.contiguous(), 0).cumsum(0)
-        _check_totals(cumulative[-1])
+        total = cumulative[-1]
         # Rounding can carry uniform * total up to total itself, past the last action that has any probability.
         most = (cumulative < cumulative[-1]).sum(0)
         if row is not None:
             cumulative, most = cumulative.index_select(1, row), most.index_select(0, row)
-        return torch.minimum((cumulative <= uniform * cumulative[-1]).sum(0), most)
+        return torch.minimum((cumulative <= uniform * cumulative[-1]).sum(0), most), total
 
     def _weights(self, logits: Tensor, dim: int) -> Tensor:
         """Unnormalised probabilities along `dim`."""
@@ -67,7 +73,7 @@ class Draw:
         probs = self._weights(logits.double(), -1)
         # The share of an action among the remaining ones; summing from the end keeps shares of exactly 0 and 1.
         rest = probs.flip(-1).cumsum(-1).flip(-1)
-        _check_totals(rest[:, 0])
+        check_possible((rest[:, 0] > 0).all())
         share = torch.where(rest > 0, probs / rest, 0).clamp_(0, 1)
         share[:, -1] = 1
         left = counts.double()
@@ -79,9 +85,12 @@ class Draw:
         return torch.stack(parts, -1).long()
 
 
-def _check_totals(total: Tensor) -> None:
-    """Raise ValueError unless the sums of the weights of all actions are positive: they are NaN where a logit is."""
-    if not (total > 0).all():
+def check_possible(possible: Tensor) -> None:
+    """Raise ValueError unless it is `possible`, a bool `[]`, to draw actions.
+
+    That is where the sums of the weights of all actions are positive; they are NaN where a logit is.
+    """
+    if not possible:
         raise ValueError("prior: its logits are NaN or infinite, or -inf for all actions that are legal")
 
 

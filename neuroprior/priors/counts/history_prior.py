@@ -80,6 +80,7 @@ class HistoryPrior(Prior):
             ValueError: other actions or another context than this prior's.
         """
         self._check_scored(plans)
+        plans = plans.to(self.device)
         size = max(self.actions_at_once // max(plans.max_length, 1), 1)
         found = [torch.zeros(0, dtype=torch.long, device=self.device)]
         for at in range(0, len(plans), size):

@@ -111,19 +111,12 @@ class GRUPrior(NeuralPrior):
         return self.head(out), torch.cat([inputs.index_select(0, row), layers.transpose(0, 1).flatten(1)], 1)
 
     def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
-        """The rest of many plans, drawn by a compiled loop; see `neuroprior.sampling.Steppable`.
+        """As that of `NeuralPrior`; on a CPU by a compiled loop, where there is one that is worth its call.
 
-        If they have a context, it goes on.
-
-        Args:
-            action: integers `[N]`, the last ones.
-            state: `[N, D + K H + lags - 1]`, of K layers, before these.
-            uniform: `[T, N]`: what the next T actions are drawn with.
-            temperature: divides the logits.
-
-        Returns:
-            int64 `[N, T]`; None where there is no such loop, or it is not worth its call.
+        The state is `[N, D + K H + lags - 1]`, of K layers.
         """
+        if state.device.type != "cpu":
+            return super().draw_rest(action, state, uniform, temperature)
         size, (steps, number), kinds = self.hidden_size, uniform.shape, self.num_actions
         # Tables of what each of the last actions adds have to be worth their making.
         worth = 4 * self.lags * kinds <= number * steps and 3 * size * self.lags * kinds <= LARGEST
@@ -142,10 +135,8 @@ class GRUPrior(NeuralPrior):
 
     @property
     def is_plain(self) -> bool:
-        """Whether its predictions can be computed from `arrays`: no module is replaced or hooked."""
-        made = type(self) is GRUPrior and self.window != 0
-        whole = made and (type(self.embedding), type(self.gru), type(self.head)) == (Embedding, nn.GRU, nn.Linear)
-        return whole and not any(part._forward_hooks or part._forward_pre_hooks for part in self.modules())
+        parts = (type(self), type(self.embedding), type(self.gru), type(self.head))
+        return parts == (GRUPrior, Embedding, nn.GRU, nn.Linear) and super().is_plain
 
     def context_gates(self, inputs: Tensor) -> Tensor:
         """What the contexts of `inputs [N, D]` add to the gates of the first layer: `[N, 3 * hidden_size]`."""
@@ -167,8 +158,8 @@ class GRUPrior(NeuralPrior):
 
     def _may_step(self, inputs: Tensor) -> bool:
         """Whether `_one_step` gives the same as `nn.GRU`, and faster."""
-        plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"))
-        return plain and inputs.device.type == "cpu" and inputs.shape[1] == 1
+        plain = not (self.training or torch.is_grad_enabled() or torch.is_autocast_enabled(inputs.device.type))
+        return plain and inputs.shape[1] == 1
 
     def _one_step(self, inputs: Tensor, layers: Tensor, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The output of `nn.GRU` for a single input; see `gru_step`.
@@ -202,8 +193,8 @@ def gru_sequence(gru: nn.GRU, inputs: Tensor, layers: Tensor | None = None) -> t
     Returns:
         The output `[N, T, width]`, and the new `layers`.
     """
-    plain = inputs.device.type == "cpu" and inputs.dtype == torch.float32 and not torch.is_autocast_enabled("cpu")
-    able = plain and COMPILE_FROM is not None and inputs.numel() >= COMPILE_FROM
+    plain = inputs.dtype == torch.float32 and not torch.is_autocast_enabled(inputs.device.type)
+    able = plain and COMPILE_FROM is not None and inputs.numel() >= COMPILE_FROM and inputs.device.type == "cpu"
     fast = compiled("neuroprior.priors.neural.compiled_gru") if able else None
     if layers is not None and inputs.shape[1] == 1 and plain and not torch.is_grad_enabled():
         out, layers = gru_step(gru, inputs[:, 0], layers)
@@ -234,6 +225,12 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
         The output `[N, width]`, and the new `layers`.
     """
     after = []
+    if layers.device.type != "cpu":
+        below = below if rows is None else below.index_select(0, rows)
+        for before, weights in zip(layers, gru.all_weights, strict=True):
+            below = torch.gru_cell(below, before.contiguous(), *weights)
+            after.append(below)
+        return below, torch.stack(after)
     for layer, before in enumerate(layers):
         w_in, w_hidden, b_in, b_hidden = gru.all_weights[layer]
         if layer > 0 or rows is None:

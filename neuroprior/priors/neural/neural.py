@@ -13,6 +13,8 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.priors.neural.features import UNSCALED, Standardise
 from neuroprior.priors.prior import Prior
+from neuroprior.priors.recordings import is_hooked, run_recorded
+from neuroprior.sampling.draws import Draw, check_possible
 
 CONTEXT_SPREAD = 0.03
 """Standard deviation of contexts' initial vectors. With 1, as for other embeddings, small data sets are overfitted."""
@@ -20,6 +22,8 @@ CONTEXT_SPREAD = 0.03
 LAG_WIDTH = 16
 """Size of the embedding of each of the last actions."""
 
+IMPOSSIBLE = -1
+"""Stands for an action where none can be drawn."""
 
 SHORT = 32
 """Plans of at most so many actions are short: each input shows a network the last actions directly."""
@@ -211,6 +215,52 @@ class NeuralPrior(Prior):
         new = self._inputs(action, context, last)
         logits, hidden = self.encode(new[:, None], None if self.window == 0 else hidden)
         return logits[:, 0], torch.cat([new, hidden], 1)
+
+    def fixed_state(self, state: Tensor, steps: int) -> Tensor:
+        """`state [N, ...]` as `fixed_step` takes it, with room for so many more steps."""
+        return state
+
+    def fixed_step(self, action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """As `step`, in a state that keeps its shape; nothing that is done depends on a number on the device.
+
+        The state may be overwritten.
+        """
+        return self.step(action, state)
+
+    def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
+        """The rest of many plans, drawn on a CUDA device by a recorded step; see `neuroprior.sampling.Steppable`.
+
+        If they have a context, it goes on.
+
+        Args:
+            action: integers `[N]`, the last ones.
+            state: before these.
+            uniform: `[T, N]`: what the next T actions are drawn with.
+            temperature: divides the logits.
+
+        Returns:
+            int64 `[N, T]`; None where recording does not pay, or does not work.
+        """
+        if state.device.type != "cuda" or not self.is_plain:
+            return None
+        draw = Draw(self.num_actions, temperature, torch.Generator(state.device))
+
+        def take(last: Tensor, state: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+            logits, state = self.fixed_step(last.clamp(min=0), state)
+            drawn, total = draw.drawn(logits, uniform)
+            return torch.where(total > 0, drawn, IMPOSSIBLE), state
+
+        key = temperature, repr(self.learned)
+        drawn = run_recorded(self, take, action, self.fixed_state(state, len(uniform)), [uniform], key)
+        if drawn is None:
+            return None
+        check_possible((drawn != IMPOSSIBLE).all())
+        return drawn.T
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it predicts as its class of this library does: it reads past actions, and no part is replaced."""
+        return self.window != 0 and not is_hooked(self)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:

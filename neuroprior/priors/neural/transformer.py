@@ -11,6 +11,12 @@ from neuroprior.plans import Plans
 from neuroprior.priors.neural.neural import FEW, Embedding, NeuralPrior, Sizes
 from neuroprior.sampling.rows import extended, states_with_room
 
+ALIGNED = 8
+"""Numbers that lie together at an address that vector loads can read from."""
+
+ROOM = 16
+"""Inputs by which a state of a fixed size grows."""
+
 FEWEST_AT_ONCE = 32
 """Inputs of a sequence that are read at once, at least, past the training length."""
 
@@ -93,6 +99,10 @@ class TransformerPrior(NeuralPrior):
         self.norm = nn.LayerNorm(self.width)
         self.head = nn.Linear(self.width, self.num_actions)
 
+    @property
+    def is_plain(self) -> bool:
+        return type(self) is TransformerPrior and super().is_plain
+
     def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         most = self.most_kept
         if most is not None and inputs.shape[1] > max(most, FEWEST_AT_ONCE):
@@ -105,7 +115,7 @@ class TransformerPrior(NeuralPrior):
             x, cache = block(x, None if past is None else past[:, :, layer], self.span, self.window)
             caches.append(cache)
         cache = torch.stack(caches, 2)
-        number = recent.new_full((len(cache), 1), cache.shape[1])
+        number = recent.new_full((len(cache), self.header - self.input_size - recent.shape[1]), cache.shape[1])
         return self.head(self.norm(x)), torch.cat([recent, number, cache.flatten(1)], 1)
 
     def _encode_in_parts(self, inputs: Tensor, hidden: Tensor | None, size: int) -> tuple[Tensor, Tensor]:
@@ -122,7 +132,7 @@ class TransformerPrior(NeuralPrior):
 
         Its keys are at the positions 0 to S - 1, as those that are read at once.
         """
-        cache = hidden[:, self.lags :].unflatten(1, (-1, self.num_layers, 2 * self.width))
+        cache = hidden[:, self.header - self.input_size :].unflatten(1, (-1, self.num_layers, 2 * self.width))
         kept, number = cache.shape[1], self._number(hidden)
         if number > kept:
             first = 0 if self.window is None else 1  # the start symbol stays where it is
@@ -134,7 +144,7 @@ class TransformerPrior(NeuralPrior):
 
     def _number(self, hidden: Tensor) -> int:
         """How many inputs were read before; the position of the next one."""
-        kept = (hidden.shape[1] - self.lags) // self.cache_size
+        kept = (hidden.shape[1] + self.input_size - self.header) // self.cache_size
         full = kept == self.most_kept and len(hidden) > 0
         return int(hidden[0, self.lags - 1]) if full else kept
 
@@ -142,6 +152,14 @@ class TransformerPrior(NeuralPrior):
     def most_kept(self) -> int | None:
         """At most so many inputs are kept in the key-value cache; if None, no limit."""
         return self.window + 1 if self.window is not None else None if self.span is None else self.span + 1
+
+    @property
+    def header(self) -> int:
+        """Numbers of a state before the key-value cache: the last input, actions before it, how many inputs there were.
+
+        The last one fills up the header, so that keys and values lie where kernels of a CUDA device can read them.
+        """
+        return -(-(self.input_size + self.lags) // ALIGNED) * ALIGNED
 
     @property
     def cache_size(self) -> int:
@@ -172,30 +190,66 @@ class TransformerPrior(NeuralPrior):
             room: None: the cache is copied once, and `state` stays as it is. Otherwise a state that has room is
                 overwritten, and any other is copied to a tensor with room for so many further steps.
         """
-        given, recent, most = self.input_size, self.input_size + self.lags - 1, self.most_kept
-        number, kept = self._number(state[:, given:]), (state.shape[1] - recent - 1) // self.cache_size
+        given, recent, header, most = self.input_size, self.input_size + self.lags - 1, self.header, self.most_kept
+        number, kept = self._number(state[:, given:]), (state.shape[1] - header) // self.cache_size
         new = self._inputs(action, context, state[:, :given])
         x, line = self.embedding(new[:, None], state[:, given:recent], self.window)
         grown = kept if kept == most else kept + 1
-        size = recent + 1 + grown * self.cache_size
+        size = header + grown * self.cache_size
         after = None if room is None else extended(state, size)
         if after is None:
             more = 0 if room is None else room if most is None else min(room, most - grown)
             after = states_with_room(state, size, more * self.cache_size)
-            after[:, recent + 1 : state.shape[1]] = state[:, recent + 1 :]
-        after[:, :given], after[:, given:recent], after[:, recent] = new, line, number + 1
-        cache = after[:, recent + 1 :].unflatten(1, (grown, self.num_layers, -1))
+            after[:, header : state.shape[1]] = state[:, header:]
+        after[:, :given], after[:, given:recent], after[:, recent:header] = new, line, number + 1
+        cache = after[:, header:].unflatten(1, (grown, self.num_layers, -1))
         first = 0 if self.window is None else 1
         place = number if number < grown else first + (number - first) % (grown - first)
-        size = self.width // self.num_heads
-        turns = rotation(torch.tensor([number], device=state.device), size)
-        if self.window is not None and number > self.window:  # keep the distance of the start symbol
-            key = cache[:, 0, :, : self.width]
-            key.copy_(rotate(key, *rotation(torch.tensor([1], device=state.device), size)))
+        if self.window is not None and number > self.window:
+            self._keep_distance(cache, torch.tensor([1], device=state.device))
+        here = torch.tensor([number], device=state.device)
+        return self._read(x, cache, here, slice(place, place + 1), None), after
+
+    def fixed_state(self, state: Tensor, steps: int) -> Tensor:
+        kept, most = (state.shape[1] - self.header) // self.cache_size, self.most_kept
+        slots = kept + -(-steps // ROOM) * ROOM
+        slots = slots if most is None else min(slots, most)
+        return functional.pad(state, (0, (slots - kept) * self.cache_size))
+
+    def fixed_step(self, action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        given, recent, header = self.input_size, self.input_size + self.lags - 1, self.header
+        cache = state[:, header:].unflatten(1, (-1, self.num_layers, 2 * self.width))
+        number, slots = state[0, recent : recent + 1].long(), cache.shape[1]
+        new = self._inputs(action, None, state[:, :given])
+        x, line = self.embedding(new[:, None], state[:, given:recent], self.window)
+        state[:, :given], state[:, given:recent], state[:, recent:header] = new, line, number + 1
+        first = 0 if self.window is None else 1
+        place = torch.where(number < slots, number, first + (number - first) % max(slots - first, 1))
+        if self.window is not None:
+            self._keep_distance(cache, (number > self.window).long())
+        filled = torch.arange(slots, device=state.device) <= number
+        return self._read(x, cache, number, place, filled[None]), state
+
+    def _keep_distance(self, cache: Tensor, steps: Tensor) -> None:
+        """Turn the start symbol's keys in `cache [N, S, num_layers, 2 * width]` by so many `steps [1]`."""
+        key = cache[:, 0, :, : self.width]
+        key.copy_(rotate(key, *rotation(steps, self.width // self.num_heads)))
+
+    def _read(self, x: Tensor, cache: Tensor, number: Tensor, place: slice | Tensor, filled: Tensor | None) -> Tensor:
+        """The logits `[N, A]` after one more input.
+
+        Args:
+            x: `[N, 1, width]`, its vectors.
+            cache: `[N, S, num_layers, 2 * width]`, in which its keys and values are written to this `place`.
+            number: `[1]`, its position.
+            filled: bool `[1, S]`: the places that are attended to; None: all.
+        """
+        turns = rotation(number, self.width // self.num_heads)
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, Block)
-            x = block.step(x, cache[:, :, layer], place, turns)
-        return self.head(self.norm(x))[:, 0], after
+            x = block.step(x, cache[:, :, layer], place, turns, filled)
+        logits: Tensor = self.head(self.norm(x))
+        return logits[:, 0]
 
     def writes_in_place(self, state: Tensor) -> bool:
         """Whether the next step may be written in place.
@@ -253,15 +307,17 @@ class Block(nn.Module):
             value = torch.cat([value[:, :first], value[:, first + excess :]], 1)
         return x, torch.cat([key, value], -1)
 
-    def step(self, x: Tensor, cache: Tensor, place: int, turns: tuple[Tensor, Tensor]) -> Tensor:
+    def step(
+        self, x: Tensor, cache: Tensor, place: slice | Tensor, turns: tuple[Tensor, Tensor], filled: Tensor | None
+    ) -> Tensor:
         """The new `x [N, 1, width]`; keys and values are written to this place of `cache [N, S, 2 * width]`.
 
-        `turns`: the rotation of the input's position.
+        `turns`: the rotation of the input's position; `filled`: see `TransformerPrior`.
         """
         query, key, value = self._project(x)
-        cache[:, place] = torch.cat([rotate(key, *turns), value], -1)[:, 0]
+        cache[:, place] = torch.cat([rotate(key, *turns), value], -1)
         key, value = cache.chunk(2, -1)
-        return self._add(x, self._attend(rotate(query, *turns), key, value, None))
+        return self._add(x, self._attend(rotate(query, *turns), key, value, None, filled))
 
     def _project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values of `x [N, T, width]`."""
@@ -274,15 +330,18 @@ class Block(nn.Module):
         added: Tensor = self.drop(self.mlp(x))
         return x + added
 
-    def _attend(self, query: Tensor, key: Tensor, value: Tensor, span: int | None) -> Tensor:
-        """`[N, T, width]`: attention of each query over keys and values `[N, S + T, width]`."""
+    def _attend(
+        self, query: Tensor, key: Tensor, value: Tensor, span: int | None, filled: Tensor | None = None
+    ) -> Tensor:
+        """`[N, T, width]`: attention of each query over keys and values `[N, S + T, width]`, or those `filled`."""
         num, total = query.shape[1], key.shape[1]
         span = total if span is None else span
         every = total <= span + 1
         plain = num == total and every
-        mask = None if plain or (num == 1 and every) else reached(num, total, span, query.device)
+        mask = filled if plain or (num == 1 and every) else reached(num, total, span, query.device)
         query, key, value = map(self._heads, (query, key, value))
-        mixed: Tensor = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask, is_causal=plain)
+        causal = plain and mask is None
+        mixed: Tensor = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask, is_causal=causal)
         return mixed.transpose(1, 2).flatten(2)
 
     def _attend_to_first(self, query: Tensor, near: Tensor, key: Tensor, value: Tensor, window: int) -> Tensor:

@@ -135,6 +135,7 @@ class DiscretisedPrior(VectorPrior):
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
         self.check_plans(plans)
+        plans = plans.to(self.device)
         if not plans.max_length or not len(plans):
             return torch.zeros(plans.actions.shape[:2], device=self.device)
         tokens = self._plans(plans)

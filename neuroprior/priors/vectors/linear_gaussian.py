@@ -175,6 +175,7 @@ class LinearGaussianPrior(VectorPrior):
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
         self.check_plans(plans)
+        plans = plans.to(self.device)
         tables = LinearTables(self.weights[None], self.offset[None], self.std[None], self.coupling[None])
         return linear_nats(tables, self.scaled(plans.actions), self.half_range)[0].masked_fill(~plans.mask(), 0)
 

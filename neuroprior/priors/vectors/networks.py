@@ -19,6 +19,7 @@ from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.neural.gru import gru_step
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.neural.transformer import Block
+from neuroprior.priors.recordings import run_recorded
 from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
 from neuroprior.priors.vectors.linear_gaussian import held_out_split, mean_nats
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
@@ -216,11 +217,21 @@ class VectorNetwork(VectorPrior):
         """
         each = max(len(state) // max(len(out), 1), 1)
         forecast = self._forecast(out, state[::each, state.shape[1] - self.input_size :]).repeat_interleave(each)
-        vectors = [forecast.drawn(uniform[:, 0], noise[:, 0])]
-        for t in range(1, noise.shape[1]):
-            forecast, state = self.step(vectors[-1], state)
-            vectors.append(forecast.drawn(uniform[:, t], noise[:, t]))
-        return torch.stack(vectors, 1)
+        first = forecast.drawn(uniform[:, 0], noise[:, 0])
+        return torch.cat([first[:, None], self._rest(first, state, uniform[:, 1:], noise[:, 1:])], 1)
+
+    def _rest(self, last: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+        """The vectors `[N, T, D]` after `last [N, D]`."""
+        vectors = noise.clone()
+        for t in range(noise.shape[1]):
+            last, state = self._drawn(last, state, uniform[:, t], noise[:, t])
+            vectors[:, t] = last
+        return vectors
+
+    def _drawn(self, last: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """The next vectors `[N, D]`, and the state before them."""
+        forecast, state = self.step(last, state)
+        return forecast.drawn(uniform, noise), state
 
     def _after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""
@@ -256,6 +267,7 @@ class VectorNetwork(VectorPrior):
 
     def action_log_probs(self, plans: VectorPlans) -> Tensor:
         self.check_plans(plans)
+        plans = plans.to(self.device)
         actions, context = plans.actions, plans.context
         if not plans.max_length or not len(plans):
             return torch.zeros(actions.shape[:2], device=self.device)
@@ -372,9 +384,9 @@ class VectorNetwork(VectorPrior):
 
     def _chain(self, plans: VectorPlans, seed: int, order: int | None = None) -> AutoregressivePrior:
         """An autoregression on last vectors that the network is given; None: of the order that fits best."""
-        chain = AutoregressivePrior(self.action_low, self.action_high, order).to(plans.actions.device)
+        chain = AutoregressivePrior(self.action_low, self.action_high, order)
         chain.orders = tuple(each for each in chain.orders if each <= self.lags)
-        return chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed)).to(self.device)
+        return chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed))
 
     @torch.no_grad()
     def _begin(self, chain: AutoregressivePrior) -> None:
@@ -452,6 +464,11 @@ class VectorGRU(VectorNetwork):
             return super().draw(out, state, uniform, noise)
         plans: Tensor = fast.draw_recurrent(self, 2 * LEAST_STD, state, uniform, noise)
         return plans
+
+    def _rest(self, last: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+        numbers = uniform.transpose(0, 1), noise.transpose(0, 1)
+        recorded = run_recorded(self, self._drawn, last, state, numbers) if type(self) is VectorGRU else None
+        return super()._rest(last, state, uniform, noise) if recorded is None else recorded.transpose(0, 1)
 
 
 class VectorTransformer(VectorNetwork):

@@ -364,6 +364,7 @@ class VectorPrior(SavedModule):
             ValueError: plans with other bounds, or another context than this prior's.
         """
         self.check_plans(plans)
+        plans = plans.to(self.device)
         actions, context = plans.actions, plans.context
         if not plans.max_length or not len(plans):
             return torch.zeros(actions.shape[:2], device=self.device)
@@ -428,7 +429,7 @@ class VectorPrior(SavedModule):
             raise
         if plans.action_names is not None:
             self.action_names = tuple(map(str, plans.action_names))
-        return plans[plans.mask().any(1)]
+        return plans[plans.mask().any(1)].to(self.device)
 
     def warn_if_coarse(self, plans: VectorPlans) -> None:
         """Warn where the bounds of a dimension are so wide that what vectors do in it is lost to this prior."""
