@@ -311,8 +311,8 @@ class _Trees:
         )  # fmt: skip
         self.result.log_bound[self.result.solved] = 0.0
         logits, hidden = stepper.start_in(world, state)
-        self.queue = self.minima = torch.zeros(0, 0, dtype=torch.float64)
-        self.seen = torch.zeros(0, 0, dtype=torch.long)
+        self.queue = self.minima = torch.zeros(0, 0, dtype=torch.float64, device=device)
+        self.seen = torch.zeros(0, 0, dtype=torch.long, device=device)
         self.nodes = {
             "edge": torch.full((batch, self.capacity), -1, device=device),
             **{name: torch.zeros(batch, self.capacity, dtype=torch.long, device=device) for name in ("depth", "since")},

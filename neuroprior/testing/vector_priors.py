@@ -105,10 +105,10 @@ def _check_reading(prior: VectorPrior, plans: VectorPlans) -> None:
 
 def quadrature(prior: VectorPrior, points: int = 400) -> tuple[Tensor, Tensor]:
     """Values `[D, points + 2]` of each dimension and their weights: the two bounds, of mass 1, and points between."""
-    nodes, weights = (torch.from_numpy(each).float() for each in roots_legendre(points))
-    low, half = prior.action_low.cpu()[:, None], prior.half_range.cpu()[:, None]
+    nodes, weights = (torch.from_numpy(each).float().to(prior.device) for each in roots_legendre(points))
+    low, half = prior.action_low[:, None], prior.half_range[:, None]
     values = torch.cat([low, low + half * (nodes + 1), low + 2 * half], 1)
-    values[:, -1] = prior.action_high.cpu()
+    values[:, -1] = prior.action_high
     ones = torch.ones_like(low)
     return values, torch.cat([ones, half * weights, ones], 1)
 
@@ -187,7 +187,7 @@ def _first_ranks(prior: VectorPrior, forecast: Forecast, first: Tensor, generato
 def _marginal_ranks(prior: VectorPrior, forecast: Forecast, first: Tensor, generator: torch.Generator) -> Tensor:
     """`[N]`: the probability of less than `first [N]`, the first of two numbers, in a forecast of one row."""
     grid = _grid(prior, 0)
-    values, weights = (each[1] for each in quadrature(prior, 200))
+    values, weights = (each[1].cpu() for each in quadrature(prior, 200))
     points = torch.cartesian_prod(grid, values).to(first)
     joint = forecast.repeat_interleave(len(points)).log_prob(points).exp().view(len(grid), -1).cpu()
     return _ranks_on(grid, (joint * weights).sum(1).expand(len(first), -1), first.cpu(), generator)

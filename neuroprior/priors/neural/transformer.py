@@ -15,7 +15,7 @@ ALIGNED = 8
 """Numbers that lie together at an address that vector loads can read from."""
 
 ROOM = 16
-"""Inputs by which a state of a fixed size grows."""
+"""A state of a fixed size has room for a multiple of so many inputs, so that few sizes occur."""
 
 FEWEST_AT_ONCE = 32
 """Inputs of a sequence that are read at once, at least, past the training length."""
@@ -212,7 +212,7 @@ class TransformerPrior(NeuralPrior):
 
     def fixed_state(self, state: Tensor, steps: int) -> Tensor:
         kept, most = (state.shape[1] - self.header) // self.cache_size, self.most_kept
-        slots = kept + -(-steps // ROOM) * ROOM
+        slots = -(-(kept + steps) // ROOM) * ROOM
         slots = slots if most is None else min(slots, most)
         return functional.pad(state, (0, (slots - kept) * self.cache_size))
 

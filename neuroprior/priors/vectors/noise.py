@@ -76,11 +76,11 @@ class NoisePrior(LinearGaussianPrior):
 
     def _moments(self, mean: Tensor, scale: Tensor, exponent: float) -> WindowMoments:
         memory = int(self._given["memory"] or 0) if exponent else 0
-        lags = torch.arange(memory + 1, dtype=torch.double)
-        frequency = torch.arange(1, memory + 2, dtype=torch.double) / (2 * (memory + 1))
+        lags = torch.arange(memory + 1, dtype=torch.double, device=mean.device)
+        frequency = (lags + 1) / (2 * (memory + 1))
         power = frequency**-exponent
         shape = (power[:, None] * torch.cos(2 * torch.pi * frequency[:, None] * lags)).sum(0) / power.sum()
-        toeplitz = shape[(lags[:, None] - lags).abs().long()] if exponent else torch.ones(1, 1, dtype=torch.double)
+        toeplitz = shape[(lags[:, None] - lags).abs().long()] if exponent else torch.ones_like(lags)[:, None]
         variance = torch.diag(scale.double().square())
         return WindowMoments(mean.double().repeat(memory + 1), torch.kron(toeplitz.contiguous(), variance))
 

@@ -168,11 +168,12 @@ class StepSynergies(LinearGaussianPrior):
             # The coordinates keep their covariance over time; what is beside the plane is white, and the same in all
             # directions.
             vectors = components[:, -number:]
-            plane = torch.kron(torch.eye(window, dtype=torch.double), vectors @ vectors.T)
+            each, eye = (torch.eye(n, dtype=torch.double, device=components.device) for n in (window, size))
+            plane = torch.kron(each, vectors @ vectors.T)
             beside = covariance.trace() - (vectors.T @ covariance @ vectors).trace()
-            white = torch.eye(size, dtype=torch.double) - vectors @ vectors.T
+            white = eye - vectors @ vectors.T
             level = beside / max(size - number, 1)
-            noise = torch.kron(torch.eye(window, dtype=torch.double), level * white)
+            noise = torch.kron(each, level * white)
             return WindowMoments(whole, plane @ joint @ plane + noise, RIDGE)
 
         return moments
