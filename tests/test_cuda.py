@@ -249,9 +249,15 @@ def test_plans_beside_a_world_and_what_is_collected() -> None:
 def test_searches_of_puzzles() -> None:
     world = sliding_tiles(shape=(3, 3), scramble=20).to(DEVICE)
     state = world.reset(5, seeded(0))
-    for planner in (AStarPlanner(world.lower_bound), LevinPlanner(UniformPrior(4))):
+    for planner in (AStarPlanner(world.lower_bound), LevinPlanner(UniformPrior(4).to(DEVICE))):
         found = planner.search(world, state)
         assert found.solved.any()
+
+
+def test_a_prior_elsewhere_than_the_states_is_refused() -> None:
+    world = gridworld(8, 8).to(DEVICE)
+    with pytest.raises(ValueError, match="it is on cpu, and the states on cuda"):
+        SamplingPlanner(GRUPrior(4, 8), 6, 64).plan(world, world.reset(5, seeded(0)), seeded(1))
 
 
 LOW, HIGH = torch.tensor([-1.0, -0.5]), torch.tensor([1.0, 1.5])

@@ -1,5 +1,6 @@
 """The jobs of `python -m eval bench`: what the library does in each, its peers, and how far ahead it should be."""
 
+import math
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ from importlib.util import find_spec
 from itertools import product
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -37,7 +39,7 @@ from neuroprior import (
 )
 from neuroprior.planners import AStarPlanner, ICEMPlanner, MPPIPlanner
 from neuroprior.planners import control as run_control
-from neuroprior.priors import CombinedPrior, VectorGRU
+from neuroprior.priors import CombinedPrior, VectorGRU, recordings
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS, networks
 from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import DoubleIntegrator, GridWorld, cube, maze, sliding_tiles
@@ -119,7 +121,10 @@ def against_peers(
 
 
 def on_device(name: str, device: torch.device, scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
-    """The row of a job on an accelerator: seconds there and on the CPU, and bytes of the device at the peak."""
+    """The row of a job on an accelerator, and bytes of the device at the peak.
+
+    Seconds there, also with each step ordered by itself (see `neuroprior.priors.recordings`), and on the CPU.
+    """
     cuda = device.type == "cuda"
     job = JOBS[name](scale)
     alone = median_seconds(job.make(torch.device("cpu")), repetitions)
@@ -135,6 +140,8 @@ def on_device(name: str, device: torch.device, scale: float, repetitions: int) -
     row: dict[str, Any] = {"job": name, "about": job.about}
     row |= {"device": torch.cuda.get_device_name(device) if cuda else device.type}
     row |= {"cpu_seconds": alone, "seconds": median_seconds(finished, repetitions)}
+    with patch.object(recordings, "WORTH", math.inf):
+        row |= {"step_seconds": median_seconds(finished, repetitions)}
     yield row | {"peak_bytes": torch.cuda.max_memory_allocated(device) if cuda else None}
 
 
@@ -178,6 +185,16 @@ def _sample_gru(name: str, size: int, num_layers: int, scale: float) -> Job:
         f"sample {number:,} plans of length 64, {name}",
         lambda device: partial(GRUPrior(4, size, num_layers, lags=1).to(device).sample, number, 64),
         (Peer("plain PyTorch", lambda: partial(peers.PlainGRU(4, size, num_layers).eval().sample, number, 64), 3),),
+    )
+
+
+def sample_few(scale: float, make: type[GRUPrior] | type[TransformerPrior] = GRUPrior) -> Job:
+    """The candidates of one decision."""
+    number, name = scaled(256, scale), make.__name__.removesuffix("Prior")
+    return Job(
+        f"sample {number:,} plans of length 20, {name}",
+        lambda device: partial(make(4).to(device).sample, number, 20),
+        (),
     )
 
 
@@ -513,7 +530,7 @@ def simulations(planner: MCTSPlanner, world: TabularWorld, state: Tensor) -> int
 JOBS: dict[str, Callable[[float], Job]] = {
     make.__name__: make
     for make in (
-        *(sample_short, sample_long, sample_gru, sample_gru_two, sample_beside, sample_beside_cube),
+        *(sample_short, sample_long, sample_few, sample_gru, sample_gru_two, sample_beside, sample_beside_cube),
         *(sample_combined, fit_combined, sample_markov, fit_markov, fit_tree),
         *(evaluate, table_1, train, shoot, decide, decide_vectors, search_tiles, control),
     )
@@ -526,6 +543,8 @@ JOBS |= {
     for starts in (1, 64, 1024)
 }
 
+JOBS["sample_few_transformer"] = partial(sample_few, make=TransformerPrior)
+
 JOBS |= {
     f"horizon_{name}_{times}": partial(horizon, make, times)
     for name, make in (("gru", GRUPrior), ("transformer", TransformerPrior))
@@ -533,8 +552,9 @@ JOBS |= {
 }
 
 ON_DEVICES = (
-    *("sample_short", "sample_long", "sample_gru", "sample_gru_two", "sample_markov", "sample_combined"),
-    *("horizon_gru_16", "horizon_transformer_16", "evaluate", "decide", "decide_vectors"),
+    *("sample_short", "sample_long", "sample_few", "sample_few_transformer", "sample_gru", "sample_gru_two"),
+    *("sample_markov", "sample_combined"),
+    *("horizon_gru_16", "horizon_transformer_2", "evaluate", "decide", "decide_vectors"),
 )
 """Jobs that can be done on other devices than the CPU."""
 

@@ -174,6 +174,11 @@ def check_in_world(prior: Steppable, world: World, state: Tensor) -> None:
     """Raise ValueError unless a prior can act in a world from `state [B, ...]`."""
     check_is_world(world)
     world.check_state(state)
+    device = getattr(prior, "device", None)
+    if device is not None and torch.device(device).type != state.device.type:
+        raise ValueError(
+            f"prior: it is on {device}, and the states on {state.device}; move one of them, as prior.to(state.device)"
+        )
     if getattr(prior, "end", None) is not None:
         raise ValueError(
             "prior: it samples an end symbol, which is no action of the world; fit it to plans without one"
