@@ -191,6 +191,15 @@ def test_learning_on_the_device(name: str, where: str) -> None:
     assert mine.mean().item() == pytest.approx(theirs.mean().item(), abs=0.05)
 
 
+def test_plans_move_with_all_that_belongs_to_them() -> None:
+    here = Plans(plans().actions, A, torch.full((60,), 4), context=index(), group=torch.arange(60))
+    for moved in (here.to(DEVICE), vectors(2).to(DEVICE)):
+        tensors = [value for value in vars(moved).values() if isinstance(value, Tensor)]
+        assert len(tensors) == 4
+        assert all(value.device.type == DEVICE.type for value in tensors)
+    assert here.to(DEVICE).to("cpu").actions.equal(here.actions)
+
+
 def test_one_call(tmp_path: Any) -> None:
     prior = fit(plans(300), effort="fast").to(DEVICE)
     there = Plans(plans().actions.to(DEVICE), A)

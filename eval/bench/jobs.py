@@ -139,9 +139,9 @@ def on_device(name: str, device: torch.device, scale: float, repetitions: int) -
         torch.cuda.reset_peak_memory_stats(device)
     row: dict[str, Any] = {"job": name, "about": job.about}
     row |= {"device": torch.cuda.get_device_name(device) if cuda else device.type}
-    row |= {"cpu_seconds": alone, "seconds": median_seconds(finished, repetitions)}
-    with patch.object(recordings, "WORTH", math.inf):
-        row |= {"step_seconds": median_seconds(finished, repetitions)}
+    with patch.object(recordings, "WORTH", math.inf):  # first, since what was recorded once is used
+        row |= {"cpu_seconds": alone, "step_seconds": median_seconds(finished, repetitions)}
+    row |= {"seconds": median_seconds(finished, repetitions)}
     yield row | {"peak_bytes": torch.cuda.max_memory_allocated(device) if cuda else None}
 
 

@@ -16,6 +16,9 @@ Take = Callable[..., tuple[Tensor, Tensor]]
 """A step of N plans: their last actions, their states and random numbers to the next actions and states, all of the
 same shapes. It waits for nothing on the device."""
 
+DEVICES = ("cuda",)
+"""Kinds of devices on which steps are recorded."""
+
 WORTH, LARGEST, KEPT = 16, 2**26, 2
 """Steps of as many plans after which one is recorded; the most numbers in their states; and recordings of a prior that
 are kept, which hold the memory of a step."""
@@ -94,7 +97,7 @@ def run_recorded(
     """
     steady = not (prior.training or torch.is_grad_enabled() or torch.is_autocast_enabled(state.device.type))
     fits, steps = 0 < state.numel() <= LARGEST, len(numbers[0])
-    if state.device.type != "cuda" or not steady or is_hooked(prior) or not fits or not steps:
+    if state.device.type not in DEVICES or not steady or is_hooked(prior) or not fits or not steps:
         return None
     weights = tuple(tensor.data_ptr() for tensor in (*prior.parameters(), *prior.buffers()))
     key = weights, state.shape, key

@@ -102,3 +102,11 @@ def test_what_does_not_fit_is_refused():
         sample(CHAIN, 10, 4, torch.zeros(10, dtype=torch.long))
     with refuses("4 actions"):
         SamplingPlanner(Minimal(torch.zeros(5, 4)), 3, 2).plan(random_world(0), torch.tensor([0]))
+
+
+def test_a_prior_on_another_device_than_the_states_is_named():
+    prior = Minimal(CHAIN.log_probs)
+    prior.device = torch.device("cuda")
+    world = WORLDS["all legal"]
+    with refuses("it is on cuda", "the states on cpu"):
+        SamplingPlanner(prior, 4, 8).plan(world, world.reset(3, seeded(0)))

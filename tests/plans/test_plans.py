@@ -254,3 +254,8 @@ def test_plans_keep_their_names():
     for wrong, words in ((["a", "b"], "3 are expected, one a plan, not 2"), ("abc", "a list of texts")):
         with pytest.raises(ValueError, match=f"plan_names: {words}"):
             Plans(plans.actions, 6, plan_names=wrong)
+
+
+def test_plans_that_need_not_move_are_themselves():
+    plans = Plans(ACTIONS, 3, group=torch.arange(len(ACTIONS)))
+    assert plans.to("cpu") is plans

@@ -207,3 +207,10 @@ def test_one_start_for_all_resets_is_said():
     assert len(several.observe(starts).unique(dim=0)) == 5
     zero = several.observe(starts[several.layout(starts) == 0][:1])
     torch.testing.assert_close(zero, first)
+
+
+def test_environments_are_stepped_on_the_cpu():
+    world = from_gymnasium("CartPole-v1", seeds=[4])
+    assert world.to("cpu") is world
+    with refuses("SteppedWorld simulates on the CPU", "cuda"):
+        world.to("cuda")

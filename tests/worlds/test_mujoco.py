@@ -203,3 +203,10 @@ def test_without_mujoco_the_extra_is_named():
         "else: raise SystemExit('no error')"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_tasks_are_simulated_on_the_cpu():
+    world = world_of("Reacher-v5")
+    assert world.to("cpu") is world
+    with pytest.raises(ValueError, match="simulates on the CPU"):
+        world.to("cuda")

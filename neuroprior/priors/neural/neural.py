@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
+from neuroprior.priors import recordings
 from neuroprior.priors.neural.features import UNSCALED, Standardise
 from neuroprior.priors.prior import Prior
-from neuroprior.priors.recordings import is_hooked, run_recorded
 from neuroprior.sampling.draws import Draw, check_possible
 
 CONTEXT_SPREAD = 0.03
@@ -241,7 +241,7 @@ class NeuralPrior(Prior):
         Returns:
             int64 `[N, T]`; None where recording does not pay, or does not work.
         """
-        if state.device.type != "cuda" or not self.is_plain:
+        if state.device.type not in recordings.DEVICES or not self.is_plain:
             return None
         draw = Draw(self.num_actions, temperature, torch.Generator(state.device))
 
@@ -251,7 +251,7 @@ class NeuralPrior(Prior):
             return torch.where(total > 0, drawn, IMPOSSIBLE), state
 
         key = temperature, repr(self.learned)
-        drawn = run_recorded(self, take, action, self.fixed_state(state, len(uniform)), [uniform], key)
+        drawn = recordings.run_recorded(self, take, action, self.fixed_state(state, len(uniform)), [uniform], key)
         if drawn is None:
             return None
         check_possible((drawn != IMPOSSIBLE).all())
@@ -260,7 +260,7 @@ class NeuralPrior(Prior):
     @property
     def is_plain(self) -> bool:
         """Whether it predicts as its class of this library does: it reads past actions, and no part is replaced."""
-        return self.window != 0 and not is_hooked(self)
+        return self.window != 0 and not recordings.is_hooked(self)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
