@@ -40,7 +40,7 @@ def sample(
     Plans that share a prefix share its evaluation: the number of plans is split multinomially over the distinct
     prefixes of each length ("tree"), which gives the same distribution as drawing each plan by itself ("ancestral").
     "auto" splits as long as there are far fewer prefixes than plans, and draws plan by plan from there on; plans that
-    still begin alike are stepped once.
+    still begin alike are stepped once. Many plans of a small chain are drawn by a compiled loop.
 
     Args:
         prior: any prior.
@@ -291,6 +291,9 @@ def _sample_from_roots(
     for t, action in enumerate(past.expand(len(counts), behind).unbind(1)):
         given = context[:, t + 1] if context is not None and per_step else None
         logits, state = stepper.step(action, state, given, behind - t - 1)
+    whole = stepper.draw_plans(state, counts, length, draw) if method == "auto" and not per_step else None
+    if whole is not None:
+        return whole
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
     root = torch.arange(len(counts), device=counts.device)
     always = {"tree": True, "ancestral": False}

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_same_names, is_integer
 from neuroprior._threads import one_thread
 from neuroprior.plans import is_per_step
-from neuroprior.sampling.draws import after_end
+from neuroprior.sampling.draws import Draw, after_end
 from neuroprior.worlds.world import World, check_is_world
 
 FEWEST_TO_SHARE = 256
@@ -39,6 +39,8 @@ class Steppable(Protocol):
       and `context [K, ...]` are the distinct ones, `row [N]` says which of them each plan gets.
     - `draw_rest(action, state, uniform, temperature)`: the actions `[N, T]` that follow `action [N]`, drawn with the
       numbers `uniform [T, N]`; None: not now, so that the prior is stepped.
+    - `draw_plans(state, counts, length, temperature, generator)`: `counts[r]` plans `[N, length]` from each row of
+      `state [R, ...]` before their first actions, row by row; None: not now.
     - `device`: where the prior computes; a prior that takes a context computes on the CPU without it.
     - `shares_steps`: true where steps of different plans may be taken on several threads at once.
 
@@ -78,6 +80,7 @@ class Stepper:
         self.shares: bool = getattr(prior, "shares_steps", False)
         self._advance = getattr(prior, "advance", None) if in_place else None
         self._draw_rest = getattr(prior, "draw_rest", None) if in_place and self.end is None else None
+        self._draw_plans = getattr(prior, "draw_plans", None) if in_place else None
         self._advance_shared = getattr(prior, "advance_shared", None) if in_place else None
 
     @property
@@ -136,6 +139,13 @@ class Stepper:
         """The rest of N plans, `[N, T]`, where the prior draws it at once; see `Steppable`."""
         rest: Tensor | None = None if self._draw_rest is None else self._draw_rest(action, state, uniform, temperature)
         return rest
+
+    def draw_plans(self, state: Tensor, counts: Tensor, length: int, draw: Draw) -> Tensor | None:
+        """Plans from few states, where the prior draws them at once; see `Steppable`."""
+        if self._draw_plans is None:
+            return None
+        plans: Tensor | None = self._draw_plans(state, counts, length, draw.temperature, draw.generator)
+        return plans
 
     def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
         """As `start`, with the observation of `state [B, ...]` as context.

@@ -3,12 +3,23 @@
 from abc import abstractmethod
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuroprior.plans import Plans, is_per_step
+from neuroprior._compiled import compiled
+from neuroprior._random import draw_seed
+from neuroprior._threads import share
+from neuroprior.plans import Plans, action_dtype, is_per_step
 from neuroprior.priors.counts.histories import MAX_TABLE_BYTES, Counts, Tree, count_histories
 from neuroprior.priors.prior import Prior
+
+COMPILE_FROM: int | None = 2**16
+"""Actions of plans from which a compiled loop that draws them is worth its call, where numba is installed; None: never.
+"""
+
+LARGEST, RUNS = 2**17, 256
+"""The most numbers in the tables that it draws from, and in a row of them."""
 
 _TABLES = ("next_node", "parent", "start_node", "row_code", "log_probs")
 
@@ -59,6 +70,41 @@ class HistoryPrior(Prior):
         contexts = self.num_contexts or 1
         node = self.next_node.view(-1)[state.div(contexts, rounding_mode="floor") * self.num_actions + action].long()
         return self._at(node, state % contexts if context is None else context.long())
+
+    def draw_plans(
+        self, state: Tensor, counts: Tensor, length: int, temperature: float, generator: torch.Generator
+    ) -> Tensor | None:
+        """Many plans from few states, drawn by a compiled loop; see `neuroprior.sampling.Steppable`."""
+        actions, contexts, total = self.num_actions, self.num_contexts or 1, int(counts.sum())
+        states, drawn = len(self.next_node) * contexts, total * length
+        worth = COMPILE_FROM is not None and drawn >= COMPILE_FROM and 8 * states * actions <= drawn
+        able = type(self).step is HistoryPrior.step and self.device.type == "cpu" and self.end is None
+        fits = states * actions <= LARGEST
+        fast = compiled("neuroprior.priors.counts.compiled_draws") if worth and able and fits else None
+        if fast is None:
+            return None
+        every, dtype, run = torch.arange(states), action_dtype(actions), 1
+        room = min(LARGEST, max(drawn // 4, states * actions)) // states
+        while actions ** (2 * run) <= min(RUNS, room) and 2 * run <= 8 // dtype.itemsize and run < length:
+            run *= 2
+        logits, _ = self._at(every.div(contexts, rounding_mode="floor"), every % contexts)
+        single = (logits.double() / temperature).softmax(-1)
+        if not single.isfinite().all():
+            return None  # which is refused when plans are stepped
+        follow = torch.stack([self.step(torch.full_like(every, a), every)[1] for a in range(actions)], 1)
+        probs, after = single, follow
+        for _ in range(run - 1):
+            probs, after = (probs[..., None] * single[after]).flatten(1), follow[after].flatten(1)
+        runs = torch.cartesian_prod(*[torch.arange(actions)] * run).view(-1, run).to(dtype).numpy()
+        tables = fast.tables(probs.numpy(), after.numpy(), runs)
+        plans = np.empty((total, -(-length // run)), tables.actions.dtype)
+        ends, start, seed = counts.cumsum(0).numpy(), state.numpy(), draw_seed(generator)
+
+        def part(first: int) -> None:
+            fast.draw(tables, start, ends, seed, first, plans[first : first + fast.PLANS])
+
+        share(part, range(0, total, fast.PLANS))
+        return torch.from_numpy(plans.view(runs.dtype))[:, :length].contiguous()
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         return self.log_probs[self._places(plans, context)[0]]
