@@ -123,6 +123,7 @@ def _entries(contest: Contest, one: Contestant, name: str) -> list[dict[str, Any
 
 def planned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:
     """The normalised score of a planner's decisions, and their model steps and seconds for each start."""
+    _warm_up(starts, planner)
     begin = perf_counter()
     decision = planner.plan(starts.world, starts.state, generator)
     seconds = (perf_counter() - begin) / len(starts.state)
@@ -132,8 +133,14 @@ def planned(starts: Starts, planner: Planner, generator: torch.Generator) -> dic
     return {"share": starts.normalised(score), "model_steps": decision.model_steps, "seconds": seconds}
 
 
+def _warm_up(starts: Starts, planner: Planner) -> None:
+    """A decision that is not timed: the first one may compile loops for seconds."""
+    planner.plan(starts.world, starts.state[:1], torch.Generator().manual_seed(0))
+
+
 def replanned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:
     """As `planned`, of as many actions as a plan has, each the first of a new plan; the mean of `TRAJECTORIES`."""
+    _warm_up(starts, planner)
     begin = perf_counter()
     state = starts.state.repeat_interleave(TRAJECTORIES, 0)
     done = execute(planner, starts.world, state, starts.length, 1, generator)

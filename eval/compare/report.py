@@ -100,13 +100,24 @@ def _figures(title: str, text: str, boxes: Iterable[FigureBox], beside: bool = F
     return Section(title, [text] if text else [], (), list(boxes), beside)
 
 
+HOW_CHOSEN = (
+    "The best prior of each kind is chosen on half of the seeds and compared on the other half, both ways, so that the"
+    " choice does not favour it. Intervals and p-values hold whichever prior is the best of its kind: better is a prior"
+    " that is better than every prior of the other kind (paired t-tests over seeds, corrected for the number of priors"
+    " by Bonferroni and for the number of worlds by Holm). The number of plans is the median of those that were asked"
+    " for."
+)
+"""How the best prior of each kind is compared with that of the other."""
+
+
 def lead(results: Results) -> str:
     """In how many worlds the best neural prior is better than the best chain, without context and curriculum."""
     words = results.words
     best = words[(words["what"] == BEST) & (words["context"] == "none") & (words["rounds"] == 0)]
     seeds = f"Seeds: {len({run['seed'] for run in results.runs})}."
     if best.empty:
-        return f"Neural priors and Markov chains were not compared. {seeds}"
+        others = "; the tables compare the priors in pairs" if len(words) else ""
+        return f"Neural priors and Markov chains were not compared{others}. {seeds}"
     better, worse = (int((best["better"] == best[side]).sum()) for side in ("first", "second"))
     return (
         f"With {results.shown:,} candidate plans the best neural prior is significantly better than the best Markov"
@@ -131,8 +142,9 @@ def headlines(results: Results) -> Section:
             "p": "p_value:.2g",
             "Holm p": "p_holm:.2g",
         }
+        what = "The best prior of each kind: normalised" if best.any() else "Normalised"
         caption = (
-            f"The best prior of each kind: normalised score, % of the optimum, with {results.shown:,} candidate plans,"
+            f"{what} score, % of the optimum, with {results.shown:,} candidate plans,"
             f" and the difference in percentage points. after: after the horizon curriculum. {HALF} Holm p: corrected"
             " for the number of worlds; *: below 0.05."
         )
@@ -155,20 +167,15 @@ def headlines(results: Results) -> Section:
         alt = "; ".join(f"{row['world']} {100 * row['difference']:+.1f}" for _, row in rows.iterrows())
         drawn = figures.gap_figure(rows, ("Markov better", "neural better"))
         boxes.append(FigureBox(drawn, f"{caption} Intervals: 95 %, over seeds.", alt))
-    text = [
-        "The best prior of each kind is chosen on half of the seeds and compared on the other half, both ways, so that"
-        " the choice does not favour it. Intervals and p-values hold whichever prior is the best of its kind: better is"
-        " a prior that is better than every prior of the other kind (paired t-tests over seeds, corrected for the"
-        " number of priors by Bonferroni and for the number of worlds by Holm). The number of plans is the median of"
-        " those that were asked for."
-    ]
+    text = [HOW_CHOSEN] if best.any() or not len(words) else []
     if len(across := results.across):
         unit = f"the normalised score, % of the optimum, with {results.shown:,} candidate plans"
         tables += over_worlds(across, {"prior": "prior", "baseline": "baseline"}, ("score", "baseline's"), unit)
     if len(combined := results.combined):
         unit = "the normalised score, % of the optimum; most: the last context that each world offers"
         tables += over_worlds(combined, {"other": "prior", "candidates": "num_plans"}, ("combined", "other's"), unit)
-    return Section("Neural priors against Markov chains", text, tables, boxes)
+    title = "Neural priors against Markov chains" if text else "Priors in pairs"
+    return Section(title, text, tables, boxes)
 
 
 def over_worlds(
@@ -324,10 +331,12 @@ def tables_of(results: Results, world: str) -> Iterator[Table]:
         columns = {
             "prior": "label",
             "bits per action": lambda row: plus_minus(row, "bits_per_action", digits=3),
-            "more": lambda row: plus_minus(row, "more", digits=3, sign="+", ends="more_"),
         }
-        caption = f"{world}: bits per held-out action; more: than the best Markov chain of equal context, paired."
-        yield table(bits, columns, caption, world)
+        caption = f"{world}: bits per held-out action"
+        if bits["more"].notna().any():
+            columns["more"] = lambda row: plus_minus(row, "more", digits=3, sign="+", ends="more_")
+            caption += "; more: than the best Markov chain of equal context, paired"
+        yield table(bits, columns, f"{caption}.", world)
     caption = f"{world}: optimal in % of the starts, by candidate plans; ms: a decision with {results.shown:,} plans."
     shares = [f"{100 * one:.1f}" for one in rows["at_oracle"]]
     yield table_by(rows, {"prior": "label"}, "num_plans", shares, caption, world, timed=results.shown)

@@ -35,6 +35,9 @@ MISSING: tuple[Missing, ...] = ("gap", "label", "error")
 EVENT_TYPES = ("START", "STOP", "POINT")
 """Values of the column `Columns.event_type`: an action begins, ends, or takes no time."""
 
+ROUNDING = 4
+"""Of the last binary digits: so far may the sum of a start and a duration be from the time that it stands for."""
+
 UNLABELLED = "missing"
 """The action of rows without a label, where these are to count as one."""
 
@@ -170,7 +173,9 @@ class Table:
         found = found or [i for i, known in enumerate(names) if known.strip().lower() == name.strip().lower()]
         if len(found) != 1:
             much = "there twice" if found else f"not there; the columns are {self._names()}"
-            raise ValueError(f"columns.{what}: the column {name!r} is {much}")
+            several = what == "context" and all(part.strip() in names for part in name.split(","))
+            hint = f" (several are given as '[{name}]')" if several else ""
+            raise ValueError(f"columns.{what}: the column {name!r} is {much}{hint}")
         return found[0]
 
     def texts(self, position: int) -> tuple[Integers, list[str]]:
@@ -345,7 +350,7 @@ def fields_of(
     begin = np.diff(plan, prepend=-1) != 0
     seconds, ends = _durations(table, start, row, begin)
     if "stop" in table.at and ends is not None and start is not None:
-        early = ~begin[1:] & (start[row][1:] < ends[:-1])
+        early = ~begin[1:] & (start[row][1:] < ends[:-1] - ROUNDING * np.spacing(np.abs(ends[:-1])))
         if early.any():
             notes.append(f"{int(early.sum()):,} actions begin before the one before them ended")
     pause = np.zeros(len(row), bool)
@@ -353,7 +358,7 @@ def fields_of(
         if start is None or ends is None or not {"stop", "duration"} & table.at.keys():
             raise ValueError("max_gap: the columns start, and stop or duration, are expected with it")
         latest = _running_maximum(ends, plan)
-        pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap)
+        pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap + ROUNDING * np.spacing(np.abs(latest[:-1])))
     if without.all():
         raise ValueError(f"{of}: no row has an action")
     # A gap is a run of rows without a label between actions of one plan, or a pause.
@@ -539,7 +544,7 @@ def _durations(
                 raise ValueError(
                     f"{table.place(int(row[wrong]))}: {what}: the action takes {taken[wrong]:g}; 0 or more is expected"
                 )
-            return taken, None if when is None else when + taken
+            return taken, values if what == "stop" else None if when is None else when + taken
     if when is None:
         return None, None
     # An action goes on until the next one begins; when the last one of a plan ended is not known.

@@ -19,7 +19,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
     become features for a prior that was trained with them.
 
     Args:
-        plans: N plans without an end symbol.
+        plans: N plans; of a prior that learned an end symbol, with or without theirs.
         prior: the prior.
         name: of the prior, for messages.
 
@@ -32,6 +32,10 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
         [[1, 0]]
     """
     check_are_plans(plans)
+    if plans.end is not None:
+        if prior.end is None:
+            raise ValueError(f"{name}: it learned no end symbol, and the plans have one; give plans.without_end()")
+        plans = plans.without_end()
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
         raise ValueError(

@@ -25,7 +25,8 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
 
     Args:
         prior: fitted.
-        plans: N of them, without an end symbol; their actions and contexts are matched by name, where both have names.
+        plans: N of them, with or without an end symbol for a prior that learned one, else without. Actions and contexts
+            are matched by name, where both have names.
         by: what a row is.
 
     Returns:
@@ -48,7 +49,7 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
         )
     with torch.no_grad():
         log_probs = prior.action_log_probs(match_plans(plans, prior))
-    return scores_by(-log_probs.cpu().double() / log(2), plans, by)
+    return scores_by(-log_probs.cpu().double() / log(2), plans if plans.end is None else plans.without_end(), by)
 
 
 def scores_by(bits: Tensor, plans: Plans, by: str) -> Any:

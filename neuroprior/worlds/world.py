@@ -28,6 +28,7 @@ Holder = TypeVar("Holder")
 
 def moved(holder: Holder, device: torch.device | str) -> Holder:
     """`holder`, whose tensors, and attributes that can be moved `to` a device, are moved to `device`."""
+    device = torch.device(device)
     for name, value in list(vars(holder).items()):
         if hasattr(value, "to"):
             setattr(holder, name, value.to(device))

@@ -37,6 +37,7 @@ OK = '{"actions": [0, 1]}'
         ([OK, '{"actions": [0, 1]'], ["line 2", "not JSON"]),
         ([OK, "", OK + OK], ["line 3", "one object a line"]),
         ([OK, "[0, 1]"], ["line 2", "is no plan"]),
+        ([OK, '{"actions": [0], "actions": [1]}'], ["line 2", "the key 'actions' is given twice"]),
         ([OK, '{"action": [0]}'], ["line 2", '"actions"', "nothing"]),
         ([OK, '{"actions": 3}'], ["line 2", "a list is expected, not 3"]),
         ([OK, '{"actions": [0, true]}'], ["line 2", "action True"]),

@@ -598,3 +598,35 @@ def test_what_a_frame_cannot_hold():
         Plans(STEPS, 3, torch.tensor([3, 0, 2])).to_dataframe()
     with refuses("'-'"):
         Plans(STEPS, 3, action_names=("a", "-", "b")).to_dataframe()
+
+
+@pytest.mark.parametrize("ends", ["stop", "duration"])
+def test_actions_that_follow_one_another_at_once_do_so_whatever_is_rounded(ends):
+    """In floating point .011 + (.051 - .011) is less than .051, and .1 + .2 more than .3."""
+    rng = np.random.default_rng(0)
+    steps = rng.integers(1, 2000, (300, 6))
+    times = steps.cumsum(1) / 1000
+    rows = pd.DataFrame(
+        {
+            "plan": np.repeat(np.arange(300), 5),
+            "action": np.tile(list("abcde"), 300),
+            "start": times[:, :-1].ravel(),
+            "stop": times[:, 1:].ravel(),
+        }
+    )
+    if ends == "duration":
+        rows["duration"] = (steps[:, 1:] / 1000).ravel()
+        rows = rows.drop(columns="stop")
+    plans = Plans.from_dataframe(rows, max_gap=0)
+    assert len(plans) == 300
+    assert not plans.notes
+    late = 0.0005 * (rows["action"] == "e")
+    for column in {"start", "stop"} & set(rows.columns):
+        rows[column] += late
+    assert len(Plans.from_dataframe(rows, max_gap=0)) == 600
+
+
+def test_several_columns_of_a_context_in_one_text():
+    frame = pd.DataFrame({"plan": [1, 1], "action": ["a", "b"], "c1": [0.0, 1.0], "c2": [0.0, 1.0]})
+    with refuses("columns.context: the column 'c1,c2' is not there", "several are given as '[c1,c2]'"):
+        Plans.from_dataframe(frame, context="c1,c2")

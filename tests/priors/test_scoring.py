@@ -92,3 +92,12 @@ def test_plans_that_were_learned_from_are_known_again(tmp_path):
     longer = Plans(torch.nn.functional.pad(TRAINING.actions, (0, 2)), 3, torch.full((40,), 8), action_names=NAMES)
     assert learned_from(tmp_path, longer) == known
     assert sum(learned_from(tmp_path, Plans(TRAINING.actions, 3))) == 0
+
+
+def test_plans_with_an_end_symbol_are_scored_by_priors_that_learned_one():
+    ended = Plans(torch.randint(3, (50, 6), generator=seeded(0)), 3).with_end()
+    prior = MarkovPrior(4, 1).fit(ended)
+    assert score(prior, ended)["log_likelihood"].tolist() == pytest.approx(prior.log_prob(ended).tolist())
+    assert score(prior, ended).equals(score(prior, ended.without_end()))
+    with refuses("it learned no end symbol", "plans.without_end()"):
+        score(MarkovPrior(3, 1).fit(ended.without_end()), ended)

@@ -103,7 +103,7 @@ def write_jsonl(plans: Plans, path: Path) -> None:
 
 def _objects(file: Any, path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """The JSON objects of a file with the numbers of their lines; blank lines are skipped."""
-    decode = json.JSONDecoder(parse_constant=_refuse_constant).raw_decode
+    decode = json.JSONDecoder(parse_constant=_refuse_constant, object_pairs_hook=_once_each).raw_decode
     for number, line in enumerate(file, 1):
         text = line.strip()
         if not text:
@@ -121,6 +121,15 @@ def _objects(file: Any, path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         if type(row) is not dict:
             raise ValueError(f'{path}, line {number}: {_short(row)} is no plan; {{"actions": [...]}} is expected')
         yield number, row
+
+
+def _once_each(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object; raises ValueError where a key is given twice, of which one would be lost."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} is given twice")
+    return found
 
 
 def _refuse_constant(text: str) -> NoReturn:

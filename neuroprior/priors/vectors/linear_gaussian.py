@@ -21,9 +21,9 @@ from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
 LEAST_STD = 1e-3
 """Of half a dimension's range: the standard deviations of priors are at least so large, see `least_std`."""
 
-LEAST_SHARE, CONSTANT_STD = 1e-2, 1e-6
-"""The share of the standard deviation of the vectors that is enough where bounds are wide, and the standard deviation,
-of half the range, of vectors that count as constant.
+LEAST_SHARE, ROUNDING = 1e-2, 1e-6
+"""The share of the standard deviation of the vectors that is enough where bounds are wide; and the share of their mean
+that single precision tells apart: vectors that vary by no more count as constant.
 """
 
 HELD_OUT = 0.2
@@ -206,13 +206,23 @@ def draw_linear(prior: LinearGaussianPrior, vectors: Tensor, known: int, noise: 
             now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
 
 
-def least_std(std: Tensor) -> Tensor:
-    """The least standard deviations of predictions for vectors with these `std`, all in units of half the range.
+def is_constant(std: Tensor, mean: Tensor) -> Tensor:
+    """Which dimensions have vectors that differ by rounding alone, by their standard deviations and means."""
+    return std <= ROUNDING * mean.abs()
+
+
+def least_std(std: Tensor, mean: Tensor) -> Tensor:
+    """The least standard deviations of predictions, in units of half the range, as all here.
 
     Without them predictions could be infinitely likely. Where bounds are wide, `LEAST_STD` is more than the vectors
-    vary by, so that a share of what they vary by is taken. Constant dimensions have `LEAST_STD`.
+    vary by, so that a share of what they vary by is taken; of constant ones, of their distance from the middle.
+
+    Args:
+        std, mean: of the vectors, from the middle of the range.
     """
-    return torch.where(std > CONSTANT_STD, LEAST_SHARE * std, torch.inf).clamp(max=LEAST_STD)
+    constant, far = is_constant(std, mean), mean.abs()
+    share = torch.where(constant, LEAST_SHARE * far, (LEAST_SHARE * std).maximum(ROUNDING * far))
+    return torch.where(share > 0, share, torch.inf).clamp(max=LEAST_STD)
 
 
 def predictions(moments: Sequence[WindowMoments], size: int) -> LinearTables:
@@ -222,7 +232,7 @@ def predictions(moments: Sequence[WindowMoments], size: int) -> LinearTables:
     ridge = torch.tensor([each.ridge for each in moments], dtype=torch.double, device=mean.device)
     memory = mean.shape[1] // size - 1
     last, eye = slice(memory * size, None), torch.eye(size, dtype=torch.double, device=mean.device)
-    least = least_std(covariance[:, last, last].diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()).square()
+    least = least_std(covariance[:, last, last].diagonal(dim1=1, dim2=2).clamp(min=0).sqrt(), mean[:, last]).square()
     rows = []
     for h in range(memory + 1):
         past = slice((memory - h) * size, memory * size)

@@ -9,10 +9,10 @@ from torch import Tensor
 from neuroprior._checks import check_count
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import (
-    CONSTANT_STD,
     LinearGaussianPrior,
     WindowMoments,
     best_of,
+    is_constant,
     window_moments,
 )
 
@@ -88,7 +88,7 @@ class NoisePrior(LinearGaussianPrior):
         values = self.scaled(plans.actions)[plans.mask()]
         mean, covariance, _ = window_moments(values[:, None])
         std = covariance.diagonal().sqrt()
-        std = torch.where(std > CONSTANT_STD, std, 0.0)  # a constant has the least standard deviation of predictions
+        std = std.masked_fill(is_constant(std, mean), 0)  # a constant has the least standard deviation of predictions
         if self._given["scale"] is not None:
             mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])
         moments = partial(self._moments, mean, std)

@@ -164,9 +164,9 @@ class StoredWindows(VectorPrior):
             windows = windows[torch.linspace(0, len(windows) - 1, most).round().long()]
         self.register_buffer("segments", self.scaled(windows).to(self.device))
         variance = self.segments.var((0, 1), correction=0)
-        std, stds = variance.mean().sqrt(), variance.sqrt()
-        extent = (EXTENT * std).maximum(least_std(std) / NOISES[0]).clamp(max=1)
-        in_proportion = (extent * stds / std).maximum(least_std(stds) / NOISES[0])
+        std, stds, means = variance.mean().sqrt(), variance.sqrt(), self.segments.mean((0, 1))
+        extent = (EXTENT * std).maximum(least_std(std, means.abs().mean()) / NOISES[0]).clamp(max=1)
+        in_proportion = (extent * stds / std).maximum(least_std(stds, means) / NOISES[0])
         self.extent = in_proportion if own and std > 0 else extent.expand(self.action_size).contiguous()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:

@@ -14,6 +14,7 @@ from neuroprior.priors.vectors.linear_gaussian import (
     WindowMoments,
     best_of,
     held_out_split,
+    is_constant,
     moments_or_white,
     window_moments,
 )
@@ -83,11 +84,13 @@ class WindowSynergies(LinearGaussianPrior):
         values = self.scaled(plans.actions)[plans.mask()]
         mean, covariance, _ = moments_or_white(self.scaled(plans.windows(window)), values, window - 1)
         white = torch.diag(values.double().var(0, correction=0).repeat(window))
+        both = varying(values, window)
         sizes, components = torch.linalg.eigh(covariance)
 
         def moments(setting: tuple[int, float]) -> WindowMoments:
             number, share = setting
-            return WindowMoments(mean, torch.lerp(principal(sizes, components, number), white, share))
+            # What components leave is the same in all directions, but a constant stays one.
+            return WindowMoments(mean, torch.lerp(principal(sizes, components, number) * both, white, share))
 
         return moments
 
@@ -163,6 +166,7 @@ class StepSynergies(LinearGaussianPrior):
         components = torch.linalg.eigh(covariance)[1]
         window, size = self.order + 1, self.action_size
         whole, joint, _ = moments_or_white(self.scaled(plans.windows(window)), values, self.order)
+        both = varying(values, window)
 
         def moments(number: int) -> WindowMoments:
             # The coordinates keep their covariance over time; what is beside the plane is white, and the same in all
@@ -174,9 +178,15 @@ class StepSynergies(LinearGaussianPrior):
             white = eye - vectors @ vectors.T
             level = beside / max(size - number, 1)
             noise = torch.kron(each, level * white)
-            return WindowMoments(whole, plane @ joint @ plane + noise, RIDGE)
+            return WindowMoments(whole, (plane @ joint @ plane + noise) * both, RIDGE)
 
         return moments
+
+
+def varying(values: Tensor, window: int) -> Tensor:
+    """`[W * D, W * D]`: 1 between dimensions of windows of W vectors that vary in `values [S, D]`, 0 for constants."""
+    varies = ~is_constant(values.double().std(0, correction=0), values.double().mean(0)).repeat(window)
+    return (varies[:, None] & varies).double()
 
 
 def principal(values: Tensor, vectors: Tensor, number: int) -> Tensor:

@@ -223,3 +223,15 @@ def test_the_optimum_is_drawn_where_it_is_near():
 def test_nothing_to_draw_is_an_error(make):
     with pytest.raises(ValueError, match="at least one is expected"):
         make()
+
+
+def test_two_saved_priors_are_compared_in_pairs(tmp_path):
+    """Nothing is said of the best of a kind, or of chains, where none is known to be there."""
+    times = {"uniform": 1.0, "runs/mine": 3.0, "runs/other": 8.0}
+    results, page, shown = reported(worlds(["maze"], 4, times), tmp_path)
+    assert [row["what"] for row in results["words"]] == ["learned minus other"]
+    assert "Priors in pairs" in page
+    for text in (page, shown):
+        assert "the tables compare the priors in pairs. Seeds: 4." in " ".join(text.split())
+        for wrong in ("Neural priors against", "The best prior of each kind", "than the best Markov chain"):
+            assert wrong not in " ".join(text.split())

@@ -274,3 +274,36 @@ def test_a_censored_autoregression_is_recovered():
     forecast, _ = prior.read(ends)
     assert forecast.mean.flatten().tolist() == pytest.approx(means, abs=0.06)
     assert float(forecast.std.mean()) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("half", [3.0, 9e5, 1.2e6, 1e7])
+@pytest.mark.parametrize("kind", ["noise", "autoregressive", "window synergies", "step synergies"])
+def test_however_wide_bounds_are_linear_priors_follow_the_vectors(kind, half):
+    values = walk(20, 0, 1.0, 1, 0.9).clamp(-3, 3)
+    plans = VectorPlans(values, [-half], [half])
+    prior = WIDE[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded())
+    drawn = prior.sample(500, 40, generator=seeded(1))[0]
+    assert float(drawn.std()) == pytest.approx(float(values.std()), rel=0.3)
+
+
+@pytest.mark.parametrize(("value", "half", "near"), [(0.0, 10.0, 0.05), (3.0, 10.0, 0.05), (3.0, 1e6, 0.15)])
+@pytest.mark.parametrize("kind", CLOSED)
+def test_what_never_changes_is_drawn_close_to_where_it_is(kind, value, half, near):
+    """Within five standard deviations of a thousandth of half the range, or a hundredth of the distance from 0."""
+    plans = VectorPlans(torch.full((10, 20, 1), value), [-half], [half])
+    prior = CLOSED[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded())
+    drawn = prior.sample(100, 20, generator=seeded(1))
+    assert float((drawn - value).abs().max()) < near
+    assert 0 < float(drawn.std()) < near / 4
+
+
+@pytest.mark.parametrize("kind", ["noise", "autoregressive", "window synergies", "step synergies"])
+def test_what_never_changes_beside_others_does_not_borrow_their_spread(kind):
+    """From two short plans, of which synergies show little."""
+    moving = torch.randn(2, 12, 2, generator=seeded(0)).cumsum(1).mul(0.1).tanh()
+    values = torch.cat([moving[..., :1], torch.full((2, 12, 1), 3.0), moving[..., 1:]], -1)
+    plans = VectorPlans(values, [-1.0, -1e4, -1.0], [1.0, 1e4, 1.0])
+    make = {"window synergies": WindowSynergies, "step synergies": StepSynergies}.get(kind, CLOSED[kind])
+    prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded())
+    drawn = prior.sample(100, 10, generator=seeded(1))[..., 1]
+    assert float((drawn - 3).abs().max()) < 0.2
