@@ -118,7 +118,7 @@ def load(
     saved = SavedModule.known[config["prior"]]
     if not issubclass(saved, KINDS[kind]):
         own = next((name for name in KINDS if issubclass(saved, KINDS[name])), None)
-        instead = "" if own is None else f'; use load(folder, kind="{own}")'
+        instead = "" if own is None else f'; in Python, load(folder, kind="{own}") reads it'
         raise ValueError(f"{folder}: {config['prior']} is no {NOUNS[kind]}{instead}")
     data = (folder / "model.safetensors").read_bytes()
     digest = hashlib.sha256(data).hexdigest()

@@ -348,7 +348,7 @@ def test_folders_say_what_they_hold(tmp_path):
     save(AutoregressivePrior(LOW, HIGH).fit(source(), generator=seeded()), tmp_path / "vectors")
     save(MarkovPrior(3), tmp_path / "actions")
     assert isinstance(load(tmp_path / "vectors", kind="vectors"), VectorPrior)
-    with pytest.raises(ValueError, match='no prior over actions; use load\\(folder, kind="vectors"\\)'):
+    with pytest.raises(ValueError, match='no prior over actions; in Python, load\\(folder, kind="vectors"\\) reads it'):
         load(tmp_path / "vectors")
     with pytest.raises(ValueError, match="no prior over vectors"):
         load(tmp_path / "actions", kind="vectors")
