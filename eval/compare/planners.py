@@ -103,13 +103,16 @@ def _entries(contest: Contest, one: Contestant, name: str) -> list[dict[str, Any
     """What a planner reaches with a prior; the temperature is chosen for both, in the validation worlds."""
     numbers = contest.settings.num_plans
 
-    def reached(starts: Starts, number: int, temperature: float) -> dict[str, Any]:
+    def made(starts: Starts, number: int, temperature: float) -> Planner:
         how: dict[str, Any] = starts.task.scoring | {"temperature": temperature}
         if starts.world.stochastic:
             how["num_rollouts"] = ROLLOUTS
         # All decisions of "replanning" take no more steps together than one of the others, but for one plan each.
         number = max(number // starts.length, 1) if name == "replanning" else number
-        planner = PLANNERS[name](one.prior, starts.length, number, **how)
+        return PLANNERS[name](one.prior, starts.length, number, **how)
+
+    def reached(starts: Starts, number: int, temperature: float) -> dict[str, Any]:
+        planner = made(starts, number, temperature)
         return (replanned if name == "replanning" else planned)(starts, planner, contest.generator)
 
     best = 1.0
@@ -117,13 +120,15 @@ def _entries(contest: Contest, one: Contestant, name: str) -> list[dict[str, Any
         validation = contest.validation_at[contest.task.length]
         shares = {t: reached(validation, max(numbers), t)["share"] for t in TEMPERATURES}
         best = max(shares, key=lambda t: shares[t])
+    else:  # a decision that is not timed, since the first may compile loops
+        few = made(contest.starts, min(numbers), best)
+        few.plan(contest.starts.world, contest.starts.state[:1], torch.Generator().manual_seed(0))
     label = {"planner": name, "prior": one.label, "context": one.context, "temperature": best}
     return [label | {"num_plans": number} | reached(contest.starts, number, best) for number in numbers]
 
 
 def planned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:
     """The normalised score of a planner's decisions, and their model steps and seconds for each start."""
-    _warm_up(starts, planner)
     begin = perf_counter()
     decision = planner.plan(starts.world, starts.state, generator)
     seconds = (perf_counter() - begin) / len(starts.state)
@@ -133,14 +138,8 @@ def planned(starts: Starts, planner: Planner, generator: torch.Generator) -> dic
     return {"share": starts.normalised(score), "model_steps": decision.model_steps, "seconds": seconds}
 
 
-def _warm_up(starts: Starts, planner: Planner) -> None:
-    """A decision that is not timed: the first one may compile loops for seconds."""
-    planner.plan(starts.world, starts.state[:1], torch.Generator().manual_seed(0))
-
-
 def replanned(starts: Starts, planner: Planner, generator: torch.Generator) -> dict[str, Any]:
     """As `planned`, of as many actions as a plan has, each the first of a new plan; the mean of `TRAJECTORIES`."""
-    _warm_up(starts, planner)
     begin = perf_counter()
     state = starts.state.repeat_interleave(TRAJECTORIES, 0)
     done = execute(planner, starts.world, state, starts.length, 1, generator)

@@ -350,7 +350,7 @@ def fields_of(
     begin = np.diff(plan, prepend=-1) != 0
     seconds, ends = _durations(table, start, row, begin)
     if "stop" in table.at and ends is not None and start is not None:
-        early = ~begin[1:] & (start[row][1:] < ends[:-1] - ROUNDING * np.spacing(np.abs(ends[:-1])))
+        early = ~begin[1:] & (start[row][1:] < ends[:-1] - _rounded(start[row][1:], ends[:-1]))
         if early.any():
             notes.append(f"{int(early.sum()):,} actions begin before the one before them ended")
     pause = np.zeros(len(row), bool)
@@ -358,7 +358,8 @@ def fields_of(
         if start is None or ends is None or not {"stop", "duration"} & table.at.keys():
             raise ValueError("max_gap: the columns start, and stop or duration, are expected with it")
         latest = _running_maximum(ends, plan)
-        pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap + ROUNDING * np.spacing(np.abs(latest[:-1])))
+        error = _rounded(start[row][1:], latest[:-1], max_gap)
+        pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap + error)
     if without.all():
         raise ValueError(f"{of}: no row has an action")
     # A gap is a run of rows without a label between actions of one plan, or a pause.
@@ -551,6 +552,11 @@ def _durations(
     until: NDArray[np.float64] = np.append(when[1:], np.nan).astype(np.float64)
     until[np.append(begin[1:], True)] = np.nan
     return until - when, until
+
+
+def _rounded(*times: Any) -> Any:
+    """By how much sums and differences of times may be wrong."""
+    return ROUNDING * np.spacing(np.maximum.reduce(np.broadcast_arrays(*map(np.abs, times))))
 
 
 def _running_maximum(ends: NDArray[np.float64], plan: Integers) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
     become features for a prior that was trained with them.
 
     Args:
-        plans: N plans; of a prior that learned an end symbol, with or without theirs.
+        plans: N plans without an end symbol; or with that of the prior, whose actions are then numbered as the prior's.
         prior: the prior.
         name: of the prior, for messages.
 
@@ -32,10 +32,14 @@ def match_plans(plans: Plans, prior: Prior, name: str = "prior") -> Plans:
         [[1, 0]]
     """
     check_are_plans(plans)
-    if plans.end is not None:
-        if prior.end is None:
-            raise ValueError(f"{name}: it learned no end symbol, and the plans have one; give plans.without_end()")
-        plans = plans.without_end()
+    if plans.end is not None and prior.end is not None:  # some may have been cut off before theirs: none is added
+        if (plans.end, plans.num_actions) != (prior.end, prior.num_actions):
+            raise ValueError(
+                f"{name}: its end symbol is {prior.end} of {prior.num_actions} actions, and that of the plans"
+                f" {plans.end} of {plans.num_actions}; give plans.without_end()"
+            )
+        plans = plans if prior.takes_context else plans.without_context()
+        return plans if prior.past_durations is None else prior.past_durations.added_to(plans)
     known = prior.num_actions - (prior.end is not None)
     if plans.num_actions > known:
         raise ValueError(

@@ -19,7 +19,7 @@ same shapes. It waits for nothing on the device."""
 DEVICES = ("cuda",)
 """Kinds of devices on which steps are recorded."""
 
-WORTH, LARGEST, KEPT = 16, 2**26, 2
+WORTH, LARGEST, KEPT = 16, 2**26, 4
 """Steps of as many plans after which one is recorded; the most numbers in their states; and recordings of a prior that
 are kept, which hold the memory of a step."""
 
@@ -80,6 +80,7 @@ class _Known:
 
 
 _KNOWN: WeakKeyDictionary[nn.Module, _Known] = WeakKeyDictionary()
+_LOCK = Lock()
 
 
 def run_recorded(
@@ -100,8 +101,11 @@ def run_recorded(
     if state.device.type not in DEVICES or not steady or is_hooked(prior) or not fits or not steps:
         return None
     weights = tuple(tensor.data_ptr() for tensor in (*prior.parameters(), *prior.buffers()))
-    key = weights, state.shape, key
-    known = _KNOWN.setdefault(prior, _Known())
+    # Each stream has recordings of its own, which no other one overwrites while they run.
+    stream = torch.cuda.current_stream(state.device).cuda_stream if state.is_cuda else 0
+    key = weights, state.shape, stream, torch.is_inference_mode_enabled(), key
+    with _LOCK:
+        known = _KNOWN.setdefault(prior, _Known())
     with known.lock:
         made = known.made.pop(key, 0)
         if isinstance(made, int):

@@ -25,8 +25,8 @@ def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", 
 
     Args:
         prior: fitted.
-        plans: N of them, with or without an end symbol for a prior that learned one, else without. Actions and contexts
-            are matched by name, where both have names.
+        plans: N of them; their actions and contexts are matched by name, where both have names (not in plans with the
+            end symbol of the prior, see `match_plans`).
         by: what a row is.
 
     Returns:

@@ -27,9 +27,14 @@ Holder = TypeVar("Holder")
 
 
 def moved(holder: Holder, device: torch.device | str) -> Holder:
-    """`holder`, whose tensors, and attributes that can be moved `to` a device, are moved to `device`."""
+    """`holder`, whose tensors, and other attributes that can be moved `to` a device, are moved to `device`.
+
+    Tensors of its class are moved for it alone. What is in lists or other containers stays where it is.
+    """
     device = torch.device(device)
-    for name, value in list(vars(holder).items()):
+    of_class = {name: value for kind in reversed(type(holder).__mro__) for name, value in vars(kind).items()}
+    tensors = {name: value for name, value in of_class.items() if isinstance(value, Tensor)}
+    for name, value in (tensors | vars(holder)).items():
         if hasattr(value, "to"):
             setattr(holder, name, value.to(device))
     return holder
@@ -65,7 +70,7 @@ class World(ABC):
     action_names: tuple[str, ...] | None = None
 
     def to(self, device: torch.device | str) -> Self:
-        """Move the tensors of this world to `device`, where its states then are; returns self."""
+        """Move the tensors of this world, and of worlds that it holds, to `device`; returns self."""
         return moved(self, device)
 
     @abstractmethod

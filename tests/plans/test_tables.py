@@ -630,3 +630,10 @@ def test_several_columns_of_a_context_in_one_text():
     frame = pd.DataFrame({"plan": [1, 1], "action": ["a", "b"], "c1": [0.0, 1.0], "c2": [0.0, 1.0]})
     with refuses("columns.context: the column 'c1,c2' is not there", "several are given as '[c1,c2]'"):
         Plans.from_dataframe(frame, context="c1,c2")
+
+
+def test_a_pause_of_just_max_gap_is_none_whatever_is_rounded():
+    """1,035.9 - 35.9 is more than 1,000 in floating point."""
+    frame = pd.DataFrame({"plan": 1, "action": ["a", "b"], "start": [0.0, 1035.9], "stop": [35.9, 1036.9]})
+    assert len(Plans.from_dataframe(frame, max_gap=1000)) == 1
+    assert len(Plans.from_dataframe(frame, max_gap=999.999)) == 2

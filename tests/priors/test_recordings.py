@@ -102,10 +102,26 @@ def test_a_step_is_recorded_once_enough_are_asked_for(stepwise):
     assert rest(prior, 20, number=5).shape == (5, 20)
     assert rest(prior, 20, temperature=2.0).shape == (4, 20)
     assert Stepwise.made == 3
-    rest(prior, 20, number=5)
-    assert Stepwise.made == 3  # the last two are kept
     rest(prior, 20)
+    assert Stepwise.made == 3
+    stepwise.setattr(recordings, "KEPT", 2)
+    rest(prior, 20, number=5)
+    rest(prior, 20)
+    assert Stepwise.made == 3  # the last two are kept
+    rest(prior, 20, temperature=2.0)
     assert Stepwise.made == 4
+
+
+def test_what_was_recorded_in_inference_mode_is_not_used_elsewhere(stepwise):
+    """Its tensors cannot be written to there."""
+    prior = network(GRUPrior)
+    with torch.inference_mode():
+        rest(prior)
+        rest(prior)
+    assert Stepwise.made == 1
+    with torch.no_grad():
+        rest(prior)
+    assert Stepwise.made == 2
 
 
 @torch.no_grad()
@@ -138,7 +154,8 @@ def test_what_is_not_recorded(stepwise):
     assert rest(prior) is None
     handle.remove()
     assert rest(network(GRUPrior, window=0)) is None
-    assert rest(type("Mine", (GRUPrior,), {})(A, 16).eval()) is None
+    for kind in (GRUPrior, TransformerPrior):
+        assert rest(type("Mine", (kind,), {})(A, 16).eval()) is None
 
 
 @torch.no_grad()

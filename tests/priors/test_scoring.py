@@ -5,7 +5,7 @@ from math import log
 import pytest
 import torch
 
-from neuroprior import MarkovPrior, Plans, score
+from neuroprior import MarkovPrior, Plans, UniformPrior, score
 from neuroprior.priors import match_plans
 from neuroprior.priors.scoring import keep_learned, learned_from
 from tests.support.sources import refuses, seeded
@@ -95,9 +95,16 @@ def test_plans_that_were_learned_from_are_known_again(tmp_path):
 
 
 def test_plans_with_an_end_symbol_are_scored_by_priors_that_learned_one():
+    """As they are: to plans that were cut off before their end, such as samples, none is added."""
     ended = Plans(torch.randint(3, (50, 6), generator=seeded(0)), 3).with_end()
     prior = MarkovPrior(4, 1).fit(ended)
     assert score(prior, ended)["log_likelihood"].tolist() == pytest.approx(prior.log_prob(ended).tolist())
     assert score(prior, ended).equals(score(prior, ended.without_end()))
-    with refuses("it learned no end symbol", "plans.without_end()"):
-        score(MarkovPrior(3, 1).fit(ended.without_end()), ended)
+    samples = Plans(prior.sample(40, 4, generator=seeded(1)), 4, end=3)
+    assert 0 < (samples.actions[:, -1] == 3).sum() < 40
+    found = score(prior, samples)
+    assert found["log_likelihood"].tolist() == pytest.approx(prior.log_prob(samples).tolist())
+    assert found["actions"].tolist() == (samples.actions != 3).logical_and(samples.mask()).sum(1).tolist()
+    with refuses("its end symbol is 3 of 4 actions", "3 of 5", "plans.without_end()"):
+        score(prior, Plans(ended.actions, 5, ended.lengths, end=3))
+    assert score(UniformPrior(4), ended)["log_likelihood"].tolist() == pytest.approx([-7 * log(4)] * 50)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from neuroprior import TabularWorld, World, gridworld
 from neuroprior._compiled import compiled
-from neuroprior.worlds import Rollout
+from neuroprior.worlds import ContinuousWorld, Rollout
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
 
 UP, RIGHT, DOWN, LEFT = range(4)
@@ -349,3 +349,26 @@ def test_rollout_names_the_wrong_dtype(state, plans, words):
 def test_state_refuses(cell, number, word):
     with refuses(word):
         random_world(0).state(torch.tensor([cell]), number)
+
+
+def test_all_tensors_of_a_world_are_moved():
+    """Those of its class, too, for it alone."""
+
+    class Mine(ContinuousWorld):
+        action_low, action_high = -torch.ones(2), torch.ones(2)
+
+        def __init__(self):
+            self.weights, self.inner, self.name, self.device = torch.ones(3), gridworld(3, 3), "x", "mine"
+
+        def reset(self, batch_size, generator=None):
+            return torch.zeros(batch_size, 2)
+
+        def step(self, state, action, generator=None):
+            return state + action, state[:, 0]
+
+    world = Mine()
+    assert world.to("meta") is world
+    moved = (world.action_low, world.action_high, world.weights, world.inner.next_state)
+    assert [value.device.type for value in moved] == ["meta"] * 4
+    assert Mine.action_low.device.type == Mine().action_high.device.type == "cpu"
+    assert world.device == "mine"

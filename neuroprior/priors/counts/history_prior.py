@@ -14,8 +14,9 @@ from neuroprior.plans import Plans, action_dtype, is_per_step
 from neuroprior.priors.counts.histories import MAX_TABLE_BYTES, Counts, Tree, count_histories
 from neuroprior.priors.prior import Prior
 
-COMPILE_FROM: int | None = 2**16
-"""Actions of plans from which a compiled loop that draws them is worth its call, where numba is installed; None: never.
+COMPILE_FROM: int | None = 2**20
+"""Actions of plans from which a compiled loop draws them, where numba is installed; None: never. Its call is worth less
+by far, but the first one in a process loads numba, which takes about a second.
 """
 
 LARGEST, RUNS = 2**17, 256

@@ -259,8 +259,9 @@ class NeuralPrior(Prior):
 
     @property
     def is_plain(self) -> bool:
-        """Whether it predicts as its class of this library does: it reads past actions, and no part is replaced."""
-        return self.window != 0 and not recordings.is_hooked(self)
+        """Whether it is of a class of this library, reads past actions, and is not hooked."""
+        own = type(self).__module__.startswith(f"{__package__}.")
+        return own and self.window != 0 and not recordings.is_hooked(self)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:

@@ -103,10 +103,6 @@ class TransformerPrior(NeuralPrior):
         self.norm = nn.LayerNorm(self.width)
         self.head = nn.Linear(self.width, self.num_actions)
 
-    @property
-    def is_plain(self) -> bool:
-        return type(self) is TransformerPrior and super().is_plain
-
     def encode(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         most = self.most_kept
         if most is not None and inputs.shape[1] > max(most, FEWEST_AT_ONCE):

@@ -21,9 +21,9 @@ from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
 LEAST_STD = 1e-3
 """Of half a dimension's range: the standard deviations of priors are at least so large, see `least_std`."""
 
-LEAST_SHARE, ROUNDING = 1e-2, 1e-6
-"""The share of the standard deviation of the vectors that is enough where bounds are wide; and the share of their mean
-that single precision tells apart: vectors that vary by no more count as constant.
+LEAST_SHARE, ROUNDING = 1e-2, 2.0**-24
+"""The share of the standard deviation of the vectors that is enough where bounds are wide; and the error of single
+precision, as a share of a number.
 """
 
 HELD_OUT = 0.2
@@ -104,7 +104,7 @@ class LinearGaussianPrior(VectorPrior):
 
     def set_window(self, moments: WindowMoments) -> None:
         """Predict the last of W successive vectors from those before it, as a Gaussian over all of them has it."""
-        tables = predictions([moments], self.action_size)
+        tables = predictions([moments], self)
         self._allocate(tables.offset.shape[1] - 1)
         for name, rows in tables._asdict().items():
             getattr(self, name).copy_(rows[0])
@@ -127,7 +127,7 @@ class LinearGaussianPrior(VectorPrior):
             first = moments(rest[0])
             at_once = max(LARGEST // max(first.covariance.numel(), values.numel()), 1)
             some, rest = rest[:at_once], rest[at_once:]
-            tables = predictions([first, *map(moments, some[1:])], self.action_size)
+            tables = predictions([first, *map(moments, some[1:])], self)
             nats = linear_nats(tables, values, self.half_range).masked_fill(~mask, 0)
             means = (nats.double().sum((1, 2)) / mask.sum()).nan_to_num(nan=float("-inf"), neginf=float("-inf"))
             found |= dict(zip(some, means.tolist(), strict=True))
@@ -206,33 +206,40 @@ def draw_linear(prior: LinearGaussianPrior, vectors: Tensor, known: int, noise: 
             now[:, d] = (free[:, d] + (now[:, :d] - mean[:, :d]) @ coupling[d, :d]).clamp(-1, 1)
 
 
-def is_constant(std: Tensor, mean: Tensor) -> Tensor:
-    """Which dimensions have vectors that differ by rounding alone, by their standard deviations and means."""
-    return std <= ROUNDING * mean.abs()
+def rounding(prior: VectorPrior, mean: Tensor) -> Tensor:
+    """By how much scaled vectors near `mean [..., D]` may be wrong: as vectors were rounded, and as they are scaled."""
+    return ROUNDING * ((prior.middle / prior.half_range).abs() + mean.abs())
 
 
-def least_std(std: Tensor, mean: Tensor) -> Tensor:
+def is_constant(std: Tensor, error: Tensor) -> Tensor:
+    """Which dimensions have vectors that differ by rounding alone, by their standard deviations and its `error`."""
+    return std <= 2 * error
+
+
+def least_std(std: Tensor, error: Tensor) -> Tensor:
     """The least standard deviations of predictions, in units of half the range, as all here.
 
     Without them predictions could be infinitely likely. Where bounds are wide, `LEAST_STD` is more than the vectors
-    vary by, so that a share of what they vary by is taken; of constant ones, of their distance from the middle.
+    vary by, so that a share of what they vary by is taken. Constant dimensions have `LEAST_STD`.
 
     Args:
-        std, mean: of the vectors, from the middle of the range.
+        std: of the vectors.
+        error: of their rounding.
     """
-    constant, far = is_constant(std, mean), mean.abs()
-    share = torch.where(constant, LEAST_SHARE * far, (LEAST_SHARE * std).maximum(ROUNDING * far))
-    return torch.where(share > 0, share, torch.inf).clamp(max=LEAST_STD)
+    share = (LEAST_SHARE * std).maximum(error)
+    return share.masked_fill(is_constant(std, error), torch.inf).clamp(max=LEAST_STD)
 
 
-def predictions(moments: Sequence[WindowMoments], size: int) -> LinearTables:
-    """The next vector of `size` dimensions given those before it in a window, for each of S Gaussians over windows."""
+def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearTables:
+    """The next vector of a `prior` given those before it in a window, for each of S Gaussians over windows."""
+    size = prior.action_size
     mean = torch.stack([each.mean for each in moments]).double()
     covariance = torch.stack([each.covariance for each in moments]).double()
     ridge = torch.tensor([each.ridge for each in moments], dtype=torch.double, device=mean.device)
     memory = mean.shape[1] // size - 1
     last, eye = slice(memory * size, None), torch.eye(size, dtype=torch.double, device=mean.device)
-    least = least_std(covariance[:, last, last].diagonal(dim1=1, dim2=2).clamp(min=0).sqrt(), mean[:, last]).square()
+    spread = covariance[:, last, last].diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
+    least = least_std(spread, rounding(prior, mean[:, last])).square()
     rows = []
     for h in range(memory + 1):
         past = slice((memory - h) * size, memory * size)

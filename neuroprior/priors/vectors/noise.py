@@ -13,6 +13,7 @@ from neuroprior.priors.vectors.linear_gaussian import (
     WindowMoments,
     best_of,
     is_constant,
+    rounding,
     window_moments,
 )
 
@@ -88,7 +89,8 @@ class NoisePrior(LinearGaussianPrior):
         values = self.scaled(plans.actions)[plans.mask()]
         mean, covariance, _ = window_moments(values[:, None])
         std = covariance.diagonal().sqrt()
-        std = std.masked_fill(is_constant(std, mean), 0)  # a constant has the least standard deviation of predictions
+        # A constant has the least standard deviation of predictions.
+        std = std.masked_fill(is_constant(std, rounding(self, mean)), 0)
         if self._given["scale"] is not None:
             mean, std = torch.zeros_like(mean), torch.full_like(std, self._given["scale"])
         moments = partial(self._moments, mean, std)

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_count, check_memory, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.plans.vector_plans import VectorPlans
-from neuroprior.priors.vectors.linear_gaussian import best_of, held_out_split, least_std, mean_nats
+from neuroprior.priors.vectors.linear_gaussian import best_of, held_out_split, least_std, mean_nats, rounding
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
 BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
@@ -165,8 +165,9 @@ class StoredWindows(VectorPrior):
         self.register_buffer("segments", self.scaled(windows).to(self.device))
         variance = self.segments.var((0, 1), correction=0)
         std, stds, means = variance.mean().sqrt(), variance.sqrt(), self.segments.mean((0, 1))
-        extent = (EXTENT * std).maximum(least_std(std, means.abs().mean()) / NOISES[0]).clamp(max=1)
-        in_proportion = (extent * stds / std).maximum(least_std(stds, means) / NOISES[0])
+        error = rounding(self, means)
+        extent = (EXTENT * std).maximum(least_std(std, error.min()) / NOISES[0]).clamp(max=1)
+        in_proportion = (extent * stds / std).maximum(least_std(stds, error) / NOISES[0])
         self.extent = in_proportion if own and std > 0 else extent.expand(self.action_size).contiguous()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:

@@ -16,6 +16,7 @@ from neuroprior.priors.vectors.linear_gaussian import (
     held_out_split,
     is_constant,
     moments_or_white,
+    rounding,
     window_moments,
 )
 
@@ -84,7 +85,7 @@ class WindowSynergies(LinearGaussianPrior):
         values = self.scaled(plans.actions)[plans.mask()]
         mean, covariance, _ = moments_or_white(self.scaled(plans.windows(window)), values, window - 1)
         white = torch.diag(values.double().var(0, correction=0).repeat(window))
-        both = varying(values, window)
+        both = varying(self, values, window)
         sizes, components = torch.linalg.eigh(covariance)
 
         def moments(setting: tuple[int, float]) -> WindowMoments:
@@ -166,7 +167,7 @@ class StepSynergies(LinearGaussianPrior):
         components = torch.linalg.eigh(covariance)[1]
         window, size = self.order + 1, self.action_size
         whole, joint, _ = moments_or_white(self.scaled(plans.windows(window)), values, self.order)
-        both = varying(values, window)
+        both = varying(self, values, window)
 
         def moments(number: int) -> WindowMoments:
             # The coordinates keep their covariance over time; what is beside the plane is white, and the same in all
@@ -183,9 +184,10 @@ class StepSynergies(LinearGaussianPrior):
         return moments
 
 
-def varying(values: Tensor, window: int) -> Tensor:
+def varying(prior: LinearGaussianPrior, values: Tensor, window: int) -> Tensor:
     """`[W * D, W * D]`: 1 between dimensions of windows of W vectors that vary in `values [S, D]`, 0 for constants."""
-    varies = ~is_constant(values.double().std(0, correction=0), values.double().mean(0)).repeat(window)
+    error = rounding(prior, values.double().mean(0))
+    varies = ~is_constant(values.double().std(0, correction=0), error).repeat(window)
     return (varies[:, None] & varies).double()
 
 

@@ -38,13 +38,8 @@ class ContinuousWorld(ABC):
         """The number of dimensions of an action, D."""
         return len(self.action_low)
 
-    @property
-    def device(self) -> torch.device:
-        """Where the bounds are, and so actions and states."""
-        return self.action_low.device
-
     def to(self, device: torch.device | str) -> Self:
-        """Move the tensors of this world to `device`, where its states then are; returns self."""
+        """Move the tensors of this world, and of worlds that it holds, to `device`; returns self."""
         return moved(self, device)
 
     @abstractmethod

@@ -60,8 +60,9 @@ class DoubleIntegrator(ContinuousWorld):
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """Positions (m) and velocities (m/s), float32 `[batch_size, 2 * D]`, each uniform between -1 and 1."""
-        draws = generator_on(generator, self.device)
-        return 2 * torch.rand(batch_size, 2 * self.action_size, generator=draws, device=self.device) - 1
+        device = self.action_low.device
+        draws = generator_on(generator, device)
+        return 2 * torch.rand(batch_size, 2 * self.action_size, generator=draws, device=device) - 1
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         position, velocity = state.chunk(2, -1)

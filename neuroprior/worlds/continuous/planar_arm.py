@@ -87,8 +87,9 @@ class PlanarArm(ContinuousWorld):
 
     def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
         """The arm at rest, nearly stretched along the x axis: each angle normal with standard deviation 0.1."""
-        draws = generator_on(generator, self.device)
-        angles = START * torch.randn(batch_size, self.action_size, generator=draws, device=self.device)
+        device = self.action_low.device
+        draws = generator_on(generator, device)
+        angles = START * torch.randn(batch_size, self.action_size, generator=draws, device=device)
         return torch.cat([angles, torch.zeros_like(angles)], -1)
 
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
