@@ -155,9 +155,10 @@ class TransformerPrior(NeuralPrior):
 
     @property
     def header(self) -> int:
-        """Numbers of a state before the key-value cache: the last input, actions before it, how many inputs there were.
+        """How many numbers of a state lie before the key-value cache.
 
-        The last one fills up the header, so that keys and values lie where kernels of a CUDA device can read them.
+        They are the last input, the actions before it, and how many inputs there were; this fills up the rest, so that
+        keys and values lie where kernels of a CUDA device can read them.
         """
         return -(-(self.input_size + self.lags) // ALIGNED) * ALIGNED
 
