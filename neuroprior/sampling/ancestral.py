@@ -40,7 +40,8 @@ def sample(
     Plans that share a prefix share its evaluation: the number of plans is split multinomially over the distinct
     prefixes of each length ("tree"), which gives the same distribution as drawing each plan by itself ("ancestral").
     "auto" splits as long as there are far fewer prefixes than plans, and draws plan by plan from there on; plans that
-    still begin alike are stepped once. Many plans of a small chain are drawn by a compiled loop.
+    still begin alike are stepped once. Many plans of a small chain are drawn by a compiled loop, where numba is
+    installed; with the same seed they are other ones than without.
 
     Args:
         prior: any prior.
