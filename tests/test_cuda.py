@@ -128,11 +128,12 @@ def test_recorded_steps_draw_what_steps_draw(name: str, monkeypatch: pytest.Monk
 
     def agree() -> bool:
         drawn = []
-        for worth in (1, 10**9):
-            monkeypatch.setattr(recordings, "WORTH", worth)
+        for devices in ((), ("cuda",)):  # without recordings, and with them
+            monkeypatch.setattr(recordings, "DEVICES", devices)
             drawn.append(prior.sample(500, 40, context, generator=seeded(2), method="ancestral"))
         return float((drawn[0] == drawn[1]).float().mean()) > 0.999
 
+    monkeypatch.setattr(recordings, "WORTH", 1)
     assert agree()
     assert agree()
     with torch.no_grad():
@@ -143,7 +144,6 @@ def test_recorded_steps_draw_what_steps_draw(name: str, monkeypatch: pytest.Monk
     assert agree()
     with torch.no_grad():
         next(prior.parameters()).fill_(torch.nan)
-    monkeypatch.setattr(recordings, "WORTH", 1)
     with pytest.raises(ValueError, match="logits are NaN"):
         prior.sample(500, 40, context, method="ancestral")
 
@@ -152,8 +152,9 @@ def test_recorded_steps_of_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     prior = VectorGRU(LOW, HIGH, width=16, lags=2).fit(vectors(), generator=seeded(0), **QUICK).to(DEVICE)
     past = vectors().actions[:, :5]
     drawn = []
-    for worth in (1, 10**9):
-        monkeypatch.setattr(recordings, "WORTH", worth)
+    monkeypatch.setattr(recordings, "WORTH", 1)
+    for devices in ((), ("cuda",)):
+        monkeypatch.setattr(recordings, "DEVICES", devices)
         drawn.append(prior.sample(30, 20, past=past, generator=seeded(2)))
     torch.testing.assert_close(*drawn, rtol=1e-3, atol=1e-3)
 

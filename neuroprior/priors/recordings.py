@@ -4,6 +4,8 @@ A step of a small network is dozens of short operations, and giving the device i
 CUDA graph gives them all at once.
 """
 
+import math
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from threading import Lock
@@ -33,6 +35,9 @@ class Recording:
     Args:
         take: the step.
         last: `[N, ...]`, `state [N, ...]` and `numbers`, each `[N, ...]`: such as it will be given.
+
+    Attributes:
+        agrees: whether it led from these to the state to which the step leads.
     """
 
     def __init__(self, take: Take, last: Tensor, state: Tensor, numbers: Sequence[Tensor]) -> None:
@@ -52,6 +57,9 @@ class Recording:
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
             step()
+        self.run(last, state, [each[None] for each in numbers])
+        due = take(last, state.clone(), *numbers)[1]
+        self.agrees = torch.allclose(self._state, due, rtol=1e-3, atol=1e-3, equal_nan=True)
 
     def run(self, last: Tensor, state: Tensor, numbers: Sequence[Tensor]) -> Tensor:
         """The actions `[T, N, ...]` of T steps with random `numbers`, each `[T, N, ...]`."""
@@ -72,11 +80,11 @@ def is_hooked(module: nn.Module) -> bool:
 
 
 class _Known:
-    """Of a prior: its recordings, or how many steps there were without one."""
+    """Of a prior: its recordings, or how many steps there were without one; -inf where there can be none."""
 
     def __init__(self) -> None:
         self.lock = Lock()
-        self.made: OrderedDict[Hashable, Recording | int] = OrderedDict()
+        self.made: OrderedDict[Hashable, Recording | float] = OrderedDict()
 
 
 _KNOWN: WeakKeyDictionary[nn.Module, _Known] = WeakKeyDictionary()
@@ -108,10 +116,13 @@ def run_recorded(
         known = _KNOWN.setdefault(prior, _Known())
     with known.lock:
         made = known.made.pop(key, 0)
-        if isinstance(made, int):
+        if not isinstance(made, Recording):
             made += steps
-        if isinstance(made, int) and made >= WORTH:
-            made = Recording(take, last, state, [each[0] for each in numbers])
+            if made >= WORTH:
+                made = Recording(take, last, state, [each[0] for each in numbers])
+                if not made.agrees:
+                    warnings.warn(f"a recorded step of {type(prior).__name__} differs, and is not used", stacklevel=2)
+                    made = -math.inf
         known.made[key] = made
         while len(known.made) > KEPT:
             known.made.popitem(last=False)

@@ -51,6 +51,7 @@ class Stepwise:
     """In place of a recording: takes the step each time."""
 
     made = 0
+    agrees = True
 
     def __init__(self, take, last, state, numbers):
         type(self).made += 1
@@ -79,7 +80,7 @@ def test_recorded_plans_are_those_of_steps(stepwise):
     context = {"generator": seeded(3), "method": "ancestral", "temperature": 1.3}
     drawn = prior.sample(200, 30, **context)
     assert Stepwise.made == 1
-    stepwise.setattr(recordings, "WORTH", 10**9)
+    stepwise.setattr(recordings, "DEVICES", ())  # what was recorded would be used again
     again = prior.sample(200, 30, **context | {"generator": seeded(3)})
     assert Stepwise.made == 1
     assert float((drawn == again).float().mean()) > 0.999  # but for rounding
@@ -110,6 +111,16 @@ def test_a_step_is_recorded_once_enough_are_asked_for(stepwise):
     assert Stepwise.made == 3  # the last two are kept
     rest(prior, 20, temperature=2.0)
     assert Stepwise.made == 4
+
+
+@torch.no_grad()
+def test_a_recording_that_differs_from_its_step_is_not_used(stepwise):
+    prior = network(GRUPrior)
+    stepwise.setattr(Stepwise, "agrees", False)
+    with pytest.warns(UserWarning, match="a recorded step of GRUPrior differs"):
+        assert rest(prior) is None
+    assert rest(prior) is None
+    assert Stepwise.made == 1
 
 
 def test_what_was_recorded_in_inference_mode_is_not_used_elsewhere(stepwise):

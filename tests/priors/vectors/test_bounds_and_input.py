@@ -288,7 +288,7 @@ def test_however_wide_bounds_are_linear_priors_follow_the_vectors(kind, half):
 
 @pytest.mark.parametrize("kind", ["noise", "autoregressive", "window synergies", "step synergies"])
 def test_vectors_far_from_the_middle_of_wide_bounds(kind):
-    """Single precision tells them apart in units of half the range, of which they are .002 %."""
+    """Single precision distinguishes them in units of half the range, of which they are .002 %."""
     values, nats = 3 + 0.05 * torch.randn(40, 30, 1, generator=seeded(0)).cumsum(1), []
     for high in (10.0, 3e5):
         plans = VectorPlans(values.clamp(min=0), [0.0], [high])
