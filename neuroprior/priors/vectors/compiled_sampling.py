@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from torch import Tensor, contiguous_format
-from torch.nn.functional import linear
+from torch import Tensor
 
 from neuroprior.priors.neural.compiled_gru import sigmoid, tanh
 
@@ -49,17 +48,6 @@ def _linear(
                 plan[t, d] = min(max(centre, np.float32(-1)), np.float32(1))
 
 
-def read_recurrent(gru: Any, vectors: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
-    """As `gru(vectors [N, T, width], layers [num_layers, N, width])`, of float32 on the CPU; no gradients."""
-    layers = layers.clone(memory_format=contiguous_format)
-    for layer, (w_in, w_hidden, b_in, b_hidden) in enumerate(gru.all_weights):
-        given = linear(vectors, w_in, b_in)
-        vectors = vectors.new_empty(vectors.shape)
-        own = np.ascontiguousarray(w_hidden.detach().numpy().T)
-        _read(given.detach().numpy(), layers[layer].numpy(), own, b_hidden.detach().numpy(), vectors.numpy())
-    return vectors, layers
-
-
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _gated(into: Array, from_own: Array, state: Array) -> None:
     """Move on the `state` of a layer, by what its input and its own state give to the gates."""
@@ -71,18 +59,7 @@ def _gated(into: Array, from_own: Array, state: Array) -> None:
         state[k] = fresh + update * (state[k] - fresh)
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _read(given: Array, states: Array, own: Array, own_bias: Array, out: Array) -> None:
-    from_own = np.empty(len(own_bias), np.float32)
-    for n in range(given.shape[0]):
-        for t in range(given.shape[1]):
-            from_own[:] = own_bias
-            _add_product(from_own, states[n], own)
-            _gated(given[n, t], from_own, states[n])
-            out[n, t] = states[n]
-
-
-def draw_recurrent(prior: Any, least_std: float, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
     """As `VectorNetwork.draw`, for a `VectorGRU` of float32 on the CPU; `least_std` in units of half the range."""
     # numpy throughout: for these sizes a call of torch takes longer than what it computes.
     layers = [[each.detach().numpy() for each in layer] for layer in prior.gru.all_weights]
@@ -91,9 +68,6 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, uniform: Tensor,
         for each in (prior.inputs.weight, prior.inputs.bias, prior.head.weight, prior.head.bias, prior.linear.weight)
     )
     bounds = np.stack([each.numpy() for each in (prior.middle, prior.half_range, prior.action_low, prior.action_high)])
-    numbers, start = state.numpy(), state.shape[1] - prior.input_size
-    hidden = np.array(numbers[:, :start], order="C").reshape(len(state), len(layers), prior.width)
-    inputs = np.array(numbers[:, start:], order="C")
     # What the first layer is given is linear in the inputs: two matrices in one.
     given = inputs_weight.T @ layers[0][0].T
     given_bias = layers[0][0] @ inputs_bias + layers[0][2]
@@ -107,8 +81,7 @@ def draw_recurrent(prior: Any, least_std: float, state: Tensor, uniform: Tensor,
     vectors = noise.new_empty(noise.shape)
     _recurrent(
         vectors.numpy(),
-        hidden,
-        inputs,
+        inputs.contiguous().numpy(),
         uniform.numpy(),
         noise.numpy(),
         above,
@@ -145,6 +118,33 @@ def _add_product(total: Array, vector: Array, matrix: Array) -> None:
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def _advance(
+    hidden: Array,
+    inputs: Array,
+    given: Array,
+    given_bias: Array,
+    own: Array,
+    own_bias: Array,
+    above: Array,
+    above_bias: Array,
+    into: Array,
+    from_own: Array,
+) -> None:
+    """Move on the hidden states `[num_layers, width]` by `inputs [E]`; `into` and `from_own` are room."""
+    for layer in range(len(hidden)):
+        before = hidden[layer]
+        from_own[:] = own_bias[layer]
+        _add_product(from_own, before, own[layer])
+        if layer:
+            into[:] = above_bias[layer]
+            _add_product(into, hidden[layer - 1], above[layer])
+        else:
+            into[:] = given_bias
+            _add_product(into, inputs, given)
+        _gated(into, from_own, before)
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _dot(start: Any, one: Array, other: Array) -> Any:
     total = np.float32(0)
     for k in range(len(one)):
@@ -155,8 +155,7 @@ def _dot(start: Any, one: Array, other: Array) -> Any:
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _recurrent(
     vectors: Array,
-    hidden: Array,
-    inputs: Array,
+    past: Array,
     uniform: Array,
     noise: Array,
     above: Array,
@@ -175,32 +174,31 @@ def _recurrent(
     recent: int,
     least_std: Any,
 ) -> None:
-    """`inputs [N, E]` begin with `recent` numbers of the last vectors; `bounds`: centre, half the range, low, high."""
+    """`past [B, T, E]` begins with `recent` numbers of last vectors; `bounds`: centre, half the range, low, high."""
     length, size = vectors.shape[1], vectors.shape[2]
-    width, entry, one = hidden.shape[2], size + 1, np.float32(1)
+    num_layers, width, entry, one = own.shape[0], own.shape[1], size + 1, np.float32(1)
     into, from_own = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
+    known, hidden = np.empty((num_layers, width), np.float32), np.empty((num_layers, width), np.float32)
+    inputs = np.empty(past.shape[2], np.float32)
+    each = len(vectors) // max(len(past), 1)
     weights, mean = np.empty(num, np.float32), np.empty(size, np.float32)
     centre, half, low, high = bounds[0], bounds[1], bounds[2], bounds[3]
     for n in range(len(vectors)):
+        if n % each == 0:
+            known[:] = 0
+            for t in range(past.shape[1]):
+                _advance(known, past[n // each, t], given, given_bias, own, own_bias, above, above_bias, into, from_own)
+        hidden[:] = known
+        inputs[:] = past[n // each, past.shape[1] - 1]
+        top = hidden[num_layers - 1]
         for t in range(length):
             if t:
                 for j in range(recent - entry):
-                    inputs[n, j] = inputs[n, j + entry]
+                    inputs[j] = inputs[j + entry]
                 for d in range(size):
-                    inputs[n, recent - entry + d] = (vectors[n, t - 1, d] - centre[d]) / half[d]
-                inputs[n, recent - 1] = one
-                for layer in range(hidden.shape[1]):
-                    before = hidden[n, layer]
-                    from_own[:] = own_bias[layer]
-                    _add_product(from_own, before, own[layer])
-                    if layer:
-                        into[:] = above_bias[layer]
-                        _add_product(into, hidden[n, layer - 1], above[layer])
-                    else:
-                        into[:] = given_bias
-                        _add_product(into, inputs[n], given)
-                    _gated(into, from_own, before)
-            top = hidden[n, hidden.shape[1] - 1]
+                    inputs[recent - entry + d] = (vectors[n, t - 1, d] - centre[d]) / half[d]
+                inputs[recent - 1] = one
+                _advance(hidden, inputs, given, given_bias, own, own_bias, above, above_bias, into, from_own)
             highest, total = np.float32(-np.inf), np.float32(0)
             for c in range(num):
                 weights[c] = _dot(head_bias[c], head[c], top)
@@ -214,10 +212,10 @@ def _recurrent(
                 so_far += weights[chosen]
             for d in range(size):
                 row = num + chosen * size + d
-                value = _dot(_dot(head_bias[row], head[row], top), direct[d], inputs[n])
+                value = _dot(_dot(head_bias[row], head[row], top), direct[d], inputs)
                 mean[d] = centre[d] + half[d] * value
                 row += num * size
-                log_std = _dot(head_bias[row], head[row], top) + (one - inputs[n, recent - 1]) * first_log_std[d]
+                log_std = _dot(head_bias[row], head[row], top) + (one - inputs[recent - 1]) * first_log_std[d]
                 std = np.exp(min(max(log_std, np.float32(-9)), np.float32(3))) + least_std
                 value = mean[d] + half[d] * std * noise[n, t, d]
                 for j in range(d):

@@ -42,9 +42,6 @@ TINY = 1e-9
 DEFAULTS = {"window": 64, "learning_rate": 3e-3}
 """Settings of a training, where they are not given."""
 
-COMPILE_TO = 16
-"""Sequences that a compiled loop reads faster than `nn.GRU`, at most, where numba is installed."""
-
 FEWEST, MOST, VECTORS_A_STEP = 300, 4000, 40
 """Steps of a training, where these are not given: one for so many vectors, within these bounds. More steps overfit some
 thousand vectors before the learning rate has fallen."""
@@ -198,27 +195,25 @@ class VectorNetwork(VectorPrior):
     def continuations(
         self, num_plans: int, length: int, past: Tensor, context: Tensor | None, generator: torch.Generator
     ) -> Tensor:
-        out, state = self._encoded(self._inputs(past, context), None)
-        state = state.repeat_interleave(num_plans, 0)
+        inputs, number = self._inputs(past, context), len(past) * num_plans
         # All random numbers at once, so that compiled loops draw the same.
-        uniform = torch.rand(len(state), length, generator=generator, device=self.device)
-        noise = torch.randn(len(state), length, self.action_size, generator=generator, device=self.device)
-        plans = self.draw(out, state, uniform, noise)
-        return plans.view(len(past), num_plans, length, self.action_size)
+        uniform = torch.rand(number, length, generator=generator, device=self.device)
+        noise = torch.randn(number, length, self.action_size, generator=generator, device=self.device)
+        return self.draw(inputs, uniform, noise).view(len(past), num_plans, length, self.action_size)
 
-    def draw(self, out: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
-        """The next vectors `[N, L, D]` that random numbers make; see `GaussianForecast.drawn`.
+    def draw(self, inputs: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+        """The vectors `[N, L, D]` that random numbers make, after a past; see `GaussianForecast.drawn`.
 
         Args:
-            out: `[M, width]`, what the first forecast is made of, each row for N / M successive rows of the state.
-            state: `[N, ...]`, as `step` returns it.
+            inputs: `[B, T, E]`, what the past is read as, T > 0, each row for N / B successive plans.
             uniform: `[N, L]`, uniform from 0 to 1.
             noise: `[N, L, D]`, standard normal.
         """
-        each = max(len(state) // max(len(out), 1), 1)
-        forecast = self._forecast(out, state[::each, state.shape[1] - self.input_size :]).repeat_interleave(each)
-        first = forecast.drawn(uniform[:, 0], noise[:, 0])
-        return torch.cat([first[:, None], self._rest(first, state, uniform[:, 1:], noise[:, 1:])], 1)
+        forecast, state = self._after(inputs)
+        each = len(noise) // max(len(inputs), 1)
+        first = forecast.repeat_interleave(each).drawn(uniform[:, 0], noise[:, 0])
+        rest = self._rest(first, state.repeat_interleave(each, 0), uniform[:, 1:], noise[:, 1:])
+        return torch.cat([first[:, None], rest], 1)
 
     def _rest(self, last: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
         """The vectors `[N, T, D]` after `last [N, D]`."""
@@ -235,13 +230,8 @@ class VectorNetwork(VectorPrior):
 
     def _after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""
-        out, state = self._encoded(inputs, hidden)
-        return self._forecast(out, inputs[:, -1]), state
-
-    def _encoded(self, inputs: Tensor, hidden: Tensor | None) -> tuple[Tensor, Tensor]:
-        """What the forecast after the last of `inputs [N, T, E]` is made of, `[N, width]`, and the state."""
         out, hidden = self.encode(self.drop(self.inputs(inputs)), hidden)
-        return out[:, -1], torch.cat([hidden, inputs[:, -1]], 1)
+        return self._forecast(out[:, -1], inputs[:, -1]), torch.cat([hidden, inputs[:, -1]], 1)
 
     def log_probs_from(
         self, actions: Tensor, context: Tensor | None, previous: Tensor | None, state: Tensor | None
@@ -443,26 +433,19 @@ class VectorGRU(VectorNetwork):
         if hidden is None:
             hidden = vectors.new_zeros(len(vectors), self.num_layers * self.width)
         layers = hidden.unflatten(1, (self.num_layers, self.width)).transpose(0, 1)
-        fast = self._fast(vectors) if len(vectors) <= COMPILE_TO and not torch.is_grad_enabled() else None
         if vectors.shape[1] == 1 and not (self.training or torch.is_grad_enabled()):
             out, layers = gru_step(self.gru, vectors[:, 0], layers)
             out = out[:, None]
-        elif fast is not None:
-            out, layers = fast.read_recurrent(self.gru, vectors, layers)
         else:
             out, layers = self.gru(vectors, layers.contiguous())
         return out, layers.transpose(0, 1).flatten(1)
 
-    def _fast(self, values: Tensor) -> Any:
-        """Compiled loops over these values, where there are any."""
-        able = not self.training and values.device.type == "cpu" and values.dtype == torch.float32
-        return compiled("neuroprior.priors.vectors.compiled_sampling") if able else None
-
-    def draw(self, out: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
-        fast = self._fast(state)
+    def draw(self, inputs: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
+        able = not self.training and inputs.device.type == "cpu" and inputs.dtype == torch.float32
+        fast = compiled("neuroprior.priors.vectors.compiled_sampling") if able else None
         if fast is None:
-            return super().draw(out, state, uniform, noise)
-        plans: Tensor = fast.draw_recurrent(self, 2 * LEAST_STD, state, uniform, noise)
+            return super().draw(inputs, uniform, noise)
+        plans: Tensor = fast.draw_recurrent(self, 2 * LEAST_STD, inputs, uniform, noise)
         return plans
 
     def _rest(self, last: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:

@@ -156,6 +156,9 @@ class VectorPrior(SavedModule):
         ValueError: an argument is out of range.
     """
 
+    action_size: int
+    """D."""
+
     action_names: tuple[str, ...] | None
     """Names of the D dimensions, as they were in the plans that it learned from, or None."""
 
@@ -187,16 +190,11 @@ class VectorPrior(SavedModule):
         check_widths(low, high)
         if context_size is not None:
             check_sizes(context_size=context_size)
-        self.context_size = context_size
+        self.action_size, self.context_size = len(low), context_size
         self.register_buffer("action_low", low, persistent=False)
         self.register_buffer("action_high", high, persistent=False)
         self.register_buffer("middle", (low + high) / 2, persistent=False)
         self.register_buffer("half_range", (high - low) / 2, persistent=False)
-
-    @property
-    def action_size(self) -> int:
-        """D."""
-        return len(self.action_low)
 
     def scaled(self, vectors: Tensor) -> Tensor:
         """`vectors [..., D]` in units of half the range, from its middle: -1 and 1 at the bounds, and there alone.

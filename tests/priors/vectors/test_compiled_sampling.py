@@ -23,8 +23,8 @@ def drawn(prior, past, monkeypatch, context=None):
         return fast, prior.sample(6, 9, context, past=past, generator=seeded(1))
 
 
-def pasts(length):
-    return LOW + (HIGH - LOW) * torch.rand(2, length, 3, generator=seeded(2))
+def pasts(length, number=2):
+    return LOW + (HIGH - LOW) * torch.rand(number, length, 3, generator=seeded(2))
 
 
 @pytest.mark.parametrize("length", [0, 2, 12])
@@ -48,6 +48,7 @@ def test_linear_priors(make, length, monkeypatch):
     assert slow.std(1).amax(-1).amin() > 0  # not in all dimensions: a step may be at a bound in all plans
 
 
+@pytest.mark.parametrize("number", [2, 17])
 @pytest.mark.parametrize("length", [0, 1, 7])
 @pytest.mark.parametrize(
     ("settings", "features"),
@@ -57,12 +58,12 @@ def test_linear_priors(make, length, monkeypatch):
         ({"width": 8, "lags": 2}, 4),
     ],
 )
-def test_a_recurrent_network(settings, features, length, monkeypatch):
+def test_a_recurrent_network(settings, features, length, number, monkeypatch):
     prior = VectorGRU(LOW, HIGH, features, **settings).requires_grad_(False)
     for name, numbers in prior.named_parameters():
         numbers.add_(0.3 * torch.randn(numbers.shape, generator=seeded(len(name))))
-    context = None if features is None else torch.randn(2, length + 1, features, generator=seeded(4))
-    fast, slow = drawn(prior, pasts(length), monkeypatch, context)
+    context = None if features is None else torch.randn(number, length + 1, features, generator=seeded(4))
+    fast, slow = drawn(prior, pasts(length, number), monkeypatch, context)
     torch.testing.assert_close(fast, slow, atol=2e-5, rtol=1e-5)
     assert (slow == HIGH).any()
     assert ((slow > LOW) & (slow < HIGH)).any()
