@@ -354,7 +354,10 @@ def begin(nodes: Nodes, known: Known, exploration: float, draws: Array, descent:
     rows, path, plan, depth, first = descent
     number = 0
     for b in range(len(known.left)):
-        if known.left[b] > 0 and not known.over[b] and not nodes.closed[b, 0].all():
+        tried = True
+        for a in range(nodes.closed.shape[2]):
+            tried &= nodes.closed[b, 0, a]
+        if known.left[b] > 0 and not known.over[b] and not tried:
             rows[number] = b
             number += 1
     if len(draws) < number * path.shape[1] * (1 + nodes.child.shape[2]):
@@ -448,8 +451,10 @@ def follow(
             new = known.size[b]
             known.size[b] += 1
             nodes.child[b, path[k, t], plan[k, t]] = new
-            nodes.child[b, new], nodes.visits[b, new], nodes.total[b, new] = 0, 0, 0
-            nodes.closed[b, new], nodes.probs[b, new] = False, probs[k]
+            # Number by number: an assignment of rows takes numba seconds to compile, since it words an error of shapes.
+            for a in range(actions):
+                nodes.child[b, new, a], nodes.visits[b, new, a], nodes.total[b, new, a] = 0, 0, 0.0
+                nodes.closed[b, new, a], nodes.probs[b, new, a] = False, probs[k, a]
             known.state[b, new], known.reward[b, new] = cell[k], found.rewards[simulation, b, t]
             known.code[b, new] = code[k]
             for j in range(size):
@@ -465,8 +470,8 @@ def follow(
             gained = found.rewards[simulation, b, t]
             total = total + gained * discounts[t] if len(discounts) else gained
             best = max(best, total)
+            path[going, t], plan[going, t] = path[k, t], plan[k, t]
         rows[going], score[going] = b, best if any_prefix else total
-        path[going], plan[going] = path[k], plan[k]
         going += 1
     back_up(nodes, rows[:going], path[:going], plan[:going], score[:going])
 

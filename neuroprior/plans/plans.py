@@ -220,7 +220,8 @@ class Plans(Sequences):
             merge_repeats: take the same label in successive rows for one action, as in tables with a row a frame; it
                 lasts as long as they do together, or as many rows as they are where no times are known.
             max_gap: a longer pause between the end of an action and the start of the next one ends the plan, too; in
-                the unit of `start` (seconds, for times of day and dates). None: no pause does.
+                the unit of `start` (seconds, for times of day and dates). An unknown end counts as the action's start.
+                None: no pause does.
             num_actions: A; None: the number of names, else the largest action + 1.
             action_names: A names in the order of their numbers; None: the names that occur, sorted.
 

@@ -125,13 +125,19 @@ def test_a_pause_ends_a_plan(tmp_path):
     text = "action,start,stop\na,0,5\nb,1,2\nc,6,7\nd,9,10\n"
     assert listed(read(tmp_path, text, max_gap=1.5)) == [["a", "b", "c"], ["d"]]
     assert listed(read(tmp_path, text, max_gap=2)) == [["a", "b", "c", "d"]]
-    # The end of an action of another plan does not count, and of unknown ends the latest known one does.
+    # The end of an action of another plan does not count, and an unknown end as the beginning.
     assert listed(read(tmp_path, "plan,action,start,stop\n1,a,0,99\n2,b,0,1\n2,c,5,6\n", max_gap=1)) == [
         ["a"],
         ["b"],
         ["c"],
     ]
     assert listed(read(tmp_path, "action,start,stop\na,0,1\nb,2,\nc,10,11\n", max_gap=5)) == [["a", "b"], ["c"]]
+    # It has not ended before it began: 12 - 9 is no gap, and 1,000 - 0 is one, in a plan's first action as in others.
+    text = "action,start,stop\na,0,1\nb,9,\nc,12,13\nd,500,\ne,1000,1001\n"
+    plans = read(tmp_path, text, max_gap=10)
+    assert listed(plans) == [["a", "b", "c"], ["d"], ["e"]]
+    assert any("2 actions without an end" in note for note in plans.notes)
+    assert listed(read(tmp_path, "action,start,stop\na,0,\nb,1000,1001\n", max_gap=10)) == [["a"], ["b"]]
     with refuses("max_gap", "start"):
         read(tmp_path, "plan,action\n1,a\n", max_gap=1)
 
