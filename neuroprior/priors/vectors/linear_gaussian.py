@@ -231,7 +231,10 @@ def least_std(std: Tensor, error: Tensor) -> Tensor:
 
 
 def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearTables:
-    """The next vector of a `prior` given those before it in a window, for each of S Gaussians over windows."""
+    """The next vector of a `prior` given those before it in a window, for each of S Gaussians over windows.
+
+    With all of the window's past known, see `steady`.
+    """
     size = prior.action_size
     mean = torch.stack([each.mean for each in moments]).double()
     covariance = torch.stack([each.covariance for each in moments]).double()
@@ -247,6 +250,8 @@ def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearT
         level = known.diagonal(dim1=1, dim2=2).mean(1, keepdim=True).nan_to_num() * ridge[:, None]
         level = level + 1e-3 * least.repeat(1, h)
         weights = torch.linalg.solve(known + torch.diag_embed(level), cross)
+        if h == memory > 0:
+            weights = steady(weights)
         # The mean square of what is left, which with a ridge is more than the conditional variance.
         shared = cross.mT @ weights
         rest = now - shared - shared.mT + weights.mT @ known @ weights
@@ -260,6 +265,21 @@ def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearT
         offset = mean[:, last] - (mean[:, None, past] @ weights)[:, 0]
         rows.append((functional.pad(weights, (0, 0, past.start, 0)), offset, std, coupling))
     return LinearTables(*(torch.stack(each, 1).float() for each in zip(*rows, strict=True)))
+
+
+def steady(weights: Tensor) -> Tensor:
+    """Linear predictions `[S, h * D, D]`, oldest first, so that plans do not run away from their mean exponentially.
+
+    Estimates from few vectors may do so, by chance, though no vector went there. The powers of the recursion then grow
+    like those of its spectral radius r > 1, and what lag k adds is divided by r^k, so that the radius is 1.
+    """
+    number, rows, size = weights.shape
+    recursion = torch.zeros(number, rows, rows, dtype=weights.dtype)
+    recursion[:, size:, :-size] = torch.eye(rows - size, dtype=weights.dtype)
+    recursion[:, :, -size:] = weights.nan_to_num(0, 0, 0).cpu()
+    radius = torch.linalg.eigvals(recursion).abs().amax(1).clamp(min=1).to(weights)
+    lag = torch.arange(rows // size, 0, -1, device=weights.device).repeat_interleave(size)
+    return weights / radius[:, None, None] ** lag[:, None]
 
 
 def linear_nats(tables: LinearTables, values: Tensor, half_range: Tensor) -> Tensor:

@@ -418,3 +418,35 @@ def test_stored_windows_describe_vectors_in_a_small_part_of_the_range_as_well():
         found = prior.action_log_probs(VectorPlans(test, low, high))
         nats.append(float(found.mean()) + 2 * log(part))
     assert min(nats[1:]) > nats[0] - 0.2
+
+
+def walks(num_plans: int, length: int, size: int, seed: int) -> VectorPlans:
+    """Stationary autoregressions of order 1, of standard deviation .15."""
+    noise = torch.randn(length + 50, num_plans, size, generator=seeded(seed))
+    values = [torch.zeros(num_plans, size)]
+    for now in noise:
+        values.append(0.95 * values[-1] + (1 - 0.95**2) ** 0.5 * now)
+    bounds = [[side] * size for side in (-1.0, 1.0)]
+    return VectorPlans((0.15 * torch.stack(values[-length:], 1)).clamp(-1, 1), *bounds)
+
+
+@pytest.mark.parametrize("make", [AutoregressivePrior, StepSynergies, WindowSynergies])
+def test_plans_of_few_vectors_do_not_run_away(make):
+    """By chance, the recursions of some of these would grow exponentially."""
+    for seed in range(8):
+        plans = walks(2, 25, 4, seed)
+        prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
+        drawn = prior.sample(100, 50, generator=seeded(1))[0]
+
+        assert (drawn[:, 30:].std((0, 1)) < 3 * plans.actions.std((0, 1))).all(), seed
+        assert (drawn.abs() == 1).float().mean() < 0.01
+
+
+def test_what_grows_is_slowed_to_a_walk():
+    """Doubling numbers have a spectral radius of 2, oscillating ones that grow likewise; the rest is as it was."""
+    for root in (2.0, -2.0, 0.5):
+        values = 0.01 * root ** torch.arange(6.0).expand(30, 6)[..., None] * torch.linspace(-2, 2, 30)[:, None, None]
+        prior = AutoregressivePrior([-1.0], [1.0], order=1).fit(VectorPlans(values, [-1.0], [1.0]))
+        ahead = prior.read(torch.full((1, 3, 1), 0.1))[0].mean
+        want = 0.1 * min(max(root, -1), 1)
+        assert float(ahead) == pytest.approx(want, abs=0.01)
