@@ -641,10 +641,17 @@ def _of_plans(what: str, codes: Integers, plan: Integers, place: Callable[[int],
 
 
 def _alike(labels: list[str], what: str) -> list[str]:
-    """A note on names that differ in case, spaces, dashes or underscores only, if there are any."""
+    """Notes on names that differ in case, spaces, dashes or underscores only, and on a number in several spellings."""
     alike: dict[str, list[str]] = {}
-    for label in labels:
-        if number_in(label) is None:
+    numbers = [number_in(label) for label in labels]
+    if labels and None not in numbers:
+        for label, number in zip(labels, numbers, strict=True):
+            if label.isdecimal():
+                alike.setdefault(str(number), []).append(label)
+        same = [" and ".join(map(repr, each)) for each in alike.values() if len(each) > 1]
+        return [f"{what}s {', '.join(same)} are the same number, and count as the same"] if same else []
+    for label, number in zip(labels, numbers, strict=True):
+        if number is None:
             plain = unicodedata.normalize("NFC", label.casefold())  # a letter may be written as one character or as two
             alike.setdefault(re.sub(r"[\s_-]", "", plain), []).append(label)
     sets = [" and ".join(map(repr, names)) for key, names in alike.items() if key and len(names) > 1]

@@ -113,6 +113,17 @@ def test_a_missing_label_is_no_behaviour(tmp_path, word):
         read(tmp_path, text, missing="error")
 
 
+def test_a_number_in_two_spellings_is_noted(tmp_path):
+    plans = read(tmp_path, "group,plan,action\n01,a,x\n1,b,y\n01,c,y\n2,d,x\n")
+    assert plans.group.tolist() == [1, 1, 1, 2]
+    assert plans.notes == ("groups '01' and '1' are the same number, and count as the same",)
+    assert "actions '007' and '7'" in " ".join(read(tmp_path, "plan,action\na,007\na,7\nb,8\n").notes)
+    # Among names they are names.
+    plans = read(tmp_path, "group,plan,action\n01,a,x\n1,b,y\nz,c,y\n")
+    assert plans.group_names == ("01", "1", "z")
+    assert plans.notes == ()
+
+
 def test_missing_values_of_pandas():
     frame = pd.DataFrame({"action": ["a", None, "b", np.nan, pd.NA, "c"]})
     plans = Plans.from_dataframe(frame)
