@@ -357,10 +357,10 @@ def fields_of(
     if max_gap is not None:
         if start is None or ends is None or not {"stop", "duration"} & table.at.keys():
             raise ValueError("max_gap: the columns start, and stop or duration, are expected with it")
-        unknown = np.isnan(ends)
-        if unknown.any():
-            notes.append(f"{int(unknown.sum()):,} actions without an end count for max_gap as ended when they began")
-        latest = _running_maximum(np.where(unknown, start[row], ends), plan)
+        endless = np.isnan(ends)
+        if endless.any():
+            notes.append(f"{int(endless.sum()):,} actions without an end count for max_gap as ended when they began")
+        latest = _running_maximum(np.where(endless, start[row], ends), plan)
         error = _rounded(start[row][1:], latest[:-1], max_gap)
         pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap + error)
     if without.all():

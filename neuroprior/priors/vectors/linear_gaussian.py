@@ -279,7 +279,8 @@ def steady(weights: Tensor) -> Tensor:
     recursion[:, :, -size:] = weights.nan_to_num(0, 0, 0).cpu()
     radius = torch.linalg.eigvals(recursion).abs().amax(1).clamp(min=1).to(weights)
     lag = torch.arange(rows // size, 0, -1, device=weights.device).repeat_interleave(size)
-    return weights / radius[:, None, None] ** lag[:, None]
+    steadied: Tensor = weights / radius[:, None, None] ** lag[:, None]
+    return steadied
 
 
 def linear_nats(tables: LinearTables, values: Tensor, half_range: Tensor) -> Tensor:
