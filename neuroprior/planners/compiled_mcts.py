@@ -354,10 +354,7 @@ def begin(nodes: Nodes, known: Known, exploration: float, draws: Array, descent:
     rows, path, plan, depth, first = descent
     number = 0
     for b in range(len(known.left)):
-        tried = True
-        for a in range(nodes.closed.shape[2]):
-            tried &= nodes.closed[b, 0, a]
-        if known.left[b] > 0 and not known.over[b] and not tried:
+        if known.left[b] > 0 and not known.over[b] and not nodes.closed[b, 0].all():
             rows[number] = b
             number += 1
     if len(draws) < number * path.shape[1] * (1 + nodes.child.shape[2]):
@@ -451,7 +448,7 @@ def follow(
             new = known.size[b]
             known.size[b] += 1
             nodes.child[b, path[k, t], plan[k, t]] = new
-            # Number by number: an assignment of rows takes numba seconds to compile, since it words an error of shapes.
+            # Number by number: an assignment of rows takes numba longer to compile, since it words an error of shapes.
             for a in range(actions):
                 nodes.child[b, new, a], nodes.visits[b, new, a], nodes.total[b, new, a] = 0, 0, 0.0
                 nodes.closed[b, new, a], nodes.probs[b, new, a] = False, probs[k, a]

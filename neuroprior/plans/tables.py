@@ -642,17 +642,15 @@ def _of_plans(what: str, codes: Integers, plan: Integers, place: Callable[[int],
 
 def _alike(labels: list[str], what: str) -> list[str]:
     """Notes on names that differ in case, spaces, dashes or underscores only, and on a number in several spellings."""
-    alike: dict[str, list[str]] = {}
     numbers = [number_in(label) for label in labels]
-    if labels and None not in numbers:
-        for label, number in zip(labels, numbers, strict=True):
-            if label.isdecimal():
-                alike.setdefault(str(number), []).append(label)
-        same = [" and ".join(map(repr, each)) for each in alike.values() if len(each) > 1]
-        return [f"{what}s {', '.join(same)} are the same number, and count as the same"] if same else []
+    named = None in numbers
+    alike: dict[str, list[str]] = {}
     for label, number in zip(labels, numbers, strict=True):
         if number is None:
             plain = unicodedata.normalize("NFC", label.casefold())  # a letter may be written as one character or as two
             alike.setdefault(re.sub(r"[\s_-]", "", plain), []).append(label)
-    sets = [" and ".join(map(repr, names)) for key, names in alike.items() if key and len(names) > 1]
-    return [f"{what}s {', '.join(sets)} are nearly the same; rename them if they mean the same"] if sets else []
+        elif not named and label.isdecimal():
+            alike.setdefault(str(number), []).append(label)
+    sets = ", ".join(" and ".join(map(repr, each)) for key, each in alike.items() if key and len(each) > 1)
+    means = "nearly the same; rename them if they mean the same" if named else "the same number, and count as the same"
+    return [f"{what}s {sets} are {means}"] if sets else []

@@ -233,7 +233,7 @@ def least_std(std: Tensor, error: Tensor) -> Tensor:
 def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearTables:
     """The next vector of a `prior` given those before it in a window, for each of S Gaussians over windows.
 
-    With all of the window's past known, see `steady`.
+    Where all of the window's past is known, predictions are made `steady`.
     """
     size = prior.action_size
     mean = torch.stack([each.mean for each in moments]).double()

@@ -437,7 +437,6 @@ def test_plans_of_few_vectors_do_not_run_away(make):
         plans = walks(2, 25, 4, seed)
         prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded(0))
         drawn = prior.sample(100, 50, generator=seeded(1))[0]
-
         assert (drawn[:, 30:].std((0, 1)) < 3 * plans.actions.std((0, 1))).all(), seed
         assert (drawn.abs() == 1).float().mean() < 0.01
 
