@@ -38,9 +38,9 @@ class AutoregressivePrior(LinearGaussianPrior):
 
     Args:
         action_low, action_high: D numbers each: the bounds.
-        order: p, vectors that predictions depend on; None: the one of `orders` that predicts held-out plans best. The
-            ridge is always chosen so and, with few vectors, how much of the covariances between dimensions is taken
-            over.
+        order: p, vectors that predictions depend on; None: the one of `orders` that predicts held-out plans best (0
+            where vectors are as good as independent, or too few follow one another to say). The ridge is always chosen
+            so and, with few vectors, how much of the covariances between dimensions is taken over.
 
     Raises:
         ValueError: an argument is out of range.
@@ -53,7 +53,7 @@ class AutoregressivePrior(LinearGaussianPrior):
         torch.Size([1, 5, 10, 1])
     """
 
-    orders: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16)
+    orders: tuple[int, ...] = (0, 1, 2, 3, 4, 6, 8, 12, 16)
     """Those that `fit` tries."""
 
     def __init__(self, action_low: Any, action_high: Any, order: int | None = None) -> None:
@@ -74,7 +74,7 @@ class AutoregressivePrior(LinearGaussianPrior):
         for order in orders:
             numbers = (order + 1) * self.action_size
             fewest = min(int((learning.mask().sum(1) - order).clamp(min=0).sum()) for learning, _ in parts)
-            if scores and fewest <= numbers:
+            if order > 1 and scores and fewest <= numbers:
                 break
             few = self.action_size > 1 and fewest < MANY * numbers
             tried = list(product(SHARES if few else SHARES[-1:], RIDGES))

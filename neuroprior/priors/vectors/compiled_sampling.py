@@ -78,6 +78,9 @@ def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor
     if prior.coupling is not None:
         coupling = np.tril(prior.coupling.detach().numpy(), -1) * (bounds[1][:, None] / bounds[1])
     first_log_std = prior.first_log_std.detach().numpy()
+    linear = prior.autoregression
+    linear_coupling = linear.coupling.numpy() * (bounds[1][:, None] / bounds[1])
+    share = prior.autoregressive_share
     vectors = noise.new_empty(noise.shape)
     _recurrent(
         vectors.numpy(),
@@ -95,6 +98,11 @@ def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor
         direct,
         first_log_std,
         coupling,
+        linear.weights.numpy(),
+        linear.offset.numpy(),
+        linear.std.numpy(),
+        linear_coupling,
+        np.float32(share / (1 - share)),
         bounds,
         prior.num_components,
         prior.entry_size * prior.lags,
@@ -169,19 +177,28 @@ def _recurrent(
     direct: Array,
     first_log_std: Array,
     coupling: Array,
+    linear_weights: Array,
+    linear_offset: Array,
+    linear_std: Array,
+    linear_coupling: Array,
+    odds: Any,
     bounds: Array,
     num: int,
     recent: int,
     least_std: Any,
 ) -> None:
-    """`past [B, T, E]` begins with `recent` numbers of last vectors; `bounds`: centre, half the range, low, high."""
+    """`past [B, T, E]` begins with `recent` numbers of last vectors; `bounds`: centre, half the range, low, high.
+
+    `odds`: of the autoregression, against the network's components together.
+    """
     length, size = vectors.shape[1], vectors.shape[2]
     num_layers, width, entry, one = own.shape[0], own.shape[1], size + 1, np.float32(1)
     into, from_own = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
     known, hidden = np.empty((num_layers, width), np.float32), np.empty((num_layers, width), np.float32)
     inputs = np.empty(past.shape[2], np.float32)
     each = len(vectors) // max(len(past), 1)
-    weights, mean = np.empty(num, np.float32), np.empty(size, np.float32)
+    weights, mean = np.empty(num + 1, np.float32), np.empty(size, np.float32)
+    last = num if odds > 0 else num - 1
     centre, half, low, high = bounds[0], bounds[1], bounds[2], bounds[3]
     for n in range(len(vectors)):
         if n % each == 0:
@@ -206,10 +223,23 @@ def _recurrent(
             for c in range(num):
                 weights[c] = np.exp(weights[c] - highest)
                 total += weights[c]
+            weights[num] = total * odds
+            total += weights[num]
             chosen, so_far = 0, weights[0]
-            while chosen < num - 1 and uniform[n, t] * total > so_far:
+            while chosen < last and uniform[n, t] * total > so_far:
                 chosen += 1
                 so_far += weights[chosen]
+            if chosen == num:
+                h = 0
+                for j in range(entry - 1, recent, entry):
+                    h += int(inputs[j])
+                for d in range(size):
+                    mean[d] = centre[d] + half[d] * _dot(linear_offset[h, d], linear_weights[h, d], inputs[:recent])
+                    value = mean[d] + half[d] * linear_std[h, d] * noise[n, t, d]
+                    for j in range(d):
+                        value += linear_coupling[h, d, j] * (vectors[n, t, j] - mean[j])
+                    vectors[n, t, d] = min(max(value, low[d]), high[d])
+                continue
             for d in range(size):
                 row = num + chosen * size + d
                 value = _dot(_dot(head_bias[row], head[row], top), direct[d], inputs)

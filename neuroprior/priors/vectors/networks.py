@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from math import log
+from math import log, log1p
 from typing import Any, ClassVar, Self
 
 import torch
@@ -21,7 +21,7 @@ from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.neural.transformer import Block
 from neuroprior.priors.recordings import run_recorded
 from neuroprior.priors.vectors.autoregressive import AutoregressivePrior
-from neuroprior.priors.vectors.linear_gaussian import held_out_split, mean_nats
+from neuroprior.priors.vectors.linear_gaussian import LinearTables, held_out_split
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior
 
 LEAST_STD = 1e-3
@@ -33,11 +33,12 @@ FIRST_STD = 0.15
 FIRST_SPREAD = 0.5
 """Standard deviation of the components' means before training, so that they differ, as a share of the mixture's."""
 
-WORSE = 0.1
-"""Nats per vector of the plans learned from that fitting the autoregression to all of them may cost, at most."""
-
 TINY = 1e-9
 """Instead of 0, where a number is divided by."""
+
+EVEN, ROUNDS = 20, 100
+"""Held-out vectors that equal shares of the network and the autoregression count for when these are estimated, and the
+steps of EM for that."""
 
 DEFAULTS = {"window": 64, "learning_rate": 3e-3}
 """Settings of a training, where they are not given."""
@@ -47,6 +48,54 @@ FEWEST, MOST, VECTORS_A_STEP = 300, 4000, 40
 thousand vectors before the learning rate has fallen."""
 
 
+class Autoregression(nn.Module):
+    """An `AutoregressivePrior` as a network reads it: linear in the last `lags` vectors, of which some may be missing.
+
+    Row h of each table is for h known vectors, in units of half the range from its middle.
+
+    Args:
+        lags: vectors that predictions depend on, at most.
+        size: D.
+    """
+
+    weights: Tensor
+    """`[lags + 1, D, lags * (D + 1)]`, of inputs as `VectorNetwork` makes them."""
+
+    offset: Tensor
+    """`[lags + 1, D]`."""
+
+    std: Tensor
+    """`[lags + 1, D]`."""
+
+    coupling: Tensor
+    """`[lags + 1, D, D]`, strictly lower triangular."""
+
+    def __init__(self, lags: int, size: int) -> None:
+        super().__init__()
+        shapes = ((size, lags * (size + 1)), (size,), (size,), (size, size))
+        for name, shape in zip(LinearTables._fields, shapes, strict=True):
+            self.register_buffer(name, torch.full((lags + 1, *shape), float(name == "std")))
+
+    def learn_from(self, chain: AutoregressivePrior) -> None:
+        """Take over an autoregression of at most `lags` vectors."""
+        size, order = self.offset.shape[1], len(chain.offset) - 1
+        rows = torch.arange(len(self.offset), device=self.offset.device).clamp(max=order)
+        for name in ("offset", "std", "coupling"):
+            getattr(self, name).copy_(getattr(chain, name)[rows])
+        weights = chain.weights[rows].unflatten(1, (order, size)).permute(0, 3, 1, 2)
+        self.weights.zero_()
+        if order:
+            self.weights.unflatten(2, (-1, size + 1))[:, :, -order:, :size] = weights
+
+    def forward(self, recent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean and std `[M, D]` and coupling `[M, D, D]` after inputs `[M, lags * (D + 1)]`."""
+        lags, size = len(self.offset) - 1, self.offset.shape[1]
+        known = recent.unflatten(1, (lags, size + 1))[..., -1].sum(1).long()
+        means = (recent @ self.weights.flatten(0, 1).T).unflatten(1, (lags + 1, size)) + self.offset
+        mean = means.take_along_dim(known[:, None, None], 1)[:, 0]
+        return mean, self.std[known], self.coupling[known]
+
+
 class VectorNetwork(VectorPrior):
     """A network that predicts the next vector as a mixture of K censored Gaussians (Bishop 1994).
 
@@ -54,8 +103,11 @@ class VectorNetwork(VectorPrior):
     where it takes them, standardised (`neuroprior.priors.neural.features.Standardise`). The
     means of all components have a common part that is linear in these inputs; the rest of the means, the weights and
     the standard deviations are the network's; those of a plan's first vector have factors of their own. Training begins
-    with the linear part and the standard deviations of an `AutoregressivePrior` of at most `lags` vectors: from
-    few vectors a network learns little that is better.
+    with the linear part and the standard deviations of an `AutoregressivePrior` of at most `lags` vectors.
+
+    From few vectors a network learns little that is better, and is sometimes far too sure. After training the
+    autoregression is therefore one more component of the mixture, with a constant weight that held-out vectors choose:
+    about half of few vectors, next to nothing where the network predicts many vectors better.
 
     Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
     state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
@@ -79,12 +131,17 @@ class VectorNetwork(VectorPrior):
 
     Attributes:
         memory: vectors read at once in training; None before `fit`.
+        autoregressive_share: weight of the autoregression in the mixture; 0 before `fit`.
 
     Raises:
         ValueError: an argument is out of range.
     """
 
-    later: ClassVar[Mapping[str, float]] = {"first_log_std": 0.0, "features.most": torch.inf}
+    later: ClassVar[Mapping[str, float]] = {
+        "first_log_std": 0.0,
+        "features.most": torch.inf,
+        **{f"autoregression.{name}": float(name == "std") for name in LinearTables._fields},
+    }
     renamed: ClassVar[Mapping[str, str]] = {"_mean": "features.mean", "_std": "features.std"}
 
     def __init__(
@@ -114,6 +171,7 @@ class VectorNetwork(VectorPrior):
         check_memory(4 * width * self.input_size, width=width, lags=lags)
         self.features = Standardise(features)
         self.coupling = nn.Parameter(torch.zeros(size, size)) if coupled else None
+        self.autoregression, self.autoregressive_share = Autoregression(lags, size), 0.0
         self.first_log_std = nn.Parameter(torch.zeros(size))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -137,7 +195,7 @@ class VectorNetwork(VectorPrior):
 
     @property
     def learned(self) -> dict[str, Any]:
-        return super().learned | {"memory": self.memory}
+        return super().learned | {"memory": self.memory, "autoregressive_share": self.autoregressive_share}
 
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
@@ -145,6 +203,10 @@ class VectorNetwork(VectorPrior):
         if memory is not None:
             check_sizes(memory=memory)
         self.memory = memory
+        share = learned.get("autoregressive_share", 0.0)  # which older files do not have
+        if not is_number(share) or not 0 <= share < 1:
+            raise ValueError(f"autoregressive_share: a share from 0 to below 1 is expected, not {share!r}")
+        self.autoregressive_share = float(share)
 
     @property
     def learns_anew(self) -> bool:
@@ -308,6 +370,15 @@ class VectorNetwork(VectorPrior):
         stds = stds + no_last * self.first_log_std
         std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
         coupling = None if self.coupling is None else self.coupling.tril(-1) * (half[:, None] / half)
+        if self.autoregressive_share:
+            linear_mean, linear_std, linear_coupling = self.autoregression(inputs[:, : self.lags * self.entry_size])
+            mean = torch.cat([mean, (self.middle + half * linear_mean)[:, None]], 1)
+            std = torch.cat([std, (half * linear_std)[:, None]], 1)
+            weights = weights.log_softmax(-1) + log1p(-self.autoregressive_share)
+            weights = functional.pad(weights, (0, 1), value=log(self.autoregressive_share))
+            own = torch.zeros_like(linear_coupling) if coupling is None else coupling.expand_as(linear_coupling)
+            linear_coupling = linear_coupling * (half[:, None] / half)
+            coupling = torch.stack([own] * self.num_components + [linear_coupling], 1)
         return GaussianForecast(mean, std, self.action_low, self.action_high, weights, coupling)
 
     @property
@@ -317,9 +388,8 @@ class VectorNetwork(VectorPrior):
     def fit(self, plans: VectorPlans, *, generator: torch.Generator | None = None, **settings: Any) -> Self:
         """Train with Lightning until the likelihood of held-out plans no longer rises; returns self.
 
-        A prior that has learned before is trained further from its present weights. In one that learns for the first
-        time, and holds out a share of the plans, the autoregression in its linear part is fitted to all plans in the
-        end, unless these become clearly less likely by that.
+        A prior that has learned before is trained further from its present weights. The autoregression is fitted anew,
+        to all plans.
 
         Args:
             plans: see `VectorPrior.fit`; at least two vectors.
@@ -354,33 +424,39 @@ class VectorNetwork(VectorPrior):
             elif isinstance(validation, VectorPlans):
                 validation = self.training_plans(validation)
             check_alike(learning, validation)
+            assert isinstance(validation, VectorPlans)  # as the plans that are learned from
         except ValueError:
             self.action_names, self.memory = known, memory  # what is refused is not learned from
             raise
         if first:
             self.features.learn_from(plans)
-        chain = self._chain(learning, seed) if first else None
-        if chain is not None:
-            self._begin(chain)
+        chain = AutoregressivePrior(self.action_low, self.action_high)
+        chain.orders = tuple(each for each in chain.orders if each <= self.lags)
+        chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed))
+        self.autoregression.learn_from(chain)
+        if first:
+            self._begin()
+        self.autoregressive_share = 0.0
         train(self, learning, replace(how, validation=validation), seed)
-        if chain is not None and learning is not plans:
-            weights = {name: value.clone() for name, value in self.state_dict().items()}
-            before = mean_nats(self, plans)
-            self._add(self._chain(plans, seed, chain.memory))
-            self._add(chain, -1.0)
-            if mean_nats(self, plans) < before - WORSE:  # a chain of too few vectors, or one that training corrected
-                self.load_state_dict(weights)
+        self._mix(chain, validation)
         return self
 
-    def _chain(self, plans: VectorPlans, seed: int, order: int | None = None) -> AutoregressivePrior:
-        """An autoregression on last vectors that the network is given; None: of the order that fits best."""
-        chain = AutoregressivePrior(self.action_low, self.action_high, order)
-        chain.orders = tuple(each for each in chain.orders if each <= self.lags)
-        return chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed))
+    @torch.no_grad()
+    def _mix(self, chain: AutoregressivePrior, held_out: VectorPlans) -> None:
+        """Estimate the share of the autoregression from vectors that the network has not learned from."""
+        mask = held_out.mask()
+        both = self.action_log_probs(held_out), chain.action_log_probs(held_out.without_context())
+        nats = torch.stack([each[mask].double() for each in both])
+        log_shares = torch.full((2, 1), 0.5, dtype=torch.double).log().to(nats)
+        for _ in range(ROUNDS):
+            taken = (nats + log_shares).softmax(0).nan_to_num().sum(1, keepdim=True) + EVEN / 2
+            log_shares = (taken / taken.sum()).log()
+        self.autoregressive_share = float(log_shares[1].exp())
 
     @torch.no_grad()
-    def _begin(self, chain: AutoregressivePrior) -> None:
-        """Take over the linear part and the standard deviations of an autoregression, before the first training."""
+    def _begin(self) -> None:
+        """Take over the linear part and the standard deviations of the autoregression, before the first training."""
+        chain, recent = self.autoregression, self.lags * self.entry_size
         _, means, stds = self._parts(self.head.bias)
         share = FIRST_SPREAD if self.num_components > 1 else 0.0
         eye = torch.eye(self.action_size, device=chain.std.device)
@@ -396,18 +472,11 @@ class VectorNetwork(VectorPrior):
         stds.copy_(own.clamp(min=LEAST_STD).log().expand_as(stds))
         weights = self._parts(self.head.weight.T)[1]
         weights.copy_(weights @ (root.T / (2 * FIRST_STD)))
-        self._add(chain)
-
-    @torch.no_grad()
-    def _add(self, chain: AutoregressivePrior, sign: float = 1.0) -> None:
-        """Add the linear part of an autoregression to that of the means; with -1 take it away."""
-        weights = functional.pad(chain.weights[-1].unflatten(0, (-1, self.action_size)), (0, 0, 0, 1))
-        weights[-1, -1] = chain.offset[-1] - chain.offset[0]  # where there is a last vector
-        recent = slice((self.lags - len(weights)) * self.entry_size, self.lags * self.entry_size)
-        self.linear.weight[:, recent] += sign * weights.flatten(0, 1).T
-        self._parts(self.head.bias)[1].add_(chain.offset[0], alpha=sign)
+        self.linear.weight[:, :recent] += chain.weights[-1]
+        self.linear.weight[:, recent - 1] += chain.offset[-1] - chain.offset[0]  # where there is a last vector
+        means += chain.offset[0]
         if self.coupling is not None:
-            self.coupling.add_(chain.coupling[-1], alpha=sign)
+            self.coupling.add_(chain.coupling[-1])
 
 
 class VectorGRU(VectorNetwork):

@@ -48,6 +48,7 @@ def test_linear_priors(make, length, monkeypatch):
     assert slow.std(1).amax(-1).amin() > 0  # not in all dimensions: a step may be at a bound in all plans
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
 @pytest.mark.parametrize("number", [2, 17])
 @pytest.mark.parametrize("length", [0, 1, 7])
 @pytest.mark.parametrize(
@@ -58,10 +59,14 @@ def test_linear_priors(make, length, monkeypatch):
         ({"width": 8, "lags": 2}, 4),
     ],
 )
-def test_a_recurrent_network(settings, features, length, number, monkeypatch):
+def test_a_recurrent_network(settings, features, length, number, share, monkeypatch):
     prior = VectorGRU(LOW, HIGH, features, **settings).requires_grad_(False)
     for name, numbers in prior.named_parameters():
         numbers.add_(0.3 * torch.randn(numbers.shape, generator=seeded(len(name))))
+    walks = (0.3 * torch.randn(5, 40, 3, generator=seeded(3))).cumsum(1).sin()
+    values = VectorPlans(LOW + (HIGH - LOW) * (walks + 1) / 2, LOW, HIGH)
+    prior.autoregression.learn_from(AutoregressivePrior(LOW, HIGH, prior.lags).fit(values))
+    prior.autoregressive_share = share
     context = None if features is None else torch.randn(number, length + 1, features, generator=seeded(4))
     fast, slow = drawn(prior, pasts(length, number), monkeypatch, context)
     torch.testing.assert_close(fast, slow, atol=2e-5, rtol=1e-5)

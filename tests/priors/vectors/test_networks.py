@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors import load, save
-from neuroprior.priors.vectors import AutoregressivePrior, VectorGRU, VectorPrior, VectorTransformer
+from neuroprior.priors.vectors import AutoregressivePrior, NoisePrior, VectorGRU, VectorPrior, VectorTransformer
 from neuroprior.priors.vectors.linear_gaussian import held_out_split
 from neuroprior.testing.chi_square import chi_square
 
@@ -119,6 +119,45 @@ def test_states_are_reordered_by_their_rows(kind):
     assert ahead.log_prob(data.actions[order, 4]).allclose(all_ahead.log_prob(data.actions[:, 4])[order], atol=1e-5)
 
 
+@pytest.mark.parametrize("coupled", [False, True])
+def test_the_autoregression_is_a_part_of_the_mixture(kind, coupled):
+    """With its share, from a plan's first vector on, whether fewer or more vectors are known than it reads."""
+    data = plans(num=40)
+    prior = kind(LOW, HIGH, width=8, lags=2, coupled=coupled).fit(data, generator=rng(), **HOW)
+    chain = AutoregressivePrior(LOW, HIGH, order=2).fit(plans(num=40, length=30), generator=rng())
+    assert chain.memory == 2
+    prior.autoregression.learn_from(chain)
+    assert 0 < prior.autoregressive_share < 1
+    nats = []
+    for share in (0.0, 0.3):
+        prior.autoregressive_share = share
+        with torch.no_grad():
+            nats.append(prior.action_log_probs(data))
+    expected = torch.logaddexp(nats[0] + log(0.7), chain.action_log_probs(data) + log(0.3))
+    assert nats[1].allclose(expected.masked_fill(~data.mask(), 0), atol=1e-4)
+
+
+def test_few_plans_are_predicted_as_well_as_by_an_autoregression_and_many_better():
+    """The data: a circle whose radius the autoregression does not know, with noise."""
+
+    def circles(num: int, seed: int) -> VectorPlans:
+        phase = 6 * torch.rand(num, 1, generator=rng(seed)) + 0.7 * torch.arange(40)
+        actions = torch.stack([phase.sin().sign(), phase.cos().sign()], -1) / 2
+        return VectorPlans(actions + 0.1 * torch.randn(num, 40, 2, generator=rng(seed + 1)), [-1, -1], [1, 1])
+
+    test, gains, shares = circles(100, 5), [], []
+    for num in (3, 100):
+        chain = AutoregressivePrior([-1, -1], [1, 1], 1).fit(circles(num, 1), generator=rng())
+        prior = VectorGRU([-1, -1], [1, 1], width=16)
+        prior.fit(circles(num, 1), generator=rng(), progress=False, max_steps=200, learning_rate=0.01)
+        with torch.no_grad():
+            gains.append(float((prior.log_prob(test) - chain.log_prob(test)).mean() / 40))
+        shares.append(prior.autoregressive_share)
+    assert gains[0] > 0
+    assert gains[1] > 0.5
+    assert shares[0] > 0.1 > 0.05 > shares[1]
+
+
 @torch.no_grad()
 def test_a_saved_prior_is_the_same_prior(kind, tmp_path: Path):
     data = plans(context_size=2)
@@ -127,6 +166,7 @@ def test_a_saved_prior_is_the_same_prior(kind, tmp_path: Path):
     again = load(save(prior, tmp_path), kind="vectors")
     assert repr(again) == repr(prior)
     assert again.memory == prior.memory
+    assert again.autoregressive_share == prior.autoregressive_share > 0
     assert again.log_prob(data).equal(prior.log_prob(data))
 
 
@@ -198,7 +238,7 @@ def test_two_modes_are_learned_and_features_are_used(kind):
 
 @pytest.mark.parametrize("lags", [1, 2])
 def test_what_has_learned_nothing_predicts_as_an_autoregression_of_all_plans(kind, lags):
-    """In training it begins with that of the plans which are not held out; here these are half of them."""
+    """Those that are held out, here half of them, are among these."""
     data, test = autoregression(40, 30, 1), autoregression(50, 60, 2)
     data.actions[20:] += 1.0
     chain = AutoregressivePrior([-4], [4], lags).fit(data, generator=rng())
@@ -236,6 +276,7 @@ def test_it_begins_with_the_spread_that_it_can_describe(kind, coupled):
         return VectorPlans(0.3 + common * shared + own * each, [-1.0, -1.0], [1.0, 1.0])
 
     prior = kind([-1, -1], [1, 1], width=8, coupled=coupled).fit(noise(200, 1), generator=rng(), **NEXT_TO_NOTHING)
+    prior.autoregressive_share = 0.0  # which describes both in any case
     with torch.no_grad():
         nats = float(prior.action_log_probs(noise(200, 3)).mean())
     alone, both = common**2 + own**2, (common**2 + own**2) ** 2 - common**4
@@ -308,21 +349,26 @@ def test_a_refused_fit_is_not_learned_from(kind):
     assert all(a.equal(b) for a, b in zip(fresh.state_dict().values(), again.state_dict().values(), strict=True))
 
 
-def test_an_autoregression_of_too_few_vectors_is_not_taken_over():
-    """The one plan of more than a vector is held out, and ends far from all else."""
+def test_of_too_few_vectors_no_autoregression_is_learned():
+    """The one plan of more than a vector is held out, and ends far from all else: vectors count as independent."""
     for num, seed in ((20, 20), (40, 2)):
         actions = 0.1 * torch.randn(num, 2, 1, generator=rng(1))
         actions[0, 1] = 0.9
         data = VectorPlans(actions, [-1.0], [1.0], torch.tensor([2] + [1] * (num - 1)))
         test = VectorPlans(0.1 * torch.randn(50, 2, 1, generator=rng(9)), [-1.0], [1.0])
-        prior = VectorGRU([-1], [1], seed=seed).fit(data, generator=rng(seed), progress=False)
+        priors = (NoisePrior([-1], [1]), AutoregressivePrior([-1], [1]), VectorGRU([-1], [1], seed=seed))
+        for prior in priors:
+            prior.fit(data, generator=rng(seed))
         with torch.no_grad():
-            nats = float(prior.log_prob(test).mean()) / 2
-        assert nats > 0.6  # the noise has .88; with that autoregression -6.4 and -2.0
+            noise, chain, network = (float(each.log_prob(test).mean()) for each in priors)
+        assert noise == pytest.approx(chain, abs=1e-5)
+        assert network > noise > 0.9  # the vectors have 1.76 a plan; with an autoregression of order 1 below -.6
 
 
 def test_learning_further_goes_on_from_the_present_weights(kind):
     prior = kind(LOW, HIGH, width=8).fit(plans(), generator=rng(), **HOW)
     before = {name: weight.clone() for name, weight in prior.state_dict().items()}
     prior.fit(plans(), generator=rng(1), **HOW | {"learning_rate": 1e-9})
-    assert all(weight.allclose(before[name], atol=1e-6) for name, weight in prior.state_dict().items())
+    autoregression = {f"autoregression.{name}" for name in prior.autoregression.state_dict()}  # is fitted anew
+    now = {name: weight for name, weight in prior.state_dict().items() if name not in autoregression}
+    assert all(weight.allclose(before[name], atol=1e-6) for name, weight in now.items())
