@@ -248,11 +248,11 @@ def test_a_cluster_does_the_jobs_though_a_worker_is_killed(cluster, tmp_path: Pa
     assert os.getpid() not in {result["process"] for result in first}
     # The address of a worker's process is known from a job; one of them is killed while it works.
     runs = JobRun(jobs.slow_square, tmp_path, {})
-    kill = subprocess.Popen([sys.executable, "-c", f"import os, time; time.sleep(2); os.kill({workers[0].pid}, 9)"])
-    found = runs.do(list(range(20)), dask=address, title="squares")
+    kill = subprocess.Popen([sys.executable, "-c", f"import os, time; time.sleep(1); os.kill({workers[0].pid}, 9)"])
+    found = runs.do(list(range(8)), dask=address, title="squares")
     kill.wait()
     assert workers[0].wait(10) == -signal.SIGKILL
-    assert [result["square"] for result in found] == [number**2 for number in range(20)]
+    assert [result["square"] for result in found] == [number**2 for number in range(8)]
     assert workers[1].pid in {result["process"] for result in found}
 
 

@@ -49,7 +49,11 @@ HARD = {
 }
 
 
-@pytest.mark.parametrize("what", HARD)
+# Those that have all but one thing in common with another one, of which there is a report in every run.
+ALIKE = ("a single plan", "plans of two actions", "always the same")
+
+
+@pytest.mark.parametrize("what", [pytest.param(what, marks=pytest.mark.slow if what in ALIKE else []) for what in HARD])
 def test_hard_files_have_a_report(what, tmp_path, recwarn):
     plans = HARD[what]
     closed = int(plans.end is not None)

@@ -102,7 +102,7 @@ def by_hand(model: str, learned: Plans, held: Plans, seed: int, contexts: int | 
     [
         ("nothing", False, 0),
         ("index a plan", True, 0),
-        ("index a step", False, 0),
+        pytest.param("index a step", False, 0, marks=pytest.mark.slow),
         ("index a step", True, 2),
     ],
 )
