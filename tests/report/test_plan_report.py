@@ -32,7 +32,12 @@ def bits(document: Document, model: str, inputs: str = "actions") -> float:
 
 @pytest.mark.parametrize(
     ("group", "folds"),
-    [(None, 5), (torch.arange(12) % 3, 3), (torch.zeros(12, dtype=torch.long), 5), (torch.arange(12) % 6, 5)],
+    [
+        pytest.param(None, 5, marks=pytest.mark.slow),
+        (torch.arange(12) % 3, 3),
+        (torch.zeros(12, dtype=torch.long), 5),
+        (torch.arange(12) % 6, 5),
+    ],
 )
 def test_as_many_folds_as_there_are_units_but_five_at_most(group, folds):
     made = report(chain(group=group), **SCORES)
