@@ -124,7 +124,7 @@ def test_the_hidden_state_is_learned_to_be_used():
         generator=seeded(1),
         window=12,
         batch_size=100,
-        max_steps=300,
+        max_steps=220,
         progress=False,
         learning_rate=0.01,
     )
