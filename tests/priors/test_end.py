@@ -10,7 +10,7 @@ from neuroprior.testing import check_prior
 from tests.support.sources import FALSE_ALARM, every_plan, p_value, plan_number, refuses, seeded
 
 PRIORS = [lambda: MarkovPrior(3, 2), lambda: GRUPrior(3, 8), lambda: TransformerPrior(3, 16)]
-QUICK = {"max_steps": 60, "progress": False}
+QUICK = {"max_steps": 20, "progress": False}
 
 
 def closed(num_plans: int = 2000) -> Plans:
