@@ -78,6 +78,15 @@ def switching(num: int = 10) -> tuple[list[Prior], Plans]:
     return experts, Plans(torch.where(noise > 0, noise + turn, turn) % A, A)
 
 
+@cache
+def tracking() -> CombinedPrior:
+    """One whose best expert changes."""
+    experts, plans = switching()
+    prior = CombinedPrior(A, experts)
+    prior.learn_weights(plans)
+    return prior
+
+
 @pytest.mark.parametrize("kind", ["plain", "contexts", "features", "tracking", "untrained"])
 def test_it_is_a_prior(kind):
     if kind == "plain":
@@ -89,9 +98,7 @@ def test_it_is_a_prior(kind):
         plans = Plans(some_plans().actions, A, context=torch.randn(60, 8, 2, generator=seeded(1)))
         prior = CombinedPrior(A, effort="fast", context_size=2).fit(plans, generator=seeded(0), **QUICK)
     elif kind == "tracking":
-        experts, plans = switching()
-        prior = CombinedPrior(A, experts)
-        prior.learn_weights(plans)
+        prior = tracking()
         assert prior.share > 0
     else:
         prior = CombinedPrior(A, num_contexts=C)
@@ -102,11 +109,7 @@ def test_it_is_a_prior(kind):
 @given(st.lists(st.integers(0, A - 1), min_size=1, max_size=60), st.booleans())
 @torch.no_grad()
 def test_no_sequence_is_predicted_worse_than_by_the_best_expert_and_the_bound(sequence, tracks):
-    prior = fitted()
-    if tracks:
-        experts, plans = switching()
-        prior = CombinedPrior(A, experts)
-        prior.learn_weights(plans)
+    prior = tracking() if tracks else fitted()
     plan = torch.tensor([sequence])
     best = max(float(expert.log_prob(plan)) for expert in prior.experts)
     assert prior.bound <= math.log(prior.tried) + 1e-5
