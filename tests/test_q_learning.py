@@ -13,7 +13,7 @@ GRID = gridworld(3, 3)
 @pytest.mark.parametrize("edges", ["wall", "torus"])
 def test_q_learning_with_exploration_comes_to_the_true_values(edges):
     world = gridworld(4, 4, edges)
-    learned = q_learning(world, 5, num_agents=4, steps=4000, epsilon=1.0, step_size=1.0, generator=seeded(0))
+    learned = q_learning(world, 5, num_agents=4, steps=2500, epsilon=1.0, step_size=1.0, generator=seeded(0))
     true = value_iteration(world, goal=5)
     torch.testing.assert_close(learned.amax(-1), true.expand(4, -1), atol=1e-9, rtol=0)
     after = torch.where(torch.arange(16)[:, None] == 5, 1 / 0.9, 0.9 * true[0][world.next_state])
@@ -22,7 +22,7 @@ def test_q_learning_with_exploration_comes_to_the_true_values(edges):
 
 def test_some_exploration_and_half_steps_come_there_too():
     world = gridworld(3, 4, "wall")
-    learned = q_learning(world, 5, num_agents=3, steps=6000, epsilon=0.5, discount=0.8, generator=seeded(1))
+    learned = q_learning(world, 5, num_agents=3, steps=4000, epsilon=0.5, discount=0.8, generator=seeded(1))
     true = value_iteration(world, goal=5, discount=0.8)
     torch.testing.assert_close(learned.amax(-1), true.expand(3, -1), atol=1e-3, rtol=0)
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import cache
 
 import pytest
 import torch
@@ -222,31 +223,34 @@ def test_forgetting_follows_the_food():
     assert online.mean() > 1.1 * table_free.mean()
 
 
+def of_kind(kind):
+    if kind == "gru":
+        return agent(GRUPrior(4, hidden_size=8), training=TRAINING)
+    if kind == "context":
+        return agent(MarkovPrior(4, 1, num_contexts=36), min_score=0.0)
+    prior = MarkovPrior(4, 2)
+    return agent(prior, planner=sampler(prior, any_prefix=True), replan_every=1) if kind == "prefixes" else agent(prior)
+
+
+@cache
+def without_a_pause(kind):
+    """An agent after forty steps, and what it did: the same for every moment of a pause."""
+    through = of_kind(kind)
+    return through, through.run(40)
+
+
 @pytest.mark.parametrize(
     ("kind", "at"),
     [*((kind, at) for kind in ("no context", "context", "prefixes") for at in (8, 12, 14)), ("gru", 12), ("gru", 14)],
 )
 def test_a_pause_changes_nothing(kind, at, tmp_path):
-    def made():
-        if kind == "gru":
-            return agent(GRUPrior(4, hidden_size=8), training=TRAINING)
-        if kind == "context":
-            return agent(MarkovPrior(4, 1, num_contexts=36), min_score=0.0)
-        prior = MarkovPrior(4, 2)
-        return (
-            agent(prior, planner=sampler(prior, any_prefix=True), replan_every=1)
-            if kind == "prefixes"
-            else agent(prior)
-        )
-
-    through = made()
-    whole = through.run(40)
-    first = made()
+    through, whole = without_a_pause(kind)
+    first = of_kind(kind)
     before = first.run(at)
     save_agent(first, tmp_path / "saved")
     first.run(4)
     save_agent(first, tmp_path / "other")
-    again = restore_agent(made(), tmp_path / "saved")
+    again = restore_agent(of_kind(kind), tmp_path / "saved")
     assert again.time == at
     after = again.run(40 - at)
     for name in ("actions", "rewards", "states"):

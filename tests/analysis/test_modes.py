@@ -58,7 +58,8 @@ def chosen_by_hand(bits):
 
 def test_the_rule_is_that_of_one_standard_error_paired():
     plans, _ = source(12, 60, seed=8, stay=0.8)
-    choice = choose_modes(plans, [1, 2, 3], order=0, restarts=1, max_iterations=20, generator=seeded(0))
+    how = {"order": 0, "restarts": 1, "max_iterations": 20}
+    choice = choose_modes(plans, [1, 2, 3], number_of_folds=2, **how, generator=seeded(0))
     bits = np.stack([(score.bits / score.actions).numpy() for score in choice.scores.values()])
     assert choice.chosen == chosen_by_hand(bits)
     best = bits.mean(1).argmin()

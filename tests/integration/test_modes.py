@@ -15,6 +15,12 @@ from tests.support.sources import seeded
 QUICK: dict = {"models": ["counts"], "sections": ["modes"], "folds": 2, "processes": 1}
 
 
+@pytest.fixture(autouse=True)
+def two_folds(monkeypatch):
+    """The number of modes is chosen on two folds: to fit the modes on five takes longer than all else."""
+    monkeypatch.setattr("neuroprior.analysis.modes.FOLDS", 2)
+
+
 @pytest.fixture
 def file(tmp_path: Path) -> str:
     """Plans of two modes: nearly always 0, or nearly always 1, for ten actions each."""

@@ -20,6 +20,9 @@ pytestmark = pytest.mark.usefixtures("undrawn")
 
 CUT = ["--data.check_every", "3", "--trainer.max_steps", "15"]
 
+FAST = ["--effort", "fast", "--max-steps", "5", "--data.folds", "1"]
+"""A combined prior, scored without cross-validation, which takes longer than all else."""
+
 DRIVER = """
 import os, resource, signal, sys
 import neuroprior.cli.fit, neuroprior.cli.fit_report
@@ -236,7 +239,7 @@ def test_a_resumed_run_does_not_learn_a_saved_combined_prior_again(tmp_path, mon
     plans = Plans(torch.randint(3, (40, 6)), 3)
     write_plans(plans, tmp_path / "plans.npz")
     run = tmp_path / "run"
-    assert main(["fit", str(tmp_path / "plans.npz"), "--effort", "fast", "--max-steps", "5", "--out", str(run)]) == 0
+    assert main(["fit", str(tmp_path / "plans.npz"), *FAST, "--out", str(run)]) == 0
     model, table = (run / "model.safetensors").read_bytes(), metrics(run)["rows"]
     (run / "metrics.json").unlink()
     fitted, fit = [], CombinedPrior.fit
@@ -259,7 +262,7 @@ def test_a_resumed_run_does_not_learn_a_saved_combined_prior_again(tmp_path, mon
 def test_a_combined_prior_of_other_options_does_not_pass_for_the_one_that_was_interrupted(tmp_path, monkeypatch):
     write_plans(Plans(torch.randint(3, (40, 6), generator=torch.Generator().manual_seed(0)), 3), tmp_path / "plans.npz")
     run = tmp_path / "run"
-    assert main(["fit", str(tmp_path / "plans.npz"), "--effort", "fast", "--max-steps", "5", "--out", str(run)]) == 0
+    assert main(["fit", str(tmp_path / "plans.npz"), *FAST, "--out", str(run)]) == 0
     model, fit = (run / "model.safetensors").read_bytes(), CombinedPrior.fit
 
     def interrupted(*_, **__):

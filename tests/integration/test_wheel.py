@@ -75,7 +75,7 @@ def test_the_five_commands(installed: Path, tmp_path: Path) -> None:
     assert events["animal"].nunique() == 12
     events[events["animal"].isin(events["animal"].unique()[:3])].to_csv(tmp_path / "few.csv", index=False)
     study = ["few.csv", "--columns.action", "behaviour", "--columns.plan", "session", "--columns.group", "animal"]
-    quick = ["--trainer.max_steps", "20", "--trainer.accelerator", "cpu", "--data.folds", "1"]
+    quick = ["--trainer.max_steps", "5", "--trainer.accelerator", "cpu", "--data.folds", "1"]
     commands = [
         ["example", "study.csv"],
         ["fit", "--config", "gru", "--data.file", *study, "--out", "gru", *quick],

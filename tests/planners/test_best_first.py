@@ -108,7 +108,7 @@ def test_searches_are_those_of_a_heap(kind: str, heuristic: Any) -> None:
         prior = UniformPrior(3)
     for seed in range(2):
         world = random_table(seed)
-        state = torch.randint(200, (8,), generator=torch.Generator().manual_seed(seed))
+        state = torch.randint(200, (4,), generator=torch.Generator().manual_seed(seed))
         state[0] = 199  # solved already
         for budget in (1, 30, 400):
             planner: BestFirstPlanner = LevinPlanner(prior, budget, heuristic=heuristic, reroot=kind == "rerooted")
@@ -135,7 +135,7 @@ GROWING: dict[str, Callable[[], Prior]] = {
 @pytest.mark.parametrize("name", GROWING)
 def test_priors_whose_states_grow_search_as_others(name: str) -> None:
     prior, world = GROWING[name]().eval(), random_table(0)
-    state = torch.randint(200, (8,), generator=torch.Generator().manual_seed(0))
+    state = torch.randint(200, (5,), generator=torch.Generator().manual_seed(0))
     state[0] = 199  # solved already
     for at_once in (1, 4):
         found = LevinPlanner(prior, 120, nodes_at_once=at_once).search(world, state)
@@ -195,7 +195,7 @@ class Tree(Goal):
 
 
 def test_rerooting_needs_as_many_expansions_as_there_are_siblings_on_the_way() -> None:
-    for height in (1, 4, 8):
+    for height in (1, 4, 6):
         world, start = Tree(height), torch.tensor([0])
         blind = LevinPlanner(UniformPrior(2), 10_000).search(world, start)
         assert blind.expansions.tolist() == [2 ** (height + 1) - 2]
@@ -245,14 +245,14 @@ def test_the_compiled_search_finds_the_same(puzzle: str) -> None:
     learned = [LogLinearPrior(4, patterns), PatternCounts(4, patterns), PatternNetwork(4, patterns, size=4)]
     learned.append(LogLinearPrior(4, patterns, use_last=False))
     planners: list[BestFirstPlanner] = [
-        LevinPlanner(prior, 80)
+        LevinPlanner(prior, 40)
         for prior in (UniformPrior(4), *(prior.fit(plans, generator=generator) for prior in learned))
     ]
-    planners += [LevinPlanner(learned[0], 80, heuristic=world.lower_bound)]
-    planners += [LevinPlanner(prior, 80, reroot=True) for prior in (UniformPrior(4), learned[0])]
-    planners += [LevinPlanner(learned[0], 80, heuristic=world.lower_bound, reroot=True)]
-    planners += [AStarPlanner(world.lower_bound, weight, 80) for weight in (1.0, 3.0, math.inf)]
-    planners += [AStarPlanner(None, 1.0, 80)]
+    planners += [LevinPlanner(learned[0], 40, heuristic=world.lower_bound)]
+    planners += [LevinPlanner(prior, 40, reroot=True) for prior in (UniformPrior(4), learned[0])]
+    planners += [LevinPlanner(learned[0], 40, heuristic=world.lower_bound, reroot=True)]
+    planners += [AStarPlanner(world.lower_bound, weight, 40) for weight in (1.0, 3.0, math.inf)]
+    planners += [AStarPlanner(None, 1.0, 40)]
     solved = 0
     for planner in planners:
         compiled = planner.search(world, state)
@@ -391,17 +391,17 @@ def test_the_temperature_divides_the_logits(kind: str, temperature: float) -> No
     """In tables, and in puzzles with a prior of patterns, which the compiled loop could search with."""
     if kind == "table":
         world: Any = random_table(0)
-        state = torch.arange(20)
+        state = torch.arange(6)
         prior: Any = MarkovPrior(3, 2).fit(torch.randint(3, (30, 5), generator=torch.Generator().manual_seed(0)))
-        same = LevinPlanner(Heated(prior, temperature), 200).search(world, state)
+        same = LevinPlanner(Heated(prior, temperature), 80).search(world, state)
     else:
-        world = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=12).reset(6, torch.Generator().manual_seed(1)))
+        world = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=12).reset(3, torch.Generator().manual_seed(1)))
         state = world.boards
         prior = LogLinearPrior(4, len(world.windows.windows))
         prior.fit(puzzle_plans(world, state), generator=torch.Generator().manual_seed(0))
-        same = LevinPlanner(prior, 200, temperature=temperature, compile=False).search(world, state)
-    warm = LevinPlanner(prior, 200, temperature=temperature).search(world, state)
-    cold = LevinPlanner(prior, 200).search(world, state)
+        same = LevinPlanner(prior, 80, temperature=temperature, compile=False).search(world, state)
+    warm = LevinPlanner(prior, 80, temperature=temperature).search(world, state)
+    cold = LevinPlanner(prior, 80).search(world, state)
     assert warm.expansions.equal(same.expansions)
     assert warm.plan.equal(same.plan)
     assert not warm.expansions.equal(cold.expansions)

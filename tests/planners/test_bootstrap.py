@@ -197,7 +197,7 @@ def test_symmetries_of_solutions_are_solutions() -> None:
     others = [sliding_tiles(goal=goal, scramble=30) for goal in (corner, side)]
     assert [world.symmetries() for world in others] == [2, 1]  # a blank beside the diagonal would go elsewhere
     for world in (tiles(), *others, sokoban(LEVELS)):
-        state = world.reset(30, seeded()) if world.boards is None else world.boards[:30]
+        state = world.reset(12, seeded()) if world.boards is None else world.boards[:12]
         found = AStarPlanner(world.lower_bound, 5.0, 3000).search(world, state)
         assert found.solved.sum() > 5
         kept = found.solved

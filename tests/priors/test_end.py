@@ -1,5 +1,7 @@
 """The end-of-plan symbol: learned, scored and sampled by every prior as the end of a plan."""
 
+from functools import cache
+
 import pytest
 import torch
 
@@ -8,7 +10,7 @@ from neuroprior.testing import check_prior
 from tests.support.sources import FALSE_ALARM, every_plan, p_value, plan_number, refuses, seeded
 
 PRIORS = [lambda: MarkovPrior(3, 2), lambda: GRUPrior(3, 8), lambda: TransformerPrior(3, 16)]
-QUICK = {"max_steps": 60, "progress": False}
+QUICK = {"max_steps": 20, "progress": False}
 
 
 def closed(num_plans: int = 2000) -> Plans:
@@ -17,7 +19,9 @@ def closed(num_plans: int = 2000) -> Plans:
     return Plans(actions, 2, lengths=torch.randint(5, (num_plans,), generator=seeded(2))).with_end()
 
 
+@cache
 def fitted(make):
+    """The same one in all tests, which leave it as it is."""
     prior = make()
     return prior.fit(closed()) if isinstance(prior, MarkovPrior) else prior.fit(closed(), generator=seeded(0), **QUICK)
 

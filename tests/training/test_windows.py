@@ -124,7 +124,7 @@ def test_the_hidden_state_is_learned_to_be_used():
         generator=seeded(1),
         window=12,
         batch_size=100,
-        max_steps=300,
+        max_steps=220,
         progress=False,
         learning_rate=0.01,
     )
@@ -157,8 +157,8 @@ def test_validation_reads_no_more_than_it_must():
     many = Plans(torch.zeros(351, 12_000, dtype=torch.uint8), 2, lengths=lengths)
     assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 301
     # one that has enough actions by itself is still read with others
-    lengths = torch.cat([torch.tensor([30_000]), torch.full((2000,), 10), torch.zeros(50, dtype=torch.long)])
-    many = Plans(torch.zeros(2051, 30_000, dtype=torch.uint8), 2, lengths=lengths)
+    lengths = torch.cat([torch.tensor([17_000]), torch.full((2000,), 10), torch.zeros(50, dtype=torch.long)])
+    many = Plans(torch.zeros(2051, 17_000, dtype=torch.uint8), 2, lengths=lengths)
     assert len(PlansModule(Plans(actions[:, :9], 2), many, Settings(), 0).validation.plans) == 256
 
 

@@ -162,7 +162,7 @@ def test_minigrid(name, limit):
     assert world.action_names == ("left", "right", "forward", "pickup", "drop", "toggle", "done")
     env.action_space.seed(0)
     state, ends = world.reset(1), 0
-    for _ in range(800):
+    for _ in range(400):
         env.step_count = 0  # so that rewards are those of a first step, and time never runs out
         action = int(env.action_space.sample())
         observed, reward, ended, _, _ = env.step(action)

@@ -16,7 +16,7 @@ from tests.support.reports import FROM_ELSEWHERE
 pytestmark = pytest.mark.usefixtures("undrawn")
 
 SMALL = ["compare", "--planners", *planners.PLANNERS, "--kinds", "markov", "--rounds", "1", "--processes", "1"]
-SMALL += ["--worlds", "grid", "slippery", "--seeds", "2", "--starts", "4", "--training-starts", "60"]
+SMALL += ["--worlds", "grid", "slippery", "--seeds", "2", "--starts", "2", "--training-starts", "30"]
 SMALL += ["--num-plans", "4", "16"]
 
 

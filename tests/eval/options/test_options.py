@@ -26,7 +26,7 @@ from tests.support.sources import seeded
 pytestmark = pytest.mark.usefixtures("undrawn")
 
 SMALL = ["options", "--worlds", "goal_maze", "--seeds", "2", "--starts", "8", "--num-plans", "2", "8", "--modes", "2"]
-SMALL += ["--training-starts", "40", "--processes", "1"]
+SMALL += ["--training-starts", "20", "--processes", "1"]
 
 
 def test_a_small_run(tmp_path, capsys):

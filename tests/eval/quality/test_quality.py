@@ -121,7 +121,8 @@ def test_text_is_cut_into_parts_that_are_divided():
     parts = text(seeded(0))
     line = "".join(CHARACTERS[number] for number in parts.actions[0].tolist())
     assert sum(line.count(word) for word in (" the ", " of ", " is ")) > 10  # among 1,000 characters of English
-    learned, other = sequences(20, seeded(0))[1].training, sequences(20, seeded(0))[1].test
+    second = sequences(20, seeded(0))[1]
+    learned, other = second.training, second.test
     assert (len(learned), len(other)) == (20, 10)
     assert len(torch.cat([learned.actions, other.actions]).unique(dim=0)) == 30
     assert sequences(0, seeded(0)) == []

@@ -149,7 +149,7 @@ def rows_of(plans, per):
     return rows if per else [(actions, [None] * len(actions)) for actions, _ in rows]
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(problems())
 def test_every_tree(problem):
     plans, contexts, per, arguments, generator = problem

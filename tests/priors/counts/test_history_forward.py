@@ -51,7 +51,7 @@ def equals_stepping(prior: Prior, length: int, kind: str, seed: int = 0, num: in
 def test_forward_is_stepping(name, kind):
     """At every length from which plans are read in other chunks; the shorter ones are beginnings of the longest."""
     make, depth, more = PRIORS[name]
-    prior, longest = fitted(make, depth, more, kind), 1500 if depth in (0, 3, 6) else 600
+    prior, longest = fitted(make, depth, more, kind), 1500 if name in ("markov-3 joint", "tree-6") else 600
     plans = torch.randint(3, (3, longest), generator=seeded(depth))
     plans[0] = torch.randint(2, (longest,), generator=seeded(depth + 1))  # as those learned from
     current = contexts(kind, 3, 3, longest, seed=depth + 2)

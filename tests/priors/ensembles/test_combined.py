@@ -54,6 +54,14 @@ def drawn(probs: list[float], num: int = 400, length: int = 50, seed: int = 0) -
     return Plans(actions.view(num, length), len(probs))
 
 
+@pytest.fixture
+def few_orders(monkeypatch) -> tuple[int, ...]:
+    """Chains of the first orders alone are tried: most of the time is that of counting for all of them."""
+    few = tuple(ORDERS[:4])
+    monkeypatch.setattr("neuroprior.priors.ensembles.candidates.ORDERS", few)
+    return few
+
+
 @cache
 def fitted() -> CombinedPrior:
     experts = [UniformPrior(A), MarkovPrior(A, 1), ContextTreePrior(A, 3), GRUPrior(A, 8)]
@@ -70,6 +78,15 @@ def switching(num: int = 10) -> tuple[list[Prior], Plans]:
     return experts, Plans(torch.where(noise > 0, noise + turn, turn) % A, A)
 
 
+@cache
+def tracking() -> CombinedPrior:
+    """One whose best expert changes."""
+    experts, plans = switching()
+    prior = CombinedPrior(A, experts)
+    prior.learn_weights(plans)
+    return prior
+
+
 @pytest.mark.parametrize("kind", ["plain", "contexts", "features", "tracking", "untrained"])
 def test_it_is_a_prior(kind):
     if kind == "plain":
@@ -81,9 +98,7 @@ def test_it_is_a_prior(kind):
         plans = Plans(some_plans().actions, A, context=torch.randn(60, 8, 2, generator=seeded(1)))
         prior = CombinedPrior(A, effort="fast", context_size=2).fit(plans, generator=seeded(0), **QUICK)
     elif kind == "tracking":
-        experts, plans = switching()
-        prior = CombinedPrior(A, experts)
-        prior.learn_weights(plans)
+        prior = tracking()
         assert prior.share > 0
     else:
         prior = CombinedPrior(A, num_contexts=C)
@@ -94,11 +109,7 @@ def test_it_is_a_prior(kind):
 @given(st.lists(st.integers(0, A - 1), min_size=1, max_size=60), st.booleans())
 @torch.no_grad()
 def test_no_sequence_is_predicted_worse_than_by_the_best_expert_and_the_bound(sequence, tracks):
-    prior = fitted()
-    if tracks:
-        experts, plans = switching()
-        prior = CombinedPrior(A, experts)
-        prior.learn_weights(plans)
+    prior = tracking() if tracks else fitted()
     plan = torch.tensor([sequence])
     best = max(float(expert.log_prob(plan)) for expert in prior.experts)
     assert prior.bound <= math.log(prior.tried) + 1e-5
@@ -374,7 +385,7 @@ def test_of_few_plans_it_is_hardly_behind_the_best_of_its_experts():
     assert sum(behind) / 3 < 0.01
 
 
-def test_of_few_plans_a_network_that_is_better_is_kept():
+def test_of_few_plans_a_network_that_is_better_is_kept(few_orders):
     """Each plan follows one of three chains: a network finds out which, a chain does not."""
     with torch.random.fork_rng():
         torch.manual_seed(7)
@@ -406,7 +417,7 @@ def test_of_few_plans_a_network_that_is_better_is_kept():
         ("full", {GRUPrior, StackedPrior, TransformerPrior, SwitchingNetwork}),
     ],
 )
-def test_effort_says_which_networks_are_trained(effort, kinds, monkeypatch):
+def test_effort_says_which_networks_are_trained(effort, kinds, few_orders, monkeypatch):
     trained = []
 
     def record(kind: type[Prior]) -> None:
@@ -425,12 +436,12 @@ def test_effort_says_which_networks_are_trained(effort, kinds, monkeypatch):
     assert prior.num_contexts == C
     assert set(trained) == kinds
     # The bound counts every chain that was tried, though the best alone is an expert: without the context, and with it.
-    counting = len(ORDERS) * len(BACKOFFS_TRIED) + 1
+    counting = len(few_orders) * len(BACKOFFS_TRIED) + 1
     networks = {"fast": 1, "standard": 2, "full": 4}[effort]
     assert prior.tried == 1 + 2 * counting + networks + 2  # uniform first; the pool and the fixed share last
 
 
-def test_the_same_seed_gives_the_same_prior(tmp_path):
+def test_the_same_seed_gives_the_same_prior(few_orders, tmp_path):
     plans, found = some_plans(contexts=True), []
     for seed in (3, 3, 4):
         prior = neuroprior.fit(plans, generator=seeded(seed), effort="fast", **QUICK)
@@ -468,7 +479,7 @@ def test_what_cannot_be_fitted(plans, how, word):
         neuroprior.fit(plans, **how)
 
 
-def test_a_prior_that_was_read_back_is_fitted_anew_as_the_one_that_was_saved(tmp_path):
+def test_a_prior_that_was_read_back_is_fitted_anew_as_the_one_that_was_saved(few_orders, tmp_path):
     """It tries experts of every kind again, not those alone that it kept before."""
     plans = some_plans(30)
     prior = neuroprior.fit(plans, generator=seeded(0), effort="fast", **QUICK)
@@ -485,7 +496,7 @@ def test_what_is_no_share_and_no_plans_cannot_be_held_out(prior, validation):
         neuroprior.fit(some_plans(), prior, validation=validation)
 
 
-def test_the_experts_that_were_kept_are_restored():
+def test_the_experts_that_were_kept_are_restored(few_orders):
     """As where an agent is restored: into a prior that was made as the saved one was."""
     plans = some_plans(30)
     prior, again = CombinedPrior(A, effort="fast").fit(plans, generator=seeded(0), **QUICK), CombinedPrior(A)

@@ -161,7 +161,7 @@ def test_it_is_a_prior(inner):
     check_prior(fitted(INNER[inner](), **quick), length=4, num_plans=5000)
 
 
-@pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
+@pytest.mark.parametrize("kind", [pytest.param(GRUPrior, marks=pytest.mark.slow), TransformerPrior])
 def test_networks_inside_predict_plans_longer_than_their_window(kind):
     """Recoded plans are short, and so is the window that is learned."""
     words = torch.tensor([[0, 1, 2, 3], [3, 2, 2, 0], [1, 1, 0, 3]])

@@ -90,7 +90,11 @@ def signs(features):
 @pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
 @pytest.mark.parametrize(
     "features",
-    [lambda x: 1e-5 * x, lambda x: x + 100, lambda x: x * torch.tensor([0.3, 9.0]) + 37],
+    [
+        pytest.param(lambda x: 1e-5 * x, marks=pytest.mark.slow),
+        pytest.param(lambda x: x + 100, marks=pytest.mark.slow),
+        lambda x: x * torch.tensor([0.3, 9.0]) + 37,
+    ],
 )
 @torch.no_grad()
 def test_units_of_features_make_no_difference(kind, features):

@@ -13,7 +13,7 @@ from neuroprior.priors.neural import gru
 from tests.support.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
 
 BOTH = pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])
-QUICK = {"max_steps": 30, "progress": False}
+QUICK = {"max_steps": 6, "progress": False}
 
 
 def small(kind, num_actions=3, **arguments):

@@ -46,7 +46,7 @@ def test_plans_may_be_of_unequal_lengths() -> None:
     assert bool((found[~mask] == 0).all())
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_priors_of_different_plans_learn_the_same_modes(order: int) -> None:
     """So that modes can be matched: three priors, each of plans of its own, agree about those of others."""
     plans, truth = source(40, 7)

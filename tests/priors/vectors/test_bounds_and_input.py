@@ -20,6 +20,7 @@ from neuroprior.priors import (
 from neuroprior.testing import check_prior
 
 RANGES = [(-0.4, 0.7), (9.3, 10.9), (100.1, 101.3), (-1e-6, 1e-6), (-1e6, 1e6), (1000.0, 1001.0)]
+TELLING = (100.1, -1e-6, -1e6)  # far from 0, narrow, wide
 CLOSED = {
     "noise": lambda low, high: NoisePrior(low, high, None, memory=4),
     "autoregressive": lambda low, high: AutoregressivePrior(low, high, 2),
@@ -53,7 +54,9 @@ def source(low, high, num=10, length=30, seed=0):
     return VectorPlans(values, low, high)
 
 
-@pytest.mark.parametrize("bounds", RANGES)
+@pytest.mark.parametrize(
+    "bounds", [pytest.param(each, marks=[] if each[0] in TELLING else pytest.mark.slow) for each in RANGES]
+)
 @pytest.mark.parametrize("kind", CLOSED)
 def test_conformance_between_any_bounds(kind, bounds):
     """A mass at a bound is one in scores as in samples, wherever the bounds are: rounding must not move it beside."""
@@ -193,7 +196,7 @@ def test_wide_bounds_make_no_difference(kind):
         plans = VectorPlans(values, [-most] * 2, [most] * 2)
         prior = WIDE[kind](plans.action_low, plans.action_high).fit(plans, generator=seeded())
         found.append(float(prior.log_prob(plans).mean()))
-        spread.append(float(prior.sample(2000, 20, generator=seeded(1)).std()))
+        spread.append(float(prior.sample(500, 20, generator=seeded(1)).std()))
     assert found[1] == pytest.approx(found[0], abs=0.1)
     assert spread[1] == pytest.approx(spread[0], rel=1e-3)
     assert spread[0] == pytest.approx(float(values.std()), rel=0.3)
@@ -212,7 +215,7 @@ def test_priors_that_wide_bounds_make_coarse_say_so(make):
 def test_stored_windows_are_followed_in_each_dimension_as_closely_as_it_varies():
     values = torch.cat([walk(20, 0, 0.25, 1, 0.9), walk(20, 1, 0.01, 1, 0.9), torch.full((20, 60, 1), 0.25)], 2)
     prior = StoredWindows([-1.0] * 3, [1.0] * 3).fit(VectorPlans(values, [-1.0] * 3, [1.0] * 3), generator=seeded())
-    own, drawn = values.std((0, 1)), prior.sample(500, 60, generator=seeded(1))[0].std((0, 1))
+    own, drawn = values.std((0, 1)), prior.sample(200, 60, generator=seeded(1))[0].std((0, 1))
     assert drawn[:2].tolist() == pytest.approx(own[:2].tolist(), rel=0.4)
     assert drawn[2] < 0.02
 

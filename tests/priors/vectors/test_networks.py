@@ -313,7 +313,7 @@ def test_of_a_long_plan_and_single_vectors_the_long_one_is_learned_from_and_vali
     test = VectorPlans(slow_noise(50, 50, 3), low, high)
     for seed in range(3):
         prior = kind(low, high, width=8, seed=seed)
-        prior.fit(data, generator=rng(seed), progress=False, max_steps=40)
+        prior.fit(data, generator=rng(seed), progress=False, max_steps=15)
         with torch.no_grad():
             assert prior.action_log_probs(test)[:, 1:].mean() > 2.2  # the noise has 2.4
 

@@ -54,8 +54,11 @@ def source(num: int = 12, length: int = 40, low=LOW, high=HIGH, seed: int = 0) -
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("fitted", [False, True])
-@pytest.mark.parametrize("size", [1, 2])
+@pytest.mark.parametrize(
+    ("size", "fitted"),
+    # Those of one dimension that were fitted are tested between several bounds in test_bounds_and_input.py.
+    [(1, False), pytest.param(1, True, marks=pytest.mark.slow), (2, False), (2, True)],
+)
 def test_conformance(kind, fitted, size):
     prior = KINDS[kind](LOW[:size], HIGH[:size])
     if fitted:
