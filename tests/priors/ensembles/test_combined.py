@@ -385,7 +385,7 @@ def test_of_few_plans_it_is_hardly_behind_the_best_of_its_experts():
     assert sum(behind) / 3 < 0.01
 
 
-def test_of_few_plans_a_network_that_is_better_is_kept(few_orders):
+def test_of_few_plans_a_network_that_is_better_is_kept():
     """Each plan follows one of three chains: a network finds out which, a chain does not."""
     with torch.random.fork_rng():
         torch.manual_seed(7)
