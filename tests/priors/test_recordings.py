@@ -184,5 +184,9 @@ def test_recorded_vectors_are_those_of_steps(stepwise):
     prior = VectorGRU(low, high, width=8, lags=2).fit(VectorPlans(actions, low, high), max_steps=5, progress=False)
     drawn = prior.sample(6, 20, past=actions[:3, :4], generator=seeded(1))
     assert Stepwise.made == 1
+    share, prior.autoregressive_share = prior.autoregressive_share, 0.9
+    prior.sample(6, 20, past=actions[:3, :4], generator=seeded(1))
+    assert Stepwise.made == 2  # a recording keeps the numbers that the step found
+    prior.autoregressive_share = share
     stepwise.setattr(recordings, "DEVICES", ("cuda",))
     torch.testing.assert_close(prior.sample(6, 20, past=actions[:3, :4], generator=seeded(1)), drawn)

@@ -518,8 +518,8 @@ class VectorGRU(VectorNetwork):
         return plans
 
     def _rest(self, last: Tensor, state: Tensor, uniform: Tensor, noise: Tensor) -> Tensor:
-        numbers = uniform.transpose(0, 1), noise.transpose(0, 1)
-        recorded = run_recorded(self, self._drawn, last, state, numbers) if type(self) is VectorGRU else None
+        numbers, key = (uniform.transpose(0, 1), noise.transpose(0, 1)), self.autoregressive_share
+        recorded = run_recorded(self, self._drawn, last, state, numbers, key) if type(self) is VectorGRU else None
         return super()._rest(last, state, uniform, noise) if recorded is None else recorded.transpose(0, 1)
 
 
