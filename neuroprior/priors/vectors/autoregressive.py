@@ -1,7 +1,7 @@
 """Vector autoregressions: the Markov chains of continuous actions."""
 
 from collections.abc import Callable
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_count
 from neuroprior._random import draw_seed
-from neuroprior.plans.folds import divisible, folds, num_units
+from neuroprior.plans.folds import divisible, folds, num_units, ungrouped
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
@@ -69,19 +69,19 @@ class AutoregressivePrior(LinearGaussianPrior):
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         orders = self.orders if self.order is None else (self.order,)
         parts = self._parts(plans, generator)
-        total = sum(int(held_out.mask().sum()) for _, held_out in parts)
+        total = sum(int(held_out.mask()[:, skip:].sum()) for _, held_out, skip in parts)
         scores: dict[tuple[int, float, float], float] = {}
         for order in orders:
             numbers = (order + 1) * self.action_size
-            fewest = min(int((learning.mask().sum(1) - order).clamp(min=0).sum()) for learning, _ in parts)
+            fewest = min(int((learning.mask().sum(1) - order).clamp(min=0).sum()) for learning, *_ in parts)
             if order > 1 and scores and fewest <= numbers:
                 break
             few = self.action_size > 1 and fewest < MANY * numbers
             tried = list(product(SHARES if few else SHARES[-1:], RIDGES))
             scores |= {(order, *each): 0.0 for each in tried}
-            for learning, held_out in parts:
-                weight = int(held_out.mask().sum()) / total
-                found = self.mean_nats_of(tried, self._moments(learning, order), held_out)
+            for learning, held_out, skip in parts:
+                weight = int(held_out.mask()[:, skip:].sum()) / total
+                found = self.mean_nats_of(tried, self._moments(learning, order), held_out, skip)
                 for each, nats in found.items():
                     scores[order, *each] += weight * nats
         order, share, ridge = best_of(scores)
@@ -93,14 +93,32 @@ class AutoregressivePrior(LinearGaussianPrior):
         mean, covariance, _ = moments_or_white(windows, values, order)
         return lambda setting: WindowMoments(mean, self._apart(covariance, setting[0]), setting[1])
 
-    def _parts(self, plans: VectorPlans, generator: torch.Generator) -> list[tuple[VectorPlans, VectorPlans]]:
-        """Plans to learn from and plans to choose on: of few vectors all are held out once, part by part."""
+    def _parts(self, plans: VectorPlans, generator: torch.Generator) -> list[tuple[VectorPlans, VectorPlans, int]]:
+        """Plans to learn from, plans to choose on, and how many vectors of these are only read.
+
+        Of few vectors all are held out once, part by part; where most are in one plan, it is cut into parts.
+        """
         plans = divisible(plans[plans.mask().any(1)])
-        units = num_units(plans)
-        if units < 2 or int(plans.mask().sum()) > MOST_IN_FOLDS:
-            return [held_out_split(plans, generator)]
+        units, lengths = num_units(plans), plans.mask().sum(1)
+        longest, total = int(lengths.max()), int(lengths.sum())
+        if total < 2 or total > MOST_IN_FOLDS:
+            return [(*held_out_split(plans, generator), 0)]
+        if 2 * longest > total:
+            at = [round(longest * k / FOLDS) for k in range(FOLDS + 1)]
+            return [self._without(ungrouped(plans), *each) for each in pairwise(at) if each[0] < each[1]]
         found = folds(plans, min(units, FOLDS), draw_seed(generator))
-        return [(plans[learned], plans[left_out]) for learned, left_out in found]
+        return [(plans[learned], plans[left_out], 0) for learned, left_out in found]
+
+    def _without(self, plans: VectorPlans, first: int, end: int) -> tuple[VectorPlans, VectorPlans, int]:
+        """The plans without a part of the longest, this part behind the vectors before it, and how many these are."""
+        lengths = plans.mask().sum(1)
+        row, longest = int(lengths.argmax()), int(lengths.max())
+        behind = plans.actions[row : row + 1].roll(-end, 1)
+        lengths[row] = first
+        both = torch.cat([lengths, lengths.new_tensor([longest - end])])
+        learning = VectorPlans(torch.cat([plans.actions, behind]), plans.action_low, plans.action_high, both)
+        known = min(first, max(self.orders))
+        return learning[both > 0], plans[row : row + 1].steps(first - known, end), known
 
     def _apart(self, covariance: Tensor, share: float) -> Tensor:
         """The covariance of windows with that share of what different dimensions have in common taken away."""

@@ -69,7 +69,8 @@ def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor
     )
     bounds = np.stack([each.numpy() for each in (prior.middle, prior.half_range, prior.action_low, prior.action_high)])
     # What the first layer is given is linear in the inputs: two matrices in one.
-    given = inputs_weight.T @ layers[0][0].T
+    given = np.zeros((prior.input_size, layers[0][0].shape[0]), np.float32)
+    given[len(given) - inputs_weight.shape[1] :] = inputs_weight.T @ layers[0][0].T
     given_bias = layers[0][0] @ inputs_bias + layers[0][2]
     # Gates of higher layers are given what the layer below has found; the first layer's place is not read.
     above, own, above_bias, own_bias = (np.array([layer[i].T for layer in layers], order="C") for i in range(4))
@@ -105,7 +106,7 @@ def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor
         np.float32(share / (1 - share)),
         bounds,
         prior.num_components,
-        prior.entry_size * prior.lags,
+        prior.recent_size,
         np.float32(least_std),
     )
     return vectors

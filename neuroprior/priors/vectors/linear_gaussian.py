@@ -111,17 +111,19 @@ class LinearGaussianPrior(VectorPrior):
 
     @torch.no_grad()
     def mean_nats_of(
-        self, settings: Sequence[Key], moments: Callable[[Key], WindowMoments], plans: VectorPlans
+        self, settings: Sequence[Key], moments: Callable[[Key], WindowMoments], plans: VectorPlans, skip: int = 0
     ) -> dict[Key, float]:
         """The mean log-density of a vector of `plans` for each setting, nats; -inf where it is not a number.
 
         Args:
             settings: those to compare.
             moments: makes the Gaussian of a setting; of equally many vectors for all.
-            plans: with at least one vector.
+            plans: with at least one vector that counts.
+            skip: first vectors of each plan, which are read and do not count.
         """
         found: dict[Key, float] = {}
         values, mask = self.scaled(plans.actions), plans.mask()
+        mask[:, :skip] = False
         rest = list(settings)
         while rest:
             first = moments(rest[0])

@@ -36,7 +36,7 @@ FIRST_SPREAD = 0.5
 TINY = 1e-9
 """Instead of 0, where a number is divided by."""
 
-EVEN, ROUNDS = 20, 100
+EVEN, ROUNDS = 1, 100
 """Held-out vectors that equal shares of the network and the autoregression count for when these are estimated, and the
 steps of EM for that."""
 
@@ -103,7 +103,7 @@ class VectorNetwork(VectorPrior):
     where it takes them, standardised (`neuroprior.priors.neural.features.Standardise`). The
     means of all components have a common part that is linear in these inputs; the rest of the means, the weights and
     the standard deviations are the network's; those of a plan's first vector have factors of their own. Training begins
-    with the linear part and the standard deviations of an `AutoregressivePrior` of at most `lags` vectors.
+    with the linear part and the standard deviations of an `AutoregressivePrior` of at most `order` vectors.
 
     From few vectors a network learns little that is better, and is sometimes far too sure. After training the
     autoregression is therefore one more component of the mixture, with a constant weight that held-out vectors choose:
@@ -122,7 +122,8 @@ class VectorNetwork(VectorPrior):
         width: of the network's vectors.
         num_layers: number of layers.
         num_components: K.
-        lags: last vectors that each input shows directly.
+        lags: last vectors that each input shows the network directly.
+        order: last vectors that the linear part and the autoregression read, at most (and at most `memory`).
         coupled: within a component, each dimension depends on those before it, in the same way at all times; otherwise
             they are independent. (With some thousand vectors, couplings that the network itself predicts are
             overfitted.)
@@ -153,44 +154,47 @@ class VectorNetwork(VectorPrior):
         num_layers: int = 1,
         num_components: int = 5,
         lags: int = 1,
+        order: int = 8,
         coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
     ) -> None:
         super().__init__(action_low, action_high, context_size)
-        check_sizes(width=width, num_layers=num_layers, num_components=num_components, lags=lags)
+        check_sizes(width=width, num_layers=num_layers, num_components=num_components, lags=lags, order=order)
         check_memory(48 * num_layers * width**2, num_layers=num_layers, width=width)
         if not is_number(dropout) or not 0 <= dropout < 1:
             raise ValueError(f"dropout: a share from 0 to below 1 is expected, not {dropout!r}")
         check_seed(seed)
-        self.width, self.num_layers, self.num_components, self.lags = width, num_layers, num_components, lags
+        self.width, self.num_layers, self.num_components = width, num_layers, num_components
+        self.lags, self.order, reach = lags, order, max(lags, order)
         self.coupled, self.dropout = coupled, dropout
         size, features = self.action_size, context_size or 0
         self.entry_size = size + 1
-        self.input_size = lags * self.entry_size + features
-        check_memory(4 * width * self.input_size, width=width, lags=lags)
+        self.recent_size = reach * self.entry_size
+        self.input_size = self.recent_size + features
+        check_memory(4 * self.input_size * (width + reach * size), width=width, lags=lags, order=order)
         self.features = Standardise(features)
         self.coupling = nn.Parameter(torch.zeros(size, size)) if coupled else None
-        self.autoregression, self.autoregressive_share = Autoregression(lags, size), 0.0
+        self.autoregression, self.autoregressive_share = Autoregression(reach, size), 0.0
         self.first_log_std = nn.Parameter(torch.zeros(size))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.inputs = nn.Linear(self.input_size, width)
-            self.linear = nn.Linear(self.input_size, size, bias=False)
+            self.inputs = nn.Linear(lags * self.entry_size + features, width)
             self.drop = nn.Dropout(dropout)
             self.build()
             self.head = nn.Linear(width, num_components * (1 + 2 * size))
-            nn.init.zeros_(self.linear.weight)
             with torch.no_grad():
                 self.head.weight.mul_(0.3)
                 _, means, stds = self._parts(self.head.bias)
                 means.normal_(0, 2 * FIRST_STD * FIRST_SPREAD)
                 stds.fill_(log(2 * FIRST_STD))
+            self.linear = nn.Linear(self.input_size, size, bias=False)
+            nn.init.zeros_(self.linear.weight)
         self.to(self.device).eval()
 
     @property
     def config(self) -> dict[str, Any]:
-        names = ("width", "num_layers", "num_components", "lags", "coupled", "dropout")
+        names = ("width", "num_layers", "num_components", "lags", "order", "coupled", "dropout")
         return super().config | {name: getattr(self, name) for name in names}
 
     @property
@@ -207,6 +211,13 @@ class VectorNetwork(VectorPrior):
         if not is_number(share) or not 0 <= share < 1:
             raise ValueError(f"autoregressive_share: a share from 0 to below 1 is expected, not {share!r}")
         self.autoregressive_share = float(share)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        name = f"{prefix}linear.weight"
+        if name in state_dict:  # that of older files reads no more than `lags` vectors
+            missing = max(self.input_size - state_dict[name].shape[-1], 0)
+            state_dict[name] = functional.pad(state_dict[name], (missing, 0))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def learns_anew(self) -> bool:
@@ -229,12 +240,12 @@ class VectorNetwork(VectorPrior):
         """
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
-        none = torch.zeros(batch_size, 1, self.lags * self.entry_size, device=self.device)
+        none = torch.zeros(batch_size, 1, self.recent_size, device=self.device)
         features = self._features(context)
         return self._after(none if features is None else torch.cat([none, features[:, None]], -1))
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
-        size, last = self.lags * self.entry_size, state.shape[1] - self.input_size
+        size, last = self.recent_size, state.shape[1] - self.input_size
         kept, features = state[:, last + self.entry_size : last + size], self._features(context)
         if features is None:
             features = state[:, last + size :]
@@ -292,8 +303,13 @@ class VectorNetwork(VectorPrior):
 
     def _after(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         """The distribution after the last of `inputs [N, T, E]`, and the state."""
-        out, hidden = self.encode(self.drop(self.inputs(inputs)), hidden)
+        out, hidden = self.encode(self._taken_in(inputs), hidden)
         return self._forecast(out[:, -1], inputs[:, -1]), torch.cat([hidden, inputs[:, -1]], 1)
+
+    def _taken_in(self, inputs: Tensor) -> Tensor:
+        """What the network reads, `[N, T, width]`, of `inputs [N, T, E]`: the last `lags` vectors and the features."""
+        taken_in: Tensor = self.drop(self.inputs(inputs[..., self.recent_size - self.lags * self.entry_size :]))
+        return taken_in
 
     def log_probs_from(
         self, actions: Tensor, context: Tensor | None, previous: Tensor | None, state: Tensor | None
@@ -312,7 +328,7 @@ class VectorNetwork(VectorPrior):
         entries = torch.cat([first, self._entries(actions[:, :-1])], 1)
         inputs = self._lagged(entries, state, context)
         out, hidden = self.encode(
-            self.drop(self.inputs(inputs)), None if state is None else state[:, : state.shape[1] - self.input_size]
+            self._taken_in(inputs), None if state is None else state[:, : state.shape[1] - self.input_size]
         )
         nats = self._forecast(out.flatten(0, 1), inputs.flatten(0, 1)).log_prob(actions.flatten(0, 1))
         return nats.view(actions.shape[:2]), torch.cat([hidden, inputs[:, -1]], 1)
@@ -340,14 +356,15 @@ class VectorNetwork(VectorPrior):
         return functional.pad((actions - self.middle) / self.half_range, (0, 1), value=1.0)
 
     def _lagged(self, entries: Tensor, state: Tensor | None, context: Tensor | None) -> Tensor:
-        """The inputs `[N, T, E]`: the last `lags` of `entries [N, T, D + 1]` and the features before each vector."""
+        """The inputs `[N, T, E]`: the last of `entries [N, T, D + 1]` and the features before each vector."""
         inputs, features = entries, self._features(context)
-        if self.lags > 1:
-            before = entries.new_zeros(len(entries), self.lags - 1, self.entry_size)
+        reach = self.recent_size // self.entry_size
+        if reach > 1:
+            before = entries.new_zeros(len(entries), reach - 1, self.entry_size)
             if state is not None:
                 last = state.shape[1] - self.input_size
-                before = state[:, last + self.entry_size : last + self.lags * self.entry_size].reshape(before.shape)
-            inputs = torch.cat([before, entries], 1).unfold(1, self.lags, 1).transpose(2, 3).flatten(2)
+                before = state[:, last + self.entry_size : last + self.recent_size].reshape(before.shape)
+            inputs = torch.cat([before, entries], 1).unfold(1, reach, 1).transpose(2, 3).flatten(2)
         if features is None:
             return inputs
         if features.dim() == 2:
@@ -366,12 +383,12 @@ class VectorNetwork(VectorPrior):
         weights, means, stds = self._parts(self.head(self.drop(out)))
         half = self.half_range
         mean = self.middle + half * (means + self.linear(inputs)[:, None])
-        no_last = 1 - inputs[:, self.lags * self.entry_size - 1, None, None]
+        no_last = 1 - inputs[:, self.recent_size - 1, None, None]
         stds = stds + no_last * self.first_log_std
         std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
         coupling = None if self.coupling is None else self.coupling.tril(-1) * (half[:, None] / half)
         if self.autoregressive_share:
-            linear_mean, linear_std, linear_coupling = self.autoregression(inputs[:, : self.lags * self.entry_size])
+            linear_mean, linear_std, linear_coupling = self.autoregression(inputs[:, : self.recent_size])
             mean = torch.cat([mean, (self.middle + half * linear_mean)[:, None]], 1)
             std = torch.cat([std, (half * linear_std)[:, None]], 1)
             weights = weights.log_softmax(-1) + log1p(-self.autoregressive_share)
@@ -389,7 +406,8 @@ class VectorNetwork(VectorPrior):
         """Train with Lightning until the likelihood of held-out plans no longer rises; returns self.
 
         A prior that has learned before is trained further from its present weights. The autoregression is fitted anew,
-        to all plans.
+        to all plans. What is held out should then be given as `validation`, and be the same as before: a share is drawn
+        anew, from plans that the network has learned from.
 
         Args:
             plans: see `VectorPrior.fit`; at least two vectors.
@@ -431,7 +449,7 @@ class VectorNetwork(VectorPrior):
         if first:
             self.features.learn_from(plans)
         chain = AutoregressivePrior(self.action_low, self.action_high)
-        chain.orders = tuple(each for each in chain.orders if each <= self.lags)
+        chain.orders = tuple(each for each in chain.orders if each <= min(self.order, self.memory))
         chain.fit(plans.without_context(), generator=torch.Generator().manual_seed(seed))
         self.autoregression.learn_from(chain)
         if first:
@@ -443,7 +461,7 @@ class VectorNetwork(VectorPrior):
 
     @torch.no_grad()
     def _mix(self, chain: AutoregressivePrior, held_out: VectorPlans) -> None:
-        """Estimate the share of the autoregression from vectors that the network has not learned from."""
+        """Estimate the share of the autoregression from vectors that this training has not learned from."""
         mask = held_out.mask()
         both = self.action_log_probs(held_out), chain.action_log_probs(held_out.without_context())
         nats = torch.stack([each[mask].double() for each in both])
@@ -456,7 +474,7 @@ class VectorNetwork(VectorPrior):
     @torch.no_grad()
     def _begin(self) -> None:
         """Take over the linear part and the standard deviations of the autoregression, before the first training."""
-        chain, recent = self.autoregression, self.lags * self.entry_size
+        chain, recent = self.autoregression, self.recent_size
         _, means, stds = self._parts(self.head.bias)
         share = FIRST_SPREAD if self.num_components > 1 else 0.0
         eye = torch.eye(self.action_size, device=chain.std.device)
@@ -472,8 +490,10 @@ class VectorNetwork(VectorPrior):
         stds.copy_(own.clamp(min=LEAST_STD).log().expand_as(stds))
         weights = self._parts(self.head.weight.T)[1]
         weights.copy_(weights @ (root.T / (2 * FIRST_STD)))
-        self.linear.weight[:, :recent] += chain.weights[-1]
-        self.linear.weight[:, recent - 1] += chain.offset[-1] - chain.offset[0]  # where there is a last vector
+        linear = chain.weights[-1].unflatten(1, (-1, self.entry_size)).clone()
+        linear[..., -1] = -(linear[..., :-1] @ chain.offset[0])  # vectors that are missing count as the mean
+        linear[:, -1, -1] += chain.offset[-1] - chain.offset[0] - linear[..., -1].sum(1)
+        self.linear.weight[:, :recent] += linear.flatten(1)
         means += chain.offset[0]
         if self.coupling is not None:
             self.coupling.add_(chain.coupling[-1])
@@ -484,7 +504,7 @@ class VectorGRU(VectorNetwork):
 
     Args:
         action_low, action_high, context_size: see `VectorPrior`.
-        width, num_layers, num_components, lags, coupled, dropout, seed: see `VectorNetwork`.
+        width, num_layers, num_components, lags, order, coupled, dropout, seed: see `VectorNetwork`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -532,7 +552,7 @@ class VectorTransformer(VectorNetwork):
         action_low, action_high, context_size: see `VectorPrior`.
         width: a multiple of 2 * `num_heads`.
         num_heads: attention heads.
-        num_layers, num_components, lags, coupled, dropout, seed: see `VectorNetwork`.
+        num_layers, num_components, lags, order, coupled, dropout, seed: see `VectorNetwork`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -553,6 +573,7 @@ class VectorTransformer(VectorNetwork):
         num_heads: int = 4,
         num_components: int = 5,
         lags: int = 1,
+        order: int = 8,
         coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
@@ -562,7 +583,17 @@ class VectorTransformer(VectorNetwork):
             raise ValueError(f"width: a multiple of 2 * num_heads = {2 * num_heads} is expected, not {width}")
         self.num_heads = num_heads
         super().__init__(
-            action_low, action_high, context_size, width, num_layers, num_components, lags, coupled, dropout, seed
+            action_low,
+            action_high,
+            context_size,
+            width,
+            num_layers,
+            num_components,
+            lags,
+            order,
+            coupled,
+            dropout,
+            seed,
         )
 
     @property

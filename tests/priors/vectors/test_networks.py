@@ -1,10 +1,13 @@
 """Neural priors over vectors: one density however it is computed, and it is the one that generated the data."""
 
+import hashlib
+import json
 from math import e, log, pi
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from neuroprior.plans.vector_plans import VectorPlans
@@ -123,7 +126,7 @@ def test_states_are_reordered_by_their_rows(kind):
 def test_the_autoregression_is_a_part_of_the_mixture(kind, coupled):
     """With its share, from a plan's first vector on, whether fewer or more vectors are known than it reads."""
     data = plans(num=40)
-    prior = kind(LOW, HIGH, width=8, lags=2, coupled=coupled).fit(data, generator=rng(), **HOW)
+    prior = kind(LOW, HIGH, width=8, order=2, coupled=coupled).fit(data, generator=rng(), **HOW)
     chain = AutoregressivePrior(LOW, HIGH, order=2).fit(plans(num=40, length=30), generator=rng())
     assert chain.memory == 2
     prior.autoregression.learn_from(chain)
@@ -135,6 +138,24 @@ def test_the_autoregression_is_a_part_of_the_mixture(kind, coupled):
             nats.append(prior.action_log_probs(data))
     expected = torch.logaddexp(nats[0] + log(0.7), chain.action_log_probs(data) + log(0.3))
     assert nats[1].allclose(expected.masked_fill(~data.mask(), 0), atol=1e-4)
+
+
+def test_a_file_of_an_earlier_version_holds_the_same_prior(kind, tmp_path: Path):
+    """Its linear part reads as many vectors as the network, and there is no autoregression in the mixture."""
+    data = plans(context_size=2)
+    prior = kind(LOW, HIGH, 2, width=8, lags=2, order=1).fit(data, generator=rng(), **HOW)
+    prior.autoregressive_share = 0.0
+    folder = save(prior, tmp_path)
+    weights = load_file(folder / "model.safetensors")
+    older = {name: value for name, value in weights.items() if "autoregression" not in name}
+    save_file(older, folder / "model.safetensors")
+    described = json.loads((folder / "config.json").read_text())
+    del described["config"]["order"], described["learned"]["autoregressive_share"]
+    described["sha256"] = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    (folder / "config.json").write_text(json.dumps(described))
+    again = load(folder, kind="vectors")
+    assert again.order > prior.order
+    torch.testing.assert_close(again.log_prob(data), prior.log_prob(data))
 
 
 def test_few_plans_are_predicted_as_well_as_by_an_autoregression_and_many_better():
@@ -242,7 +263,7 @@ def test_what_has_learned_nothing_predicts_as_an_autoregression_of_all_plans(kin
     data, test = autoregression(40, 30, 1), autoregression(50, 60, 2)
     data.actions[20:] += 1.0
     chain = AutoregressivePrior([-4], [4], lags).fit(data, generator=rng())
-    prior = kind([-4], [4], width=8, num_components=3, lags=lags, dropout=0.0)
+    prior = kind([-4], [4], width=8, num_components=3, lags=lags, order=lags, dropout=0.0)
     prior.fit(data, generator=rng(), progress=False, max_steps=1, learning_rate=1e-9, validation=0.5)
     with torch.no_grad():
         prior.head.weight.zero_()  # what a network adds that was not trained
@@ -259,7 +280,7 @@ NEXT_TO_NOTHING = {"progress": False, "max_steps": 1, "learning_rate": 1e-9}
 
 def test_of_many_lags_it_begins_with_as_many_as_pay(kind):
     data, test = autoregression(6, 20, 1), autoregression(50, 60, 2)
-    prior = kind([-4], [4], width=8, lags=16).fit(data, generator=rng(), **NEXT_TO_NOTHING)
+    prior = kind([-4], [4], width=8, order=16).fit(data, generator=rng(), **NEXT_TO_NOTHING)
     chosen, all_lags = (AutoregressivePrior([-4], [4], order).fit(data, generator=rng()) for order in (None, 16))
     with torch.no_grad():
         begun, few, many = (float(each.action_log_probs(test)[:, 16:].mean()) for each in (prior, chosen, all_lags))
