@@ -96,17 +96,23 @@ class AutoregressivePrior(LinearGaussianPrior):
     def _parts(self, plans: VectorPlans, generator: torch.Generator) -> list[tuple[VectorPlans, VectorPlans, int]]:
         """Plans to learn from, plans to choose on, and how many vectors of these are only read.
 
-        Of few vectors all are held out once, part by part; where most are in one plan, it is cut into parts.
+        Of few vectors all are held out once, part by part; where most are in one plan, it is cut into parts, and where
+        most are in one group, plans are held out instead of groups.
         """
         plans = divisible(plans[plans.mask().any(1)])
-        units, lengths = num_units(plans), plans.mask().sum(1)
+        lengths = plans.mask().sum(1)
         longest, total = int(lengths.max()), int(lengths.sum())
+        if (
+            plans.group is not None
+            and 2 * int(plans.group.unique(return_inverse=True)[1].bincount(lengths).max()) > total
+        ):
+            plans = ungrouped(plans)
         if total < 2 or total > MOST_IN_FOLDS:
             return [(*held_out_split(plans, generator), 0)]
         if 2 * longest > total:
             at = [round(longest * k / FOLDS) for k in range(FOLDS + 1)]
             return [self._without(ungrouped(plans), *each) for each in pairwise(at) if each[0] < each[1]]
-        found = folds(plans, min(units, FOLDS), draw_seed(generator))
+        found = folds(plans, min(num_units(plans), FOLDS), draw_seed(generator))
         return [(plans[learned], plans[left_out], 0) for learned, left_out in found]
 
     def _without(self, plans: VectorPlans, first: int, end: int) -> tuple[VectorPlans, VectorPlans, int]:
@@ -117,7 +123,7 @@ class AutoregressivePrior(LinearGaussianPrior):
         lengths[row] = first
         both = torch.cat([lengths, lengths.new_tensor([longest - end])])
         learning = VectorPlans(torch.cat([plans.actions, behind]), plans.action_low, plans.action_high, both)
-        known = min(first, max(self.orders))
+        known = min(first, max(self.orders) if self.order is None else self.order)
         return learning[both > 0], plans[row : row + 1].steps(first - known, end), known
 
     def _apart(self, covariance: Tensor, share: float) -> Tensor:

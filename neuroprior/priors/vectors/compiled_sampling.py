@@ -69,8 +69,7 @@ def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor
     )
     bounds = np.stack([each.numpy() for each in (prior.middle, prior.half_range, prior.action_low, prior.action_high)])
     # What the first layer is given is linear in the inputs: two matrices in one.
-    given = np.zeros((prior.input_size, layers[0][0].shape[0]), np.float32)
-    given[len(given) - inputs_weight.shape[1] :] = inputs_weight.T @ layers[0][0].T
+    given = inputs_weight.T @ layers[0][0].T
     given_bias = layers[0][0] @ inputs_bias + layers[0][2]
     # Gates of higher layers are given what the layer below has found; the first layer's place is not read.
     above, own, above_bias, own_bias = (np.array([layer[i].T for layer in layers], order="C") for i in range(4))
@@ -190,6 +189,7 @@ def _recurrent(
 ) -> None:
     """`past [B, T, E]` begins with `recent` numbers of last vectors; `bounds`: centre, half the range, low, high.
 
+    Of the inputs the network reads the last ones, as many as `given` has rows.
     `odds`: of the autoregression, against the network's components together.
     """
     length, size = vectors.shape[1], vectors.shape[2]
@@ -197,7 +197,7 @@ def _recurrent(
     into, from_own = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
     known, hidden = np.empty((num_layers, width), np.float32), np.empty((num_layers, width), np.float32)
     inputs = np.empty(past.shape[2], np.float32)
-    each = len(vectors) // max(len(past), 1)
+    each, skip = len(vectors) // max(len(past), 1), past.shape[2] - len(given)
     weights, mean = np.empty(num + 1, np.float32), np.empty(size, np.float32)
     last = num if odds > 0 else num - 1
     centre, half, low, high = bounds[0], bounds[1], bounds[2], bounds[3]
@@ -205,7 +205,18 @@ def _recurrent(
         if n % each == 0:
             known[:] = 0
             for t in range(past.shape[1]):
-                _advance(known, past[n // each, t], given, given_bias, own, own_bias, above, above_bias, into, from_own)
+                _advance(
+                    known,
+                    past[n // each, t, skip:],
+                    given,
+                    given_bias,
+                    own,
+                    own_bias,
+                    above,
+                    above_bias,
+                    into,
+                    from_own,
+                )
         hidden[:] = known
         inputs[:] = past[n // each, past.shape[1] - 1]
         top = hidden[num_layers - 1]
@@ -216,7 +227,7 @@ def _recurrent(
                 for d in range(size):
                     inputs[recent - entry + d] = (vectors[n, t - 1, d] - centre[d]) / half[d]
                 inputs[recent - 1] = one
-                _advance(hidden, inputs, given, given_bias, own, own_bias, above, above_bias, into, from_own)
+                _advance(hidden, inputs[skip:], given, given_bias, own, own_bias, above, above_bias, into, from_own)
             highest, total = np.float32(-np.inf), np.float32(0)
             for c in range(num):
                 weights[c] = _dot(head_bias[c], head[c], top)

@@ -106,8 +106,9 @@ class VectorNetwork(VectorPrior):
     with the linear part and the standard deviations of an `AutoregressivePrior` of at most `order` vectors.
 
     From few vectors a network learns little that is better, and is sometimes far too sure. After training the
-    autoregression is therefore one more component of the mixture, with a constant weight that held-out vectors choose:
-    about half of few vectors, next to nothing where the network predicts many vectors better.
+    autoregression is therefore one more component of the mixture, with a constant weight that held-out vectors choose.
+    The autoregression has learned from these, too, which favours it: with few vectors its weight is about one half, and
+    next to nothing where the network predicts many vectors better.
 
     Plans longer than `Settings.window` (64 where it is not given) are read window by window in training, the hidden
     state carried over, and in use it runs on without limit. To read a past, see `read`, the network begins at most
@@ -123,12 +124,12 @@ class VectorNetwork(VectorPrior):
         num_layers: number of layers.
         num_components: K.
         lags: last vectors that each input shows the network directly.
-        order: last vectors that the linear part and the autoregression read, at most (and at most `memory`).
         coupled: within a component, each dimension depends on those before it, in the same way at all times; otherwise
             they are independent. (With some thousand vectors, couplings that the network itself predicts are
             overfitted.)
         dropout: share of the network's activations that is set to 0 at random in training.
         seed: draws the initial weights; torch's global generator is left alone.
+        order: last vectors that the autoregression reads, at most (and at most `memory`), and the linear part.
 
     Attributes:
         memory: vectors read at once in training; None before `fit`.
@@ -154,10 +155,10 @@ class VectorNetwork(VectorPrior):
         num_layers: int = 1,
         num_components: int = 5,
         lags: int = 1,
-        order: int = 8,
         coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
+        order: int = 8,
     ) -> None:
         super().__init__(action_low, action_high, context_size)
         check_sizes(width=width, num_layers=num_layers, num_components=num_components, lags=lags, order=order)
@@ -214,7 +215,8 @@ class VectorNetwork(VectorPrior):
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
         name = f"{prefix}linear.weight"
-        if name in state_dict:  # that of older files reads no more than `lags` vectors
+        if name in state_dict and f"{prefix}autoregression.weights" not in state_dict:
+            # That of older files reads no more than `lags` vectors.
             missing = max(self.input_size - state_dict[name].shape[-1], 0)
             state_dict[name] = functional.pad(state_dict[name], (missing, 0))
         super()._load_from_state_dict(state_dict, prefix, *args)
@@ -393,9 +395,12 @@ class VectorNetwork(VectorPrior):
             std = torch.cat([std, (half * linear_std)[:, None]], 1)
             weights = weights.log_softmax(-1) + log1p(-self.autoregressive_share)
             weights = functional.pad(weights, (0, 1), value=log(self.autoregressive_share))
-            own = torch.zeros_like(linear_coupling) if coupling is None else coupling.expand_as(linear_coupling)
-            linear_coupling = linear_coupling * (half[:, None] / half)
-            coupling = torch.stack([own] * self.num_components + [linear_coupling], 1)
+            linear_coupling = (linear_coupling * (half[:, None] / half))[:, None]
+            if coupling is None:
+                coupling = linear_coupling
+            else:
+                own = coupling.expand(len(mean), self.num_components, *coupling.shape)
+                coupling = torch.cat([own, linear_coupling], 1)
         return GaussianForecast(mean, std, self.action_low, self.action_high, weights, coupling)
 
     @property
@@ -406,8 +411,8 @@ class VectorNetwork(VectorPrior):
         """Train with Lightning until the likelihood of held-out plans no longer rises; returns self.
 
         A prior that has learned before is trained further from its present weights. The autoregression is fitted anew,
-        to all plans. What is held out should then be given as `validation`, and be the same as before: a share is drawn
-        anew, from plans that the network has learned from.
+        to all plans. Give the same held-out plans as `validation` each time: a share is drawn anew, so that the network
+        would be judged on plans that it has learned from, and its weight would be too large.
 
         Args:
             plans: see `VectorPrior.fit`; at least two vectors.
@@ -442,10 +447,10 @@ class VectorNetwork(VectorPrior):
             elif isinstance(validation, VectorPlans):
                 validation = self.training_plans(validation)
             check_alike(learning, validation)
-            assert isinstance(validation, VectorPlans)  # as the plans that are learned from
         except ValueError:
             self.action_names, self.memory = known, memory  # what is refused is not learned from
             raise
+        assert isinstance(validation, VectorPlans)  # as the plans that are learned from
         if first:
             self.features.learn_from(plans)
         chain = AutoregressivePrior(self.action_low, self.action_high)
@@ -454,14 +459,18 @@ class VectorNetwork(VectorPrior):
         self.autoregression.learn_from(chain)
         if first:
             self._begin()
-        self.autoregressive_share = 0.0
-        train(self, learning, replace(how, validation=validation), seed)
+        share, self.autoregressive_share = self.autoregressive_share, 0.0  # the network alone is trained
+        try:
+            train(self, learning, replace(how, validation=validation), seed)
+        except BaseException:
+            self.autoregressive_share = share
+            raise
         self._mix(chain, validation)
         return self
 
     @torch.no_grad()
     def _mix(self, chain: AutoregressivePrior, held_out: VectorPlans) -> None:
-        """Estimate the share of the autoregression from vectors that this training has not learned from."""
+        """Estimate the share of the autoregression from vectors that the network has not learned from."""
         mask = held_out.mask()
         both = self.action_log_probs(held_out), chain.action_log_probs(held_out.without_context())
         nats = torch.stack([each[mask].double() for each in both])
@@ -504,7 +513,7 @@ class VectorGRU(VectorNetwork):
 
     Args:
         action_low, action_high, context_size: see `VectorPrior`.
-        width, num_layers, num_components, lags, order, coupled, dropout, seed: see `VectorNetwork`.
+        width, num_layers, num_components, lags, coupled, dropout, seed, order: see `VectorNetwork`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -552,7 +561,7 @@ class VectorTransformer(VectorNetwork):
         action_low, action_high, context_size: see `VectorPrior`.
         width: a multiple of 2 * `num_heads`.
         num_heads: attention heads.
-        num_layers, num_components, lags, order, coupled, dropout, seed: see `VectorNetwork`.
+        num_layers, num_components, lags, coupled, dropout, seed, order: see `VectorNetwork`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -573,10 +582,10 @@ class VectorTransformer(VectorNetwork):
         num_heads: int = 4,
         num_components: int = 5,
         lags: int = 1,
-        order: int = 8,
         coupled: bool = False,
         dropout: float = 0.1,
         seed: int = 0,
+        order: int = 8,
     ) -> None:
         check_sizes(num_heads=num_heads, width=width)
         if width % (2 * num_heads):
@@ -590,10 +599,10 @@ class VectorTransformer(VectorNetwork):
             num_layers,
             num_components,
             lags,
-            order,
             coupled,
             dropout,
             seed,
+            order,
         )
 
     @property

@@ -53,7 +53,8 @@ class GaussianForecast(NamedTuple):
         std: `[N, K, D]` or broadcast to it, above 0.
         low, high: `[D]`, the bounds.
         log_weights: `[N, K]`, logarithms of the components' probabilities, or None for equal ones.
-        coupling: `[D, D]` or `[N, K, D, D]`, strictly lower triangular, or None for independent dimensions.
+        coupling: `[D, D]` or `[N, k, D, D]`, strictly lower triangular, of all components or of the last k of them, or
+            None; the dimensions of the others are independent.
     """
 
     mean: Tensor
@@ -65,9 +66,11 @@ class GaussianForecast(NamedTuple):
 
     def log_prob(self, vector: Tensor) -> Tensor:
         value = vector[:, None]
-        mean = self.mean
-        if self.coupling is not None:
-            mean = mean + (self.coupling @ (value - mean)[..., None])[..., 0]
+        mean, coupling = self.mean, self.coupling
+        if coupling is not None:
+            first = 0 if coupling.dim() == 2 else mean.shape[1] - coupling.shape[1]
+            coupled = mean[:, first:] + (coupling @ (value - mean[:, first:])[..., None])[..., 0]
+            mean = torch.cat([mean[:, :first], coupled], 1) if first else coupled
         each = censored_log_prob(value, mean, self.std, self.low, self.high).sum(-1)
         if self.log_weights is None:
             return each.logsumexp(-1) - log(each.shape[-1])
@@ -101,7 +104,8 @@ class GaussianForecast(NamedTuple):
         if coupling is None:
             return (mean + noise).clamp(self.low, self.high)
         if coupling.dim() == 4:
-            coupling = coupling[row, chosen]
+            among = chosen - (self.mean.shape[1] - coupling.shape[1])
+            coupling = coupling[row, among.clamp(min=0)] * (among >= 0)[:, None, None]
         parts: list[Tensor] = []
         for d in range(mean.shape[-1]):
             centre = mean[:, d]

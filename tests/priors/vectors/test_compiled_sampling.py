@@ -65,7 +65,7 @@ def test_a_recurrent_network(settings, features, length, number, share, monkeypa
         numbers.add_(0.3 * torch.randn(numbers.shape, generator=seeded(len(name))))
     walks = (0.3 * torch.randn(5, 40, 3, generator=seeded(3))).cumsum(1).sin()
     values = VectorPlans(LOW + (HIGH - LOW) * (walks + 1) / 2, LOW, HIGH)
-    prior.autoregression.learn_from(AutoregressivePrior(LOW, HIGH, prior.lags).fit(values))
+    prior.autoregression.learn_from(AutoregressivePrior(LOW, HIGH, prior.order).fit(values))
     prior.autoregressive_share = share
     context = None if features is None else torch.randn(number, length + 1, features, generator=seeded(4))
     fast, slow = drawn(prior, pasts(length, number), monkeypatch, context)

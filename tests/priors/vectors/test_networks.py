@@ -370,6 +370,15 @@ def test_a_refused_fit_is_not_learned_from(kind):
     assert all(a.equal(b) for a, b in zip(fresh.state_dict().values(), again.state_dict().values(), strict=True))
 
 
+def test_after_a_fit_that_fails_the_autoregression_keeps_its_share(kind):
+    prior = kind(LOW, HIGH, width=8).fit(plans(), generator=rng(), **HOW)
+    share = prior.autoregressive_share
+    assert share > 0
+    with pytest.raises(ValueError, match="diverged"):
+        prior.fit(plans(), generator=rng(), **HOW | {"learning_rate": 1e30, "max_steps": 20})
+    assert prior.autoregressive_share == share
+
+
 def test_of_too_few_vectors_no_autoregression_is_learned():
     """The one plan of more than a vector is held out, and ends far from all else: vectors count as independent."""
     for num, seed in ((20, 20), (40, 2)):

@@ -446,6 +446,16 @@ def test_of_a_single_plan_no_order_is_chosen_that_it_is_too_short_for(lengths):
     assert sum(lost) / len(lost) < 0.15
 
 
+def test_of_a_small_group_beside_a_large_one_little_is_learned():
+    """Where the large one is held out, the small one is all there is: plans are held out instead of groups."""
+    data = walks(9, 40, 2, 1)
+    plans = VectorPlans(
+        data.actions, [-1.0] * 2, [1.0] * 2, torch.tensor([40] * 8 + [2]), group=torch.tensor([0] * 8 + [1])
+    )
+    for seed in range(6):
+        assert AutoregressivePrior([-1.0] * 2, [1.0] * 2).fit(plans, generator=seeded(seed)).memory >= 1
+
+
 def test_a_single_plan_is_known_by_the_vectors_before_each_part():
     plans = walks(1, 100, 2, 1)
     chain = AutoregressivePrior([-1.0] * 2, [1.0] * 2).fit(plans, generator=seeded(0))
