@@ -119,8 +119,6 @@ def test_folds_are_those_of_the_seed(with_context, tmp_path, monkeypatch):
     assert found["trained"].inputs == "actions"
     assert (found["markov-1"].inputs == "actions and context") == any(takes)
     assert any(takes) == with_context
-    if not with_context:
-        return  # what is read again and what is refused is the same with and without one
     # The same is read again; a run of another prior, share or context is refused or made anew.
     number = len(list((tmp_path / "folds").rglob("*.npz")))
     cross_validated(tmp_path, fresh, {}, data, contexts)

@@ -102,11 +102,10 @@ class AutoregressivePrior(LinearGaussianPrior):
         plans = divisible(plans[plans.mask().any(1)])
         lengths = plans.mask().sum(1)
         longest, total = int(lengths.max()), int(lengths.sum())
-        if (
-            plans.group is not None
-            and 2 * int(plans.group.unique(return_inverse=True)[1].bincount(lengths).max()) > total
-        ):
-            plans = ungrouped(plans)
+        if plans.group is not None:
+            group = plans.group.unique(return_inverse=True)[1]
+            if 2 * int(group.bincount(lengths).max()) > total:
+                plans = ungrouped(plans)
         if total < 2 or total > MOST_IN_FOLDS:
             return [(*held_out_split(plans, generator), 0)]
         if 2 * longest > total:

@@ -74,12 +74,12 @@ def draw_recurrent(prior: Any, least_std: float, inputs: Tensor, uniform: Tensor
     # Gates of higher layers are given what the layer below has found; the first layer's place is not read.
     above, own, above_bias, own_bias = (np.array([layer[i].T for layer in layers], order="C") for i in range(4))
     size = prior.action_size
-    coupling = np.zeros((size, size), np.float32)
+    coupling, relative = np.zeros((size, size), np.float32), bounds[1][:, None] / bounds[1]
     if prior.coupling is not None:
-        coupling = np.tril(prior.coupling.detach().numpy(), -1) * (bounds[1][:, None] / bounds[1])
+        coupling = np.tril(prior.coupling.detach().numpy(), -1) * relative
     first_log_std = prior.first_log_std.detach().numpy()
     linear = prior.autoregression
-    linear_coupling = linear.coupling.numpy() * (bounds[1][:, None] / bounds[1])
+    linear_coupling = linear.coupling.numpy() * relative
     share = prior.autoregressive_share
     vectors = noise.new_empty(noise.shape)
     _recurrent(

@@ -384,18 +384,19 @@ class VectorNetwork(VectorPrior):
         """The mixture for rows of the network's output `[M, width]` and input `[M, E]`."""
         weights, means, stds = self._parts(self.head(self.drop(out)))
         half = self.half_range
+        relative = half[:, None] / half  # couplings are of dimensions in units of half the range
         mean = self.middle + half * (means + self.linear(inputs)[:, None])
         no_last = 1 - inputs[:, self.recent_size - 1, None, None]
         stds = stds + no_last * self.first_log_std
         std = half * (stds.clamp(-9, 3).exp() + 2 * LEAST_STD)
-        coupling = None if self.coupling is None else self.coupling.tril(-1) * (half[:, None] / half)
+        coupling = None if self.coupling is None else self.coupling.tril(-1) * relative
         if self.autoregressive_share:
             linear_mean, linear_std, linear_coupling = self.autoregression(inputs[:, : self.recent_size])
             mean = torch.cat([mean, (self.middle + half * linear_mean)[:, None]], 1)
             std = torch.cat([std, (half * linear_std)[:, None]], 1)
             weights = weights.log_softmax(-1) + log1p(-self.autoregressive_share)
             weights = functional.pad(weights, (0, 1), value=log(self.autoregressive_share))
-            linear_coupling = (linear_coupling * (half[:, None] / half))[:, None]
+            linear_coupling = (linear_coupling * relative)[:, None]
             if coupling is None:
                 coupling = linear_coupling
             else:
