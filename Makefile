@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PYTHONPATH :=
 
-.PHONY: paper mice mice-planner results test check bench docs clean
+.PHONY: paper mice mice-planner results test check style types pytest bench docs clean
 
 paper: .venv/cli
 	$(BIN)/python -m eval paper
@@ -17,14 +17,22 @@ mice-planner: .venv/cli
 results: .venv/all
 	$(BIN)/python -m eval pages
 
-# One thread a process: two processes of two threads each wait for one another.
-test: check
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+# Types take a minute on one core, so they are checked beside the tests.
+test: style
+	$(MAKE) --no-print-directory -j 2 types pytest
 
-check: .venv/dev
+check: style types
+
+style: .venv/dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: .venv/dev
 	$(BIN)/mypy neuroprior train eval tests/typing
+
+# One thread a process: two processes of two threads each wait for one another.
+pytest: .venv/dev
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench

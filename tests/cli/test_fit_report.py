@@ -95,7 +95,7 @@ def test_the_learning_curve():
     assert (list(kept.get_xdata()), list(kept.get_ydata())) == ([20], [1.6])
 
 
-@pytest.mark.parametrize("with_context", [False, True])
+@pytest.mark.parametrize("with_context", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_folds_are_those_of_the_seed(with_context, tmp_path, monkeypatch):
     """Seven animals in two folds: each model is fitted without a fold, on settings chosen on a share of the rest."""
     group, plans = torch.arange(56) % 7, chain(56)

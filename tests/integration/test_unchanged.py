@@ -11,7 +11,9 @@ def results():
     return pinned()
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if case.slow else name for name, case in CASES.items()]
+)
 def test_nothing_has_changed(name, results):
     lines = differences(results.get(name), found_of(name), CASES[name].relative)
     few = "\n".join(lines[:40])

@@ -46,26 +46,29 @@ class Case(NamedTuple):
     Attributes:
         run: makes the results.
         relative: how far apart numbers may be.
+        slow: whether the case takes seconds, so that it is not run each time.
     """
 
     run: Callable[[], Any]
     relative: float
+    slow: bool
 
 
 CASES: dict[str, Case] = {}
 
 
-def case(function: Callable[[], Any] | None = None, *, relative: float = RELATIVE) -> Any:
+def case(function: Callable[[], Any] | None = None, *, relative: float = RELATIVE, slow: bool = False) -> Any:
     """Enter a function among the `CASES`, under its name.
 
     Args:
         function: returns nested dicts and lists of what `simple` knows.
         relative: how far apart numbers may be.
+        slow: see `Case`.
     """
     if function is None:
-        return lambda function: case(function, relative=relative)
+        return lambda function: case(function, relative=relative, slow=slow)
     assert function.__name__ not in CASES, function.__name__
-    CASES[function.__name__] = Case(function, relative)
+    CASES[function.__name__] = Case(function, relative, slow)
     return function
 
 

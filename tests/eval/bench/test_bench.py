@@ -190,6 +190,7 @@ def test_gymnasium_takes_the_plans(make):
         assert found[1] == 0
 
 
+@pytest.mark.slow
 def test_mctx_finds_the_actions_that_pay():
     """A reward for action 2 alone, and more for whoever goes on with it."""
     pytest.importorskip("mctx")

@@ -364,6 +364,7 @@ def test_chains_are_chosen_on_the_plans_that_are_held_out(num_contexts):
     assert bits(found, held_out) < bits(min(tried, key=lambda chain: bits(chain, learned)), held_out) - 10
 
 
+@pytest.mark.slow
 def test_of_few_plans_it_is_hardly_behind_the_best_of_its_experts():
     """A tenth of a hundred plans of eight actions is held out: on eighty actions nearly anything may seem best."""
     table = torch.distributions.Dirichlet(torch.full((4,), 0.3)).sample
@@ -385,6 +386,7 @@ def test_of_few_plans_it_is_hardly_behind_the_best_of_its_experts():
     assert sum(behind) / 3 < 0.01
 
 
+@pytest.mark.slow
 def test_of_few_plans_a_network_that_is_better_is_kept():
     """Each plan follows one of three chains: a network finds out which, a chain does not."""
     with torch.random.fork_rng():

@@ -353,6 +353,7 @@ def test_the_network_is_a_prior(contexts):
     check_prior(prior.fit(plans, generator=seeded(0), progress=False, max_steps=5))
 
 
+@pytest.mark.slow
 def test_the_network_learns_modes_that_persist():
     actions = switching_source(120, 40)[0]
     held_out = switching_source(60, 40, seed=5)[0]

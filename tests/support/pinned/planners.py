@@ -110,7 +110,7 @@ def decisions():
     return found
 
 
-@case
+@case(slow=True)
 def searches():
     found: dict[str, Any] = {}
     tiles, boxes = sliding_tiles(shape=(3, 3), scramble=9), sokoban(LEVELS)

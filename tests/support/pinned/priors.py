@@ -119,7 +119,7 @@ def context_trees():
     return found
 
 
-@case(relative=2e-3)
+@case(relative=2e-3, slow=True)
 def combined():
     found = {}
     for context in (None, "step", "features"):
@@ -147,7 +147,7 @@ def combined_of_chains():
     return found
 
 
-@case(relative=2e-3)
+@case(relative=2e-3, slow=True)
 def experts_of_every_kind():
     """All networks and what counts, with a context; and plans of so few groups that these are split."""
     plans, found = behaviour(24, 10, context="plan"), {}

@@ -55,7 +55,7 @@ def report_on_plans():
     return of_document(report(plans, **QUICK, folds=2, command="neuroprior report plans.csv"))
 
 
-@case(relative=2e-3)
+@case(relative=2e-3, slow=True)
 def report_on_modes():
     made = report(behaviour(12, 10, context="step"), **QUICK, folds=2, modes=[2], sections=["modes"])
     return of_document(made) | {"frames": made.frames}
@@ -68,7 +68,7 @@ def report_on_paired_conditions():
     return of_document(report(plans, **QUICK, folds=2, sections=["conditions", "durations"]))
 
 
-@case(relative=2e-3)
+@case(relative=2e-3, slow=True)
 def report_with_contexts():
     """A context of each step, a network beside the counts, the first actions left out; scored on other plans."""
     plans, test = behaviour(30, context="step"), behaviour(14, context="step", seed=5)
