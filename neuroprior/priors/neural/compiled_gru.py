@@ -164,7 +164,9 @@ def draw_to_the_end(
     for begin in range(0, number, BLOCK):
         rows = min(BLOCK, number - begin)
         for layer in range(layers):
-            states[layer, :rows] = hidden[begin : begin + rows, layer]
+            for i in range(rows):
+                for j in range(size):
+                    states[layer, i, j] = hidden[begin + i, layer, j]
         for t in range(steps):
             at = before + t - 1
             for i in range(rows):

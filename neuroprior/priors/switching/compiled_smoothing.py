@@ -25,6 +25,7 @@ def smooth(
         moved: `[N, L - 1, K, K]`: gets the modes of successive actions.
     """
     num, length, modes = likelihood.shape
+    # Single numbers are divided, not rows: compiling an operation on rows takes seconds.
     behind, weighted = np.empty(modes), np.empty(modes)
     for n in range(num):
         for t in range(length):
@@ -36,7 +37,8 @@ def smooth(
                 after[n, t, k] = predicted * likelihood[n, t, k]
                 total += after[n, t, k]
             totals[n, t] = max(total, tiny)
-            after[n, t] /= totals[n, t]
+            for k in range(modes):
+                after[n, t, k] /= totals[n, t]
         behind[:] = 1.0
         for t in range(length - 1, -1, -1):
             total = 0.0
@@ -44,18 +46,22 @@ def smooth(
                 smoothed[n, t, k] = after[n, t, k] * behind[k]
                 total += smoothed[n, t, k]
                 weighted[k] = likelihood[n, t, k] * behind[k]
-            smoothed[n, t] /= max(total, tiny)
+            for k in range(modes):
+                smoothed[n, t, k] /= max(total, tiny)
             if t > 0:
                 total = 0.0
                 for j in range(modes):
                     for k in range(modes):
                         moved[n, t - 1, j, k] = after[n, t - 1, j] * steps[n, t, j, k] * weighted[k]
                         total += moved[n, t - 1, j, k]
-                moved[n, t - 1] /= max(total, tiny)
+                for j in range(modes):
+                    for k in range(modes):
+                        moved[n, t - 1, j, k] /= max(total, tiny)
             total = 0.0
             for j in range(modes):
                 behind[j] = 0.0
                 for k in range(modes):
                     behind[j] += steps[n, t, j, k] * weighted[k]
                 total += behind[j]
-            behind /= max(total, tiny)
+            for j in range(modes):
+                behind[j] /= max(total, tiny)

@@ -17,6 +17,13 @@ def draw_linear(prior: Any, vectors: Tensor, known: int, noise: Tensor) -> None:
     _linear(vectors.numpy(), known, prior.memory, weights, offset, std, coupling, noise.numpy())
 
 
+@njit(nogil=True, cache=True)
+def _copy(into: Array, row: Array) -> None:
+    """`into[:] = row`, which takes seconds to compile."""
+    for k in range(len(into)):
+        into[k] = row[k]
+
+
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _linear(
     vectors: Array,
@@ -34,7 +41,7 @@ def _linear(
         plan = vectors[n]
         for t in range(known, len(plan)):
             h = min(t, depth)
-            mean[:] = offset[h]
+            _copy(mean, offset[h])
             for back in range(h):
                 row = (depth - h + back) * size
                 for j in range(size):
@@ -141,13 +148,13 @@ def _advance(
     """Move on the hidden states `[num_layers, width]` by `inputs [E]`; `into` and `from_own` are room."""
     for layer in range(len(hidden)):
         before = hidden[layer]
-        from_own[:] = own_bias[layer]
+        _copy(from_own, own_bias[layer])
         _add_product(from_own, before, own[layer])
         if layer:
-            into[:] = above_bias[layer]
+            _copy(into, above_bias[layer])
             _add_product(into, hidden[layer - 1], above[layer])
         else:
-            into[:] = given_bias
+            _copy(into, given_bias)
             _add_product(into, inputs, given)
         _gated(into, from_own, before)
 
@@ -217,8 +224,9 @@ def _recurrent(
                     into,
                     from_own,
                 )
-        hidden[:] = known
-        inputs[:] = past[n // each, past.shape[1] - 1]
+        for layer in range(num_layers):
+            _copy(hidden[layer], known[layer])
+        _copy(inputs, past[n // each, past.shape[1] - 1])
         top = hidden[num_layers - 1]
         for t in range(length):
             if t:
