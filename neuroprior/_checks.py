@@ -24,14 +24,20 @@ def check_single_precision(name: str, features: Tensor) -> None:
     if features.dtype != torch.float64 or not features.numel():
         return
     values = features.flatten(0, -2)
-    std, largest = values.std(0, correction=0), values.abs().amax(0)
-    lost = ((values - values.float()).abs().amax(0) > LOST * std) & (std > 1e-13 * largest)
-    if lost.any():
-        c = int(lost.int().argmax())
+    for c in precision_lost(values, values.std(0, correction=0)):
         raise ValueError(
-            f"{name}: feature {c + 1} of {len(lost)} is about {float(values[:, c].mean()):.4g}, where single precision"
-            " does not hold how it varies; subtract a constant from it"
+            f"{name}: feature {c + 1} of {values.shape[1]} is about {float(values[:, c].mean()):.4g}, where single"
+            " precision does not hold how it varies; subtract a constant from it"
         )
+
+
+def precision_lost(values: Tensor, std: Tensor) -> list[int]:
+    """Which features of `values [N, C]` differ by so little, by standard deviations `std [C]`, that float32 loses it.
+
+    Features that vary by the rounding of float64 alone count as constant.
+    """
+    error, largest = (values - values.float()).abs().amax(0), values.abs().amax(0)
+    return ((error > LOST * std) & (std > 1e-13 * largest)).nonzero()[:, 0].tolist()
 
 
 def check_range(name: str, values: Tensor, stop: int, what: str) -> None:

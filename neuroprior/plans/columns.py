@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from neuroprior._checks import check_single_precision
+
 Integers = NDArray[np.integer[Any]]
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating[Any]]
 Names = tuple[str, ...]
 Place = Callable[[int], str]
 """Where an entry stands: its position among all the entries to "FILE, line N"."""
@@ -18,6 +21,7 @@ MOST_ENTRIES = 2**33
 """Entries of padded plans beyond which a file is refused."""
 
 LARGEST_INTEGER = 2**62
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
 BLOCK = 2**20
 """Entries that a column holds as Python's integers or texts before they become an array."""
 
@@ -277,6 +281,12 @@ def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> 
     if num_actions not in (None, len(names)):
         raise ValueError(f"action_names: {num_actions} names are expected, as many as num_actions, not {len(names)}")
     return names
+
+
+def as_single(name: str, features: NDArray[Any]) -> NDArray[np.float32]:
+    """Features as float32; ValueError where they vary by too little, far from 0, for that."""
+    check_single_precision(name, torch.from_numpy(features))
+    return features.astype(np.float32)
 
 
 def padded(values: NDArray[Any], lengths: Integers, source: str) -> NDArray[Any]:

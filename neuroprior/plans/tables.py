@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior._checks import check_single_precision, is_number
+from neuroprior._checks import is_number, precision_lost
 from neuroprior.plans.columns import (
     Column,
-    Floats,
     Integers,
     Names,
+    as_single,
     check_names,
     is_missing,
     listed,
@@ -396,7 +396,7 @@ def fields_of(
     found["actions"] = torch.from_numpy(padded(actions, lengths, of))
     found["lengths"] = None if (lengths == lengths.max()).all() else torch.from_numpy(lengths)
     if table.context:
-        found |= _context(table, row, lengths)
+        found |= _context(table, row, lengths, notes)
     if seconds is not None:
         found["durations"] = torch.from_numpy(padded(seconds.astype(np.float32), lengths, of))
         if unknown := int(np.isnan(seconds).sum()):
@@ -600,8 +600,8 @@ def _named(what: str, numbers: Integers, names: Names | None) -> dict[str, Any]:
     return found | {f"{what}_names": names}
 
 
-def _context(table: Table, row: Integers, lengths: Integers) -> dict[str, Any]:
-    """The context of each step: names or whole numbers of one column, or features."""
+def _context(table: Table, row: Integers, lengths: Integers, notes: list[str]) -> dict[str, Any]:
+    """The context of each step: names or whole numbers of one column, or features; `notes` gets what is lost of it."""
     place = table.place
     if len(table.context) == 1:
         codes, labels = table.texts(table.context[0])
@@ -620,11 +620,18 @@ def _context(table: Table, row: Integers, lengths: Integers) -> dict[str, Any]:
             return _named("context", padded(numbers, lengths, table.of), names)
     columns = [table.numbers("context", at)[row] for at in table.context]
     whole = np.stack(columns, 1)
-    check_single_precision(f"{table.of}: context", torch.from_numpy(whole))
-    features: Floats = whole.astype(np.float32)
+    features = as_single(f"{table.of}: context", whole)
     wrong = np.argwhere(~np.isfinite(features))
     if wrong.size:
         raise ValueError(f"{place(int(row[wrong[0, 0]]))}: context: a finite number is expected in each column")
+    plan = np.repeat(np.arange(len(lengths)), lengths)
+    sums = [np.bincount(plan, values, len(lengths)) for values in whole.T]
+    centred = whole - (np.stack(sums, 1) / np.maximum(lengths, 1)[:, None])[plan]
+    for c in precision_lost(torch.from_numpy(whole), torch.from_numpy(centred).std(0, correction=0)):
+        notes.append(
+            f"feature {c + 1} of the context is about {whole[:, c].mean():.4g}, where single precision hardly holds how"
+            " it varies within plans; subtract a constant from it"
+        )
     return {"context": torch.from_numpy(padded(features, lengths, table.of))}
 
 

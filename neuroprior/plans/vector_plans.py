@@ -46,8 +46,8 @@ class VectorPlans(Sequences):
 
     def __post_init__(self) -> None:
         actions = as_floats("actions", self.actions)
-        if actions.dim() != 3:
-            raise ValueError(f"actions: shape [N, L, D] is expected, not {list(actions.shape)}")
+        if actions.dim() != 3 or not actions.shape[2]:
+            raise ValueError(f"actions: shape [N, L, D] is expected, D of 1 or more, not {list(actions.shape)}")
         object.__setattr__(self, "actions", actions)
         num, length, size = actions.shape
         for name in ("action_low", "action_high"):
@@ -100,12 +100,12 @@ class VectorPlans(Sequences):
     def _check_context(self, num: int, length: int) -> None:
         context = as_floats("context", self.context)
         shape = tuple(context.shape)
-        if context.dim() > 1:
-            check_single_precision("context", torch.as_tensor(self.context))
         if shape[:-1] not in ((num,), (num, length)):
             raise ValueError(
                 f"context: features of shape [{num}, C] or [{num}, {length}, C] are expected, not {list(shape)}"
             )
+        given = torch.as_tensor(self.context)
+        check_single_precision("context", given[self.mask().to(given.device)] if len(shape) == 3 else given)
         if len(shape) == 3:
             context = context.masked_fill(~self.mask()[..., None], 0)
         if not context.isfinite().all():

@@ -10,7 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans import VectorPlans, read_plans, write_plans
+from neuroprior.plans import (
+    VectorPlans,
+    from_trajectories,
+    read_plans,
+    vector_plans_from_trajectories,
+    write_plans,
+)
 from tests.support.sources import refuses
 
 ONE = Plans(torch.tensor([[0, 1]]), 2)
@@ -314,3 +320,50 @@ def test_features_that_single_precision_does_not_hold(tmp_path):
     context = 1.7e9 + torch.arange(10, dtype=torch.float64).view(2, 5, 1)
     with refuses("context", "feature 1 of 1", "single precision"):
         VectorPlans(torch.zeros(2, 5, 1), [-1.0], [1.0], context=context)
+    context[1, 3:] = 0  # beyond the end of a plan
+    with refuses("context", "feature 1 of 1", "single precision"):
+        VectorPlans(torch.zeros(2, 5, 1), [-1.0], [1.0], torch.tensor([5, 3]), context)
+
+
+@pytest.mark.parametrize("name", ["a.jsonl", "a.csv"])
+def test_features_that_files_hold_and_single_precision_does_not(name, tmp_path):
+    """Of JSON lines, and of one plan a row."""
+    rows = {"a.jsonl": '{{"actions": [0, 1], "context": [[{0}], [{1}]]}}\n', "a.csv": "0,1,{0},{1}\n"}
+    head = {"a.jsonl": "", "a.csv": "action_1,action_2,context_1,context_2\n"}
+    for begin in (1.7e9, 0.0):
+        lines = "".join(rows[name].format(begin + 4.5 * i, begin + 4.5 * i + 2) for i in range(6))
+        (tmp_path / name).write_text(head[name] + lines)
+        if begin:
+            with refuses(name, "context: feature 1 of", "single precision"):
+                read_plans(tmp_path / name)
+        else:
+            assert read_plans(tmp_path / name).context.unique().tolist() == sorted(
+                {4.5 * i + more for i in range(6) for more in (0, 2)}
+            )
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.int64])
+def test_observations_that_single_precision_does_not_hold(kind):
+    """Times of episodes of unequal lengths, whose padding says nothing; not their last observations."""
+    times = (1_700_000_000 + np.arange(21, dtype=kind))[:, None]
+    for begin, refused in ((0, True), (1_700_000_000, False)):
+        episodes = [{"actions": [0] * num, "observations": times[: num + 1] - begin} for num in (20, 5)]
+        vectors = [{**one, "actions": np.zeros((len(one["actions"]), 1))} for one in episodes]
+        for make in (
+            lambda made=episodes: from_trajectories(made, 2),
+            lambda made=vectors: vector_plans_from_trajectories(made, [-1.0], [1.0]),
+        ):
+            if refused:
+                with refuses("trajectories", "context: feature 1 of 1", "single precision"):
+                    make()
+            else:
+                assert make().context[1, :, 0].tolist() == [0, 1, 2, 3, 4] + 15 * [0]
+
+
+def test_features_that_hardly_vary_within_plans_are_noted(tmp_path):
+    """Sessions far apart, each of some seconds: what is left is a clock of sessions."""
+    for begin in (1.7e9, 0):
+        lines = [f"p{i // 5},{i % 3},0.5,{begin + 1000 * (i // 5) + i}\n" for i in range(60)]
+        (tmp_path / "a.csv").write_text("plan,action,context_1,context_2\n" + "".join(lines))
+        noted = [note for note in read_plans(tmp_path / "a.csv").notes if "within plans" in note]
+        assert [note.split(",")[0] for note in noted] == ["feature 2 of the context is about 1.7e+09"] * bool(begin)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from neuroprior.plans.columns import Floats, Integers, Names, never_notes, padded
+from neuroprior.plans.columns import Floats, Integers, Names, as_single, never_notes, padded
 from neuroprior.plans.plans import Plans, action_dtype
 
 
@@ -30,7 +30,7 @@ def assembled(
         actions: `[S]`.
         num_actions: None for one more than the largest.
         action_names: None for none.
-        context: `[N]` or `[N, C]`, or, if `per_step`, `[S]` or `[S, C]`.
+        context: `[N]` or `[N, C]`, or, if `per_step`, `[S]` or `[S, C]`; features are stored as float32.
         per_step: see `context`.
         context_names: None for none.
         group: `[N]`.
@@ -53,7 +53,8 @@ def assembled(
     dtype = torch.empty(0, dtype=action_dtype(num_actions)).numpy().dtype
     longest = int(lengths.max()) if len(lengths) else 0
     if context is not None:
-        context = context if context.dtype == np.float32 else context.astype(np.int64)
+        is_whole = context.dtype.kind in "iu"
+        context = context.astype(np.int64) if is_whole else as_single(f"{source}: context", context)
         context = padded(context, lengths, source) if per_step else context
     try:
         return Plans(

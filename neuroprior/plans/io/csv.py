@@ -16,6 +16,7 @@ import torch
 
 from neuroprior._files import written_whole
 from neuroprior.plans.columns import (
+    LARGEST_FLOAT,
     Column,
     Floats,
     Integers,
@@ -189,9 +190,8 @@ def _actions(actions: Column, columns: list[int], rows: list[Row]) -> tuple[Inte
 def _features(rows: list[Row], columns: list[int]) -> Floats:
     """The features `[rows, C]` of some columns; ValueError for what is not a finite number."""
     texts = _cells(rows, columns)
-    with np.errstate(over="ignore"):
-        values = np.array([_float(text) for text in texts]).astype(np.float32)
-    wrong = np.flatnonzero(~np.isfinite(values))
+    values = np.array([_float(text) for text in texts])
+    wrong = np.flatnonzero(~(np.abs(values) <= LARGEST_FLOAT))
     if wrong.size:
         raise ValueError(f"context {texts[wrong[0]]!r} is not a finite number")
     return values.reshape(len(rows), len(columns))

@@ -15,6 +15,7 @@ import torch
 
 from neuroprior._files import written_whole
 from neuroprior.plans.columns import (
+    LARGEST_FLOAT,
     LARGEST_INTEGER,
     Column,
     Floats,
@@ -33,7 +34,6 @@ from neuroprior.plans.plans import Plans
 from neuroprior.plans.sequences import is_per_step
 
 HEADER = ("num_actions", "action_names", "context_names", "group_names", "condition_names", "end")
-LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 OF_PLANS = ("group", "condition")
 """What a plan has one of."""
@@ -282,7 +282,7 @@ class _Contexts:
     def __init__(self, names: Names | None) -> None:
         self.kind: str | None = None  # None until a plan shows it: an empty list does not
         self.column = Column("context", names)
-        self.features: array[float] | None = None  # float32; None while there is neither a decimal point nor a row
+        self.features: array[float] | None = None  # None while there is neither a decimal point nor a row
         self.width: int = -1
         self.sizes = array("q")
 
@@ -306,7 +306,7 @@ class _Contexts:
             _check_numbers(values, LARGEST_FLOAT if is_float else LARGEST_INTEGER)
         if is_float and self.features is None:
             # Whole numbers so far are features too.
-            self.features = array("f", () if kind == "rows" else self.column.numbers().tolist())
+            self.features = array("d", () if kind == "rows" else self.column.numbers().tolist())
         if self.features is not None:
             self.features.extend(values)
         elif kind != "none":

@@ -5,9 +5,10 @@ from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from neuroprior.plans.columns import LARGEST_INTEGER, Integers, check_names
+from neuroprior.plans.columns import LARGEST_FLOAT, LARGEST_INTEGER, Integers, check_names
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans
 from neuroprior.plans.sequences import is_per_step
@@ -41,6 +42,7 @@ def from_trajectories(trajectories: Iterable[Any], num_actions: int, *, observat
     check_names(num_actions, None)
     if observations not in ("context", None):
         raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")
+    check_are_several(trajectories)
     actions: list[Integers] = []
     observed: list[NDArray[Any] | None] = []
     for number, trajectory in enumerate(trajectories):
@@ -99,6 +101,12 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
     ]
 
 
+def check_are_several(trajectories: Any) -> None:
+    """Raise ValueError for a single trajectory, which is not in a list."""
+    if isinstance(trajectories, Mapping) or hasattr(trajectories, "actions") or hasattr(trajectories, "acts"):
+        raise ValueError("trajectories: a list of them is expected, not a single one; put it in a list")
+
+
 def parts_of(trajectory: Any, place: str) -> tuple[Any, Any]:
     """Actions and observations (or None) of a trajectory."""
     if isinstance(trajectory, Mapping):
@@ -140,7 +148,7 @@ def _actions(values: Any, num_actions: int, place: str) -> Integers:
 
 
 def observations_of(values: Any, length: int, place: str) -> NDArray[Any]:
-    """Indices `[T]` or features `[T, C]`."""
+    """Indices `[T]` or features `[T, C]`, of a precision that holds the values."""
     if isinstance(values, Mapping | tuple) or (isinstance(values, list) and values and isinstance(values[0], Mapping)):
         raise ValueError(
             f"{place}: observations are of a Dict or Tuple space; flatten them first (gymnasium.spaces.flatten)"
@@ -157,10 +165,10 @@ def observations_of(values: Any, length: int, place: str) -> NDArray[Any]:
     if observed.dtype.kind not in "iufb":
         raise ValueError(f"{place}: observations are {observed.dtype}; integers or arrays of numbers are expected")
     width = int(np.prod(observed.shape[1:]))
-    features = observed.reshape(length, width).astype(np.float32)
-    wrong = np.flatnonzero(~np.isfinite(features).all(1))
+    features = observed.reshape(length, width).astype(np.result_type(observed, np.float32))
+    wrong = np.flatnonzero(~(np.abs(features) <= LARGEST_FLOAT).all(1))
     if wrong.size:
-        raise ValueError(f"{place}: the observation of step {wrong[0]} is not finite")
+        raise ValueError(f"{place}: the observation of step {wrong[0]} is not finite (as float32)")
     return features
 
 
@@ -176,7 +184,7 @@ def joined(observed: list[NDArray[Any] | None]) -> NDArray[Any] | None:
     parts = [(i, part) for i, part in parts if len(part)] or parts[:1]
     number, first = parts[0]
     for i, part in parts:
-        if part.shape[1:] != first.shape[1:] or part.dtype != first.dtype:
+        if part.shape[1:] != first.shape[1:] or part.dtype.kind != first.dtype.kind:
             raise ValueError(
                 f"trajectory {i}: observations of another kind than trajectory {number}: {_kind(part)}, not"
                 f" {_kind(first)}"
@@ -189,10 +197,12 @@ def _kind(part: NDArray[Any]) -> str:
 
 
 def array_of(values: Any, place: str) -> NDArray[Any]:
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu()
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
         raise ValueError(f"{place}: one number or one array of a fixed shape per step is expected") from error
     if array.dtype.kind == "O":
-        raise ValueError(f"{place}: {array.dtype} values; a number or an array of numbers per step is expected")
+        raise ValueError(f"{place}: {array.dtype} values; numbers are expected")
     return array

@@ -1,6 +1,7 @@
 """Reading and writing plans of vectors: `.npz`, Minari datasets with a Box of actions, trajectories in memory."""
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,10 @@ import torch
 from torch import Tensor
 
 from neuroprior._files import written_whole
-from neuroprior.plans.columns import padded
+from neuroprior.plans.columns import listed, padded
 from neuroprior.plans.io.minari import local_dataset, one_line
 from neuroprior.plans.io.npz import arrays_of, as_array, names_of, native
-from neuroprior.plans.io.trajectories import array_of, joined, observations_of, parts_of
+from neuroprior.plans.io.trajectories import array_of, check_are_several, joined, observations_of, parts_of
 from neuroprior.plans.vector_plans import VectorPlans
 
 MINARI = "minari:"
@@ -29,6 +30,9 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
 
     Args:
         path: the file or dataset.
+
+    Warns:
+        UserWarning: the file has arrays of other names, which are not used.
 
     Raises:
         FileNotFoundError: there is no such file or dataset.
@@ -53,7 +57,13 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
     names = names_of(place, "action_names", arrays["action_names"]) if "action_names" in arrays else None
     numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in NUMBERS if key in arrays}
     if numbers["actions"].dim() == 2:
-        raise ValueError(f"{place}: actions [N, L] are no vectors; read_plans reads plans of discrete actions")
+        raise ValueError(
+            f"{place}: actions are of shape {list(numbers['actions'].shape)}; vectors [N, L, D] are expected (of"
+            " episodes one after the other make plans with vector_plans_from_trajectories; discrete actions are read by"
+            " read_plans)"
+        )
+    if unused:
+        warnings.warn(f"{place}: arrays that are not used: {listed(unused)}", stacklevel=2)
     try:
         return VectorPlans(**numbers, action_names=names)
     except (ValueError, RuntimeError, IndexError) as error:
@@ -110,6 +120,12 @@ def vector_plans_from_trajectories(
     if observations not in ("context", None):
         raise ValueError(f"observations: 'context' or None is expected, not {observations!r}")
     low, high = (array_of(bound, name) for bound, name in ((action_low, "action_low"), (action_high, "action_high")))
+    if low.ndim != 1 or low.shape != high.shape:
+        raise ValueError(
+            f"action_low, action_high: [D] numbers each, one a dimension, are expected, not of shape {list(low.shape)}"
+            f" and {list(high.shape)}"
+        )
+    check_are_several(trajectories)
     taken, observed = [], []
     for number, trajectory in enumerate(trajectories):
         place = f"trajectory {number}"
