@@ -13,11 +13,14 @@ from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import best_of, held_out_split, least_std, mean_nats, rounding
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
 
-BANDWIDTHS = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""Bandwidths of the match of the past that `fit` tries."""
+BANDWIDTHS = (0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8)
+"""Bandwidths of the match of the past that `fit` tries; the least are for vectors that take up a small part of the
+range."""
 
-NOISES = (0.02, 0.05, 0.1, 0.2, 0.4)
-"""Standard deviations around the stored vectors that `fit` tries."""
+NOISES, LEAST_NOISE = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4), 0.02
+"""Standard deviations around the stored vectors that `fit` tries; and the one at which they are at least `least_std` in
+each dimension. Lesser ones are tried where they are, too.
+"""
 
 BANDWIDTH, NOISE = 0.2, 0.1
 """The bandwidth and the noise before `fit`, and where no plans can be held out to choose them on."""
@@ -138,10 +141,10 @@ class StoredWindows(VectorPrior):
             enough = max(int((lengths.cumsum(0) <= MOST_CHOSEN_ON).sum()), 1)
             held_out = held_out[order[:enough]].steps(0, MOST_CHOSEN_ON)
             bandwidths = (self._given["bandwidth"],) if self._given["bandwidth"] else BANDWIDTHS
-            noises = (self._given["noise"],) if self._given["noise"] else NOISES
             scores = {}
             for own in (False, True):
-                self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH), own)
+                least = self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH), own)
+                noises = [self._given["noise"]] if self._given["noise"] else [each for each in NOISES if each >= least]
                 for self.bandwidth, self.noise in product(bandwidths, noises):
                     scores[self.bandwidth, self.noise, own] = mean_nats(self, held_out)
                 self.bandwidth, self.noise, own = best_of(scores)
@@ -151,8 +154,12 @@ class StoredWindows(VectorPrior):
         self._store(plans, self.max_windows, own)
         return self
 
-    def _store(self, plans: VectorPlans, most: int, own: bool) -> None:
-        """Store the windows; with `own`, the units of distances are in proportion to the spread of each dimension."""
+    def _store(self, plans: VectorPlans, most: int, own: bool) -> float:
+        """Store the windows; with `own`, the units of distances are in proportion to the spread of each dimension.
+
+        Returns:
+            The least noise that is at least `least_std` in each dimension, at most `LEAST_NOISE`.
+        """
         size = self.match + self.horizon
         windows = plans.windows(size)
         if not len(windows):
@@ -166,9 +173,12 @@ class StoredWindows(VectorPrior):
         variance = self.segments.var((0, 1), correction=0)
         std, stds, means = variance.mean().sqrt(), variance.sqrt(), self.segments.mean((0, 1))
         error = rounding(self, means)
-        extent = (EXTENT * std).maximum(least_std(std, error.min()) / NOISES[0]).clamp(max=1)
-        in_proportion = (extent * stds / std).maximum(least_std(stds, error) / NOISES[0])
-        self.extent = in_proportion if own and std > 0 else extent.expand(self.action_size).contiguous()
+        least = least_std(stds, error) if own and std > 0 else least_std(std, error.min())
+        extent = (EXTENT * std).maximum(least_std(std, error.min()) / LEAST_NOISE).clamp(max=1)
+        if own and std > 0:
+            extent = (extent * stds / std).maximum(least / LEAST_NOISE)
+        self.extent = extent.expand(self.action_size).contiguous()
+        return min(float((least / extent).max()), LEAST_NOISE)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         empty = torch.zeros(batch_size, 2 + self.match * self.action_size, device=self.device)

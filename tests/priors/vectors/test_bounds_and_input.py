@@ -202,6 +202,25 @@ def test_wide_bounds_make_no_difference(kind):
     assert spread[0] == pytest.approx(float(values.std()), rel=0.3)
 
 
+def test_stored_windows_follow_waves_as_well_between_any_bounds():
+    """Waves of standard deviation .5, predicted to about .1: within a fifth of a nat of a range that they fill."""
+
+    def waves(num, seed):
+        phase, noise = (
+            6 * torch.rand(num, 1, generator=seeded(seed)),
+            torch.randn(num, 40, 2, generator=seeded(seed + 1)),
+        )
+        time = torch.linspace(0, 12, 40) + phase
+        return (0.7 * torch.stack([time.sin(), (0.75 * time).cos()], -1) + 0.1 * noise).clamp(-1, 1)
+
+    found = []
+    for most in (1.0, 20.0):
+        plans, held_out = (VectorPlans(waves(20, seed), [-most] * 2, [most] * 2) for seed in (0, 2))
+        prior = StoredWindows(plans.action_low, plans.action_high, horizon=5).fit(plans, generator=seeded())
+        found.append(float(prior.log_prob(held_out).mean()) / 40)
+    assert min(found[1:]) > found[0] - 0.2
+
+
 @pytest.mark.parametrize(
     "make", [lambda *bounds: VectorGRU(*bounds, width=4), lambda *bounds: DiscretisedPrior(*bounds, num_bins=4)]
 )
