@@ -446,7 +446,10 @@ class VectorNetwork(VectorPrior):
                 if learning is validation:
                     raise ValueError("plans: at least two vectors are expected, one to be held out")
             elif isinstance(validation, VectorPlans):
-                validation = self.training_plans(validation)
+                try:
+                    validation = self.training_plans(validation)
+                except ValueError as error:
+                    raise ValueError(f"validation: {error}") from error
             check_alike(learning, validation)
         except ValueError:
             self.action_names, self.memory = known, memory  # what is refused is not learned from

@@ -384,7 +384,7 @@ class VectorPrior(SavedModule):
         """Raise ValueError unless `context` is `[num_plans, C]` or `[num_plans, T, C]`, or None for a prior without."""
         if self.context_size is None:
             if context is not None:
-                raise ValueError("context: this prior takes none (make it with context_size=)")
+                raise ValueError("context: this prior takes none; leave it out (plans.without_context())")
             return
         if context is None:
             raise ValueError("context: this prior takes features, and none were given")
