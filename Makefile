@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PYTHONPATH :=
 
-.PHONY: paper mice mice-planner results test check style types pytest bench docs clean
+.PHONY: paper mice mice-planner results test check style types pytest slow bench docs clean
 
 paper: .venv/cli
 	$(BIN)/python -m eval paper
@@ -19,7 +19,7 @@ results: .venv/all
 
 # Types take a minute on one core, so they are checked beside the tests.
 test: style
-	$(MAKE) --no-print-directory -j 2 types pytest
+	$(MAKE) --no-print-directory -j 2 types pytest || { echo "types or tests failed, see above"; exit 1; }
 
 check: style types
 
@@ -33,6 +33,10 @@ types: .venv/dev
 # One thread a process: two processes of two threads each wait for one another.
 pytest: .venv/dev
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# What takes too long for each change: to be run before a release, and after changes to what is learned.
+slow: .venv/dev
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m slow
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench

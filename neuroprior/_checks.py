@@ -18,13 +18,18 @@ def is_integer(values: Tensor) -> bool:
 LOST = 0.05
 """Share of the standard deviation of a feature that may be lost in single precision."""
 
+CONSTANT = 1e-10
+"""Standard deviation of a feature, relative to its largest value, below which it counts as constant but for noise."""
+
 
 def check_single_precision(name: str, features: Tensor) -> None:
     """Raise ValueError where `features [..., C]` vary by so little, far from 0, that float32 does not hold it."""
     if features.dtype != torch.float64 or not features.numel():
         return
     values = features.flatten(0, -2)
-    for c in precision_lost(values, values.std(0, correction=0)):
+    lost = precision_lost(values, values.std(0, correction=0))
+    if lost:
+        c = lost[0]
         raise ValueError(
             f"{name}: feature {c + 1} of {values.shape[1]} is about {float(values[:, c].mean()):.4g}, where single"
             " precision does not hold how it varies; subtract a constant from it"
@@ -34,10 +39,14 @@ def check_single_precision(name: str, features: Tensor) -> None:
 def precision_lost(values: Tensor, std: Tensor) -> list[int]:
     """Which features of `values [N, C]` differ by so little, by standard deviations `std [C]`, that float32 loses it.
 
-    Features that vary by the rounding of float64 alone count as constant.
+    Features that hardly vary, relative to their size, count as constant.
     """
-    error, largest = (values - values.float()).abs().amax(0), values.abs().amax(0)
-    return ((error > LOST * std) & (std > 1e-13 * largest)).nonzero()[:, 0].tolist()
+    lost = []
+    for c, column in enumerate(values.unbind(1)):  # one at a time, which takes little memory
+        error, largest = (column - column.float()).std(correction=0), column.abs().max()
+        if error > LOST * std[c] and std[c] > CONSTANT * largest and largest > torch.finfo(torch.float32).tiny:
+            lost.append(c)
+    return lost
 
 
 def check_range(name: str, values: Tensor, stop: int, what: str) -> None:

@@ -284,7 +284,7 @@ def check_names(num_actions: int | None, action_names: Sequence[str] | None) -> 
 
 
 def as_single(name: str, features: NDArray[Any]) -> NDArray[np.float32]:
-    """Features as float32; ValueError where they vary by too little, far from 0, for that."""
+    """Features `[N, C]` as float32; ValueError where these would not hold how they vary."""
     check_single_precision(name, torch.from_numpy(features))
     return features.astype(np.float32)
 

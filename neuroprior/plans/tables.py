@@ -624,9 +624,10 @@ def _context(table: Table, row: Integers, lengths: Integers, notes: list[str]) -
     wrong = np.argwhere(~np.isfinite(features))
     if wrong.size:
         raise ValueError(f"{place(int(row[wrong[0, 0]]))}: context: a finite number is expected in each column")
-    plan = np.repeat(np.arange(len(lengths)), lengths)
-    sums = [np.bincount(plan, values, len(lengths)) for values in whole.T]
-    centred = whole - (np.stack(sums, 1) / np.maximum(lengths, 1)[:, None])[plan]
+    plan, first = np.repeat(np.arange(len(lengths)), lengths), np.cumsum(lengths) - lengths
+    shifted = whole - whole[first[plan]]  # so that constants are exactly 0
+    sums = [np.bincount(plan, values, len(lengths)) for values in shifted.T]
+    centred = shifted - (np.stack(sums, 1) / np.maximum(lengths, 1)[:, None])[plan]
     for c in precision_lost(torch.from_numpy(whole), torch.from_numpy(centred).std(0, correction=0)):
         notes.append(
             f"feature {c + 1} of the context is about {whole[:, c].mean():.4g}, where single precision hardly holds how"

@@ -104,13 +104,14 @@ class VectorPlans(Sequences):
             raise ValueError(
                 f"context: features of shape [{num}, C] or [{num}, {length}, C] are expected, not {list(shape)}"
             )
-        given = torch.as_tensor(self.context)
-        check_single_precision("context", given[self.mask().to(given.device)] if len(shape) == 3 else given)
         if len(shape) == 3:
             context = context.masked_fill(~self.mask()[..., None], 0)
         if not context.isfinite().all():
             where = (~context.isfinite()).nonzero()[0].tolist()
             raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
+        given = torch.as_tensor(self.context)
+        if given.dtype == torch.float64:
+            check_single_precision("context", given[self.mask()] if len(shape) == 3 else given)
         object.__setattr__(self, "context", context)
 
     @property

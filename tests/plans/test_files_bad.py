@@ -360,6 +360,41 @@ def test_observations_that_single_precision_does_not_hold(kind):
                 assert make().context[1, :, 0].tolist() == [0, 1, 2, 3, 4] + 15 * [0]
 
 
+def test_features_of_arrays_that_single_precision_does_not_hold(tmp_path):
+    """Of `.npz` files; not what is beyond the end of a plan, nor without the offset."""
+    times = 1.7e9 + torch.arange(10, dtype=torch.float64).view(2, 5, 1)
+    times[1, 3:] = 0
+    for begin in (0.0, 1.7e9):
+        plans = Plans(torch.zeros(2, 5, dtype=torch.long), 2, torch.tensor([5, 3]), context=times - begin)
+        write_plans(plans, tmp_path / "a.npz")
+        if begin:
+            assert read_plans(tmp_path / "a.npz").context.shape == (2, 5, 1)
+        else:
+            with refuses("a.npz", "context: feature 1 of 1", "single precision"):
+                read_plans(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    "feature",
+    [
+        -0.323 + 1e-11 * np.sin(np.arange(1000)),  # a constant but for the noise of a solver
+        5000.3 + (np.arange(1000) == 7),  # a single event, which float32 holds
+        1e-46 * np.sin(np.arange(1000)),  # 0 in float32
+        np.full(1000, 23.7),
+    ],
+)
+def test_features_that_single_precision_holds_well_enough(feature):
+    episodes = [{"actions": [0, 1] * 250, "observations": part[:, None]} for part in np.split(feature, 2)]
+    assert from_trajectories(episodes, 2).context.shape == (2, 500, 1)
+
+
+def test_features_that_are_constant_within_plans_have_no_note(tmp_path):
+    """A dose of each session, over many frames."""
+    lines = "".join(f"p{i // 30_000},{i % 2},{(0.1, 0.2)[i // 30_000]},{i % 7}.5\n" for i in range(60_000))
+    (tmp_path / "a.csv").write_text("plan,action,context_1,context_2\n" + lines)
+    assert not [note for note in read_plans(tmp_path / "a.csv").notes if "within plans" in note]
+
+
 def test_features_that_hardly_vary_within_plans_are_noted(tmp_path):
     """Sessions far apart, each of some seconds: what is left is a clock of sessions."""
     for begin in (1.7e9, 0):

@@ -92,6 +92,39 @@ def test_minari_with_a_box_of_actions(tmp_path, monkeypatch):
         read_vector_plans("minari:arm/none-v0")
 
 
+def test_arrays_of_other_names_are_warned_of(tmp_path):
+    arrays = {"actions": np.ones((2, 3, 2)), "action_low": LOW, "action_high": HIGH}
+    np.savez(tmp_path / "a.npz", **arrays, length=[3, 2], observations=np.zeros((2, 3, 1)))
+    with pytest.warns(UserWarning, match="not used: length, observations"):
+        plans = read_vector_plans(tmp_path / "a.npz")
+    assert plans.lengths is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([{"actions": np.ones((3, 2))}], -1.0, 1.0), r"action_low, action_high: .* not of shape \[\] and \[\]"),
+        (([{"actions": np.ones((3, 2))}], [-1.0], HIGH), r"action_low, action_high: .* \[1\] and \[2\]"),
+        (([{"actions": np.ones((3, 2))}], None, None), "action_low: object values; numbers"),
+        (({"actions": np.ones((3, 2))}, LOW, HIGH), "put it in a list"),
+        (({"a": {"actions": np.ones((3, 2))}}, LOW, HIGH), "trajectories: a list of them is expected, not a dict"),
+    ],
+)
+def test_what_is_wrong_with_trajectories_is_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        vector_plans_from_trajectories(*arguments)
+
+
+def test_tensors_that_need_gradients_are_read():
+    actions = torch.full((3, 2), 0.5, requires_grad=True)
+    assert vector_plans_from_trajectories([{"actions": actions}], LOW, HIGH).actions.tolist() == [[[0.5, 0.5]] * 3]
+
+
+def test_vectors_have_a_dimension():
+    with pytest.raises(ValueError, match="D of 1 or more"):
+        VectorPlans(torch.zeros(3, 2, 0), [], [])
+
+
 def test_readers_name_one_another(tmp_path):
     write_vector_plans(VectorPlans(torch.zeros(1, 2, 2), LOW, HIGH), tmp_path / "vectors.npz")
     with pytest.raises(ValueError, match="read_vector_plans"):

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from neuroprior._checks import check_single_precision
 from neuroprior._files import written_whole
 from neuroprior.plans.columns import Names, check_file, listed, never_notes
 from neuroprior.plans.io.assembly import renamed
@@ -50,6 +51,10 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
         if known is None:
             known = _largest(numbers) + 1 if action_names is None else len(action_names)
         plans = Plans(num_actions=known, end=end, **numbers, **names)
+        if plans.context is not None and plans.context.is_floating_point():
+            check_single_precision(
+                "context", plans.context[plans.mask()] if plans.context.dim() == 3 else plans.context
+            )
         notes = list(never_notes(plans.actions[plans.mask()].numpy(), known) if guessed else [])
         if unused:
             notes.append(f"arrays that are not used: {listed(unused)}")

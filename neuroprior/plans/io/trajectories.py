@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior.plans.columns import LARGEST_FLOAT, LARGEST_INTEGER, Integers, check_names
+from neuroprior.plans.columns import LARGEST_INTEGER, Integers, check_names
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans
 from neuroprior.plans.sequences import is_per_step
@@ -102,7 +102,9 @@ def to_trajectories(plans: Plans, kind: Literal["dicts", "imitation"] = "dicts")
 
 
 def check_are_several(trajectories: Any) -> None:
-    """Raise ValueError for a single trajectory, which is not in a list."""
+    """Raise ValueError for a dict, or a single trajectory that is not in a list."""
+    if isinstance(trajectories, Mapping) and "actions" not in trajectories:
+        raise ValueError("trajectories: a list of them is expected, not a dict")
     if isinstance(trajectories, Mapping) or hasattr(trajectories, "actions") or hasattr(trajectories, "acts"):
         raise ValueError("trajectories: a list of them is expected, not a single one; put it in a list")
 
@@ -165,10 +167,12 @@ def observations_of(values: Any, length: int, place: str) -> NDArray[Any]:
     if observed.dtype.kind not in "iufb":
         raise ValueError(f"{place}: observations are {observed.dtype}; integers or arrays of numbers are expected")
     width = int(np.prod(observed.shape[1:]))
-    features = observed.reshape(length, width).astype(np.result_type(observed, np.float32))
-    wrong = np.flatnonzero(~(np.abs(features) <= LARGEST_FLOAT).all(1))
+    wide = np.result_type(observed, np.float32).itemsize > 4
+    features = observed.reshape(length, width).astype(np.float64 if wide else np.float32)
+    with np.errstate(over="ignore"):
+        wrong = np.flatnonzero(~np.isfinite(features.astype(np.float32, copy=False)).all(1))
     if wrong.size:
-        raise ValueError(f"{place}: the observation of step {wrong[0]} is not finite (as float32)")
+        raise ValueError(f"{place}: the observation of step {wrong[0]} is not finite, or too large for float32")
     return features
 
 

@@ -58,9 +58,8 @@ def read_vector_plans(path: str | os.PathLike[str]) -> VectorPlans:
     numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in NUMBERS if key in arrays}
     if numbers["actions"].dim() == 2:
         raise ValueError(
-            f"{place}: actions are of shape {list(numbers['actions'].shape)}; vectors [N, L, D] are expected (of"
-            " episodes one after the other make plans with vector_plans_from_trajectories; discrete actions are read by"
-            " read_plans)"
+            f"{place}: actions are of shape {list(numbers['actions'].shape)}; vectors [N, L, D] are expected (cut"
+            " a flat recording into episodes for vector_plans_from_trajectories; read_plans reads discrete actions)"
         )
     if unused:
         warnings.warn(f"{place}: arrays that are not used: {listed(unused)}", stacklevel=2)

@@ -17,10 +17,12 @@ BANDWIDTHS = (0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8)
 """Bandwidths of the match of the past that `fit` tries; the least are for vectors that take up a small part of the
 range."""
 
-NOISES, LEAST_NOISE = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4), 0.02
-"""Standard deviations around the stored vectors that `fit` tries; and the one at which they are at least `least_std` in
-each dimension. Lesser ones are tried where they are, too.
-"""
+NOISES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
+"""Standard deviations around the stored vectors that `fit` tries."""
+
+ORDINARY, FINE = 0.02, 0.08
+"""The least noise that is tried; a lesser one only where it is `FINE` standard deviations of the vectors or more. The
+least bandwidth is 2.5 times as large."""
 
 BANDWIDTH, NOISE = 0.2, 0.1
 """The bandwidth and the noise before `fit`, and where no plans can be held out to choose them on."""
@@ -140,15 +142,15 @@ class StoredWindows(VectorPrior):
             lengths, order = held_out.mask().sum(1).sort(descending=True, stable=True)
             enough = max(int((lengths.cumsum(0) <= MOST_CHOSEN_ON).sum()), 1)
             held_out = held_out[order[:enough]].steps(0, MOST_CHOSEN_ON)
-            bandwidths = (self._given["bandwidth"],) if self._given["bandwidth"] else BANDWIDTHS
-            scores = {}
+            scores, bandwidth = {}, self._given["bandwidth"]
             for own in (False, True):
                 least = self._store(learning, min(self.max_windows, MOST_CHOSEN_WITH), own)
                 noises = [self._given["noise"]] if self._given["noise"] else [each for each in NOISES if each >= least]
+                bandwidths = [bandwidth] if bandwidth else [each for each in BANDWIDTHS if each >= 2.5 * least]
                 for self.bandwidth, self.noise in product(bandwidths, noises):
                     scores[self.bandwidth, self.noise, own] = mean_nats(self, held_out)
                 self.bandwidth, self.noise, own = best_of(scores)
-                bandwidths = (self.bandwidth,)
+                bandwidth = self.bandwidth
         else:
             own = False
         self._store(plans, self.max_windows, own)
@@ -158,7 +160,7 @@ class StoredWindows(VectorPrior):
         """Store the windows; with `own`, the units of distances are in proportion to the spread of each dimension.
 
         Returns:
-            The least noise that is at least `least_std` in each dimension, at most `LEAST_NOISE`.
+            The least noise to try, at most `ORDINARY`: not below `least_std` in any dimension.
         """
         size = self.match + self.horizon
         windows = plans.windows(size)
@@ -174,11 +176,11 @@ class StoredWindows(VectorPrior):
         std, stds, means = variance.mean().sqrt(), variance.sqrt(), self.segments.mean((0, 1))
         error = rounding(self, means)
         least = least_std(stds, error) if own and std > 0 else least_std(std, error.min())
-        extent = (EXTENT * std).maximum(least_std(std, error.min()) / LEAST_NOISE).clamp(max=1)
+        extent = (EXTENT * std).maximum(least_std(std, error.min()) / ORDINARY).clamp(max=1)
         if own and std > 0:
-            extent = (extent * stds / std).maximum(least / LEAST_NOISE)
+            extent = (extent * stds / std).maximum(least / ORDINARY)
         self.extent = extent.expand(self.action_size).contiguous()
-        return min(float((least / extent).max()), LEAST_NOISE)
+        return min(float((least / extent).max().maximum(FINE * std / extent.mean())), ORDINARY)
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[GaussianForecast, Tensor]:
         empty = torch.zeros(batch_size, 2 + self.match * self.action_size, device=self.device)

@@ -203,7 +203,7 @@ def test_wide_bounds_make_no_difference(kind):
 
 
 def test_stored_windows_follow_waves_as_well_between_any_bounds():
-    """Waves of standard deviation .5, predicted to about .1: within a fifth of a nat of a range that they fill."""
+    """Waves of standard deviation .5, predicted to about .1: within .3 nats of a range that they fill."""
 
     def waves(num, seed):
         phase, noise = (
@@ -218,7 +218,8 @@ def test_stored_windows_follow_waves_as_well_between_any_bounds():
         plans, held_out = (VectorPlans(waves(20, seed), [-most] * 2, [most] * 2) for seed in (0, 2))
         prior = StoredWindows(plans.action_low, plans.action_high, horizon=5).fit(plans, generator=seeded())
         found.append(float(prior.log_prob(held_out).mean()) / 40)
-    assert min(found[1:]) > found[0] - 0.2
+    filled, wide = found
+    assert wide > filled - 0.3
 
 
 @pytest.mark.parametrize(
