@@ -22,7 +22,7 @@ HOURS = {
     "modes": "0.2+",
     "options": "0.2",
     "intentions": "0.1",
-    "control": "4.5+",
+    "control": "7.5+",
     "macro-actions": "2",
     "agents": "0.5",
     "quality": "1.3",
