@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from neuroprior._checks import check_single_precision
 from neuroprior.plans.sequences import Sequences
 
 MOST = 10.0
@@ -46,9 +47,15 @@ class Standardise(nn.Module):
         self.register_buffer("most", torch.tensor(torch.inf))
 
     def learn_from(self, plans: Sequences) -> None:
-        """`learn` from the contexts of plans, those of each plan or of each step."""
+        """`learn` from the contexts of plans, those of each plan or of each step.
+
+        Raises:
+            ValueError: a feature whose variation single precision does not hold, though the context is float64.
+        """
         if plans.context is not None and len(plans):
-            self.learn(plans.context if plans.context.dim() == 2 else plans.context[plans.mask()])
+            features = plans.context if plans.context.dim() == 2 else plans.context[plans.mask()]
+            check_single_precision("context", features)
+            self.learn(features)
 
     @torch.no_grad()
     def learn(self, features: Tensor) -> None:

@@ -140,6 +140,16 @@ def test_vectors_after_features_that_are_far_away_are_numbers(kind):
 
 
 @torch.no_grad()
+def test_features_that_single_precision_does_not_hold_are_not_learned_from():
+    """Plans in memory keep float64: seconds since 1970 would be one number to a network."""
+    actions = torch.arange(40)[None].expand(8, 40) % 3
+    context = torch.arange(40.0, dtype=torch.double)[None, :, None].repeat(8, 1, 1)
+    prior = GRUPrior(3, hidden_size=4, context_size=1)
+    with pytest.raises(ValueError, match=r"context: feature 1 of 1 .* single precision"):
+        prior.fit(Plans(actions, 3, context=1.7e9 + context), generator=seeded(0), **HOW)
+    prior.fit(Plans(actions, 3, context=context), generator=seeded(0), **HOW | {"max_steps": 2})
+
+
 def test_files_without_means_are_read_as_before(tmp_path):
     """Features of older networks over actions were not standardised; those over vectors were, without a limit."""
     plans = signs(lambda x: 3 * x + 1)
