@@ -124,7 +124,8 @@ def again(prior: VectorPrior) -> VectorPrior:
 
 @pytest.mark.parametrize("use", VECTOR_USES)
 def test_other_names_of_dimensions_are_refused(use):
-    with pytest.raises(ValueError, match=r"^action_names: knee, hip in the plans, hip, knee in this prior; "):
+    where = "validation: " if use == "validated" else ""
+    with pytest.raises(ValueError, match=rf"^{where}action_names: knee, hip in the plans, hip, knee in this prior; "):
         VECTOR_USES[use](SWAPPED)
     for plans in (MOVES, replace(MOVES, action_names=None)):
         VECTOR_USES[use](plans)
