@@ -115,8 +115,9 @@ def test_what_is_wrong_with_trajectories_is_named(arguments, message):
         vector_plans_from_trajectories(*arguments)
 
 
-def test_tensors_that_need_gradients_are_read():
-    actions = torch.full((3, 2), 0.5, requires_grad=True)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_tensors_that_need_gradients_are_read(dtype):
+    actions = torch.full((3, 2), 0.5, requires_grad=True, dtype=dtype)
     assert vector_plans_from_trajectories([{"actions": actions}], LOW, HIGH).actions.tolist() == [[[0.5, 0.5]] * 3]
 
 

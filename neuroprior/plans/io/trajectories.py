@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neuroprior.plans.columns import LARGEST_INTEGER, Integers, check_names
 from neuroprior.plans.io.assembly import assembled
+from neuroprior.plans.io.npz import as_array
 from neuroprior.plans.plans import Plans
 from neuroprior.plans.sequences import is_per_step
 
@@ -202,7 +203,7 @@ def _kind(part: NDArray[Any]) -> str:
 
 def array_of(values: Any, place: str) -> NDArray[Any]:
     if isinstance(values, torch.Tensor):
-        values = values.detach().cpu()
+        return as_array(values)
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError, RuntimeError) as error:
