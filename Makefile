@@ -1,6 +1,8 @@
 # make paper: the paper's simulations. make mice: mice in a labyrinth, make mice-planner: whether they help a planner. make test: everything that is checked before a change lands. make docs: the site. make results: all that the pages of results show, most of a day; it goes on where it was interrupted.
 PYTHON ?= python3
 BIN := .venv/bin
+# One thread a process: two processes of two threads each wait for one another.
+PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 export PYTHONPATH :=
 
 .PHONY: paper mice mice-planner results test check style types pytest slow bench docs clean
@@ -30,13 +32,12 @@ style: .venv/dev
 types: .venv/dev
 	$(BIN)/mypy neuroprior train eval tests/typing
 
-# One thread a process: two processes of two threads each wait for one another.
 pytest: .venv/dev
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
 
 # What takes too long for each change: to be run before a release, and after changes to what is learned.
 slow: .venv/dev
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m slow
+	$(PYTEST) -m slow
 
 bench: .venv/bench
 	$(BIN)/python -m eval bench

@@ -119,6 +119,11 @@ class Sequences(ABC):
         return self[~index], self[index]
 
 
+def counted(features: Tensor, mask: Tensor) -> Tensor:
+    """The rows `[n, C]` of `features [N, C]`, or of those `[N, L, C]` where `mask [N, L]` is True."""
+    return features[mask] if features.dim() == 3 else features
+
+
 def is_per_step(context: Tensor | None) -> bool:
     """True for a context per step (`[N, L]`, `[N, L, F]`, `[N, L, C]`), False for none or one per plan.
 

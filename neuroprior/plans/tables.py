@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from neuroprior._checks import is_number, precision_lost
 from neuroprior.plans.columns import (
     Column,
+    Floats,
     Integers,
     Names,
     as_single,
@@ -624,16 +625,21 @@ def _context(table: Table, row: Integers, lengths: Integers, notes: list[str]) -
     wrong = np.argwhere(~np.isfinite(features))
     if wrong.size:
         raise ValueError(f"{place(int(row[wrong[0, 0]]))}: context: a finite number is expected in each column")
-    plan, first = np.repeat(np.arange(len(lengths)), lengths), np.cumsum(lengths) - lengths
-    shifted = whole - whole[first[plan]]  # so that constants are exactly 0
-    sums = [np.bincount(plan, values, len(lengths)) for values in shifted.T]
-    centred = shifted - (np.stack(sums, 1) / np.maximum(lengths, 1)[:, None])[plan]
-    for c in precision_lost(torch.from_numpy(whole), torch.from_numpy(centred).std(0, correction=0)):
+    for c in precision_lost(torch.from_numpy(whole), torch.from_numpy(_std_within_plans(whole, lengths))):
         notes.append(
             f"feature {c + 1} of the context is about {whole[:, c].mean():.4g}, where single precision hardly holds how"
             " it varies within plans; subtract a constant from it"
         )
     return {"context": torch.from_numpy(padded(features, lengths, table.of))}
+
+
+def _std_within_plans(features: Floats, lengths: Integers) -> Floats:
+    """Standard deviations `[C]` of `features [S, C]` from the means of their plans; of constants exactly 0."""
+    plan, first = np.repeat(np.arange(len(lengths)), lengths), np.cumsum(lengths) - lengths
+    shifted = features - features[first[plan]]
+    sums = np.stack([np.bincount(plan, values, len(lengths)) for values in shifted.T], 1)
+    std: Floats = np.std(shifted - (sums / np.maximum(lengths, 1)[:, None])[plan], 0)
+    return std
 
 
 def _of_plans(what: str, codes: Integers, plan: Integers, place: Callable[[int], str]) -> Integers:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_range, check_share, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
-from neuroprior.plans.sequences import Sequences
+from neuroprior.plans.sequences import Sequences, counted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,7 +111,7 @@ class VectorPlans(Sequences):
             raise ValueError(f"context{where}: {float(context[tuple(where)])} is not a finite number")
         given = torch.as_tensor(self.context)
         if given.dtype == torch.float64:
-            check_single_precision("context", given[self.mask()] if len(shape) == 3 else given)
+            check_single_precision("context", counted(given, self.mask()))
         object.__setattr__(self, "context", context)
 
     @property

@@ -175,9 +175,10 @@ class StoredWindows(VectorPrior):
         variance = self.segments.var((0, 1), correction=0)
         std, stds, means = variance.mean().sqrt(), variance.sqrt(), self.segments.mean((0, 1))
         error = rounding(self, means)
-        least = least_std(stds, error) if own and std > 0 else least_std(std, error.min())
-        extent = (EXTENT * std).maximum(least_std(std, error.min()) / ORDINARY).clamp(max=1)
+        least = least_std(std, error.min())
+        extent = (EXTENT * std).maximum(least / ORDINARY).clamp(max=1)
         if own and std > 0:
+            least = least_std(stds, error)
             extent = (extent * stds / std).maximum(least / ORDINARY)
         self.extent = extent.expand(self.action_size).contiguous()
         return min(float((least / extent).max().maximum(FINE * std / extent.mean())), ORDINARY)

@@ -139,7 +139,6 @@ def test_vectors_after_features_that_are_far_away_are_numbers(kind):
     assert prior.sample(50, 4, context=torch.full((1, 1), 1e30), generator=seeded(2)).isfinite().all()
 
 
-@torch.no_grad()
 def test_features_that_single_precision_does_not_hold_are_not_learned_from():
     """Plans in memory keep float64: seconds since 1970 would be one number to a network."""
     actions = torch.arange(40)[None].expand(8, 40) % 3
@@ -150,6 +149,7 @@ def test_features_that_single_precision_does_not_hold_are_not_learned_from():
     prior.fit(Plans(actions, 3, context=context), generator=seeded(0), **HOW | {"max_steps": 2})
 
 
+@torch.no_grad()
 def test_files_without_means_are_read_as_before(tmp_path):
     """Features of older networks over actions were not standardised; those over vectors were, without a limit."""
     plans = signs(lambda x: 3 * x + 1)
