@@ -122,20 +122,21 @@ class ICEMPlanner(VectorPlanner):
         drawn = [size - old for size, old in zip(self.populations, again, strict=True)]
         with_mean = drawn[-1] > 1
         drawn[-1] -= with_mean
-        there = self.prior_iterations
-        counts = self.prior_counts(drawn[:there]) + [0] * len(drawn[there:])
-        proposals = self.proposals(sum(counts), world, state, memory, generator).split(counts, 1)
+        shares = self.shares(drawn, memory, generator, self.prior_iterations)
+        proposals = self.proposals(shares, world, state, memory, generator)
         elites, elite_score = shifted[:, :0], torch.zeros(len(state), 0, device=state.device)
         best, best_score = mean, torch.full((len(state),), -torch.inf, device=state.device)
-        for i, (number, from_prior) in enumerate(zip(drawn, counts, strict=True)):
-            noise = coloured_noise((len(state), number - from_prior, *mean.shape[1:]), self.noise_beta, generator)
-            parts = [mean[:, None] + std[:, None] * noise, self.around(mean, proposals[i], (std / first)[:, None])]
+        for i, number in enumerate(drawn):
+            noise = coloured_noise((len(state), shares.most[i][0], *mean.shape[1:]), self.noise_beta, generator)
+            proposed = self.around(mean, proposals[i], (std / first)[:, None])
+            parts = [shares.mixed(i, mean[:, None] + std[:, None] * noise, proposed)]
             if i == len(drawn) - 1 and with_mean:
                 parts.append(mean[:, None])
             if again[i]:
                 parts.append(shifted[:, : again[i]])
             plans = torch.cat(parts, 1).clamp(low, high)
             score = self.scores(world, state, plans, generator)
+            shares.observe(i, score[:, :number], score[:, number:])
             plans = torch.cat([plans, elites[:, : self.num_kept]], 1)
             score = torch.cat([score, elite_score[:, : self.num_kept]], 1)
             top = random_top(score, self.num_elites, generator)
@@ -147,7 +148,7 @@ class ICEMPlanner(VectorPlanner):
             centre = elites.mean(1)
             spread = (elites - centre[:, None]).square().mean(1).sqrt()
             mean, std = torch.lerp(centre, mean, self.momentum), torch.lerp(spread, std, self.momentum)
-        kept = memory._replace(mean=mean, elites=elites[:, : self.num_kept])
+        kept = memory._replace(mean=mean, elites=elites[:, : self.num_kept], added=shares.added)
         return VectorDecision(best, best_score, self.num_plans * self.length, kept)
 
     def _shifted(self, elites: Tensor | None, mean: Tensor, std: Tensor, generator: torch.Generator) -> Tensor:

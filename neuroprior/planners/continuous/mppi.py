@@ -91,25 +91,25 @@ class MPPIPlanner(VectorPlanner):
         mean = filled(memory.mean, len(state), self.length, middle, repeat=False)
         rounds = range(self.iterations)
         drawn = [self.num_plans * (i + 1) // len(rounds) - self.num_plans * i // len(rounds) for i in rounds]
-        counts = self.prior_counts(drawn)
-        proposals = self.proposals(sum(counts), world, state, memory, generator).split(counts, 1)
+        shares = self.shares(drawn, memory, generator)
         best_scores = []
-        for number, from_prior, proposed in zip(drawn, counts, proposals, strict=True):
-            own = number - from_prior
-            noise = coloured_noise((len(state), own, *mean.shape[1:]), self.noise_beta, generator)
-            parts = [mean[:, None] + self.std * half * noise, self.around(mean, proposed)]
-            plans = torch.cat(parts, 1).clamp(low, high)
+        for i, proposed in enumerate(self.proposals(shares, world, state, memory, generator)):
+            noise = coloured_noise((len(state), shares.most[i][0], *mean.shape[1:]), self.noise_beta, generator)
+            own = mean[:, None] + self.std * half * noise
+            plans = shares.mixed(i, own, self.around(mean, proposed)).clamp(low, high)
             score = self.scores(world, state, plans, generator)
+            shares.observe(i, score)
             logits = self._logits(score)
-            if self.control_cost and own:
+            if self.control_cost:
                 control = (mean - middle)[:, None] / (self.std * half).square()
-                cost = (control * (plans[:, :own] - mean[:, None])).sum((-2, -1))
-                logits = torch.cat([logits[:, :own] - cost, logits[:, own:]], 1)
+                cost = (control * (plans - mean[:, None])).sum((-2, -1))
+                logits = logits - torch.where(shares.is_prior(i), 0, cost)
             weights = logits.softmax(1).to(plans.dtype)
             mean = (weights[:, None] @ plans.flatten(2)).view_as(mean).clamp(low, high)
             best_scores.append(score.amax(1))
         best = torch.stack(best_scores).amax(0)
-        return VectorDecision(mean, best, self.num_plans * self.length, memory._replace(mean=mean, elites=None))
+        kept = memory._replace(mean=mean, elites=None, added=shares.added)
+        return VectorDecision(mean, best, self.num_plans * self.length, kept)
 
     def _logits(self, score: Tensor) -> Tensor:
         """The logarithms of the weights `[B, P]`, up to a constant in each row."""

@@ -71,14 +71,16 @@ class ShootingPlanner(VectorPlanner):
         # A single candidate is drawn: else the plan would never change.
         again = last is not None and self.num_plans > 1
         drawn = self.num_plans - again
-        (from_prior,) = self.prior_counts([drawn])
-        proposals = self.proposals(from_prior, world, state, memory, generator)
-        noise = coloured_noise((len(state), drawn - from_prior, *mean.shape[1:]), self.noise_beta, generator)
-        drawn_plans = [mean[:, None] + self.std * half * noise, self.around(mean, proposals)]
-        plans = torch.cat([mean[:, None], *drawn_plans] if again else drawn_plans, 1)
+        shares = self.shares([drawn], memory, generator)
+        (proposed,) = self.proposals(shares, world, state, memory, generator)
+        noise = coloured_noise((len(state), shares.most[0][0], *mean.shape[1:]), self.noise_beta, generator)
+        plans = shares.mixed(0, mean[:, None] + self.std * half * noise, self.around(mean, proposed))
+        plans = torch.cat([mean[:, None], plans], 1) if again else plans
         plans = plans.clamp(world.action_low.to(plans), world.action_high.to(plans))
         score = self.scores(world, state, plans, generator)
+        shares.observe(0, score[:, again:], score[:, :again])
         best, row = random_best(score, generator), torch.arange(len(state), device=state.device)
         plan = plans[row, best]
         steps = self.num_plans * self.length
-        return VectorDecision(plan, score[row, best], steps, memory._replace(mean=plan, elites=None))
+        kept = memory._replace(mean=plan, elites=None, added=shares.added)
+        return VectorDecision(plan, score[row, best], steps, kept)

@@ -2,8 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from itertools import pairwise
-from math import ceil
 from typing import Literal, NamedTuple, TypedDict
 
 import torch
@@ -11,6 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_same_names, check_share, check_sizes
 from neuroprior._random import generator_on
+from neuroprior.planners.continuous.shares import Shares
 from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.plans.vector_plans import same_bounds
 from neuroprior.priors.vectors import VectorPrior
@@ -27,12 +26,15 @@ class Memory(NamedTuple):
         mean: `[B, M, D]`: the plan around which the next decision searches, without what was executed of it, M <= L;
             the planner fills up the rest. None: there is none yet.
         elites: `[B, E, M, D]`: kept candidates, shortened in the same way; None where a planner keeps none.
+        added: `[B, 2, 2]`: how much the prior's candidates and the planner's own have added to the best score, and how
+            many there were; None: nothing is known. See `VectorPlanner`.
     """
 
     past: Tensor
     observations: Tensor
     mean: Tensor | None = None
     elites: Tensor | None = None
+    added: Tensor | None = None
 
     def moved_on(self, actions: Tensor, observations: Tensor, keep: int | None = None) -> "Memory":
         """After `actions [B, T, D]` were executed, with `observations [B, T, C]` before each.
@@ -47,16 +49,12 @@ class Memory(NamedTuple):
             for before, after in ((self.past, actions), (self.observations, observations))
         )
         mean = None if self.mean is None else self.mean[:, steps:]
-        return Memory(past, seen, mean, None if self.elites is None else self.elites[:, :, steps:])
+        elites = None if self.elites is None else self.elites[:, :, steps:]
+        return self._replace(past=past, observations=seen, mean=mean, elites=elites)
 
     def rows(self, index: Tensor) -> "Memory":
         """That of the runs at `index` (integers, or a bool mask)."""
-        return Memory(
-            self.past[index],
-            self.observations[index],
-            None if self.mean is None else self.mean[index],
-            None if self.elites is None else self.elites[index],
-        )
+        return Memory._make(None if part is None else part[index] for part in self)
 
 
 class VectorDecision(NamedTuple):
@@ -67,7 +65,7 @@ class VectorDecision(NamedTuple):
         score: `[B]`: the score of the best candidate that was simulated: that of the plan, unless the planner says that
             its plan is an average.
         model_steps: single simulator steps taken for each start.
-        memory: for the next decision, not moved on yet: `past` as given; `mean` and `elites` of this decision.
+        memory: for the next decision, not moved on yet: `past` as given; `mean`, `elites` and `added` after this one.
     """
 
     plan: Tensor
@@ -81,6 +79,7 @@ class Proposal(TypedDict, total=False):
 
     prior: VectorPrior | None
     prior_share: float | None
+    adapt_share: bool
     prior_as: Literal["plans", "noise"]
     discount: float
     value: Callable[[Tensor], Tensor] | None
@@ -98,6 +97,9 @@ class VectorPlanner(ABC):
         prior_share: the share, from 0 to 1, of the candidates that are drawn which the prior proposes, rounded to a
             whole number; between 0 and 1 at least one candidate is the prior's and one the planner's own, if two are
             drawn. At 0 the plain algorithm, number for number. None: one half with a prior.
+        adapt_share: a share between 0 and 1 is that of the first decision of a run; later ones change the odds by how
+            much the prior's candidates, and the planner's own, have added to the best score in the decisions of this
+            run before (see `Shares`), so that a prior that does not help costs few candidates. False: it stays.
         prior_as: "plans": a candidate is what the prior draws, given what was executed. "noise": it is the mean around
             which the planner searches plus the difference of two such draws, divided by the square root of two: noise
             with the prior's covariance over time and dimensions, wherever the plan is.
@@ -120,6 +122,7 @@ class VectorPlanner(ABC):
         *,
         prior: VectorPrior | None = None,
         prior_share: float | None = None,
+        adapt_share: bool = True,
         prior_as: Literal["plans", "noise"] = "plans",
         discount: float = 1.0,
         value: Callable[[Tensor], Tensor] | None = None,
@@ -135,7 +138,7 @@ class VectorPlanner(ABC):
         if prior_as not in ("plans", "noise"):
             raise ValueError(f'prior_as: "plans" or "noise" is expected, not {prior_as!r}')
         self.length, self.num_plans, self.discount, self.value = length, num_plans, discount, value
-        self.prior, self.prior_share, self.prior_as = prior, share, prior_as
+        self.prior, self.prior_share, self.adapt_share, self.prior_as = prior, share, adapt_share, prior_as
 
     @property
     def keep(self) -> int | None:
@@ -185,21 +188,31 @@ class VectorPlanner(ABC):
                 raise ValueError(
                     f"memory: {name} of shape [{len(state)}, ..., {size}] is expected, not {list(values.shape)}"
                 )
+        if memory.added is not None and memory.added.shape != (len(state), 2, 2):
+            raise ValueError(f"memory: added of shape [{len(state)}, 2, 2] is expected, not {list(memory.added.shape)}")
         return generator_on(generator, state.device), memory
 
-    def prior_counts(self, drawn: Sequence[int]) -> list[int]:
-        """How many of the candidates `drawn` in each iteration the prior proposes; the share holds for their sum."""
-        total = sum(drawn)
-        wanted = round(self.prior_share * total)
-        if 0 < self.prior_share < 1 and total > 1:
-            wanted = min(max(wanted, 1), total - 1)
-        so_far = [0] + [ceil(wanted * sum(drawn[: i + 1]) / max(total, 1)) for i in range(len(drawn))]
-        return [after - before for before, after in pairwise(so_far)]
+    def shares(
+        self, drawn: Sequence[int], memory: Memory, generator: torch.Generator, iterations: int | None = None
+    ) -> Shares:
+        """Which of the candidates `drawn` in each iteration the prior proposes, in so many iterations (None: all)."""
+        adapt, added = self.adapt_share, memory.added
+        share, starts = self.prior_share, len(memory.past)
+        return Shares(drawn, share, starts, generator, iterations=iterations, adapt=adapt, added=added)
 
     def proposals(
+        self, shares: Shares, world: ContinuousWorld, state: Tensor, memory: Memory, generator: torch.Generator
+    ) -> Sequence[Tensor]:
+        """For each iteration the prior's candidates, or its noise, `[B, P, L, D]`; see `around`.
+
+        There are as many as the start needs to which the prior proposes most.
+        """
+        counts = [from_prior for _, from_prior in shares.most]
+        return torch.split(self._proposed(sum(counts), world, state, memory, generator), counts, 1)
+
+    def _proposed(
         self, number: int, world: ContinuousWorld, state: Tensor, memory: Memory, generator: torch.Generator
     ) -> Tensor:
-        """So many candidates from the prior for each start, or so much noise: `[B, number, L, D]`; see `around`."""
         if self.prior is None or not number:
             return torch.zeros(len(state), 0, self.length, world.action_size, device=state.device)
         context = None
