@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from math import ceil
+from math import ceil, log
 
 import torch
 from torch import Tensor
@@ -13,18 +13,18 @@ KEPT = 0.95
 EVEN = 4
 """So many candidates of each kind that add as much as the mean are counted besides: a few tried ones say little."""
 
-LARGEST = 3.0
-"""The odds of a candidate to be the prior's change by a factor of at most exp(3): of one half the share becomes .05 to
-.95, so that both kinds are still tried."""
+LEAST = 0.05
+"""The odds of a candidate to be the prior's are at least so much of those of the share: the prior is still tried."""
 
 
 class Shares:
     """Which of a decision's candidates a prior proposes, for B starts, and how much these have added.
 
     What a candidate adds is the amount by which the best score would be lower without it: the difference from the
-    second best candidate for the best, 0 for all others. Where `adapt`, the odds of a candidate to be the prior's are
-    those of `share` times the ratio of what a candidate of the prior and an own one added on average in the decisions
-    before. So a prior that no longer helps is soon asked for few candidates.
+    second best candidate for the best, 0 for all others. Where `adapt`, and where a candidate of the prior added less
+    on average than an own one in the decisions before, the odds of a candidate to be the prior's are those of `share`
+    times the ratio of the two. So a prior that does not help is soon asked for few candidates. Where its candidates
+    add more than own ones the share stays: without own candidates plans would no longer be improved.
 
     Args:
         drawn: the number of candidates that each of I iterations draws.
@@ -121,7 +121,7 @@ def _odds(share: float, added: Tensor) -> Tensor:
     mean = amount.sum(1, keepdim=True) / number.sum(1, keepdim=True)
     prior, own = ((amount + EVEN * mean) / (number + EVEN)).log().unbind(1)
     lead = torch.where(mean[:, 0] > 0, prior - own, 0)  # nothing was tried, or nothing added anything
-    return torch.tensor(share, device=added.device).logit() + lead.clamp(-LARGEST, LARGEST)
+    return torch.tensor(share, device=added.device).logit() + lead.clamp(log(LEAST), 0)
 
 
 def _fixed(share: float, ends: Sequence[int]) -> list[int]:

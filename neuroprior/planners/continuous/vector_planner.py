@@ -97,9 +97,9 @@ class VectorPlanner(ABC):
         prior_share: the share, from 0 to 1, of the candidates that are drawn which the prior proposes, rounded to a
             whole number; between 0 and 1 at least one candidate is the prior's and one the planner's own, if two are
             drawn. At 0 the plain algorithm, number for number. None: one half with a prior.
-        adapt_share: a share between 0 and 1 is that of the first decision of a run; later ones change the odds by how
-            much the prior's candidates, and the planner's own, have added to the best score in the decisions of this
-            run before (see `Shares`), so that a prior that does not help costs few candidates. False: it stays.
+        adapt_share: a share between 0 and 1 becomes smaller where, in the decisions of a run so far, a candidate of the
+            prior has added less to the best score than one of the planner's own (the odds change by the ratio of the
+            two means), so that a prior that does not help costs few candidates. False: it stays.
         prior_as: "plans": a candidate is what the prior draws, given what was executed. "noise": it is the mean around
             which the planner searches plus the difference of two such draws, divided by the square root of two: noise
             with the prior's covariance over time and dimensions, wherever the plan is.
