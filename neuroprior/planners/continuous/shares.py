@@ -39,6 +39,15 @@ class Shares:
     Attributes:
         counts: int64 `[B, I]`: the candidates of each iteration that are the prior's.
         most: for each iteration the largest number, over all starts, of own candidates, and of the prior's.
+
+    Example:
+        >>> shares = Shares([6, 4], 0.5, 1, torch.Generator().manual_seed(0), adapt=True)
+        >>> shares.counts
+        tensor([[3, 2]])
+        >>> shares.observe(0, torch.tensor([[1.0, 9.0, 2.0, 3.0, 5.0, 4.0]]))
+        >>> shares.added  # what the prior's three candidates added, and the three own ones
+        tensor([[[0., 3.],
+                 [4., 3.]]])
     """
 
     def __init__(

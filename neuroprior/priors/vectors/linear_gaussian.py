@@ -46,7 +46,7 @@ class WindowMoments(NamedTuple):
     """`[W * D]`, float64."""
 
     covariance: Tensor
-    """`[W * D, W * D]`, float64, positive semi-definite."""
+    """`[W * D, W * D]`, or where the dimensions are independent `[D, W, W]`; float64, positive semi-definite."""
 
     ridge: float = 0.0
     """Added to the variances of the past, as a share of their mean."""
@@ -241,10 +241,22 @@ def predictions(moments: Sequence[WindowMoments], prior: VectorPrior) -> LinearT
     mean = torch.stack([each.mean for each in moments]).double()
     covariance = torch.stack([each.covariance for each in moments]).double()
     ridge = torch.tensor([each.ridge for each in moments], dtype=torch.double, device=mean.device)
+    error = rounding(prior, mean[:, -size:])
+    if covariance.dim() == 3:
+        return _predictions(mean, covariance, ridge, error)
+    each = mean.unflatten(1, (-1, size)).mT.flatten(0, 1)
+    alone = _predictions(each, covariance.flatten(0, 1), ridge.repeat_interleave(size), error.flatten()[:, None])
+    weights, offset, std = (part[..., 0].unflatten(0, (-1, size)).movedim(1, -1) for part in alone[:3])
+    return LinearTables(weights.diag_embed().flatten(2, 3), offset, std, torch.zeros_like(std).diag_embed())
+
+
+def _predictions(mean: Tensor, covariance: Tensor, ridge: Tensor, error: Tensor) -> LinearTables:
+    """Those of `mean [S, W * D]`, `covariance [S, W * D, W * D]`, `ridge [S]` and the `error [S, D]` of rounding."""
+    size = error.shape[1]
     memory = mean.shape[1] // size - 1
     last, eye = slice(memory * size, None), torch.eye(size, dtype=torch.double, device=mean.device)
     spread = covariance[:, last, last].diagonal(dim1=1, dim2=2).clamp(min=0).sqrt()
-    least = least_std(spread, rounding(prior, mean[:, last])).square()
+    least = least_std(spread, error).square()
     rows = []
     for h in range(memory + 1):
         past = slice((memory - h) * size, memory * size)

@@ -82,8 +82,7 @@ class NoisePrior(LinearGaussianPrior):
         power = frequency**-exponent
         shape = (power[:, None] * torch.cos(2 * torch.pi * frequency[:, None] * lags)).sum(0) / power.sum()
         toeplitz = shape[(lags[:, None] - lags).abs().long()] if exponent else torch.ones_like(lags)[:, None]
-        variance = torch.diag(scale.double().square())
-        return WindowMoments(mean.double().repeat(memory + 1), torch.kron(toeplitz.contiguous(), variance))
+        return WindowMoments(mean.double().repeat(memory + 1), scale.double().square()[:, None, None] * toeplitz)
 
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         values = self.scaled(plans.actions)[plans.mask()]

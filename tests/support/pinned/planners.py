@@ -223,6 +223,7 @@ def planners_of_vectors():
         prior, state = drift(world), world.reset(3, seeded(0))
         for kind, planner in {
             "shooting": ShootingPlanner(6, 24, prior=prior, prior_share=0.25, noise_beta=1.0, discount=0.9),
+            "shooting, fixed": ShootingPlanner(6, 24, prior=prior, prior_share=0.25, adapt_share=False),
             "icem": ICEMPlanner(6, 32, iterations=3, elites=4, prior=prior, std=0.4),
             "icem, noise": ICEMPlanner(6, 24, prior=prior, prior_as="noise", prior_iterations=None),
             "icem, plain": ICEMPlanner(5, 30, keep_elites=0.5, momentum=0.3, decay=1.5),
