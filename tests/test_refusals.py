@@ -53,6 +53,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         "features are expected",
     ),
     "one plan by its number": (lambda: Plans(ZEROS, 1)[0], "plans[0 : 1]"),
+    "one plan of vectors by its number": (lambda: vectors()[torch.tensor(0)], "plans[0 : 1]"),
     "patterns of others": (lambda: Plans(ZEROS, 1, context=torch.zeros(2, 4, 5, dtype=torch.int32)), "[2, 3, F]"),
     "no patterns": (lambda: LogLinearPrior(2, 2).start(1), "context"),
     "no board": (lambda: BoardNetwork(2, (3, 3, 4)).start(1), "context"),
@@ -84,6 +85,13 @@ def test_refused(call: Callable[[], object], says: str, tmp_path: Path, monkeypa
     with refuses(says, error=IndexError if "plans[0" in says else ValueError):
         call()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("plans", [Plans(ZEROS, 1), vectors()], ids=["numbers", "vectors"])
+def test_a_loop_over_plans_has_plans_of_one(plans: Plans | VectorPlans) -> None:
+    each = list(plans)
+    assert [len(one) for one in each] == [1, 1]
+    assert torch.cat([one.actions for one in each]).equal(plans.actions)
 
 
 def test_a_sample_needs_the_context_that_the_prior_takes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -1,6 +1,6 @@
 """Executed plans in memory: actions with lengths, contexts and groups."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import log2
 from typing import Any
@@ -12,7 +12,7 @@ from torch.nn import functional
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
 from neuroprior.plans.rows import check_readable, rows_of
-from neuroprior.plans.sequences import Sequences, is_per_step
+from neuroprior.plans.sequences import Sequences, check_index, is_per_step
 from neuroprior.plans.tables import Columns, Missing, fields_of
 
 MOST_BITS = 48
@@ -153,12 +153,9 @@ class Plans(Sequences):
         taken = super().mask()
         return taken if end or self.end is None else taken & (self.actions != self.end)
 
-    def __getitem__(self, index: Tensor | slice | int) -> "Plans":
+    def __getitem__(self, index: Tensor | slice) -> "Plans":
         """The plans at `index` (a slice, integers or a bool mask), as `Plans`."""
-        if isinstance(index, int):
-            raise IndexError(
-                f"plans[{index}]: a slice or a tensor is expected; plans[{index} : {index + 1}] is one plan"
-            )
+        check_index(index)
 
         def pick(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[index]
@@ -173,10 +170,6 @@ class Plans(Sequences):
             condition=pick(self.condition),
             plan_names=None if self.plan_names is None else self._names_at(self.plan_names, index),
         )
-
-    def __iter__(self) -> Iterator["Plans"]:
-        """Each plan, as `Plans` of one."""
-        return (self[i : i + 1] for i in range(len(self)))
 
     def _names_at(self, names: Sequence[str], index: Tensor | slice) -> tuple[str, ...]:
         if isinstance(index, slice):

@@ -2,8 +2,9 @@
 
 import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Self
 
 import torch
@@ -11,6 +12,15 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, is_integer, is_number
 from neuroprior._random import generator_on
+
+
+def check_index(index: object) -> None:
+    """Raise IndexError for the number of a single plan, which would not be plans."""
+    if isinstance(index, Integral) or (isinstance(index, Tensor) and index.dim() == 0):
+        number = int(index)
+        raise IndexError(
+            f"plans[{number}]: a slice or a tensor is expected; plans[{number} : {number + 1}] is one plan"
+        )
 
 
 class Sequences(ABC):
@@ -63,6 +73,10 @@ class Sequences(ABC):
     @abstractmethod
     def __getitem__(self, index: Tensor | slice) -> Self:
         """The plans at `index` (a slice, integers or a bool mask)."""
+
+    def __iter__(self) -> Iterator[Self]:
+        """Each plan, as plans of one."""
+        return (self[i : i + 1] for i in range(len(self)))
 
     def steps(self, first: int = 0, stop: int | None = None) -> Self:
         """Actions `first` to `stop` - 1 of each plan, with what belongs to them; shorter plans have fewer, or none.

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_range, check_share, check_single_precision, check_sizes, is_integer
 from neuroprior.plans.columns import check_distinct
-from neuroprior.plans.sequences import Sequences, counted
+from neuroprior.plans.sequences import Sequences, check_index, counted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,6 +121,7 @@ class VectorPlans(Sequences):
 
     def __getitem__(self, index: Tensor | slice) -> "VectorPlans":
         """The plans at `index` (a slice, integers or a bool mask), as `VectorPlans`."""
+        check_index(index)
 
         def pick(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[index]
