@@ -183,7 +183,7 @@ def test_a_damaged_result_is_named(tmp_path: Path) -> None:
         runs.do([1])
 
 
-@pytest.mark.parametrize("interrupt", [os.kill, os.killpg])
+@pytest.mark.parametrize("interrupt", [pytest.param(os.kill, marks=pytest.mark.slow), os.killpg])
 def test_an_interrupted_run_goes_on(tmp_path: Path, interrupt: Callable[[int, int], None]) -> None:
     """Whether the program alone is interrupted, or its workers, too, as a terminal does."""
     program = (

@@ -54,6 +54,7 @@ def test_a_network_as_its_action_prior(file: str, tmp_path: Path):
     assert load(tmp_path / "run").actions.hidden_size == 8
 
 
+@pytest.mark.slow
 def test_a_network_that_knows_the_last_durations(file: str, tmp_path: Path):
     """It is better than one that does not; score and report make the same context; a resumed run keeps it."""
     out, gru = str(tmp_path / "run"), ["--config", "gru", "--model.prior.hidden_size", "16"]

@@ -81,6 +81,7 @@ def test_the_report_describes_the_modes(file, tmp_path):
     assert (tmp_path / "report" / "mode_table.csv").is_file()
 
 
+@pytest.mark.slow
 def test_the_report_compares_conditions_by_modes():
     """Six animals that are hardly ever in the second mode against six that often are."""
     often = (torch.arange(36) % 2)[:, None]
@@ -110,6 +111,7 @@ def test_the_report_refuses_modes_that_cannot_be(given):
         report(Plans(torch.zeros(4, 4, dtype=torch.long), 3), models=["counts"], **given)
 
 
+@pytest.mark.slow
 def test_the_modes_of_a_single_long_plan_are_described_over_its_course():
     """Parts serve to choose among numbers of modes; occupancy is over the plan, which begins in one mode alone."""
     mode = (torch.arange(500) // 20) % 2

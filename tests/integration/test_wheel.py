@@ -68,6 +68,7 @@ for words in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.slow
 def test_the_five_commands(installed: Path, tmp_path: Path) -> None:
     """In one process, as libraries load for seconds; the next test runs the program itself."""
     example(str(tmp_path / "expected.csv"))

@@ -208,6 +208,7 @@ def test_without_durations_there_is_no_section():
         assert section(replace(plans, durations=durations)) is None
 
 
+@pytest.mark.slow
 def test_networks_with_durations():
     """They know more than those without, and the table says so."""
     plans = timed(True, 64, 12)

@@ -189,6 +189,7 @@ def test_plans_in_memory_and_in_a_file_have_the_same_report(tmp_path, made):
     write_plans(plans, tmp_path / "plans.npz")
     again = report(tmp_path / "plans.npz", sections=["scores"], out=tmp_path / "out", **ASKED)
     pd.testing.assert_frame_equal(again.tables["plans"], made.tables["plans"])
+    assert (made.title, again.title) == ("Plans", "Plans in plans.npz")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.html", "results.json", "plans.csv", "folds"}
 
 

@@ -152,7 +152,11 @@ def test_observations_of_many_kinds():
 
 
 @pytest.mark.parametrize(
-    ("name", "limit"), [("MiniGrid-DoorKey-5x5-v0", 250), ("MiniGrid-MultiRoom-N2-S4-v0", 40)], ids=["key", "rooms"]
+    ("name", "limit"),
+    [
+        pytest.param("MiniGrid-DoorKey-5x5-v0", 250, marks=pytest.mark.slow, id="key"),
+        pytest.param("MiniGrid-MultiRoom-N2-S4-v0", 40, id="rooms"),
+    ],
 )
 def test_minigrid(name, limit):
     world = from_gymnasium(name, seeds=[5], observations=True)

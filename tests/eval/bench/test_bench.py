@@ -53,6 +53,7 @@ def test_peers_that_evaluate(package):
     assert torch.equal(rewards, want.rewards)
 
 
+@pytest.mark.slow
 def test_peers_that_count():
     plans = chain_plans(50, 9)
     counts = torch.zeros(4, 4, 4, dtype=torch.long)
@@ -289,6 +290,7 @@ def test_the_program(tmp_path, capsys):
     assert "from neuroprior import *:" in shown
 
 
+@pytest.mark.slow
 def test_jobs_of_an_accelerator(tmp_path, capsys):
     """On a CPU in place of one."""
     rows = [row for name in ON_DEVICES for row in on_device(name, torch.device("cpu"), SMALL, 1)]

@@ -112,6 +112,7 @@ def test_printed(everything):
     assert line[6:] == [f"{best['p_value']:.2g}", f"{best['p_holm']:.2g}"]
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_bytes(tmp_path):
     runs = worlds(["maze"], 3, {"uniform": 1.0, "markov-1": 2.0, "gru": 4.0})
     for name, own in (("a", runs), ("b", runs[::-1])):

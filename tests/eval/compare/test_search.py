@@ -25,6 +25,7 @@ def test_ways_of_sampling_differ_in_what_may_be_chosen():
     assert found[BOTH] == list(SETTINGS)
 
 
+@pytest.mark.slow
 def test_runs_hold_every_way(monkeypatch):
     # With more layouts than that: each half of them is divided again, for early stopping.
     worlds = partial(TINY.worlds, num_layouts=8)

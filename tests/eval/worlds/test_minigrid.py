@@ -1,10 +1,12 @@
 """What is observed of MiniGrid in `eval compare`, against what its table of transitions says can be done there."""
 
+import pytest
 import torch
 
 from eval.worlds.minigrid import KINDS, MOVES, NEAR, SIDE, layouts
 
 
+@pytest.mark.slow
 def test_what_is_observed_is_what_can_be_done():
     """An agent that can go forward observes a free square, one that can open a door a closed one, and so on."""
     world = layouts("MiniGrid-DoorKey-5x5-v0", range(2))

@@ -149,6 +149,7 @@ def test_plans_that_it_cannot_learn_from(plans, word):
         StackedPrior(A, 8, num_contexts=2).fit(torch.zeros(4, 5, dtype=torch.long))
 
 
+@pytest.mark.slow
 def test_its_layers_follow_from_its_first_plans_and_are_saved(tmp_path):
     short, long = some_plans(), some_plans(8, 40)
     brief, blind = (plans.without_context() for plans in (short, long))

@@ -158,6 +158,7 @@ def test_a_file_of_an_earlier_version_holds_the_same_prior(kind, tmp_path: Path)
     torch.testing.assert_close(again.log_prob(data), prior.log_prob(data))
 
 
+@pytest.mark.slow
 def test_few_plans_are_predicted_as_well_as_by_an_autoregression_and_many_better():
     """The data: a circle whose radius the autoregression does not know, with noise."""
 

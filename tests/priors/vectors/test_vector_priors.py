@@ -446,6 +446,7 @@ def test_of_a_single_plan_no_order_is_chosen_that_it_is_too_short_for(lengths):
     assert sum(lost) / len(lost) < 0.15
 
 
+@pytest.mark.slow
 def test_of_a_small_group_beside_a_large_one_little_is_learned():
     """Where the large one is held out, the small one is all there is: plans are held out instead of groups."""
     data = walks(9, 40, 2, 1)

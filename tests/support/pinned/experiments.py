@@ -25,7 +25,7 @@ def noise(seed: int, number: int) -> list[float]:
     return [round(float(value), 6) for value in np.random.default_rng(seed).random(number)]
 
 
-@case
+@case(slow=True)
 def comparison_of_priors():
     """Priors that are nearly alike, so that choices, corrections and intervals matter."""
     times = {**TIMES, "combined": 15.0, "transformer": 13.0, "runs/mine": 3.0}
@@ -36,7 +36,7 @@ def comparison_of_priors():
     return found | {"shown": made.shown, "document": shown | {"frames": None}}
 
 
-@case
+@case(slow=True)
 def figures_of_a_comparison():
     runs = worlds(["maze"], 6, {**TIMES, "combined": 3.0}, context=("none", "initial"), rounds=1)
     made = document(Results(runs, (16, 4096)), {}, "")
