@@ -16,10 +16,10 @@ from neuroprior._random import generator_on
 
 def check_index(index: object) -> None:
     """Raise IndexError for the number of a single plan, which would not be plans."""
-    if isinstance(index, Integral) or (isinstance(index, Tensor) and index.dim() == 0):
-        number = int(index)
+    if isinstance(index, Integral) or getattr(index, "ndim", None) == 0:
+        number = int(index)  # type: ignore[call-overload]
         raise IndexError(
-            f"plans[{number}]: a slice or a tensor is expected; plans[{number} : {number + 1}] is one plan"
+            f"plans[{number}]: a slice or a tensor is expected; plans[{number} : {number + 1 or ''}] is one plan"
         )
 
 
@@ -77,6 +77,8 @@ class Sequences(ABC):
     def __iter__(self) -> Iterator[Self]:
         """Each plan, as plans of one."""
         return (self[i : i + 1] for i in range(len(self)))
+
+    __reversed__ = None
 
     def steps(self, first: int = 0, stop: int | None = None) -> Self:
         """Actions `first` to `stop` - 1 of each plan, with what belongs to them; shorter plans have fewer, or none.

@@ -58,7 +58,7 @@ class ICEMPlanner(VectorPlanner):
             (running) to 4.
         prior_iterations: the prior proposes candidates in so many first iterations, `prior_share` of those drawn there;
             None: in all.
-        **proposal: prior, prior_share, discount, value: see `VectorPlanner`.
+        **proposal: prior, prior_share, adapt_share, prior_as, discount, value: see `VectorPlanner`.
 
     Attributes:
         populations: how many candidates are simulated in each iteration; their sum is `num_plans`.
@@ -136,7 +136,8 @@ class ICEMPlanner(VectorPlanner):
                 parts.append(shifted[:, : again[i]])
             plans = torch.cat(parts, 1).clamp(low, high)
             score = self.scores(world, state, plans, generator)
-            shares.observe(i, score[:, :number], score[:, number:])
+            if i == 0:
+                shares.observe(score[:, :number], score[:, number:])
             plans = torch.cat([plans, elites[:, : self.num_kept]], 1)
             score = torch.cat([score, elite_score[:, : self.num_kept]], 1)
             top = random_top(score, self.num_elites, generator)
@@ -148,7 +149,7 @@ class ICEMPlanner(VectorPlanner):
             centre = elites.mean(1)
             spread = (elites - centre[:, None]).square().mean(1).sqrt()
             mean, std = torch.lerp(centre, mean, self.momentum), torch.lerp(spread, std, self.momentum)
-        kept = memory._replace(mean=mean, elites=elites[:, : self.num_kept], added=shares.added)
+        kept = memory._replace(mean=mean, elites=elites[:, : self.num_kept], wins=shares.wins)
         return VectorDecision(best, best_score, self.num_plans * self.length, kept)
 
     def _shifted(self, elites: Tensor | None, mean: Tensor, std: Tensor, generator: torch.Generator) -> Tensor:

@@ -29,7 +29,8 @@ class MPPIPlanner(VectorPlanner):
     its last step.
 
     A candidate that the prior proposes is weighted by its score as any other is, although it is no perturbation of the
-    plan so far: the average then moves towards it. The control cost leaves it out.
+    plan so far: the average then moves towards it. The control cost leaves it out. Which
+    candidate was the best (`adapt_share`) is judged by the scores alone.
 
     Args:
         length, num_plans: see `VectorPlanner`.
@@ -43,7 +44,7 @@ class MPPIPlanner(VectorPlanner):
         iterations: the candidates are drawn in so many rounds, each around the average of the one before; at most as
             many as there are candidates.
         noise_beta: exponent of the noise's spectrum, see `coloured_noise`; 0, as in the paper: white noise.
-        **proposal: prior, prior_share, discount, value: see `VectorPlanner`.
+        **proposal: prior, prior_share, adapt_share, prior_as, discount, value: see `VectorPlanner`.
 
     Raises:
         ValueError: an argument is out of range, or `control_cost` is given with a `noise_beta` above 0.
@@ -98,7 +99,8 @@ class MPPIPlanner(VectorPlanner):
             own = mean[:, None] + self.std * half * noise
             plans = shares.mixed(i, own, self.around(mean, proposed)).clamp(low, high)
             score = self.scores(world, state, plans, generator)
-            shares.observe(i, score)
+            if i == 0:
+                shares.observe(score)
             logits = self._logits(score)
             if self.control_cost:
                 control = (mean - middle)[:, None] / (self.std * half).square()
@@ -108,7 +110,7 @@ class MPPIPlanner(VectorPlanner):
             mean = (weights[:, None] @ plans.flatten(2)).view_as(mean).clamp(low, high)
             best_scores.append(score.amax(1))
         best = torch.stack(best_scores).amax(0)
-        kept = memory._replace(mean=mean, elites=None, added=shares.added)
+        kept = memory._replace(mean=mean, elites=None, wins=shares.wins)
         return VectorDecision(mean, best, self.num_plans * self.length, kept)
 
     def _logits(self, score: Tensor) -> Tensor:

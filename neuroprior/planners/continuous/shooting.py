@@ -30,7 +30,7 @@ class ShootingPlanner(VectorPlanner):
         std: standard deviation of the noise, as a share of half the range of each dimension.
         noise_beta: exponent of its spectrum, see `coloured_noise`; 0: white noise.
         warm_start: search around the last plan, where there is one.
-        **proposal: prior, prior_share, discount, value: see `VectorPlanner`.
+        **proposal: prior, prior_share, adapt_share, prior_as, discount, value: see `VectorPlanner`.
 
     Raises:
         ValueError: an argument is out of range.
@@ -78,9 +78,9 @@ class ShootingPlanner(VectorPlanner):
         plans = torch.cat([mean[:, None], plans], 1) if again else plans
         plans = plans.clamp(world.action_low.to(plans), world.action_high.to(plans))
         score = self.scores(world, state, plans, generator)
-        shares.observe(0, score[:, again:], score[:, :again])
+        shares.observe(score[:, again:], score[:, :again])
         best, row = random_best(score, generator), torch.arange(len(state), device=state.device)
         plan = plans[row, best]
         steps = self.num_plans * self.length
-        kept = memory._replace(mean=plan, elites=None, added=shares.added)
+        kept = memory._replace(mean=plan, elites=None, wins=shares.wins)
         return VectorDecision(plan, score[row, best], steps, kept)

@@ -26,15 +26,16 @@ class Memory(NamedTuple):
         mean: `[B, M, D]`: the plan around which the next decision searches, without what was executed of it, M <= L;
             the planner fills up the rest. None: there is none yet.
         elites: `[B, E, M, D]`: kept candidates, shortened in the same way; None where a planner keeps none.
-        added: `[B, 2, 2]`: how much the prior's candidates and the planner's own have added to the best score, and how
-            many there were; None: nothing is known. See `VectorPlanner`.
+        wins: `[B, 2, 2]`: how often a candidate of the prior, and one of the planner's own, was the best, and how many
+            there were, see `Shares`; None: nothing is known. It belongs to a prior and its `prior_as`: a planner with
+            another one is given None.
     """
 
     past: Tensor
     observations: Tensor
     mean: Tensor | None = None
     elites: Tensor | None = None
-    added: Tensor | None = None
+    wins: Tensor | None = None
 
     def moved_on(self, actions: Tensor, observations: Tensor, keep: int | None = None) -> "Memory":
         """After `actions [B, T, D]` were executed, with `observations [B, T, C]` before each.
@@ -65,7 +66,7 @@ class VectorDecision(NamedTuple):
         score: `[B]`: the score of the best candidate that was simulated: that of the plan, unless the planner says that
             its plan is an average.
         model_steps: single simulator steps taken for each start.
-        memory: for the next decision, not moved on yet: `past` as given; `mean`, `elites` and `added` after this one.
+        memory: for the next decision, not moved on yet: `past` as given; `mean`, `elites` and `wins` after this one.
     """
 
     plan: Tensor
@@ -97,9 +98,10 @@ class VectorPlanner(ABC):
         prior_share: the share, from 0 to 1, of the candidates that are drawn which the prior proposes, rounded to a
             whole number; between 0 and 1 at least one candidate is the prior's and one the planner's own, if two are
             drawn. At 0 the plain algorithm, number for number. None: one half with a prior.
-        adapt_share: a share between 0 and 1 becomes smaller where, in the decisions of a run so far, a candidate of the
-            prior has added less to the best score than one of the planner's own (the odds change by the ratio of the
-            two means), so that a prior that does not help costs few candidates. False: it stays.
+        adapt_share: a share between 0 and 1 falls where, in the last decisions of a run, a candidate of the prior was
+            less often the best than one of the planner's own: the odds fall by the ratio of the two frequencies, to a
+            twentieth at the least (see `Shares`). So a prior that does not help costs few candidates; some decisions
+            may then have none of the prior's. False: the share stays.
         prior_as: "plans": a candidate is what the prior draws, given what was executed. "noise": it is the mean around
             which the planner searches plus the difference of two such draws, divided by the square root of two: noise
             with the prior's covariance over time and dimensions, wherever the plan is.
@@ -188,25 +190,26 @@ class VectorPlanner(ABC):
                 raise ValueError(
                     f"memory: {name} of shape [{len(state)}, ..., {size}] is expected, not {list(values.shape)}"
                 )
-        if memory.added is not None and memory.added.shape != (len(state), 2, 2):
-            raise ValueError(f"memory: added of shape [{len(state)}, 2, 2] is expected, not {list(memory.added.shape)}")
+        if memory.wins is not None and memory.wins.shape != (len(state), 2, 2):
+            raise ValueError(f"memory: wins of shape [{len(state)}, 2, 2] is expected, not {list(memory.wins.shape)}")
         return generator_on(generator, state.device), memory
 
     def shares(
         self, drawn: Sequence[int], memory: Memory, generator: torch.Generator, iterations: int | None = None
     ) -> Shares:
-        """Which of the candidates `drawn` in each iteration the prior proposes, in so many iterations (None: all)."""
-        adapt, added = self.adapt_share, memory.added
+        """Which of the candidates `drawn` in each iteration the prior proposes, in so many iterations (None: all).
+
+        Of iteration i a planner draws `shares.most[i][0]` candidates itself, and tries those of `shares.mixed`. It then
+        calls `shares.observe` with the scores of the first iteration, and keeps `shares.wins` in its memory.
+        """
+        adapt, wins = self.adapt_share, memory.wins
         share, starts = self.prior_share, len(memory.past)
-        return Shares(drawn, share, starts, generator, iterations=iterations, adapt=adapt, added=added)
+        return Shares(drawn, share, starts, generator, iterations=iterations, adapt=adapt, wins=wins)
 
     def proposals(
         self, shares: Shares, world: ContinuousWorld, state: Tensor, memory: Memory, generator: torch.Generator
     ) -> Sequence[Tensor]:
-        """For each iteration the prior's candidates, or its noise, `[B, P, L, D]`; see `around`.
-
-        There are as many as the start needs to which the prior proposes most.
-        """
+        """For each iteration the prior's candidates, or its noise, `[B, P, L, D]`, P as `shares.most`; see `around`."""
         counts = [from_prior for _, from_prior in shares.most]
         return torch.split(self._proposed(sum(counts), world, state, memory, generator), counts, 1)
 

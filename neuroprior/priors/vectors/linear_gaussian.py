@@ -127,7 +127,7 @@ class LinearGaussianPrior(VectorPrior):
         rest = list(settings)
         while rest:
             first = moments(rest[0])
-            at_once = max(LARGEST // max(first.covariance.numel(), values.numel()), 1)
+            at_once = max(LARGEST // max(first.mean.numel() ** 2, values.numel()), 1)
             some, rest = rest[:at_once], rest[at_once:]
             tables = predictions([first, *map(moments, some[1:])], self)
             nats = linear_nats(tables, values, self.half_range).masked_fill(~mask, 0)
