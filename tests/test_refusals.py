@@ -54,6 +54,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "one plan by its number": (lambda: Plans(ZEROS, 1)[0], "plans[0 : 1]"),
     "one plan of vectors by its number": (lambda: vectors()[torch.tensor(0)], "plans[0 : 1]"),
+    "the last plan by its number": (lambda: Plans(ZEROS, 1)[-1], "plans[-1 : ] is"),
     "patterns of others": (lambda: Plans(ZEROS, 1, context=torch.zeros(2, 4, 5, dtype=torch.int32)), "[2, 3, F]"),
     "no patterns": (lambda: LogLinearPrior(2, 2).start(1), "context"),
     "no board": (lambda: BoardNetwork(2, (3, 3, 4)).start(1), "context"),
@@ -82,7 +83,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
 @pytest.mark.parametrize(("call", "says"), REFUSED.values(), ids=REFUSED)
 def test_refused(call: Callable[[], object], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with refuses(says, error=IndexError if "plans[0" in says else ValueError):
+    with refuses(says, error=IndexError if says.startswith("plans[") else ValueError):
         call()
     assert not list(tmp_path.iterdir())
 
@@ -92,6 +93,8 @@ def test_a_loop_over_plans_has_plans_of_one(plans: Plans | VectorPlans) -> None:
     each = list(plans)
     assert [len(one) for one in each] == [1, 1]
     assert torch.cat([one.actions for one in each]).equal(plans.actions)
+    with refuses("reversible", error=TypeError):
+        reversed(plans)  # type: ignore[call-overload]
 
 
 def test_a_sample_needs_the_context_that_the_prior_takes(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -28,7 +28,6 @@ def table(tmp_path, monkeypatch):
     pd.DataFrame(rows, columns=["animal", "session", "drug", "behaviour", "t"]).to_csv("lab.csv", index=False)
 
 
-@pytest.mark.slow
 def test_report_fit_and_score_read_it_alike(table, capsys):
     quick = ["--models", "counts", "--folds", "2", "--processes", "1"]
     assert main(["report", "lab.csv", *COLUMNS, *quick, "--out", "report"]) == 0

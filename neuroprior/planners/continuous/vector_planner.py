@@ -137,6 +137,8 @@ class VectorPlanner(ABC):
         check_share("prior_share", share)
         if share and prior is None:
             raise ValueError("prior_share: there is no prior; give prior=")
+        if not isinstance(adapt_share, bool):
+            raise ValueError(f"adapt_share: True or False is expected, not {adapt_share!r}")
         if prior_as not in ("plans", "noise"):
             raise ValueError(f'prior_as: "plans" or "noise" is expected, not {prior_as!r}')
         self.length, self.num_plans, self.discount, self.value = length, num_plans, discount, value
@@ -185,7 +187,9 @@ class VectorPlanner(ABC):
             observed = world.observe(state)
             past = torch.zeros(len(state), 0, size, device=state.device)
             memory = Memory(past, observed.new_zeros(len(state), 0, *observed.shape[1:]))
-        for name, values in (("past", memory.past), ("mean", memory.mean)):
+        if not isinstance(memory, Memory):
+            raise ValueError(f"memory: that of a decision is expected (decision.memory), not {type(memory).__name__}")
+        for name, values in (("past", memory.past), ("mean", memory.mean), ("elites", memory.elites)):
             if values is not None and (len(values) != len(state) or values.shape[-1] != size):
                 raise ValueError(
                     f"memory: {name} of shape [{len(state)}, ..., {size}] is expected, not {list(values.shape)}"

@@ -124,7 +124,6 @@ def test_from_all_starts_something_can_be_reached():
         starts_of(task, nothing, 30, 4, seeded(0))
 
 
-@pytest.mark.slow
 def test_the_optimum_of_the_cube():
     task, world = TASKS["cube"], cube(scramble=3, absorbing=True)
     state = world.reset(300, seeded(0))

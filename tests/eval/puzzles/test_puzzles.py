@@ -62,7 +62,6 @@ def test_sokoban_from_files_to_solutions(tmp_path, capsys):
     assert kept == {path: path.stat().st_mtime_ns for path in out.rglob("*-0.json")}
 
 
-@pytest.mark.slow
 def test_tiles_with_two_seeds(tmp_path):
     generator = torch.Generator().manual_seed(0)
     boards = sliding_tiles(shape=(3, 3), scramble=30).reset(30, generator)

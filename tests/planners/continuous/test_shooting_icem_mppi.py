@@ -246,6 +246,7 @@ def test_the_objective_has_a_discount_and_a_value(make):
         (MPPIPlanner, {"prior_share": 0.5}, "prior_share"),
         (MPPIPlanner, {"prior": 3}, "prior"),
         (MPPIPlanner, {"prior_as": "changes"}, "prior_as"),
+        (ShootingPlanner, {"adapt_share": "no"}, "adapt_share: True or False"),
     ],
 )
 def test_bad_settings_are_named(make, how, word):
@@ -261,6 +262,11 @@ def test_a_prior_with_other_bounds_and_a_memory_of_other_runs_are_refused(make):
         make(3, 8, prior=drift(Constant())).plan(world, state, seeded(0))
     with refuses("memory"):
         make(3, 8).plan(world, state, seeded(0), Memory(torch.zeros(3, 0, 2), torch.zeros(3, 0, 3)))
+    decision = make(3, 8).plan(world, state, seeded(0))
+    with refuses("decision.memory"):
+        make(3, 8).plan(world, state, seeded(0), decision)
+    with refuses("memory: elites of shape [2, ..., 2]"):
+        make(3, 8).plan(world, state, seeded(0), decision.memory._replace(elites=torch.zeros(3, 1, 2, 2)))
 
 
 @pytest.mark.parametrize("length", [2, 7, 20])

@@ -6,6 +6,7 @@ from math import e, erf, log, pi, sqrt
 import pytest
 import torch
 
+from neuroprior.planners.continuous import coloured_noise
 from neuroprior.plans import VectorPlans
 from neuroprior.priors import (
     AutoregressivePrior,
@@ -485,3 +486,21 @@ def test_what_grows_is_slowed_to_a_walk():
         ahead = prior.read(torch.full((1, 3, 1), 0.1))[0].mean
         want = 0.1 * min(max(root, -1), 1)
         assert float(ahead) == pytest.approx(want, abs=0.01)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.5, None])
+def test_noise_in_each_dimension_is_that_of_a_prior_of_its_own(exponent):
+    """Dimensions are independent: densities are products, and a dimension that never changes leaves others alone."""
+    actions = coloured_noise((8, 30, 3), 1.5, seeded(0)) * torch.tensor([0.1, 0.3, 0.0])
+    low, high = [-1.0, -2.0, -1.0], [1.0, 1.0, 0.5]
+    plans = VectorPlans(actions, low, high)
+    together = NoisePrior(low, high, exponent, memory=6).fit(plans)
+    alone = [
+        NoisePrior(low[d : d + 1], high[d : d + 1], together.exponent, memory=6).fit(
+            VectorPlans(actions[..., d : d + 1], low[d : d + 1], high[d : d + 1])
+        )
+        for d in range(3)
+    ]
+    each = sum(prior.log_prob(VectorPlans(actions[..., [d]], [low[d]], [high[d]])) for d, prior in enumerate(alone))
+    assert torch.allclose(together.log_prob(plans), each, rtol=1e-4)
+    assert together.exponent == exponent or (exponent is None and together.exponent > 1)
