@@ -131,7 +131,7 @@ def _fallen(share: float, even: float, wins: Tensor) -> Tensor:
     mean = won.sum(1, keepdim=True) / number.sum(1, keepdim=True)
     prior, own = ((won + even * mean) / (number + even)).log().unbind(1)
     ratio = torch.where(mean[:, 0] > 0, prior - own, 0).clamp(log(LEAST), 0)  # nobody won: nothing is known
-    return (torch.tensor(share, device=wins.device).logit() + ratio).sigmoid().clamp(max=share)
+    return torch.where(ratio < 0, (torch.tensor(share, device=wins.device).logit() + ratio).sigmoid(), share)
 
 
 def _fixed(share: float, ends: Sequence[int]) -> list[int]:
