@@ -60,13 +60,16 @@ def test_a_small_run(tmp_path, capsys):
         for prior in ("none", "autoregressive", "synergies-2")
         for budget in ((4, 8, 16) if prior == "none" else (4, 8))
     }
-    assert all((row["sampling"] > 0) == (row["prior"] != "none") for row in results["rows"])
     assert len(results["rows"]) == len(places)
     at = {(r["condition"], r["planner"], r["prior"], r["budget"]): r for r in results["rows"]}
     for row in results["rows"]:
         assert row["task"] == "double_integrator"
         assert row["low"] <= row["return"] <= row["high"]
         assert row["seconds"] > 0
+        # A prior of which the validation chose no share is not drawn from, and changes nothing.
+        alone = row["return"] == at[(row["condition"], row["planner"], "none", row["budget"])]["return"]
+        assert (row["sampling"] > 0) == (not alone)
+    assert any(row["sampling"] > 0 for row in results["rows"])
     for row in results["paired"]:
         place = row["condition"], row["planner"], row["prior"], row["budget"]
         plain = at[(*place[:2], "none", place[3])]
