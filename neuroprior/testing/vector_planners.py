@@ -94,7 +94,7 @@ def _check_rows(memory: Memory, state: Tensor, length: int) -> None:
 
 
 def _check_starts(planner: VectorPlanner, world: "_Mass", state: Tensor, seed: int) -> None:
-    """Equal starts get independent decisions, and a start's does not depend on what the others are.
+    """Equal starts get independent decisions, and a start's does not depend on what the others are, or have met.
 
     The planner draws the same numbers for as many starts, so a start's own decision is the same beside any others.
     """
@@ -103,11 +103,20 @@ def _check_starts(planner: VectorPlanner, world: "_Mass", state: Tensor, seed: i
     different = decision.plan.flatten(1).unique(dim=0).shape[0]
     require(different == 12, f"plan: of 12 equal starts only {different} have plans of their own")
     beside = torch.cat([state[:1], state[1:] + 5])
-    pair = [planner.plan(world, some, torch.Generator().manual_seed(seed)) for some in (state, beside)]
-    require(
-        torch.allclose(pair[0].plan[0], pair[1].plan[0], atol=1e-6),
-        "plan: what is decided for a start depends on the other starts",
-    )
+    memories: list[Memory | None] = [None, None]
+    for _ in range(3):
+        pair = [
+            planner.plan(world, some, torch.Generator().manual_seed(seed), memory)
+            for some, memory in zip((state, beside), memories, strict=True)
+        ]
+        require(
+            torch.allclose(pair[0].plan[0], pair[1].plan[0], atol=1e-6),
+            "plan: what is decided for a start depends on the other starts",
+        )
+        memories = [
+            each.memory.moved_on(each.plan[:, :1], world.observe(some)[:, None], planner.keep)
+            for each, some in zip(pair, (state, beside), strict=True)
+        ]
 
 
 class _Mass(ContinuousWorld):

@@ -78,11 +78,20 @@ class Together(ShootingPlanner):
 class Eager(ShootingPlanner):
     """Draws from the prior whatever its share."""
 
-    def proposals(self, number, world, state, memory, generator):
+    def proposals(self, shares, world, state, memory, generator):
         self.prior.sample(1, self.length, past=memory.past, generator=generator)
         spread = float(self.prior.std)
         torch.rand(int(10 * spread), generator=generator)
-        return super().proposals(number, world, state, memory, generator)
+        return super().proposals(shares, world, state, memory, generator)
+
+
+class Mingling(ShootingPlanner):
+    """Searches around the mean of what all runs planned."""
+
+    def plan(self, world, state, generator=None, memory=None):
+        if memory is not None and len(state):
+            memory = memory._replace(mean=memory.mean.mean(0, keepdim=True).expand_as(memory.mean))
+        return super().plan(world, state, generator, memory)
 
 
 @pytest.mark.parametrize(
@@ -100,6 +109,7 @@ class Eager(ShootingPlanner):
         (Unchecked, "bounds"),
         (Together, "model_steps"),
         (Eager, "prior_share"),
+        (Mingling, "depends on the other starts"),
     ],
 )
 def test_planners_that_break_a_rule_are_found(make, word):
