@@ -113,9 +113,14 @@ def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
         "bits per action": lambda row: plus_minus(row, "bits_per_action", "high"),
         "difference": lambda row: "" if row.name == trained else plus_minus(row, "more_than_trained", "more_high", "+"),
     }
+    uniform = frame[frame.model == "uniform"].iloc[0]
+    worse = f"{frame.model[trained]} predicts these plans worse than uniform does." if uniform.more_high < 0 else ""
     best = f"{few}." if few else "*: best on the validation plans, which chose the settings."
     caption = "\n".join(
-        filter(None, [f"±: 95 % interval over {unit}. difference: from the last row.", best, never_taken(data.plans)])
+        filter(
+            None,
+            [f"±: 95 % interval over {unit}. difference: from the last row.", best, worse, never_taken(data.plans)],
+        )
     )
     title = f"Bits per action on {len(data.held_out):,} held-out plans ({actions:,} actions)"
     title += f", {data.folds} folds" if data.folds > 1 else ""

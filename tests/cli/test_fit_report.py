@@ -84,6 +84,20 @@ def test_intervals_in_the_table_are_not_negative(tmp_path, monkeypatch, capsys):
     assert "folds" not in printed
 
 
+@pytest.mark.parametrize("kinds", [3, 500])
+def test_a_prior_that_is_worse_than_uniform_is_named(kinds, tmp_path, monkeypatch, capsys):
+    """Of 500 kinds of action that follow one another at random, 1,600 actions show hardly anything."""
+    actions = torch.randint(kinds, (200, 8), generator=seeded(0))
+    actions[:, 1::2] = actions[:, ::2] if kinds == 3 else actions[:, 1::2]
+    data = data_of(monkeypatch, Plans(actions, kinds))
+    model = PriorModel(lambda n, **size: MarkovPrior(n, 2, **size), data=data)
+    model.prior.fit(data.learned_from)
+    report(tmp_path, model, data)
+    printed = " ".join(capsys.readouterr().out.split())
+    said = "predicts these plans worse than uniform does." in printed
+    assert said == (kinds == 500), printed
+
+
 def test_the_learning_curve():
     curve = pd.DataFrame({"step": [10, 20, 30], "train_bits": [1.9, 1.5, 1.1], "validation_bits": [2.0, 1.6, 1.8]})
     (axes,) = learning_curve("gru", curve, "markov-1", 1.7).axes
