@@ -113,8 +113,8 @@ def _table(frame: pd.DataFrame, chosen: str, data: PlansData) -> Any:
         "bits per action": lambda row: plus_minus(row, "bits_per_action", "high"),
         "difference": lambda row: "" if row.name == trained else plus_minus(row, "more_than_trained", "more_high", "+"),
     }
-    uniform = frame[frame.model == "uniform"].iloc[0]
-    worse = f"{frame.model[trained]} predicts these plans worse than uniform does." if uniform.more_high < 0 else ""
+    is_worse = ((frame.model == "uniform") & (frame.more_high < 0)).any()
+    worse = f"{frame.model[trained]} predicts these plans worse than uniform does." if is_worse else ""
     best = f"{few}." if few else "*: best on the validation plans, which chose the settings."
     caption = "\n".join(
         filter(
