@@ -29,8 +29,8 @@ class MPPIPlanner(VectorPlanner):
     its last step.
 
     A candidate that the prior proposes is weighted by its score as any other is, although it is no perturbation of the
-    plan so far: the average then moves towards it. The control cost leaves it out. Which
-    candidate was the best (`adapt_share`) is judged by the scores alone.
+    plan so far: the average then moves towards it. The control cost leaves it out. Which candidate is the best
+    (`adapt_share`) is judged by the scores alone.
 
     Args:
         length, num_plans: see `VectorPlanner`.

@@ -26,8 +26,9 @@ class Shares:
     by chance, so that the share of a prior that is as good as the planner is somewhat smaller on average, too.
 
     Only the first iteration of a decision counts; in later ones own candidates may search around what the prior
-    proposed. It counts if there are candidates of both kinds. Nobody wins it where the best is a candidate that neither
-    drew, such as the last plan, or where the best of both kinds are equal.
+    proposed. It counts if there are candidates of both kinds; of a large share of few candidates all may be the prior's
+    there, and the share stays. Nobody wins where the best is a candidate that neither drew, such as the last plan, or
+    where the best of both kinds are equal.
 
     Args:
         drawn: the number of candidates that each of I iterations draws.
