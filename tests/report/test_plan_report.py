@@ -8,7 +8,7 @@ import matplotlib.figure
 import pytest
 import torch
 
-from neuroprior import Plans
+from neuroprior import Plans, write_plans
 from neuroprior.priors import MarkovPrior, UniformPrior, save
 from neuroprior.priors.scoring import keep_learned
 from neuroprior.report import Document, FigureBox, Section, report
@@ -199,3 +199,11 @@ def test_figures_of_all_sections_have_ids_of_their_own(tmp_path):
     ids = [part.split('"')[0] for part in text.split(' id="')[1:]]
     assert len(ids) > 20
     assert len(set(ids)) == len(ids)
+
+
+def test_plans_in_memory_are_those_of_their_file(tmp_path):
+    plans = chain(context=torch.arange(12) % 2, group=torch.arange(12) % 4)
+    write_plans(plans, tmp_path / "plans.npz")
+    one, two = (report(given, folds=2, **SCORES) for given in (plans, tmp_path / "plans.npz"))
+    assert one.frames["plans"].equals(two.frames["plans"])
+    assert (one.title, two.title) == ("Plans", "Plans in plans.npz")

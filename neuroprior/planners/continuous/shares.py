@@ -39,11 +39,13 @@ class Shares:
             that of all tensors.
         iterations: the prior proposes in so many first iterations; None: in all.
         adapt: the share may fall, if it is neither 0 nor 1.
-        wins: `[B, 2, 2]`: of the decisions before, see `wins`; None: this is the first, and `share` holds.
+        wins: `[B, 2, 2]`: those after the decision before; None: this is the first, and `share` holds.
 
     Attributes:
         counts: int64 `[B, I]`: the candidates of each iteration that are the prior's.
         most: for each iteration the numbers of own candidates and of the prior's that have to be drawn for each start.
+        wins: `[B, 2, 2]`: for the prior's candidates and the own ones, how often one was the best, and their number.
+            Earlier decisions count less, by the factor `KEPT` for each decision since. None where nothing adapts.
 
     Example:
         >>> shares = Shares([6, 4], 0.5, 1, torch.Generator().manual_seed(0), adapt=True)
@@ -66,18 +68,20 @@ class Shares:
         adapt: bool = False,
         wins: Tensor | None = None,
     ) -> None:
-        self.drawn, self.adapt, device = list(drawn), adapt and 0 < share < 1, generator.device
+        self.drawn, device = list(drawn), generator.device
         fixed = _fixed(share, [sum(drawn[:iterations][: i + 1]) for i in range(len(drawn))])
         self.counts = torch.tensor(fixed, device=device).expand(batch_size, -1)
-        self._wins = torch.zeros(batch_size, 2, 2, device=device) if wins is None else KEPT * wins
-        self._fallen = self.adapt and wins is not None
-        if wins is not None and self._fallen:
-            left = _fallen(share, EVEN * drawn[0], wins) / share
+        adapt = adapt and 0 < share < 1
+        self.wins = torch.zeros(batch_size, 2, 2, device=device) if adapt else None
+        self._may_differ = adapt and wins is not None
+        if adapt and wins is not None:
+            self.wins = KEPT * wins
+            left = _share_after(share, EVEN * drawn[0], wins) / share
             up_to = left[:, None] * self.counts.cumsum(1)
             whole = (up_to + torch.rand(batch_size, 1, generator=generator, device=device)).long()
             self.counts = whole.diff(dim=1, prepend=torch.zeros_like(whole[:, :1]))
         self.most = [
-            (size if self._fallen else size - from_prior, from_prior)
+            (size if self._may_differ else size - from_prior, from_prior)
             for size, from_prior in zip(drawn, fixed, strict=True)
         ]
 
@@ -94,7 +98,7 @@ class Shares:
             own, proposed: own candidates and those of the prior, for each start as many as `most`.
         """
         both, size = torch.cat([own, proposed], 1), self.drawn[i]
-        if not self._fallen:
+        if not self._may_differ:
             return both
         place, from_own = torch.arange(size, device=both.device), size - self.counts[:, i : i + 1]
         index = torch.where(place < from_own, place, own.shape[1] + place - from_own)
@@ -107,26 +111,19 @@ class Shares:
             score: `[B, P]`: of the candidates, in the order of `mixed`.
             others: `[B, E]`: of further candidates of this iteration, which neither kind drew.
         """
-        if not self.adapt:
+        if self.wins is None:
             return
         prior = self.is_prior(0)
         kinds = torch.stack([prior, ~prior], 1)
         best = torch.where(kinds, score.detach()[:, None], -torch.inf).amax(-1)
-        rivals = [best.flip(1)[..., None], *([] if others is None else [others.detach()[:, None].expand(-1, 2, -1)])]
-        rival = torch.cat(rivals, -1).amax(-1)
+        best_other = best.flip(1)
+        if others is not None and others.shape[1]:
+            best_other = best_other.maximum(others.detach().amax(1, keepdim=True))
         number = kinds.sum(-1) * kinds.any(-1).all(1, keepdim=True)
-        self._wins = self._wins + torch.stack([(best > rival) & (number > 0), number], -1)
-
-    @property
-    def wins(self) -> Tensor | None:
-        """`[B, 2, 2]`: for the prior's candidates and the own ones, how often one was the best, and their number.
-
-        Earlier decisions count less, by the factor `KEPT` for each decision since. None where nothing adapts.
-        """
-        return self._wins if self.adapt else None
+        self.wins = self.wins + torch.stack([(best > best_other) & (number > 0), number], -1)
 
 
-def _fallen(share: float, even: float, wins: Tensor) -> Tensor:
+def _share_after(share: float, even: float, wins: Tensor) -> Tensor:
     """The share `[B]` after `wins`; so many candidates of each kind that win as often as all do are counted besides."""
     won, number = wins.unbind(-1)
     mean = won.sum(1, keepdim=True) / number.sum(1, keepdim=True)

@@ -215,13 +215,10 @@ class VectorPlanner(ABC):
     ) -> Sequence[Tensor]:
         """For each iteration the prior's candidates, or its noise, `[B, P, L, D]`, P as `shares.most`; see `around`."""
         counts = [from_prior for _, from_prior in shares.most]
-        return torch.split(self._proposed(sum(counts), world, state, memory, generator), counts, 1)
-
-    def _proposed(
-        self, number: int, world: ContinuousWorld, state: Tensor, memory: Memory, generator: torch.Generator
-    ) -> Tensor:
+        number = sum(counts)
         if self.prior is None or not number:
-            return torch.zeros(len(state), 0, self.length, world.action_size, device=state.device)
+            none = torch.zeros(len(state), 0, self.length, world.action_size, device=state.device)
+            return torch.split(none, counts, 1)
         context = None
         if self.prior.takes_context:
             observed = world.observe(state)
@@ -233,7 +230,7 @@ class VectorPlanner(ABC):
         noise = self.prior_as == "noise"
         drawn = self.prior.sample(number * (1 + noise), self.length, context, past=memory.past, generator=generator)
         drawn = drawn.to(state.device)
-        return (drawn[:, :number] - drawn[:, number:]) / 2**0.5 if noise else drawn
+        return torch.split((drawn[:, :number] - drawn[:, number:]) / 2**0.5 if noise else drawn, counts, 1)
 
     def around(self, mean: Tensor, proposals: Tensor, scale: Tensor | float = 1.0) -> Tensor:
         """The prior's candidates `[B, number, L, D]`: its proposals, or `mean [B, L, D]` plus `scale` times them."""

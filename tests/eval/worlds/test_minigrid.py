@@ -7,8 +7,8 @@ from eval.worlds.minigrid import KINDS, MOVES, NEAR, SIDE, layouts
 
 def test_what_is_observed_is_what_can_be_done():
     """An agent that can go forward observes a free square, one that can open a door a closed one, and so on."""
-    world = layouts("MiniGrid-DoorKey-5x5-v0", range(1))
-    assert world.num_layouts == 1
+    world = layouts("MiniGrid-DoorKey-5x5-v0", range(2))
+    assert world.num_layouts == 2
     assert world.features.shape == (world.num_states, SIDE * SIDE * KINDS)
     going_on = ~world.ended
     before, left, _, carried = world.features[:, list(NEAR[0])].view(-1, 4, KINDS).bool().unbind(1)

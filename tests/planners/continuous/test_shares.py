@@ -259,13 +259,13 @@ def test_the_control_cost_is_that_of_own_candidates_where_shares_differ():
     memory = Memory(torch.zeros(2, 1, 2), torch.zeros(2, 1, 3), mean=0.3 * torch.ones(2, 4, 2))
     counted = memory._replace(wins=torch.cat([wins((0.0, 90.0), (90.0, 90.0)), wins((9.0, 9.0), (1.0, 9.0))]))
     planner = MPPIPlanner(4, 10, **how)
-    seen = []
-    world.rollout = lambda *args, **more: (seen.append(args[1]), Cart.rollout(world, *args, **more))[1]
+    tried_plans = []
+    world.rollout = lambda *args, **more: (tried_plans.append(args[1]), Cart.rollout(world, *args, **more))[1]
     plan = planner.plan(world, state, seeded(1), counted).plan
     counts = Shares([10], 0.5, 2, seeded(1), adapt=True, wins=counted.wins).counts[:, 0].tolist()
     middle, half = (world.action_low + world.action_high) / 2, (world.action_high - world.action_low) / 2
     for run, count in enumerate(counts):
-        tried, mean = seen[0][run], counted.mean[run]
+        tried, mean = tried_plans[0][run], counted.mean[run]
         cost = ((mean - middle) / (0.5 * half).square() * (tried - mean)).sum((1, 2))
         cost[10 - count :] = 0
         score = Cart().rollout(state[run : run + 1], tried[None])[1][0].sum(-1)
