@@ -218,9 +218,13 @@ def sample_beside_cube(scale: float) -> Job:
 
 def _beside(name: str, world: World, state: Tensor, prior: Prior, number: int, length: int) -> Job:
     plain = peers.ObservingGRU(prior.num_actions, world.observe(state).shape[1]).eval()
+
+    def make(device: torch.device) -> Run:
+        return partial(sample_in_world, prior.to(device), world.to(device), state.to(device), number, length)
+
     return Job(
         f"sample {number:,} plans of length {length} beside {name} from {len(state):,} starts, GRU",
-        lambda device: partial(sample_in_world, prior, world, state, number, length),
+        make,
         (Peer("plain PyTorch", lambda: partial(plain.sample_in_world, world, state, number, length), 3),),
     )
 
@@ -553,7 +557,7 @@ JOBS |= {
 
 ON_DEVICES = (
     *("sample_short", "sample_long", "sample_few", "sample_few_transformer", "sample_gru", "sample_gru_two"),
-    *("sample_markov", "sample_combined"),
+    *("sample_markov", "sample_combined", "sample_beside", "sample_beside_cube"),
     *("horizon_gru_16", "horizon_transformer_2", "evaluate", "decide", "decide_vectors"),
 )
 """Jobs that can be done on other devices than the CPU."""

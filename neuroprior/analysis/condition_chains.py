@@ -33,8 +33,9 @@ class _Counts(NamedTuple):
         wanted = blocks[row] * width + column[:, None]
         at = torch.searchsorted(codes, wanted).clamp(max=len(codes) - 1)
         own = torch.where(codes[at] == wanted, times[at], 0).double()
-        cells, shape = torch.stack([column, row]), (width, len(blocks))
-        matrix = torch.sparse_coo_tensor(cells, times.double(), shape, check_invariants=False).coalesce()
+        order = (column * len(blocks) + row).argsort()
+        cells, shape = torch.stack([column, row])[:, order], (width, len(blocks))
+        matrix = torch.sparse_coo_tensor(cells, times[order].double(), shape, check_invariants=False, is_coalesced=True)
         return _Counts(row, column, times.double(), own, matrix)
 
     def without_unit(self, taken: Tensor, blocks: Tensor) -> Tensor:

@@ -220,7 +220,8 @@ def order_section(found: Evaluation) -> Part | None:
     columns: dict[str, Column] = {"order": "order", "input": _input, "parameters": "num_parameters:,"}
     for heading, name in criteria.items():
         least = (both[name] == both.groupby("context")[name].transform("min")) & (not found.too_few)
-        both[heading] = both[name].map("{:.4f}".format, na_action="ignore") + least.map({True: "*", False: " "})
+        marked = both[name].map("{:.4f}".format) + least.map({True: "*", False: " "})
+        both[heading] = marked.where(both[name].notna())
         columns[heading] = heading
     star = "" if found.too_few else ", the least of each input with a star"
     caption = f"Bits per action{star}; the information criteria are halved, so that they stand on the same scale."

@@ -1,6 +1,7 @@
 """The program `python -m eval`, end to end on small cases, and its answers to bad input."""
 
 import csv
+import importlib.metadata
 import json
 import re
 import signal
@@ -34,7 +35,7 @@ def test_paper_writes_results(small_run: Path) -> None:
     results = json.loads((small_run / "results.json").read_text())
     assert results["settings"]["worlds"] == 3
     assert results["seed"] == 0
-    assert results["versions"]["torch"] == str(torch.__version__)
+    assert results["versions"]["torch"] == importlib.metadata.version("torch")
     rows = {row["planner"]: row for row in results["simulation_1"]["rows"]}
     assert list(rows) == ["deterministic", "random", "markov-1", "markov-2", "markov-3", "gru", "transformer", "oracle"]
     for name, row in rows.items():

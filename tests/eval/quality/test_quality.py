@@ -119,8 +119,8 @@ def test_sequences_are_drawn_from_their_source():
 
 def test_text_is_cut_into_parts_that_are_divided():
     parts = text(seeded(0))
-    line = "".join(CHARACTERS[number] for number in parts.actions[0].tolist())
-    assert sum(line.count(word) for word in (" the ", " of ", " is ")) > 10  # among 1,000 characters of English
+    line = "".join(CHARACTERS[number] for number in parts.actions[:10].flatten().tolist())
+    assert sum(line.count(word) for word in (" the ", " of ", " is ")) > 100  # among 10,000 characters of English
     second = sequences(20, seeded(0))[1]
     learned, other = second.training, second.test
     assert (len(learned), len(other)) == (20, 10)

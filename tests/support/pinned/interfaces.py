@@ -9,6 +9,7 @@ import pkgutil
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import GenericAlias
 from typing import Any
 from unittest import mock
 
@@ -32,6 +33,8 @@ from tests.support.unchanged import case
 
 def arguments(function: Any) -> list[str]:
     """Each argument with its default; those by keyword alone come after a star."""
+    if isinstance(function, GenericAlias):  # which some versions of Python call a function of anything
+        return []
     try:
         given = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
