@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from neuroprior.analysis.flat import FlatPlans
@@ -22,7 +23,7 @@ class _Counts(NamedTuple):
     column: Tensor  # int64 [Z]
     times: Tensor  # float64 [Z]
     own: Tensor  # float64 [Z, S]: of the same column in the S blocks of the same unit
-    matrix: Tensor  # [K, B], sparse
+    matrix: sparse.csr_array  # [K, B]
 
     @staticmethod
     def of(block: Tensor, column: Tensor, blocks: Tensor) -> "_Counts":
@@ -33,14 +34,13 @@ class _Counts(NamedTuple):
         wanted = blocks[row] * width + column[:, None]
         at = torch.searchsorted(codes, wanted).clamp(max=len(codes) - 1)
         own = torch.where(codes[at] == wanted, times[at], 0).double()
-        order = (column * len(blocks) + row).argsort()
-        cells, shape = torch.stack([column, row])[:, order], (width, len(blocks))
-        matrix = torch.sparse_coo_tensor(cells, times[order].double(), shape, check_invariants=False, is_coalesced=True)
-        return _Counts(row, column, times.double(), own, matrix)
+        times = times.double()
+        matrix = sparse.csr_array((times, (column, row)), (width, len(blocks)))
+        return _Counts(row, column, times, own, matrix)
 
     def without_unit(self, taken: Tensor, blocks: Tensor) -> Tensor:
         """`[Z, P]`: how often the column occurred in the blocks `taken [B, P]` (0 or 1) of all other units."""
-        found: Tensor = torch.sparse.mm(self.matrix, taken)[self.column]
+        found = torch.from_numpy(self.matrix @ taken.numpy())[self.column]
         for own, sibling in zip(self.own.T, blocks.T, strict=True):
             found.addcmul_(own[:, None], taken[sibling][self.block], value=-1)
         return found
