@@ -10,7 +10,14 @@ from neuroprior._random import generator_on
 from neuroprior._threads import share
 from neuroprior.plans import is_per_step
 from neuroprior.plans.plans import action_dtype
-from neuroprior.sampling.draws import Draw, check_temperature, levels_worth_splitting, shuffled_rows, worth_splitting
+from neuroprior.sampling.draws import (
+    Draw,
+    check_temperature,
+    levels_worth_splitting,
+    shuffled_rows,
+    takes_all,
+    worth_splitting,
+)
 from neuroprior.sampling.prefixes import Prefixes
 from neuroprior.sampling.rows import rows_of
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
@@ -172,8 +179,8 @@ def _sample_in_world(
     now, root = state, torch.arange(batch, device=state.device)
     counts = torch.full((batch,), num_plans, device=state.device)
     begun: list[list[Tensor]] = [[], [], []]  # actions, rewards and states of each step of the tree
-    depth = 0
-    while depth < length and not world.stochastic and 2 * logits.numel() <= batch * num_plans:
+    depth, alone = 0, world.stochastic or takes_all(batch * num_plans, state.device)
+    while depth < length and not alone and 2 * logits.numel() <= batch * num_plans:
         children = draw.split(counts, legal_logits(world, now, logits))
         row, action = children.nonzero(as_tuple=True)
         counts = children[row, action]
@@ -197,7 +204,7 @@ def _sample_in_world(
     def draw_part(number: int) -> None:
         some = row[parts[number]]
         own = [_taken(some, *column) for column in begun]
-        plans, (here, after, memory) = _begun(some, draw, uniform is not None, now, logits, hidden)
+        plans, (here, after, memory) = _begun(some, draw, not alone, now, logits, hidden)
         for k in range(len(steps)):
             given = None if uniform is None else uniform[k, parts[number]]
             action = draw.actions(legal_logits(world, here, after), given, plans.row)
@@ -297,7 +304,7 @@ def _sample_from_roots(
         return whole
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
     root = torch.arange(len(counts), device=counts.device)
-    always = {"tree": True, "ancestral": False}
+    always = {"tree": True, "ancestral": False} | ({"auto": False} if takes_all(total, counts.device) else {})
     while prefix.shape[1] < length and always.get(method, worth_splitting(len(counts) * draw.num_actions, total)):
         children = draw.split(counts, logits)
         parent, action = children.nonzero(as_tuple=True)
@@ -329,7 +336,8 @@ def _sample_one_by_one(
     uniform = draw.uniform((len(steps), len(row)), logits)
 
     def draw_part(part: slice) -> None:
-        plans, (now, hidden) = _begun(row[part], draw, context is None, logits, state)
+        shared = context is None and not takes_all(len(row), row.device)
+        plans, (now, hidden) = _begun(row[part], draw, shared, logits, state)
         for k, t in enumerate(steps):
             action = draw.actions(now, uniform[k, part], plans.row)
             actions[part, k] = action

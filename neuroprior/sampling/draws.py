@@ -8,6 +8,9 @@ from torch import Tensor
 from neuroprior.plans import action_dtype
 from neuroprior.sampling.rows import rows_of
 
+FEW = {"cuda": 0}
+"""Of a kind of device, the number of plans up to which each is drawn by itself."""
+
 
 def check_temperature(temperature: Any) -> None:
     """Raise ValueError unless logits can be divided by it."""
@@ -92,6 +95,11 @@ def check_possible(possible: Tensor) -> None:
     """
     if not possible:
         raise ValueError("prior: its logits are NaN or infinite, or -inf for all actions that are legal")
+
+
+def takes_all(total: int, device: torch.device) -> bool:
+    """Whether so many plans are few for a device, so that finding those that begin alike takes longer than all do."""
+    return total <= FEW.get(device.type, 0)
 
 
 def worth_splitting(children: int, total: int) -> bool:
