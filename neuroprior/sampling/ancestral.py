@@ -12,10 +12,10 @@ from neuroprior.plans import is_per_step
 from neuroprior.plans.plans import action_dtype
 from neuroprior.sampling.draws import (
     Draw,
+    are_few,
     check_temperature,
     levels_worth_splitting,
     shuffled_rows,
-    takes_all,
     worth_splitting,
 )
 from neuroprior.sampling.prefixes import Prefixes
@@ -47,8 +47,9 @@ def sample(
     Plans that share a prefix share its evaluation: the number of plans is split multinomially over the distinct
     prefixes of each length ("tree"), which gives the same distribution as drawing each plan by itself ("ancestral").
     "auto" splits as long as there are far fewer prefixes than plans, and draws plan by plan from there on; plans that
-    still begin alike are stepped once. Many plans of a small chain are drawn by a compiled loop, where numba is
-    installed; with the same seed they are other ones than without.
+    still begin alike are stepped once. On a GPU, up to 32,768 plans are stepped each by itself, which is faster. Many
+    plans of a small chain are drawn by a compiled loop, where numba is installed; with the same seed they are other
+    ones than without.
 
     Args:
         prior: any prior.
@@ -125,8 +126,8 @@ def sample_in_world(
 ) -> tuple[Tensor, Rollout]:
     """Sample plans and step the world along, so that the prior gets each observation before it chooses an action.
 
-    The plans of a start that share a prefix share its evaluation and its steps (see `sample`), unless the world is
-    stochastic.
+    The plans of a start that share a prefix share its evaluation and its steps, unless the world is stochastic or the
+    plans are few for a GPU (see `sample`).
 
     The context of a prior that takes one is `world.observe` of the start, and again of each further state unless the
     prior was fitted to one context per plan. Actions that are not legal (`world.legal_actions`) are never sampled.
@@ -179,7 +180,7 @@ def _sample_in_world(
     now, root = state, torch.arange(batch, device=state.device)
     counts = torch.full((batch,), num_plans, device=state.device)
     begun: list[list[Tensor]] = [[], [], []]  # actions, rewards and states of each step of the tree
-    depth, alone = 0, world.stochastic or takes_all(batch * num_plans, state.device)
+    depth, alone = 0, world.stochastic or are_few(batch * num_plans, state.device)
     while depth < length and not alone and 2 * logits.numel() <= batch * num_plans:
         children = draw.split(counts, legal_logits(world, now, logits))
         row, action = children.nonzero(as_tuple=True)
@@ -304,7 +305,9 @@ def _sample_from_roots(
         return whole
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
     root = torch.arange(len(counts), device=counts.device)
-    always = {"tree": True, "ancestral": False} | ({"auto": False} if takes_all(total, counts.device) else {})
+    always = {"tree": True, "ancestral": False}
+    if method == "auto" and are_few(total, counts.device):
+        method = "ancestral"
     while prefix.shape[1] < length and always.get(method, worth_splitting(len(counts) * draw.num_actions, total)):
         children = draw.split(counts, logits)
         parent, action = children.nonzero(as_tuple=True)
@@ -336,7 +339,7 @@ def _sample_one_by_one(
     uniform = draw.uniform((len(steps), len(row)), logits)
 
     def draw_part(part: slice) -> None:
-        shared = context is None and not takes_all(len(row), row.device)
+        shared = context is None and not are_few(len(row), row.device)
         plans, (now, hidden) = _begun(row[part], draw, shared, logits, state)
         for k, t in enumerate(steps):
             action = draw.actions(now, uniform[k, part], plans.row)

@@ -8,8 +8,8 @@ from torch import Tensor
 from neuroprior.plans import action_dtype
 from neuroprior.sampling.rows import rows_of
 
-FEW = {"cuda": 0}
-"""Of a kind of device, the number of plans up to which each is drawn by itself."""
+FEW = {"cuda": 2**15}
+"""On devices of a kind, the number of plans up to which those that begin alike are not looked for."""
 
 
 def check_temperature(temperature: Any) -> None:
@@ -97,8 +97,11 @@ def check_possible(possible: Tensor) -> None:
         raise ValueError("prior: its logits are NaN or infinite, or -inf for all actions that are legal")
 
 
-def takes_all(total: int, device: torch.device) -> bool:
-    """Whether so many plans are few for a device, so that finding those that begin alike takes longer than all do."""
+def are_few(total: int, device: torch.device) -> bool:
+    """Whether so many plans are so few for a device that to find those that begin alike takes longer than it saves.
+
+    A GPU steps all of them in the time of one, and to find any it has to wait for the processor.
+    """
     return total <= FEW.get(device.type, 0)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from neuroprior._checks import check_same_names, is_integer
 from neuroprior._threads import one_thread
 from neuroprior.plans import is_per_step
-from neuroprior.sampling.draws import Draw, after_end, takes_all
+from neuroprior.sampling.draws import Draw, after_end, are_few
 from neuroprior.worlds.world import World, check_is_world
 
 FEWEST_TO_SHARE = 256
@@ -177,7 +177,7 @@ class Stepper:
 
 def _numbered(reached: Tensor) -> bool:
     """Whether states are numbers, and enough of them that finding the distinct ones pays."""
-    enough = len(reached) >= FEWEST_TO_SHARE and not takes_all(len(reached), reached.device)
+    enough = len(reached) >= FEWEST_TO_SHARE and not are_few(len(reached), reached.device)
     return reached.dim() == 1 and is_integer(reached) and enough
 
 

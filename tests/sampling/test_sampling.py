@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, TransformerPrior, UniformPrior, World, sample
 from neuroprior.priors import NoisePrior
-from neuroprior.sampling import ancestral, sample_in_world, stepping
+from neuroprior.sampling import ancestral, draws, sample_in_world, stepping
 from neuroprior.sampling.draws import Draw
 from tests.support.sources import (
     FALSE_ALARM,
@@ -505,3 +505,41 @@ def test_nothing_is_drawn_from_logits_that_are_none(method, wrong):
 def test_a_prior_over_vectors_is_refused():
     with refuses("prior", "numbered actions", "NoisePrior", "method sample"):
         sample(NoisePrior([-1.0], [1.0]), 2, 3)
+
+
+@pytest.fixture
+def few_everywhere(monkeypatch):
+    """The CPU as a device on which plans that begin alike are not looked for."""
+    monkeypatch.setitem(draws.FEW, "cpu", 2**62)
+
+
+@pytest.mark.parametrize("kind", PRIORS)
+def test_plans_that_are_few_for_a_device_fit_log_prob(kind, few_everywhere):
+    plans = PRIORS[kind].sample(30_000, 4, generator=seeded(0))
+    assert fits(plans, distribution(PRIORS[kind], 4), A)
+    assert fits(plans[:10_000], distribution(PRIORS[kind], 4), A)
+    assert plans.equal(PRIORS[kind].sample(30_000, 4, generator=seeded(0)))
+
+
+@pytest.mark.parametrize("per", [None, "plan", "step"])
+@pytest.mark.parametrize("legal", [False, True])
+def test_plans_that_are_few_for_a_device_in_a_world(per, legal, few_everywhere):
+    known, prior, starts = random_world(3, "WSA", legal=legal), world_prior(per), torch.tensor([4, 9])
+    plans, rollout = sample_in_world(prior, known, starts, 20_000, 3, generator=seeded(0), keep_states=True)
+    for found, wanted in zip(rollout, known.rollout(starts, plans, keep_states=True), strict=True):
+        assert torch.equal(found, wanted)
+    for i in range(2):
+        assert fits(plans[i], in_world_distribution(prior, known, int(starts[i]), 3), A)
+
+
+def test_plans_that_are_few_for_a_device_take_each_step_at_once(few_everywhere):
+    """From the first action on, each plan has a row of its own, so that no step waits for what the last one found."""
+    known = random_world(3)
+    world = CountingSteps(known.next_state, known.reward)
+    sample_in_world(UniformPrior(A), world, torch.tensor([4, 9]), 20_000, 3, generator=seeded(0))
+    assert world.taken == 2 * 20_000 * 3
+    prior, rows = TablePrior.random(A, 4), []
+    step = prior.step
+    prior.step = lambda action, *given: rows.append(len(action)) or step(action, *given)
+    sample(prior, 5_000, 4, generator=seeded(0))
+    assert rows == [5_000] * 3
