@@ -7,6 +7,8 @@ from math import ceil, log
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_count, check_share
+
 KEPT = 0.95
 """From one decision to the next, the numbers of the decisions before are multiplied by this."""
 
@@ -25,15 +27,15 @@ class Shares:
     so more often the share stays: without own candidates plans would not be improved. Frequencies in few decisions vary
     by chance, so that the share of a prior that is as good as the planner is somewhat smaller on average, too.
 
-    Only the first iteration of a decision counts; in later ones own candidates may search around what the prior
-    proposed. It counts if there are candidates of both kinds; of a large share of few candidates all may be the prior's
-    there, and the share stays. Nobody wins where the best is a candidate that neither drew, such as the last plan, or
-    where the best of both kinds are equal.
+    Only the first iteration of a decision counts, if there are candidates of both kinds; in later ones own candidates
+    may search around what the prior proposed. Nobody wins where the best is a candidate that neither drew, such as the
+    last plan, or where the best of both kinds are equal.
 
     Args:
         drawn: the number of candidates that each of I iterations draws.
         share: of the prior's candidates in all iterations in which it proposes together, rounded to a whole number;
-            between 0 and 1 at least one candidate is the prior's and one the planner's own, if two are drawn there.
+            between 0 and 1 at least one candidate of the first iteration is the prior's and one the planner's own, if
+            two are drawn there.
         batch_size: B.
         generator: where the share has fallen, numbers of candidates are rounded at random, and may be 0; its device is
             that of all tensors.
@@ -46,6 +48,9 @@ class Shares:
         most: for each iteration the numbers of own candidates and of the prior's that have to be drawn for each start.
         wins: `[B, 2, 2]`: for the prior's candidates and the own ones, how often one was the best, and their number.
             Earlier decisions count less, by the factor `KEPT` for each decision since. None where nothing adapts.
+
+    Raises:
+        ValueError: a share that is not between 0 and 1, numbers that are no counts, or `wins` of another shape.
 
     Example:
         >>> shares = Shares([6, 4], 0.5, 1, torch.Generator().manual_seed(0), adapt=True)
@@ -68,6 +73,14 @@ class Shares:
         adapt: bool = False,
         wins: Tensor | None = None,
     ) -> None:
+        for size in drawn:
+            check_count("drawn", size, 0)
+        check_count("batch_size", batch_size, 0)
+        check_share("share", share)
+        if wins is not None and wins.shape != (batch_size, 2, 2):
+            raise ValueError(
+                f"wins: [{batch_size}, 2, 2] are expected, as `wins` of the decision before, not {list(wins.shape)}"
+            )
         self.drawn, device = list(drawn), generator.device
         fixed = _fixed(share, [sum(drawn[:iterations][: i + 1]) for i in range(len(drawn))])
         self.counts = torch.tensor(fixed, device=device).expand(batch_size, -1)
@@ -136,6 +149,7 @@ def _fixed(share: float, ends: Sequence[int]) -> list[int]:
     """How many candidates of each iteration are the prior's, of so many that are drawn up to its end."""
     total = ends[-1] if ends else 0
     wanted = round(share * total)
-    if 0 < share < 1 and total > 1:
-        wanted = min(max(wanted, 1), total - 1)
-    return [after - before for before, after in pairwise([0, *(ceil(wanted * end / max(total, 1)) for end in ends)])]
+    own = int(0 < share < 1 and total > 1)
+    wanted = max(wanted, own)
+    up_to = [min(ceil(wanted * end / max(total, 1)), max(end - own, 0)) for end in ends]
+    return [after - before for before, after in pairwise([0, *up_to])]

@@ -1,5 +1,7 @@
 """How many candidates a prior proposes: a fixed share, and one that follows from what its candidates have added."""
 
+import itertools
+
 import pytest
 import torch
 
@@ -282,3 +284,25 @@ def test_no_runs_and_a_single_candidate():
     assert planner.plan(world, world.reset(0), seeded(0), memory).plan.shape == (0, 3, 2)
     counts = Shares([1], 0.5, 100, seeded(0), adapt=True, wins=torch.zeros(100, 2, 2)).counts
     assert not counts.any()  # as in the first decision
+
+
+@pytest.mark.parametrize("share", [0.01, 0.25, 0.5, 0.75, 0.9, 0.99])
+def test_the_first_iteration_has_candidates_of_both_kinds(share):
+    """Also where the whole number of the prior's candidates would fill it, so that a share can fall."""
+    for drawn in itertools.product(range(2, 9), range(9), range(9)):
+        counts = Shares(drawn, share, 1, seeded(0)).counts[0].tolist()
+        assert 1 <= counts[0] < drawn[0]
+        assert all(0 <= count <= size for count, size in zip(counts, drawn, strict=True))
+        total = sum(drawn)
+        assert sum(counts) == min(max(round(share * total), 1), total - 1)
+
+
+def test_arguments_of_shares():
+    with refuses("share", "a number from 0 to 1", "1.5"):
+        Shares([4], 1.5, 1, seeded(0))
+    with refuses("drawn", "-1"):
+        Shares([4, -1], 0.5, 1, seeded(0))
+    with refuses("batch_size", "-2"):
+        Shares([4], 0.5, -2, seeded(0))
+    with refuses("wins", "[3, 2, 2]", "[1, 1, 2]"):
+        Shares([4], 0.5, 3, seeded(0), adapt=True, wins=wins(1, 2)[None])

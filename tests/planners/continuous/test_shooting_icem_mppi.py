@@ -45,11 +45,10 @@ def test_the_share_is_that_of_all_candidates_that_are_drawn(make, share, number)
     everywhere = {"prior_iterations": None} if make is ICEMPlanner else {}
     planner = make(5, 41 if make is ICEMPlanner else 40, prior=prior, prior_share=share, **everywhere)
     planner.plan(world, world.reset(3, seeded(0)), seeded(1))
-    tried = torch.cat(world.tried, 1)
+    tried = torch.cat(world.tried, 1)[:, :40]  # after these iCEM tries the mean
     middle = (world.action_low + world.action_high) / 2
     alike = ((tried - middle).abs() < 1e-6).flatten(2).all(2).sum(1)
-    # The mean that iCEM refits to these alone is one of them, too: the planner's own only come last.
-    assert alike.tolist() == [number + (make is ICEMPlanner and share > 0.9)] * 3
+    assert alike.tolist() == [number] * 3
 
 
 @pytest.mark.parametrize("make", PLANNERS)
