@@ -101,8 +101,8 @@ def control(
         assert memory is not None
         action, observation = plan[:, t % replan_every], world.observe(now)
         now, reward = outcome_of(now, world.step(now, action, generator))
-        rewards = rewards.to(reward.dtype) if reward.is_floating_point() else rewards
-        actions[running, t], seen[running, t], rewards[running, t] = action, observation, reward.to(rewards.dtype)
+        rewards = rewards.to(reward.dtype)
+        actions[running, t], seen[running, t], rewards[running, t] = action, observation, reward
         states[running, t + 1] = now
         lengths[running] += 1
         memory = memory.moved_on(action[:, None], observation[:, None], planner.keep)

@@ -120,3 +120,13 @@ def test_no_runs_at_all():
     done = control(ICEMPlanner(3, 8), world, world.reset(0), 5, seeded(0))
     assert done.rewards.shape == (0, 5)
     assert len(done.plans) == 0
+
+
+def test_rewards_keep_the_precision_of_the_world():
+    class Precise(Cart):
+        def step(self, state, action, generator=None):
+            return super().step(state, action, generator)[0], torch.full((len(state),), 1 / 3, dtype=torch.double)
+
+    world = Precise()
+    done = control(ShootingPlanner(2, 4), world, world.reset(2, seeded(0)), 3, generator=seeded(1))
+    assert done.rewards.tolist() == [[1 / 3] * 3] * 2
