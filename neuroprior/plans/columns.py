@@ -8,6 +8,7 @@ from typing import IO, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from neuroprior._checks import check_single_precision
 
@@ -245,6 +246,16 @@ def never_notes(actions: Integers, num_actions: int) -> list[str]:
     """A note where some of the action numbers below the largest never occur: codes from 1, say, or with gaps."""
     never = never_occur(np.unique(actions), num_actions)
     return [f"actions are numbers from 0 to {num_actions - 1}, of which {never}"] if never else []
+
+
+def feature_notes(context: Tensor | None, length: int) -> list[str]:
+    """A note where features `[N, C]` of plans may have been meant as one feature of each action, as many as these."""
+    if context is None or not context.is_floating_point() or context.dim() != 2 or context.shape[1] != length:
+        return []
+    return [
+        f"context: {length} features of each plan, known from its first action on; if it is one feature of each of the"
+        f" {length} actions, give [N, {length}, 1], lists of one number each"
+    ]
 
 
 def never_occur(occur: Integers, num_actions: int, names: Sequence[str] | None = None) -> str:

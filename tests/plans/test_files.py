@@ -447,3 +447,25 @@ def test_groups_in_an_npz_file_have_names_and_no_spaces(tmp_path):
     np.savez(tmp_path / "plans.npz", actions=actions, group=np.array(["a", "", "b"]))
     with pytest.raises(ValueError, match="group: an empty text"):
         read_plans(tmp_path / "plans.npz")
+
+
+@pytest.mark.parametrize("name", ["a.jsonl", "a.npz"])
+def test_as_many_features_of_a_plan_as_it_has_actions_are_noted(name, tmp_path):
+    """They may have been meant as one feature of each action, and would be known to a prior beforehand."""
+    actions, features = (
+        torch.zeros(4, 3, dtype=torch.long),
+        torch.rand(4, 3, generator=torch.Generator().manual_seed(0)),
+    )
+
+    def read(context):
+        write_plans(Plans(actions, 2, context=context), tmp_path / name)
+        found = read_plans(tmp_path / name, num_actions=2)
+        assert found.context.shape == context.shape
+        return found.notes
+
+    (note,) = read(features)
+    assert note.startswith("context: 3 features of each plan")
+    assert "[N, 3, 1]" in note
+    assert not read(features[:, :2])
+    assert not read(features[:, :, None])
+    assert not read(actions)

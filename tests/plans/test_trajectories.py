@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans import from_trajectories, read_minari, to_trajectories, write_minari
+from neuroprior.plans import VectorPlans, from_trajectories, read_minari, to_trajectories, write_minari
 from tests.support.sources import refuses
 
 ACTIONS = torch.tensor([[0, 2, 1], [1, 0, 0]])
@@ -213,6 +213,8 @@ def test_minari_refuses(minari, tmp_path, monkeypatch):
         write_minari(Plans(ACTIONS, 3, torch.tensor([3, 0])), "a-v0")
     with refuses("a-v0", "no plans"):
         write_minari(Plans(ACTIONS, 3)[:0], "a-v0")
+    with refuses("numbered actions", "VectorPlans"):
+        write_minari(VectorPlans(torch.zeros(2, 3, 1), [-1.0], [1.0]), "a-v0")
     with refuses("no id"):
         write_minari(Plans(ACTIONS, 3), "no id")
     assert not (tmp_path / "no id").exists()

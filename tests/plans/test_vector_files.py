@@ -56,7 +56,8 @@ def test_trajectories_of_steps_and_of_arrays():
     assert vector_plans_from_trajectories([steps], LOW, HIGH, observations=None).context is None
 
 
-def test_minari_with_a_box_of_actions(tmp_path, monkeypatch):
+@pytest.mark.parametrize("bounded", [True, False])
+def test_minari_with_a_box_of_actions(bounded, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     from gymnasium.spaces import Box
     from minari.data_collector import EpisodeBuffer
@@ -78,9 +79,13 @@ def test_minari_with_a_box_of_actions(tmp_path, monkeypatch):
         minari.create_dataset_from_buffers(
             "arm/random-v0",
             buffers,
-            action_space=Box(np.array(LOW, np.float32), np.array(HIGH, np.float32)),
+            action_space=Box(np.array(LOW, np.float32), np.array(HIGH if bounded else [np.inf] * 2, np.float32)),
             observation_space=Box(-1, 1, (3,), np.float32),
         )
+    if not bounded:
+        with pytest.raises(ValueError, match=r"arm/random-v0: actions of the space .* finite bounds are expected"):
+            read_vector_plans("minari:arm/random-v0")
+        return
     plans = read_vector_plans("minari:arm/random-v0")
     assert plans.lengths.tolist() == [4, 2]
     assert plans.action_low.tolist() == LOW

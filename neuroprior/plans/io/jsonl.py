@@ -24,6 +24,7 @@ from neuroprior.plans.columns import (
     Place,
     check_distinct,
     check_names,
+    feature_notes,
     listed,
     named,
     open_text,
@@ -257,8 +258,11 @@ class _Rows:
             plans = replace(plans, condition=numbers, condition_names=condition_names)
         if self.plan_names:
             plans = replace(plans, plan_names=self.plan_names)
+        notes = feature_notes(plans.context, plans.max_length)
         if self.unused:
-            plans = replace(plans, notes=(*plans.notes, f"keys that are not used: {listed(sorted(self.unused))}"))
+            notes.append(f"keys that are not used: {listed(sorted(self.unused))}")
+        if notes:
+            plans = replace(plans, notes=(*plans.notes, *notes))
         return renamed(plans, self.given_names, str(self.path))
 
 

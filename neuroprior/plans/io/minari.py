@@ -89,9 +89,11 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
 
     Raises:
         ImportError: Minari is not installed.
-        ValueError: no plans, or one without actions; durations, conditions or patterns, which Minari cannot hold; or a
-            dataset of this name is there already.
+        ValueError: plans of vectors; no plans, or one without actions; durations, conditions or patterns, which Minari
+            cannot hold; or a dataset of this name is there already.
     """
+    if not isinstance(plans, Plans):
+        raise ValueError(f"plans: numbered actions, Plans, are expected, not {type(plans).__name__}")
     minari = _module("minari")
     lengths = plans.mask().sum(1).tolist()
     if not lengths or min(lengths) == 0:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from neuroprior._checks import check_single_precision
 from neuroprior._files import written_whole
-from neuroprior.plans.columns import Names, check_file, listed, never_notes
+from neuroprior.plans.columns import Names, check_file, feature_notes, listed, never_notes
 from neuroprior.plans.io.assembly import renamed
 from neuroprior.plans.plans import Plans
 from neuroprior.plans.sequences import counted
@@ -55,6 +55,7 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
         if plans.context is not None and plans.context.is_floating_point():
             check_single_precision("context", counted(plans.context, plans.mask()))
         notes = list(never_notes(plans.actions[plans.mask()].numpy(), known) if guessed else [])
+        notes += feature_notes(plans.context, plans.max_length)
         if unused:
             notes.append(f"arrays that are not used: {listed(unused)}")
         plans = replace(plans, notes=tuple(notes))

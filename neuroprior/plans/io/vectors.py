@@ -165,6 +165,11 @@ def _read_minari(dataset_id: str) -> VectorPlans:
         space = dataset.action_space
         if not hasattr(space, "low") or len(space.shape) != 1:
             raise ValueError(f"actions of the space {space}; a Box of one dimension is expected (else see read_minari)")
+        if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+            raise ValueError(
+                f"actions of the space {space}: finite bounds are expected; where you know them, give them to"
+                " vector_plans_from_trajectories(dataset.iterate_episodes(), action_low, action_high)"
+            )
         return vector_plans_from_trajectories(dataset.iterate_episodes(), space.low, space.high)
 
 

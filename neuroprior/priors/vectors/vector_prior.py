@@ -2,7 +2,7 @@
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from math import log, pi
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -214,6 +214,17 @@ class VectorPrior(SavedModule):
         inside = (self.middle + self.half_range * scaled).clamp(self.action_low, self.action_high)
         above = torch.where(scaled >= 1, self.action_high, inside)
         return torch.where(scaled <= -1, self.action_low, above)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What `nn.Module` moves a module by; also refuses another precision, in which not every prior computes."""
+        dtype = fn(self.action_low).dtype
+        if dtype != self.action_low.dtype:
+            raise ValueError(
+                f"{type(self).__name__}: priors over vectors compute in single precision (torch.float32), not {dtype};"
+                " they take vectors and states of worlds in double precision as they are"
+            )
+        applied: Self = super()._apply(fn, recurse)
+        return applied
 
     @property
     def device(self) -> torch.device:

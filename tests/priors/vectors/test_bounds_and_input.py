@@ -344,3 +344,17 @@ def test_what_never_changes_beside_others_does_not_borrow_their_spread(kind):
     prior = make(plans.action_low, plans.action_high).fit(plans, generator=seeded())
     drawn = prior.sample(100, 10, generator=seeded(1))[..., 1]
     assert float((drawn - 3).std()) == pytest.approx(10, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_another_precision_is_refused(kind):
+    """And leaves the prior as it was."""
+    plans = source(-1.0, 1.0)
+    prior = KINDS[kind](plans.action_low, plans.action_high)
+    if kind in CLOSED:
+        prior.fit(plans, generator=seeded())
+    before = prior.log_prob(plans)
+    for change in (prior.double, prior.half, lambda: prior.to(torch.bfloat16), lambda: prior.to("cpu", torch.double)):
+        with pytest.raises(ValueError, match="single precision"):
+            change()
+    assert prior.to("cpu").float().log_prob(plans).equal(before)
