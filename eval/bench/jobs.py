@@ -373,7 +373,7 @@ def our_table_1(
 
 
 def train(scale: float, within: float = 0.01, goal: float = 3) -> Job:
-    """A GRU of 64 units, trained until it is `within` a share of the entropy rate of the plans' known source.
+    """A GRU of 64 units, trained until it is above the entropy rate of the plans' source by at most a share `within`.
 
     Both sides choose their batch size, learning rate and number of steps; what is timed is the training alone, without
     the search for its settings.

@@ -250,7 +250,7 @@ def never_notes(actions: Integers, num_actions: int) -> list[str]:
 
 def feature_notes(context: Tensor | None, length: int) -> list[str]:
     """A note where features `[N, C]` of plans may have been meant as one feature of each action, as many as these."""
-    if context is None or not context.is_floating_point() or context.dim() != 2 or context.shape[1] != length:
+    if context is None or not context.is_floating_point() or context.dim() != 2 or not 1 < context.shape[1] == length:
         return []
     return [
         f"context: {length} features of each plan, known from its first action on; if it is one feature of each of the"

@@ -20,7 +20,7 @@ class Control(NamedTuple):
     Attributes:
         plans: what was executed, with the observation before each vector as context per step; each run is a group. A
             run that terminated is shorter.
-        rewards: `[B, T]`, of the world's dtype; 0 after a run terminated.
+        rewards: `[B, T]`, of the world's dtype (float32 where no run takes a step); 0 after a run terminated.
         states: `[B, T + 1, ...]`: the start, and the state after each step; the last one again after a run terminated.
         model_steps: int64 `[B]`: simulator steps that the planner took in each run, in all its decisions.
         seconds: that all decisions took together; executing them is not counted.
@@ -101,8 +101,8 @@ def control(
         assert memory is not None
         action, observation = plan[:, t % replan_every], world.observe(now)
         now, reward = outcome_of(now, world.step(now, action, generator))
-        rewards = rewards.to(reward.dtype)
-        actions[running, t], seen[running, t], rewards[running, t] = action, observation, reward
+        rewards = rewards.to(torch.promote_types(rewards.dtype, reward.dtype))
+        actions[running, t], seen[running, t], rewards[running, t] = action, observation, reward.to(rewards.dtype)
         states[running, t + 1] = now
         lengths[running] += 1
         memory = memory.moved_on(action[:, None], observation[:, None], planner.keep)

@@ -150,6 +150,7 @@ def _fixed(share: float, ends: Sequence[int]) -> list[int]:
     total = ends[-1] if ends else 0
     wanted = round(share * total)
     own = int(0 < share < 1 and total > 1)
-    wanted = max(wanted, own)
-    up_to = [min(ceil(wanted * end / max(total, 1)), max(end - own, 0)) for end in ends]
+    wanted = min(max(wanted, own), total - own)
+    left = own if ends and ends[0] > 1 else 0
+    up_to = [min(ceil(wanted * end / max(total, 1)), end - left) for end in ends]
     return [after - before for before, after in pairwise([0, *up_to])]

@@ -168,7 +168,7 @@ def _read_minari(dataset_id: str) -> VectorPlans:
         if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
             raise ValueError(
                 f"actions of the space {space}: finite bounds are expected; where you know them, give them to"
-                " vector_plans_from_trajectories(dataset.iterate_episodes(), action_low, action_high)"
+                f" vector_plans_from_trajectories(minari.load_dataset({dataset_id!r}).iterate_episodes(), low, high)"
             )
         return vector_plans_from_trajectories(dataset.iterate_episodes(), space.low, space.high)
 

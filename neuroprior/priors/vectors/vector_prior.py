@@ -220,8 +220,7 @@ class VectorPrior(SavedModule):
         dtype = fn(self.action_low).dtype
         if dtype != self.action_low.dtype:
             raise ValueError(
-                f"{type(self).__name__}: priors over vectors compute in single precision (torch.float32), not {dtype};"
-                " they take vectors and states of worlds in double precision as they are"
+                f"{type(self).__name__}: priors over vectors compute in single precision, torch.float32, not in {dtype}"
             )
         applied: Self = super()._apply(fn, recurse)
         return applied
