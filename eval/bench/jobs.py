@@ -218,13 +218,9 @@ def sample_beside_cube(scale: float) -> Job:
 
 def _beside(name: str, world: World, state: Tensor, prior: Prior, number: int, length: int) -> Job:
     plain = peers.ObservingGRU(prior.num_actions, world.observe(state).shape[1]).eval()
-
-    def make(device: torch.device) -> Run:
-        return partial(sample_in_world, prior.to(device), world.to(device), state.to(device), number, length)
-
     return Job(
         f"sample {number:,} plans of length {length} beside {name} from {len(state):,} starts, GRU",
-        make,
+        lambda device: partial(sample_in_world, prior.to(device), world.to(device), state.to(device), number, length),
         (Peer("plain PyTorch", lambda: partial(plain.sample_in_world, world, state, number, length), 3),),
     )
 

@@ -205,7 +205,7 @@ def _sample_in_world(
     def draw_part(number: int) -> None:
         some = row[parts[number]]
         own = [_taken(some, *column) for column in begun]
-        plans, (here, after, memory) = _begun(some, draw, not alone, now, logits, hidden)
+        plans, (here, after, memory) = _begun(some, draw, uniform is not None, now, logits, hidden)
         for k in range(len(steps)):
             given = None if uniform is None else uniform[k, parts[number]]
             action = draw.actions(legal_logits(world, here, after), given, plans.row)
@@ -252,9 +252,12 @@ def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 
 def _begun(row: Tensor, draw: Draw, shared: bool, *tensors: Tensor) -> tuple[Prefixes, list[Tensor]]:
-    """Plans that go on from rows `row [N]` of the tensors, and of these the rows from the first to the last."""
+    """Plans that go on from rows `row [N]` of the tensors, and of these the rows from the first to the last.
+
+    Those that begin alike are stepped once where they are `shared`, unless they are few for the device.
+    """
     first, behind = (int(row.min()), int(row.max()) + 1) if len(row) else (0, 0)
-    plans = Prefixes(row - first, behind - first, draw.num_actions, shared)
+    plans = Prefixes(row - first, behind - first, draw.num_actions, shared and not are_few(len(row), row.device))
     return plans, [tensor[first:behind] for tensor in tensors]
 
 
@@ -306,8 +309,8 @@ def _sample_from_roots(
     prefix = torch.empty(len(counts), 0, dtype=draw.dtype, device=counts.device)
     root = torch.arange(len(counts), device=counts.device)
     always = {"tree": True, "ancestral": False}
-    if method == "auto" and are_few(total, counts.device):
-        method = "ancestral"
+    if are_few(total, counts.device):
+        always["auto"] = False
     while prefix.shape[1] < length and always.get(method, worth_splitting(len(counts) * draw.num_actions, total)):
         children = draw.split(counts, logits)
         parent, action = children.nonzero(as_tuple=True)
@@ -339,8 +342,7 @@ def _sample_one_by_one(
     uniform = draw.uniform((len(steps), len(row)), logits)
 
     def draw_part(part: slice) -> None:
-        shared = context is None and not are_few(len(row), row.device)
-        plans, (now, hidden) = _begun(row[part], draw, shared, logits, state)
+        plans, (now, hidden) = _begun(row[part], draw, context is None, logits, state)
         for k, t in enumerate(steps):
             action = draw.actions(now, uniform[k, part], plans.row)
             actions[part, k] = action

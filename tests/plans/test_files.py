@@ -452,10 +452,8 @@ def test_groups_in_an_npz_file_have_names_and_no_spaces(tmp_path):
 @pytest.mark.parametrize("name", ["a.jsonl", "a.npz"])
 def test_as_many_features_of_a_plan_as_it_has_actions_are_noted(name, tmp_path):
     """They may have been meant as one feature of each action, and would be known to a prior beforehand."""
-    actions, features = (
-        torch.zeros(4, 3, dtype=torch.long),
-        torch.rand(4, 3, generator=torch.Generator().manual_seed(0)),
-    )
+    actions = torch.zeros(4, 3, dtype=torch.long)
+    features = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
 
     def read(context):
         write_plans(Plans(actions, 2, context=context), tmp_path / name)

@@ -213,7 +213,7 @@ def test_minari_refuses(minari, tmp_path, monkeypatch):
         write_minari(Plans(ACTIONS, 3, torch.tensor([3, 0])), "a-v0")
     with refuses("a-v0", "no plans"):
         write_minari(Plans(ACTIONS, 3)[:0], "a-v0")
-    with refuses("numbered actions", "VectorPlans"):
+    with refuses("plans: Plans are expected", "not VectorPlans"):
         write_minari(VectorPlans(torch.zeros(2, 3, 1), [-1.0], [1.0]), "a-v0")
     with refuses("no id"):
         write_minari(Plans(ACTIONS, 3), "no id")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
-from neuroprior.plans.plans import Plans
+from neuroprior.plans.plans import Plans, check_are_plans
 from neuroprior.plans.sequences import is_per_step
 
 OURS = "neuroprior"
@@ -92,8 +92,7 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
         ValueError: plans of vectors; no plans, or one without actions; durations, conditions or patterns, which Minari
             cannot hold; or a dataset of this name is there already.
     """
-    if not isinstance(plans, Plans):
-        raise ValueError(f"plans: numbered actions, Plans, are expected, not {type(plans).__name__}")
+    check_are_plans(plans)
     minari = _module("minari")
     lengths = plans.mask().sum(1).tolist()
     if not lengths or min(lengths) == 0:
