@@ -46,27 +46,24 @@ def planner_of(starts: Starts, prior: Prior, num_plans: int, sampling: Sampling)
 
 
 class Drawn(NamedTuple):
-    """What M candidates of each start are worth.
+    """M candidates of each start.
 
     Attributes:
-        estimated: `[B, M]`, as the planner finds it, which chooses by it.
-        exact: `[B, M]`: what counts; it differs in stochastic worlds.
+        plans: `[B, M, L]`.
+        estimated: `[B, M]`: their scores as the planner finds them, which chooses by them.
     """
 
+    plans: Tensor
     estimated: Tensor
-    exact: Tensor
 
 
 def drawn(starts: Starts, prior: Prior, num_plans: int, sampling: Sampling, generator: torch.Generator) -> Drawn:
     """So many candidates of a prior for each start, none of them uniform."""
-    planner, estimates, scores = planner_of(starts, prior, num_plans, sampling._replace(uniform_share=0.0)), [], []
+    planner, parts = planner_of(starts, prior, num_plans, sampling._replace(uniform_share=0.0)), []
     for state in starts.state.split(max(ROWS // num_plans, 1)):
         plans, score, _ = planner.candidates(starts.world, state, generator)
-        if score.dim() == 3:  # any prefix may win
-            score = score.amax(-1)
-        estimates.append(score)
-        scores.append(worth(starts.task, starts.world, state, plans) if starts.world.stochastic else score)
-    return Drawn(torch.cat(estimates), torch.cat(scores))
+        parts.append((plans, score.amax(-1) if score.dim() == 3 else score))  # any prefix may win
+    return Drawn(*map(torch.cat, zip(*parts, strict=True)))
 
 
 def drawn_uniformly(starts: Starts, share: float, num_plans: int, generator: torch.Generator) -> Drawn | None:
@@ -78,13 +75,18 @@ def drawn_uniformly(starts: Starts, share: float, num_plans: int, generator: tor
 def decided(
     starts: Starts, own: Drawn, uniform: Drawn | None, num_plans: int, share: float, generator: torch.Generator
 ) -> Tensor:
-    """The exact scores `[B, D]` of D decisions of each start, each for the best of a block of candidates."""
+    """The scores `[B, D]` of D decisions of each start, each for the best of a block of candidates.
+
+    What counts are exact scores, which differ from the planner's estimates in stochastic worlds.
+    """
     whole = own if uniform is None else Drawn(*(torch.cat(pair, 1) for pair in zip(own, uniform, strict=True)))
-    estimated = whole.estimated
-    keys = (
-        torch.rand(estimated.shape, generator=generator, device=estimated.device) if starts.world.stochastic else None
-    )
-    return whole.exact.gather(1, choices(whole.estimated, own.exact.shape[1], num_plans, share, keys))
+    estimated, number = whole.estimated, own.estimated.shape[1]
+    if not starts.world.stochastic:
+        return estimated.gather(1, choices(estimated, number, num_plans, share))
+    keys = torch.rand(estimated.shape, generator=generator, device=estimated.device)
+    best = choices(estimated, number, num_plans, share, keys)
+    row = torch.arange(len(best), device=best.device)[:, None]
+    return worth(starts.task, starts.world, starts.state, whole.plans[row, best])
 
 
 def tried(
@@ -117,8 +119,7 @@ def curve(
 ) -> dict[str, list[float]]:
     """What a sampling planner reaches with each number of candidates.
 
-    The largest number is drawn once from each start. Smaller numbers are blocks of it, each block a decision. The
-    planner chooses by its own estimates; what counts are exact scores, which differ in stochastic worlds.
+    The largest number is drawn once from each start. Smaller numbers are blocks of it, each block a decision.
 
     Returns:
         See `Starts.reached`, a list for all numbers.
