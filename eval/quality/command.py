@@ -14,9 +14,11 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from eval.quality.sequences import CONDITIONS, Sequences, sequences
+from eval.worlds.runs import plus_minus
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, fit
 from neuroprior._jobs import Progress
 from neuroprior._random import draw_seed
+from neuroprior.analysis.comparison import Score, score
 from neuroprior.priors.ensembles.candidates import best_chain
 from neuroprior.report.document import Column, Document, publish, table
 from neuroprior.report.page import Section, Table
@@ -150,9 +152,7 @@ def quality(
                 rows.append(_fit(source, name, training, test, true, seed))
                 progress.advance(f"{source.name}: {rows[-1]['model']} {rows[-1]['excess_percent']:+.2f} %")
         for given in long:
-            for name in OF_SEQUENCES:
-                of_long.append(_fit_long(given, name, seed))
-                progress.advance(f"{given.name}: {name} {of_long[-1]['bits_per_action']:.4f} bits")
+            of_long += _long_rows(given, seed, progress)
     sections, frames, lead = [], {}, ""
     if rows:
         frames["quality"] = pd.DataFrame(rows)
@@ -160,7 +160,8 @@ def quality(
         lead = f"{num_plans:,} plans of {LENGTH} actions to learn from, {held_out:,} held out."
     if of_long:
         frames["sequences"] = pd.DataFrame(of_long)
-        sections.append(Section("Bits per action of long sequences", tables=[_table_of_long(frames["sequences"])]))
+        tables = [_table_of_long(rows) for _, rows in frames["sequences"].groupby("source", sort=False)]
+        sections.append(Section("Bits per action of long sequences", tables=tables))
     settings = {"num_plans": num_plans, "held_out": held_out, "num_sequences": num_sequences, "seed": seed}
     publish(Document("Sources of known entropy", lead, sections, frames, settings, keys={"quality": "rows"}), Path(out))
 
@@ -192,7 +193,23 @@ def _fit(source: Source, name: str, training: Plans, test: Plans, true: Tensor, 
     }
 
 
-def _fit_long(given: Sequences, name: str, seed: int) -> dict[str, Any]:
+def _long_rows(given: Sequences, seed: int, progress: Progress) -> list[dict[str, Any]]:
+    """A row a prior: bits per action of the test sequences, and how many more they are than the combined prior's."""
+    found: dict[str, tuple[Score, float]] = {}
+    for name in OF_SEQUENCES:
+        found[name] = _fit_long(given, name, seed)
+        progress.advance(f"{given.name}: {name} {found[name][0].bits_per_action().mean:.4f} bits")
+    rows = []
+    for name, (own, seconds) in found.items():
+        row = {"source": given.name, "model": name, "entropy": given.entropy}
+        row |= {"bits_per_action": own.bits_per_action().mean, "seconds": seconds}
+        gap = own.minus(found["combined"][0])
+        rows.append(row | dict(zip(("more", "more_low", "more_high", "p_value"), gap, strict=True)))
+    return rows
+
+
+def _fit_long(given: Sequences, name: str, seed: int) -> tuple[Score, float]:
+    """The score of a prior on the test sequences, and the seconds in which it was fitted."""
     generator, began = torch.Generator().manual_seed(seed), time.perf_counter()
     if name == MARKOV:
         chain = best_chain([given.training.split(generator=generator)], None)
@@ -202,37 +219,36 @@ def _fit_long(given: Sequences, name: str, seed: int) -> dict[str, Any]:
         silent: dict[str, Any] = {} if name == "context-tree" else {"progress": False}
         prior = fit(given.training, name, generator=generator, **silent)
     seconds = time.perf_counter() - began
-    with torch.no_grad():
-        bits = -float(prior.action_log_probs(given.test).double().mean()) / log(2)
-    return {
-        "source": given.name,
-        "model": name,
-        "entropy": given.entropy,
-        "bits_per_action": bits,
-        "seconds": seconds,
-    }
+    return score(name, prior, given.test), seconds
 
 
-def _price(rows: pd.DataFrame) -> str:
-    """How long the combined prior takes to fit, as a multiple of its parts."""
-    seconds = rows.pivot(index="source", columns="model", values="seconds")
-    ratio = seconds["combined"] / seconds[list(PARTS)].sum(axis=1)
-    each = "; ".join(f"{source}: {value:.2f}" for source, value in ratio.items())
-    return f"Those of the combined prior divided by the sum of those of {', '.join(PARTS)}: {each}."
+def _price(rows: pd.DataFrame) -> float:
+    """How long the combined prior of a source takes to fit, as a multiple of its parts."""
+    seconds = rows.set_index("model")["seconds"]
+    return float(seconds["combined"] / seconds[list(PARTS)].sum())
 
 
 def _table_of_long(rows: pd.DataFrame) -> Table:
-    """A row a model: the bits per action of each source, and the seconds of fitting."""
-    cells = rows.assign(text=[f"{row.bits_per_action:.4f} ({row.seconds:.0f})" for row in rows.itertuples()])
-    wide = cells.pivot(index="model", columns="source", values="text").loc[list(OF_SEQUENCES)].reset_index()
-    entropy = rows["entropy"].dropna().iloc[0]
-    caption = (
-        f"switching: a chain under {CONDITIONS} hidden conditions; {entropy:.4f} bits under the source itself. text:"
-        " characters of Python's own documentation. markov: of the order that predicts a tenth of the training"
-        f" sequences best. (s): seconds of fitting. {_price(rows)}"
+    """A row a model of one source: bits per action, how many more than those of the combined prior, and seconds."""
+    columns: dict[str, Column] = {
+        "prior": "model",
+        "bits per action": "bits_per_action:.4f",
+        "more": lambda row: plus_minus(row, "more", digits=4, sign="+", ends="more_"),
+        "seconds": "seconds:.0f",
+    }
+    entropy = rows["entropy"].iloc[0]
+    source = (
+        "characters of Python's own documentation"
+        if pd.isna(entropy)
+        else f"a chain under {CONDITIONS} hidden conditions; {entropy:.4f} bits under the source itself"
     )
-    columns: dict[str, Column] = {"prior": "model", **{f"{name} (s)": name for name in rows["source"].unique()}}
-    return table(wide, columns, caption)
+    caption = (
+        f"{source}. markov: of the order that predicts a tenth of the training sequences best. more: than the combined"
+        " prior; ±: 95 % interval over the predicted sequences, paired. seconds: of fitting; the combined prior takes"
+        f" {_price(rows):.2f} times as long as {', '.join(PARTS)} together."
+    )
+    shown = rows.assign(more=rows["more"].where(rows["model"] != "combined"))
+    return table(shown, columns, caption, rows["source"].iloc[0])
 
 
 def _tables(rows: pd.DataFrame) -> list[Table]:

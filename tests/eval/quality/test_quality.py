@@ -162,7 +162,12 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
         assert (row["entropy"] or 1) < row["bits_per_action"] < math.log2(kinds)
     said = " ".join(capsys.readouterr().out.split())
     assert f"{rows[0]['bits_per_action']:.4f}" in said
-    assert "Those of the combined prior divided by" in said
+    chain, tree, combined = rows[0], rows[1], rows[5]
+    assert combined["more"] == 0
+    assert chain["more"] == pytest.approx(chain["bits_per_action"] - combined["bits_per_action"])
+    assert tree["more"] == pytest.approx(tree["bits_per_action"] - combined["bits_per_action"])
+    assert tree["more_low"] < tree["more"] < tree["more_high"]
+    assert f"{tree['more']:+.4f} ±" in said
     assert SOURCES[0].name in said
     alone = tmp_path / "alone"
     assert main(["quality", "--num-plans", "0", "--num-sequences", "4", "--out", str(alone)]) == 0
@@ -179,7 +184,7 @@ def test_the_price_of_the_combined_prior_is_that_of_its_parts():
     """It takes 30 s; its parts, a chain, a tree, a GRU and a stacked prior, 1, 2, 8 and 9 s; a transformer is none."""
     seconds = {"markov": 1, "context-tree": 2, "gru": 8, "stacked": 9, "transformer": 80, "combined": 30}
     rows = pd.DataFrame([{"source": "text", "model": name, "seconds": value} for name, value in seconds.items()])
-    assert "text: 1.50" in _price(rows)
+    assert _price(rows) == 1.5
 
 
 def context_at(source, plans: Plans, t: int) -> torch.Tensor | int:
