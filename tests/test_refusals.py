@@ -1,6 +1,7 @@
 """Messages about bad input that no other test reads, and what happens at the edges: no plans, plans without actions."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from neuroprior.priors import (
     DurationModel,
     LogLinearPrior,
     SemiMarkovPrior,
+    SwitchingPrior,
     VectorTransformer,
     load,
     save,
@@ -154,3 +156,63 @@ def test_durations_are_counted_anew() -> None:
     fewer = prior.log_prob(plans)
     assert not torch.allclose(prior.recount(plans).log_prob(plans), fewer)
     assert repr(DurationModel(2, laws=("gamma",))) == "DurationModel(2, laws=['gamma'], transitions=True)"
+
+
+def named(order: str = "abc", contexts: str = "LR", per: str = "plan", end: bool = False) -> Plans:
+    """Plans in which each action but the last is followed by the next, named in an order; with a context of its own."""
+    actions = (torch.arange(12) + torch.randint(3, (30, 1), generator=seeded(0))) % 3
+    number = torch.tensor(["abc".index(name) for name in order]).argsort()
+    context = torch.arange(30) % 2 if per == "plan" else (torch.arange(30) % 2)[:, None].expand(30, 12)
+    how = {"action_names": tuple(order), "context": context, "context_names": tuple(contexts)}
+    plans = Plans(number[actions], 3, durations=torch.ones(30, 12), **how)
+    return plans.with_end() if end else plans
+
+
+COUNTS_AGAIN = {
+    "combined": lambda: CombinedPrior(3, [UniformPrior(3), MarkovPrior(3, 1, num_contexts=2)], num_contexts=2),
+    "mixture": lambda: MixturePrior(3, [UniformPrior(3), MarkovPrior(3, 1, num_contexts=2)], num_contexts=2),
+    "stacked": lambda: StackedPrior(3, hidden_size=4, num_contexts=2),
+    "switching": lambda: SwitchingPrior(3, 2, num_contexts=2, restarts=1, max_iterations=2),
+    "semi-Markov": lambda: SemiMarkovPrior(3, num_contexts=2),
+}
+
+
+@pytest.mark.parametrize("make", COUNTS_AGAIN.values(), ids=COUNTS_AGAIN)
+def test_plans_that_are_numbered_otherwise_are_not_counted_in_again(make) -> None:
+    prior = make()
+    settings = {"max_steps": 1, "progress": False} if "max_steps" in prior.fit_settings else {}
+    prior.fit(named(), generator=seeded(0), **settings)
+    before = prior.log_prob(named())
+    with refuses("action_names", "c, b, a", "a, b, c"):
+        prior.recount(named("cba"))
+    with refuses("context_names", "R, L", "L, R"):
+        prior.recount(named(contexts="RL"))
+    with refuses("one per plan is expected"):
+        prior.recount(named(per="step"))
+    with refuses("4"):
+        prior.recount(named(end=True))
+    with refuses("at least one with an action"):
+        prior.recount(named().steps(0, 0))
+    assert prior.log_prob(named()).equal(before)
+    assert prior.recount(named()).log_prob(named()).isfinite().all()
+
+
+def test_an_end_is_that_of_the_plans_that_were_learned_from() -> None:
+    plans = Plans(torch.randint(2, (20, 4), generator=seeded(0)), 3)
+    prior = MixturePrior(3, [UniformPrior(3), MarkovPrior(3, 1)]).fit(plans, generator=seeded(0))
+    with refuses("end=None is expected", "not 2"):
+        prior.recount(replace(plans, end=2))
+
+
+@pytest.mark.parametrize("kind", [CombinedPrior, MixturePrior])
+def test_weights_are_learned_from_plans_that_are_known(kind) -> None:
+    prior = kind(2, [UniformPrior(2), MarkovPrior(2, 1)])
+    plans = Plans(torch.randint(2, (30, 6), generator=seeded(0)), 2, action_names=("a", "b"))
+    prior.fit(plans, generator=seeded(0))
+    with refuses("action_names", "b, a"):
+        prior.learn_weights(replace(plans, action_names=("b", "a")))
+    for none in (plans[:0], plans.steps(0, 0)):
+        with refuses("at least one with an action"):
+            prior.learn_weights(none)
+    with refuses("2 actions are expected", "5"):
+        prior.learn_weights(Plans(torch.zeros(3, 4, dtype=torch.long), 5))

@@ -11,7 +11,7 @@ import yaml
 
 from neuroprior.planners import Planner, collect
 from neuroprior.plans import Columns, Missing, PastDurations, Plans, read_plans
-from neuroprior.plans.folds import longest_cut, num_units, ungrouped
+from neuroprior.plans.folds import fair_split, longest_cut, num_units, ungrouped
 from neuroprior.priors import Prior
 from neuroprior.priors.fitting import make_prior
 from neuroprior.priors.prior import context_arguments
@@ -235,14 +235,10 @@ def _fewest_actions(plans: Plans) -> int:
 def _split_two(plans: Plans, share: float, generator: torch.Generator) -> tuple[Plans, Plans]:
     """Two plans or groups, to learn from and for validation: one of them would be half, so that less is held out.
 
-    Of many plans some are held out, unless these are no such share of the actions; else the end of the longest.
+    Of many plans some are held out, see `fair_split`; of two the end of the longer.
     """
-    plans = plans[plans.mask().any(1)]
-    if len(plans) > 2:
-        learned, chosen = ungrouped(plans).split(share, generator)
-        if share / 2 <= int(chosen.mask().sum()) / int(plans.mask().sum()) <= (1 + share) / 2:
-            return learned, chosen
-    return longest_cut(plans, share)
+    plans = ungrouped(plans[plans.mask().any(1)])
+    return fair_split(plans, share, generator) if len(plans) > 2 else longest_cut(plans, share)
 
 
 def _what(plans: Plans) -> str:

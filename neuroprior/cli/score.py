@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from rich.console import Console
 from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
 from neuroprior.plans import Columns, Missing, Plans, read_plans
 from neuroprior.plans.columns import listed
-from neuroprior.priors import load
+from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, match_plans
 from neuroprior.priors.scoring import learned_from, scores_by
 from neuroprior.report.document import printed, table, write_frames
@@ -56,6 +57,7 @@ def score(
     plans = read_plans(file, action_names=action_names or (known if is_table else None), **how)
     by_number = plans.action_names is None or (is_table and action_names is None and _by_number(plans, file, how))
     plans = plans if plans.end is None else plans.without_end()
+    plans, notes = _with_contexts_of(prior, plans, is_table)
     own = match_plans(plans, prior, folder)
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()
@@ -79,7 +81,7 @@ def score(
         caption += (
             f"Training data: {sum(learned):,} of {len(learned):,} plans are the same as plans that it has learned from."
         )
-    notes = list(plans.notes)
+    notes = [*plans.notes, *notes]
     if plans.action_names and action_names is None and prior.action_names is None:
         order = listed([f"{name} = {number}" for number, name in enumerate(plans.action_names)])
         notes.append(
@@ -101,6 +103,21 @@ def score(
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
     )
+
+
+def _with_contexts_of(prior: Prior, plans: Plans, is_table: bool) -> tuple[Plans, list[str]]:
+    """The plans, whose contexts have names if they are numbers in a table that are names of the prior; and notes."""
+    known, names, context = prior.context_names, plans.context_names, plans.context
+    if prior.num_contexts is None or context is None or (known is None) == (names is None):
+        return plans, []
+    if known is None:
+        order = listed([f"{name} = {number}" for number, name in enumerate(names or ())])
+        return plans, [f"the prior knows contexts by number, so the file's were numbered: {order}"]
+    values, number = context.unique(return_inverse=True)
+    if is_table and {str(value) for value in values.tolist()} <= set(known):
+        return replace(plans, context=number, context_names=tuple(map(str, values.tolist()))), []
+    order = listed([f"{number} = {name}" for number, name in enumerate(known)])
+    return plans, [f"the contexts are numbers, which are taken for those of the prior's names: {order}"]
 
 
 def _by_number(plans: Plans, file: str, how: Mapping[str, Any]) -> bool:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_seed, check_sizes
 from neuroprior.plans.plans import Plans, check_are_plans
-from neuroprior.plans.sequences import Sequences, is_per_step
+from neuroprior.plans.sequences import Sequences, check_validation, is_per_step
 from neuroprior.plans.vector_plans import VectorPlans
 
 FEWEST_UNITS = 2
@@ -16,6 +16,9 @@ FEWEST_UNITS = 2
 
 BLOCKS = 40
 """Parts into which a single plan is cut, so that there are units for intervals and folds."""
+
+DRAWS = 8
+"""How often plans that are held out are drawn, until they are a fair share of the actions."""
 
 AnyPlans = TypeVar("AnyPlans", bound=Sequences)
 
@@ -51,6 +54,33 @@ def longest_cut(plans: AnyPlans, share: float) -> tuple[AnyPlans, AnyPlans]:
     cut = longest - max(min(round(share * int(lengths.sum())), longest // 2), 1)
     lengths[row] = cut
     return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut, longest)  # type: ignore[type-var]
+
+
+def fair_split(plans: AnyPlans, share: float, generator: torch.Generator | None = None) -> tuple[AnyPlans, AnyPlans]:
+    """Plans to learn from, and plans that are held out at random: about a share of all actions.
+
+    Groups stay together. Where these, or plans, are so unequal that those drawn are no such share, others are drawn;
+    where that does not help, plans are drawn in place of groups, and in the end the last actions of the longest plan
+    are held out.
+
+    Args:
+        plans: of actions or of vectors.
+        share: between 0 and 1.
+        generator: draws the plans.
+
+    Raises:
+        ValueError: `share` is not between 0 and 1, or there are not two actions.
+    """
+    check_validation(share)
+    plans = divisible(plans[plans.mask().any(1)])
+    total = int(plans.mask().sum())
+    for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
+        for _ in range(DRAWS):
+            learned, held_out = some.split(share, generator)
+            if share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
+                return learned, held_out
+    rest, end = longest_cut(plans, share)
+    return (learned, held_out) if int(end.mask().sum()) < share / 2 * total else (rest, end)
 
 
 def num_units(plans: Sequences) -> int:
@@ -112,21 +142,34 @@ def in_parts(plans: Plans, number: int = BLOCKS) -> Plans:
     length = int(plans.mask().sum())
     if len(plans) != 1 or length < number:
         raise ValueError(f"plans: a single one of at least {number} actions is expected, not {len(plans)} of {length}")
-    size = -(-length // number)
-    parts = -(-length // size)
-    place = torch.arange(parts * size, device=plans.actions.device).view(parts, size)
-    context = plans.context
-    if context is not None:
-        each = is_per_step(context)
-        context = context[0][place.clamp(max=length - 1)] if each else context.expand(parts, *context.shape[1:])
+    return pieces(plans, -(-length // number))
+
+
+def pieces(plans: Plans, most: int) -> Plans:
+    """Plans cut into consecutive parts of at most `most` actions, in order; the parts belong to no group.
+
+    Example:
+        >>> pieces(Plans(torch.arange(10).view(2, 5) % 3, 3, lengths=torch.tensor([5, 1])), 3).actions.tolist()
+        [[0, 1, 2], [0, 1, 1], [2, 2, 2]]
+    """
+    check_sizes(most=most)
+    lengths = plans.mask().sum(1)
+    number = (-(-lengths // most)).clamp(min=1)
+    row = torch.arange(len(plans), device=lengths.device).repeat_interleave(number)
+    first = (torch.arange(len(row), device=lengths.device) - (number.cumsum(0) - number)[row]) * most
+    place = first[:, None] + torch.arange(min(most, plans.max_length), device=lengths.device)
+    place = place.minimum((lengths[row, None] - 1).clamp(min=0))
+    parts = {name: getattr(plans, name) for name in ("actions", "durations", "context")}
+    each = {"actions", "durations"} | ({"context"} if is_per_step(plans.context) else set())
+    cut = {
+        name: values[row[:, None], place] if name in each else values[row]
+        for name, values in parts.items()
+        if values is not None
+    }
     return replace(
-        plans,
-        actions=plans.actions[0][place.clamp(max=length - 1)],
-        lengths=(length - place[:, 0]).clamp(max=size),
-        context=context,
-        group=None,
-        group_names=None,
-        durations=None if plans.durations is None else plans.durations[0][place.clamp(max=length - 1)],
-        condition=None if plans.condition is None else plans.condition.expand(parts),
-        plan_names=None if plans.plan_names is None else tuple(plans.plan_names) * parts,
+        ungrouped(plans),
+        **cut,
+        lengths=(lengths[row] - first).clamp(max=most),
+        condition=None if plans.condition is None else plans.condition[row],
+        plan_names=None if plans.plan_names is None else tuple(plans.plan_names[number] for number in row.tolist()),
     )

@@ -74,7 +74,11 @@ def fit(
         if prior is not CombinedPrior:
             raise ValueError("effort: for the combined prior alone; leave it out, or leave prior out")
         prior = partial(CombinedPrior, effort=effort)
-    return make_prior(plans, prior).fit(plans, generator=generator, **settings)
+    made = make_prior(plans, prior)
+    fitted: Prior | None = made.fit(plans, generator=generator, **settings)
+    if fitted is None:
+        raise ValueError(f"prior: {type(made).__name__}.fit returned None; it must return the prior")
+    return fitted
 
 
 def make_prior(plans: Plans, prior: MakePrior, use_context: bool = True) -> Prior:

@@ -390,6 +390,36 @@ class Prior(SavedModule):
         finally:
             self.end, self.action_names, self.context_names, self.context_per = kept
 
+    def known_plans(self, plans: Plans | Tensor) -> Plans:
+        """`plans` with the actions and contexts that this prior knows, numbered alike; it keeps nothing of them.
+
+        A prior without context ignores that of the plans.
+
+        Raises:
+            ValueError: another number of actions, other names, a context of another kind, or no action at all.
+        """
+        plans = self._as_plans(plans)
+        if not self.takes_context:
+            plans = plans.without_context()
+        self._check_scored(plans)
+        if not bool(plans.mask().any()):
+            raise ValueError("plans: at least one with an action is expected")
+        return plans
+
+    def counted_plans(self, plans: Plans | Tensor) -> Plans:
+        """As `known_plans`, of plans in which `recount` counts: their ends and contexts are like those it learned from.
+
+        Raises:
+            ValueError: see `known_plans`; or plans with another end, or whose context is given per step if that of the
+                plans it learned from was given per plan, or the other way round.
+        """
+        plans = self.known_plans(plans)
+        if plans.end != self.end:
+            raise ValueError(f"plans: end={self.end} is expected, as in those it learned from, not {plans.end}")
+        if self.takes_context and is_per_step(plans.context) != (self.context_per == "step"):
+            raise ValueError(f"context: one per {self.context_per} is expected, as in the plans it learned from")
+        return plans
+
     def check_settings(self, settings: Mapping[str, Any]) -> None:
         """Raise ValueError unless `fit` takes all of these settings."""
         known = self.fit_settings

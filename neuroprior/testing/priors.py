@@ -42,6 +42,8 @@ def check_prior(prior: Prior | VectorPrior, length: int | None = None, num_plans
     if isinstance(prior, VectorPrior):
         check_vector_prior(prior, length or 5, num_plans, seed)
         return
+    found = f"the class {prior.__name__}" if isinstance(prior, type) else type(prior).__name__
+    require(isinstance(prior, Prior), f"prior: a Prior, as `fit` has to return it, is expected, not {found}")
     actions = prior.num_actions
     if length is None:
         length = max((n for n in range(1, 6) if actions**n <= 1024), default=1)

@@ -11,7 +11,7 @@ import torch
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
 from neuroprior.cli import score as command
-from neuroprior.plans import write_plans
+from neuroprior.plans import read_plans, write_plans
 from neuroprior.priors.scoring import keep_learned
 from tests.support.sources import seeded
 
@@ -162,6 +162,44 @@ def test_names_that_look_like_numbers_are_names(names, said, tmp_path, capsys):
     (tmp_path / "f.csv").write_text("plan,action\np,run\n")
     assert main(["score", str(tmp_path / "prior"), str(tmp_path / "f.csv"), "--out", str(tmp_path / "out")]) == 2
     assert "f.csv, line 2" in capsys.readouterr().err
+
+
+def of_contexts(path, contexts):
+    """A table of ten plans of four actions: "a" in the first of two contexts, "b" in the second, now and then not."""
+    rows = ["plan,action,context"]
+    for plan in range(10):
+        number = plan % 2
+        rows += [f"{plan},{'ab'[number ^ (t == plan % 7)]},{contexts[number]}" for t in range(4)]
+    path.write_text("\n".join(rows) + "\n")
+    return str(path)
+
+
+NUMBERED = "knows contexts by number, so the file's were numbered: L = 0, R = 1"
+TAKEN = "contexts are numbers, which are taken for those of the prior's names: 0 = {}, 1 = {}"
+
+
+@pytest.mark.parametrize(
+    ("learned", "names", "file", "said"),
+    [
+        (("L", "R"), ("L", "R"), ("L", "R"), None),
+        ((0, 1), None, ("L", "R"), NUMBERED),
+        (("L", "R"), ("L", "R"), (0, 1), TAKEN.format("L", "R")),
+        ((1, 2), ("1", "2"), (1, 2), None),
+        ((1, 2), ("1", "2"), (0, 1), TAKEN.format("1", "2")),
+    ],
+)
+def test_contexts_are_matched_by_name_or_it_is_said_how_they_are_numbered(learned, names, file, said, tmp_path, capsys):
+    plans = read_plans(of_contexts(tmp_path / "learned.csv", learned))
+    if learned == (1, 2):  # numbers in a table, which another file names
+        plans = replace(plans, context=plans.context - 1, context_names=names)
+    prior = MarkovPrior(2, 0, num_contexts=2).fit(plans)
+    folder = save(prior, tmp_path / "prior")
+    assert main(["score", str(folder), of_contexts(tmp_path / "new.csv", file), "--out", str(tmp_path / "out")]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert ("note: the" in shown) == (said is not None)
+    assert said is None or said in shown
+    found = pd.read_csv(tmp_path / "out" / "plans.csv")["log_likelihood"]
+    assert found.tolist() == pytest.approx(prior.log_prob(plans).tolist(), rel=1e-5)
 
 
 def test_a_folder_that_cannot_be_made_is_said_before_the_table(tmp_path, capsys):

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans.folds import BLOCKS, folds, in_parts
-from tests.support.sources import refuses
+from neuroprior.plans.folds import BLOCKS, fair_split, folds, in_parts, pieces
+from tests.support.sources import refuses, seeded
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -108,6 +108,62 @@ def test_parts_by_default():
     closed = in_parts(in_steps(10, "none").with_end(), 3)
     assert closed.end == 5
     assert closed.actions[closed.mask()].tolist() == [*(torch.arange(10) % 5).tolist(), 5]
+
+
+@pytest.mark.parametrize("kind", ["none", "index a plan", "features a plan", "index a step", "features a step"])
+def test_pieces_of_several_plans_make_them_again(kind):
+    """Of 10, 0, 4 and 3 actions: pieces of at most 4."""
+    lengths = torch.tensor([10, 0, 4, 3])
+    one = in_steps(10, kind)
+    context = None if one.context is None else one.context.repeat(4, *[1] * (one.context.dim() - 1))
+    actions = torch.arange(40).view(4, 10) % 5
+    names = ("a", "b", "c", "d")
+    plans = Plans(actions, 5, lengths, None, context, torch.tensor([0, 0, 1, 1]), plan_names=names)
+    cut = pieces(plans, 4)
+    assert cut.mask().sum(1).tolist() == [4, 4, 2, 0, 4, 3]
+    assert cut.plan_names == ("a", "a", "a", "b", "c", "d")
+    assert cut.group is None
+    assert cut.actions[cut.mask()].equal(plans.actions[plans.mask()])
+    if kind.endswith("step"):
+        assert cut.context[cut.mask()].equal(plans.context[plans.mask()])
+    elif kind.endswith("plan"):
+        assert cut.context.equal(plans.context[[0, 0, 0, 1, 2, 3]])
+
+
+def unequal(lengths: list[int], group: list[int] | None = None) -> Plans:
+    """Plans of these lengths; each action has a context of its own."""
+    sizes = torch.tensor(lengths)
+    context = torch.arange(len(lengths) * max(lengths)).view(len(lengths), -1)
+    actions = torch.zeros(len(lengths), max(lengths), dtype=torch.long)
+    return Plans(actions, 2, sizes, None, context, None if group is None else torch.tensor(group))
+
+
+def test_a_fair_share_of_equal_plans_is_drawn_as_by_split():
+    plans = unequal([7] * 20)
+    for found, drawn in zip(fair_split(plans, 0.2, seeded(3)), plans.split(0.2, seeded(3)), strict=True):
+        assert found.context.equal(drawn.context)
+
+
+@pytest.mark.parametrize(
+    "plans",
+    [
+        unequal([300] + [2] * 39),
+        unequal([300, 30, 30]),
+        unequal([300, 0, 0, 5]),
+        unequal([50] * 10, [0] * 9 + [1]),
+        unequal([90] + [2] * 30, [0] * 16 + [1] * 15),
+        unequal([2]),
+    ],
+    ids=["one long", "one much longer", "empty plans", "unequal groups", "groups of unequal plans", "two actions"],
+)
+def test_a_share_of_the_actions_is_held_out_of_unequal_plans(plans):
+    """Whatever is drawn, between half of it and so much that most is learned from; and nothing is lost."""
+    total = int(plans.mask().sum())
+    for seed in range(20):
+        learned, held_out = fair_split(plans, 0.1, seeded(seed))
+        assert 0.05 <= int(held_out.mask().sum()) / total <= 0.55
+        both = torch.cat([part.context[part.mask()] for part in (learned, held_out)])
+        assert both.sort().values.equal(plans.context[plans.mask()].sort().values)
 
 
 @pytest.mark.parametrize(

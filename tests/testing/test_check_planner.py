@@ -82,6 +82,13 @@ def spoiled(**changes):
     return lambda prior, length, number: Broken(ExhaustivePlanner(length), spoil)
 
 
+def totals(prior, length, number):
+    """Gives the steps of all starts together."""
+    return Broken(
+        ExhaustivePlanner(length), lambda found: found._replace(model_steps=found.model_steps * len(found.plan))
+    )
+
+
 @pytest.mark.parametrize(
     ("make", "word"),
     [
@@ -89,13 +96,20 @@ def spoiled(**changes):
         (spoiled(score=lambda score: score[:, None]), "shapes"),
         (spoiled(final_state=lambda state: (state + 1) % 12), "final_state"),
         (spoiled(model_steps=lambda steps: steps - 1), "model_steps"),
+        (totals, "simulator steps were taken for 8"),
         (spoiled(plan=lambda plan: 1 - plan), "score|not legal"),
+        (spoiled(plan=lambda plan: plan.float()), "plan: integers"),
+        (lambda prior, length, number: SamplingPlanner, "make: a Planner"),
+        (lambda prior, length, number: Broken(ExhaustivePlanner(length), tuple), "plan: a Decision"),
         (spoiled(lengths=lambda lengths: torch.zeros(20, dtype=torch.long)), "lengths"),
         (lambda prior, length, number: SamplingPlanner(prior, length, 1), "below the best"),
         (Careless, "global generator"),
         (lambda prior, length, number: FirstOfEquals(length), "equally good"),
     ],
-    ids=["score", "shape", "state", "steps", "plan", "lengths", "bad", "global", "ties"],
+    ids=[
+        *("score", "shape", "state", "steps", "totals", "plan", "float", "class", "tuple", "lengths"),
+        *("bad", "global", "ties"),
+    ],
 )
 def test_planners_that_break_a_rule_fail(make, word):
     with pytest.raises(AssertionError, match=word):

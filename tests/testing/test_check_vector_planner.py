@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from neuroprior.planners.continuous import ICEMPlanner, MPPIPlanner, ShootingPlanner
+from neuroprior.planners.continuous import ICEMPlanner, MPPIPlanner, ShootingPlanner, VectorDecision, VectorPlanner
 from neuroprior.testing import check_planner
 from tests.support.sources import refuses
 
@@ -94,9 +94,38 @@ class Mingling(ShootingPlanner):
         return super().plan(world, state, generator, memory)
 
 
+class OfSamples(VectorPlanner):
+    """Chooses one of some plans: the best, or the worst; between the bounds, or not."""
+
+    def __init__(self, *given, worst=False, clamped=True, **how):
+        super().__init__(*given, **how)
+        self.worst, self.clamped = worst, clamped
+
+    def plan(self, world, state, generator=None, memory=None):
+        generator, memory = self.begin(world, state, generator, memory)
+        low, high = world.action_low, world.action_high
+        shares = self.shares([self.num_plans], memory, generator)
+        (proposed,) = self.proposals(shares, world, state, memory, generator)
+        own = torch.rand(len(state), shares.most[0][0], self.length, world.action_size, generator=generator)
+        middle = ((low + high) / 2).expand(len(state), self.length, -1)
+        plans = shares.mixed(0, torch.lerp(low, high, own), self.around(middle, proposed))
+        plans = plans.clamp(low, high) if self.clamped else plans
+        score = self.scores(world, state, plans, generator)
+        shares.observe(score)
+        best, row = score.argmin(1) if self.worst else score.argmax(1), torch.arange(len(state))
+        kept = memory._replace(mean=plans[row, best], wins=shares.wins)
+        return VectorDecision(plans[row, best], score[row, best], self.num_plans * self.length, kept)
+
+
+def test_a_planner_of_ones_own_conforms():
+    check_planner(OfSamples, vectors=True)
+
+
 @pytest.mark.parametrize(
     ("make", "word"),
     [
+        (partial(OfSamples, worst=True), "random plans"),
+        (partial(OfSamples, clamped=False), "not between the bounds"),
         (spoilt(lambda decision, world: decision._replace(score=decision.score + 1)), "score"),
         (spoilt(lambda decision, world: decision._replace(plan=decision.plan + 5)), "bounds"),
         (spoilt(lambda decision, world: decision._replace(plan=decision.plan[:, :, :1])), "shapes"),

@@ -236,6 +236,12 @@ def test_a_broken_prior_fails_with_a_message(broken: Callable[[], Prior], messag
         check_prior(broken())
 
 
+@pytest.mark.parametrize(("given", "message"), [(None, "not NoneType"), (Forgetful, "the class Forgetful")])
+def test_what_is_no_prior_fails_with_a_message(given: object, message: str) -> None:
+    with pytest.raises(AssertionError, match=f"`fit` has to return it.*{message}"):
+        check_prior(given)  # type: ignore[arg-type]
+
+
 class Line(World):
     """A right world without a table: a point on a line, to be broken in one place."""
 

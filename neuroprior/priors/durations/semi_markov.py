@@ -117,6 +117,7 @@ class SemiMarkovPrior(Prior):
         return self
 
     def recount(self, plans: Plans) -> Self:
+        plans = self.counted_plans(plans)
         self.durations.fit(plans)
         self.actions.recount(plans)
         return self

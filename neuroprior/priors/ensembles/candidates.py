@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 
 from neuroprior._random import draw_seed
-from neuroprior.plans.folds import divisible, folds, in_parts, num_units, ungrouped
+from neuroprior.plans.folds import divisible, folds, in_parts, num_units, pieces, ungrouped
 from neuroprior.plans.plans import Plans
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, ContextTreePrior, MarkovPrior, TooLargeError
 from neuroprior.priors.ensembles.stacked import StackedPrior
@@ -38,6 +38,9 @@ these are at most `MOST`.
 
 LEAST_REST = 0.4
 """The share of all actions that is left to count in, at least, where a part is held out."""
+
+PIECES = 10
+"""Where some plans are too long for that, plans are cut into pieces of at most the actions divided by this."""
 
 DEPTH = 10
 """Depth of the context trees among experts and baselines."""
@@ -107,7 +110,7 @@ def counting_parts(learned: Plans, held_out: Plans) -> list[tuple[Plans, Plans]]
     """Plans to count in and plans to forecast from that: these two, and if the second are few, parts of the first.
 
     A chain is chosen of many, and a few plans say little of which is best. Groups stay together where they are so equal
-    that enough is left to count in.
+    that enough is left to count in; where plans are not either, they are cut into pieces.
     """
     given, total = [(learned, held_out)], int(learned.mask().sum())
     if int(held_out.mask().sum()) >= ENOUGH or not 1 < total <= MOST:
@@ -115,7 +118,7 @@ def counting_parts(learned: Plans, held_out: Plans) -> list[tuple[Plans, Plans]]
     plans = divisible(learned[learned.mask().any(1)])
     if len(plans) == 1:
         plans = in_parts(plans, min(FOLDS, total))
-    for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
+    for some in (plans, ungrouped(plans), pieces(plans, -(-total // PIECES))):
         divisions = folds(some, min(FOLDS, num_units(some)))
         parts = [(some[rest], some[left_out]) for rest, left_out in divisions]
         if min(int(rest.mask().sum()) for rest, _ in parts) >= LEAST_REST * total:

@@ -247,7 +247,11 @@ class CombinedPrior(MixturePrior):
             learned: the plans that the experts learned from. Where few are held out, experts that count are combined
                 on these as well, part by part, fitted anew to the others; and those that are trained are kept only if
                 they are clearly better. None: all are chosen on the held-out plans alone.
+
+        Raises:
+            ValueError: plans of other actions or contexts than this prior's, or without any action.
         """
+        plans, learned = self.known_plans(plans), None if learned is None else self.known_plans(learned)
         experts = list(self.alternatives)
         held_out, kept, powers = chosen_on(plans, learned, experts, (tried or len(experts)) + 2)
         actions, mask = held_out.actions, held_out.mask
@@ -271,7 +275,7 @@ class CombinedPrior(MixturePrior):
         self.first = held_out.initial_weights(taken.sum(1)).float()
 
     def recount(self, plans: Plans) -> Self:
-        counted = []
+        plans, counted = self.counted_plans(plans), []
         for e in priors_in(self.spare):
             try:
                 counted.append(e.recount(plans))

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from neuroprior._checks import check_alike_named, check_same_names, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import ungrouped
+from neuroprior.plans.folds import fair_split, ungrouped
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.prior import Prior, as_prior, described, taken_of
@@ -156,13 +156,19 @@ class MixturePrior(Prior):
             expert.fit(learned, generator=generator, **known)
 
     def recount(self, plans: Plans) -> Self:
+        plans = self.counted_plans(plans)
         for expert in self._experts():
             expert.recount(plans)
         return self
 
     @torch.no_grad()
     def learn_weights(self, plans: Plans) -> None:
-        """Learn the initial weights, and which of `SHARES` is best, from plans that the experts did not learn from."""
+        """Learn the initial weights, and which of `SHARES` is best, from plans that the experts did not learn from.
+
+        Raises:
+            ValueError: plans of other actions or contexts than this prior's, or without any action.
+        """
+        plans = self.known_plans(plans)
         taken = taken_of(self._forecasts(plans.actions, plans.context), plans.actions)
         self.first, self.share = learned_weights(taken, plans.mask())
 
@@ -242,7 +248,7 @@ def learned_weights(taken: Tensor, mask: Tensor, steps: int = STEPS) -> tuple[Te
 def divided(plans: Plans, validation: Plans | float | None, generator: torch.Generator) -> tuple[Plans, Plans]:
     """The plans that experts learn from, and those on which networks are stopped and weights are learned.
 
-    Groups stay together where there are so many that few actions are lost.
+    Groups stay together where there are so many that few actions are lost; see `fair_split`.
 
     Raises:
         ValueError: there are too few plans, or the validation plans have other names.
@@ -256,7 +262,7 @@ def divided(plans: Plans, validation: Plans | float | None, generator: torch.Gen
         validation = min(MOST, max(LARGEST / max(int(plans.mask().sum()), 1), LEAST))
     if plans.group is not None and 1 / len(plans.group.unique()) > 2 * validation:
         plans = ungrouped(plans)
-    return plans.split(validation, generator)
+    return fair_split(plans, validation, generator)
 
 
 def mixed(weights: Tensor, forecasts: Tensor) -> Tensor:

@@ -185,6 +185,7 @@ class StackedPrior(Prior):
         return replace(plans, context=features, context_names=None)
 
     def recount(self, plans: Plans) -> Self:
+        plans = self.counted_plans(plans)
         for expert in self._experts():
             expert.fit(plans)
         return self

@@ -293,9 +293,9 @@ class SwitchingPrior(HistoryPrior):
     def recount(self, plans: Plans) -> Self:
         """Learn from `plans` what the modes do, beginning with the modes that are known."""
         generator, known = torch.Generator(self.device).manual_seed(0), bool(len(self.row_code))
-        if not known or plans.actions.numel() == 0:
+        if not known:
             return self.fit(plans, generator=generator)
-        return self._go_on(self.training_plans(plans), generator, SHORT_RUN)
+        return self._go_on(self.counted_plans(plans), generator, SHORT_RUN)
 
     @torch.no_grad()
     def _go_on(self, plans: Plans, generator: torch.Generator, iterations: int) -> Self:

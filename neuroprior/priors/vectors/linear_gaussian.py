@@ -13,7 +13,7 @@ from torch.nn import functional
 from neuroprior._checks import check_count
 from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
-from neuroprior.plans.folds import divisible, longest_cut, ungrouped
+from neuroprior.plans.folds import fair_split
 from neuroprior.plans.sequences import check_validation
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
@@ -325,25 +325,14 @@ def linear_nats(tables: LinearTables, values: Tensor, half_range: Tensor) -> Ten
 def held_out_split(
     plans: VectorPlans, generator: torch.Generator, share: float = HELD_OUT
 ) -> tuple[VectorPlans, VectorPlans]:
-    """Plans to learn from and plans to choose on; where there is a single vector, it is both.
-
-    Groups stay together, unless they are so unequal that a share of them is no such share of the vectors. Where the
-    plans are, the end of the longest is held out instead.
+    """Plans to learn from and plans to choose on, see `fair_split`; where there is a single vector, it is both.
 
     Raises:
         ValueError: `share` is not between 0 and 1.
     """
     check_validation(share)
-    plans = divisible(plans[plans.mask().any(1)])
-    total = int(plans.mask().sum())
-    if total < 2:
-        return plans, plans
-    for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
-        learning, held_out = some.split(share, generator)
-        if share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
-            return learning, held_out
-    rest, end = longest_cut(plans, share)
-    return (learning, held_out) if int(end.mask().sum()) < share / 2 * total else (rest, end)
+    plans = plans[plans.mask().any(1)]
+    return fair_split(plans, share, generator) if int(plans.mask().sum()) > 1 else (plans, plans)
 
 
 @torch.no_grad()

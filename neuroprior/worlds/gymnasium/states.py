@@ -7,7 +7,8 @@ import pickle
 import random
 from collections.abc import Callable, Iterator
 from enum import Enum
-from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from functools import cache, lru_cache
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType, NoneType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -231,7 +232,6 @@ class _Writer:
         self.generators: list[Any] = []
         self._seen: dict[int, int] = {}
         self._kept: list[Any] = []  # so that no address is used twice
-        self._space = import_gymnasium().Space
 
     def environment(self, env: Any) -> None:
         """The attributes of an environment and of its wrappers."""
@@ -239,28 +239,32 @@ class _Writer:
             self._attributes(layer)
 
     def _attributes(self, thing: Any) -> None:
-        for name, value in sorted(vars(thing).items()):
-            if name not in IGNORED:
-                self.parts.append(name)
-                self.value(value)
+        values = vars(thing)
+        for name in _written(tuple(values)):
+            self.parts.append(name)
+            self.value(values[name])
 
     def value(self, value: Any) -> None:
         """Any value, however deep."""
-        if value is None or isinstance(value, (int, float, str, bytes, complex)):
-            self.parts.append(repr(value.value if isinstance(value, Enum) else value))
-        elif isinstance(value, np.generic):
+        kind: Any = type(value)
+        way = _way(kind)
+        if way == "value":
+            self.parts.append(repr(value))
+        elif way == "enum":
+            self.parts.append(repr(value.value))
+        elif way == "scalar":
             self.parts.append(repr(value.item()))
-        elif isinstance(value, (FunctionType, BuiltinFunctionType, MethodType, ModuleType, type)):
+        elif way == "named":
             self.parts.append(getattr(value, "__qualname__", value.__name__))
-        elif isinstance(value, GENERATORS):
+        elif way == "generator":
             self.generators.append(value)
-        elif isinstance(value, self._space):
+        elif way == "space":
             self.parts.append("space")
-        elif isinstance(value, np.ndarray) and value.size > 64 and value.dtype != object:
+        elif way == "array" and value.size > 64 and value.dtype != object:
             self.parts.append(f"{value.dtype}{value.shape}{value.tobytes().hex()}")
-        elif isinstance(value, np.ndarray):
+        elif way == "array":
             self.value(value.tolist())
-        elif isinstance(value, Tensor):
+        elif way == "tensor":
             self.value(value.detach().cpu().numpy())
         elif id(value) in self._seen:
             self.parts.append(f"@{self._seen[id(value)]}")
@@ -271,7 +275,7 @@ class _Writer:
             self._compound(value)
 
     def _compound(self, value: Any) -> None:
-        kind = type(value)
+        kind: Any = type(value)
         self.parts.append("list" if kind is tuple else kind.__qualname__)
         if kind in (list, tuple):
             self.parts.append(str(len(value)))
@@ -284,7 +288,7 @@ class _Writer:
             for key in sorted(value, key=repr):
                 self.parts.append(repr(key))
                 self.value(value[key])
-        elif _is_plain(value):
+        elif _is_plain(kind):
             self._attributes(value)
         else:
             self._reduced(value)
@@ -301,9 +305,31 @@ class _Writer:
             self.value(list(part) if isinstance(part, Iterator) else part)
 
 
-def _is_plain(value: Any) -> bool:
-    """Whether a value is its attributes, and nothing else."""
-    kind = type(value)
+@cache
+def _way(kind: type) -> str:
+    """How values of a type are written; one that is made of others, "compound"."""
+    if issubclass(kind, (NoneType, int, float, str, bytes, complex)):
+        return "enum" if issubclass(kind, Enum) else "value"
+    ways = {
+        "scalar": np.generic,
+        "named": (FunctionType, BuiltinFunctionType, MethodType, ModuleType, type),
+        "generator": GENERATORS,
+        "space": import_gymnasium().Space,
+        "array": np.ndarray,
+        "tensor": Tensor,
+    }
+    return next((way for way, kinds in ways.items() if issubclass(kind, kinds)), "compound")
+
+
+@lru_cache(1000)
+def _written(names: tuple[str, ...]) -> list[str]:
+    """Those of the attributes that are part of a state, in order."""
+    return sorted(name for name in names if name not in IGNORED)
+
+
+@cache
+def _is_plain(kind: type) -> bool:
+    """Whether values of a type are their attributes, and nothing else."""
     if any(getattr(kind, name) is not getattr(object, name) for name in ("__reduce__", "__reduce_ex__")):
         return False
-    return hasattr(value, "__dict__") and not any("__slots__" in vars(base) for base in kind.__mro__)
+    return kind.__dictoffset__ != 0 and not any("__slots__" in vars(base) for base in kind.__mro__)

@@ -386,6 +386,22 @@ def test_of_few_plans_it_is_hardly_behind_the_best_of_its_experts():
     assert sum(behind) / 3 < 0.01
 
 
+@pytest.mark.parametrize(("short", "length", "seed"), [(39, 2, 0), (39, 2, 2), (10, 12, 1)])
+def test_of_one_long_plan_and_short_ones_it_is_hardly_behind_the_best_of_its_experts(short, length, seed):
+    """Each action comes three times in a row; whether the long plan is held out or not, enough of it is chosen on."""
+
+    def bouts(first: int) -> Plans:
+        phase = torch.randint(9, (short + 1, 1), generator=seeded(first))
+        actions = (torch.arange(300) + phase) // 3 % 3
+        return Plans(actions, 3, torch.tensor([300] + [length] * short))
+
+    plans, test = bouts(0), bouts(1)
+    prior = neuroprior.fit(plans, effort="fast", generator=seeded(seed), **QUICK)
+    others = [MarkovPrior(3, 3).fit(plans), ContextTreePrior(3, 10).fit(plans)]
+    found, *alone = (-float(one.log_prob(test).sum()) / int(test.mask().sum()) for one in (prior, *others))
+    assert found < min(alone) + 0.01
+
+
 @pytest.mark.slow
 def test_of_few_plans_a_network_that_is_better_is_kept():
     """Each plan follows one of three chains: a network finds out which, a chain does not."""
