@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_seed, check_sizes
 from neuroprior.plans.plans import Plans, check_are_plans
-from neuroprior.plans.sequences import Sequences, check_validation, is_per_step
+from neuroprior.plans.sequences import Sequences, is_per_step
 from neuroprior.plans.vector_plans import VectorPlans
 
 FEWEST_UNITS = 2
@@ -69,15 +69,13 @@ def fair_split(plans: AnyPlans, share: float, generator: torch.Generator | None 
         generator: draws the plans.
 
     Raises:
-        ValueError: `share` is not between 0 and 1, or there are not two actions.
+        ValueError: `share` is not between 0 and 1, or the plans cannot be split, see `Plans.split`.
     """
-    check_validation(share)
-    plans = divisible(plans[plans.mask().any(1)])
     total = int(plans.mask().sum())
     for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
         for _ in range(DRAWS):
             learned, held_out = some.split(share, generator)
-            if share / 2 <= int(held_out.mask().sum()) / total <= (1 + share) / 2:
+            if share / 2 * total <= int(held_out.mask().sum()) <= (1 + share) / 2 * total:
                 return learned, held_out
     rest, end = longest_cut(plans, share)
     return (learned, held_out) if int(end.mask().sum()) < share / 2 * total else (rest, end)

@@ -14,7 +14,7 @@ from neuroprior._version import __version__
 from neuroprior.analysis import Reliability, pieces, reliability
 from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits, units
 from neuroprior.plans import PastDurations, Plans, is_per_step
-from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, fair_split, folds, num_units
 from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
 from neuroprior.priors.counts import TooLargeError
 from neuroprior.priors.ensembles import candidates
@@ -170,7 +170,7 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         return  # features cannot be counted
     generator = torch.Generator().manual_seed(seed)
     if kind == "counts":
-        training, validation = learned.split(VALIDATION, generator)
+        training, validation = fair_split(learned, VALIDATION, generator)
         if int(validation.mask().sum()) < FEWEST_UNITS:
             training, validation = learned.split(0.5, generator.manual_seed(seed))
         for baseline in baselines(training, validation, sizes.get("num_contexts"), always_context=True):

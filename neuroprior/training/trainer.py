@@ -23,6 +23,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from neuroprior._files import write_whole
 from neuroprior._threads import one_thread
 from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans.folds import fair_split
 from neuroprior.plans.sequences import Sequences
 from neuroprior.training.batches import PlansModule
 from neuroprior.training.module import PriorModule
@@ -69,7 +70,7 @@ def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> 
             training, validation = plans, settings.validation
             check_alike(training, validation)
         else:
-            training, validation = plans.split(settings.validation, torch.Generator().manual_seed(seed))
+            training, validation = fair_split(plans, settings.validation, torch.Generator().manual_seed(seed))
         window = settings.window if in_windows else plans.max_length
         data = PlansModule(training, validation, replace(settings, window=window), seed)
     cuda = device.type == "cuda"

@@ -12,6 +12,7 @@ import torch
 from neuroprior import GRUPrior, Plans, TransformerPrior
 from neuroprior.training import PlansModule, PriorModule, Settings, make_trainer, run_training, train
 from neuroprior.training.batches import MOST_DISTINCT
+from tests.support.sources import seeded
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -333,3 +334,20 @@ def echo(num: int, length: int, seed: int) -> torch.Tensor:
     for t in range(5, plans.shape[1]):
         plans[:, t] = torch.where(again[:, t], plans[:, t - 5], plans[:, t])
     return plans[:, 20:]
+
+
+def test_a_fair_share_of_unequal_plans_is_held_out(monkeypatch):
+    """Of one long plan and many short ones: never nearly all actions, nor hardly any."""
+    lengths = torch.tensor([300] + [2] * 39)
+    plans, shares = Plans(torch.zeros(40, 300, dtype=torch.long), 2, lengths), []
+
+    def stop(training, validation, *_):
+        shares.append(int(validation.mask().sum()) / int(plans.mask().sum()))
+        raise InterruptedError
+
+    monkeypatch.setattr("neuroprior.training.trainer.PlansModule", stop)
+    for seed in range(10):
+        with pytest.raises(InterruptedError):
+            GRUPrior(2, 4).fit(plans, generator=seeded(seed), progress=False)
+    assert min(shares) >= 0.05
+    assert max(shares) <= 0.55

@@ -13,7 +13,7 @@ from torch.nn import functional
 from neuroprior._checks import check_count
 from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
-from neuroprior.plans.folds import fair_split
+from neuroprior.plans.folds import divisible, fair_split
 from neuroprior.plans.sequences import check_validation
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.vector_prior import GaussianForecast, VectorPrior, censored_log_prob
@@ -331,7 +331,7 @@ def held_out_split(
         ValueError: `share` is not between 0 and 1.
     """
     check_validation(share)
-    plans = plans[plans.mask().any(1)]
+    plans = divisible(plans[plans.mask().any(1)])
     return fair_split(plans, share, generator) if int(plans.mask().sum()) > 1 else (plans, plans)
 
 
