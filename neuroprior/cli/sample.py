@@ -65,7 +65,7 @@ def _context(prior: Prior, name: str | None, folder: str, num_plans: int) -> Ten
             raise ValueError(f"context: the prior in {folder} takes none")
         return None
     if prior.num_contexts is None:
-        raise ValueError(f"{folder}: its context are features; sample it from Python, with Prior.sample")
+        raise ValueError(f"{folder}: it takes features as context; sample it from Python, with Prior.sample")
     names = prior.context_names or ()
     some = ", ".join(names[:8]) if names else f"0 to {prior.num_contexts - 1}"
     if name is None:

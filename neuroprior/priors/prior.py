@@ -340,7 +340,8 @@ class Prior(SavedModule):
             check_context(context, num_plans, steps)
         if self.num_contexts is not None:
             if not is_integer(context):
-                raise ValueError(f"context: indices below {self.num_contexts} are expected, not {context.dtype}")
+                kind = str(context.dtype).removeprefix("torch.")
+                raise ValueError(f"context: indices below {self.num_contexts} are expected, not features ({kind})")
             check_range("context", context, self.num_contexts, "contexts")
         elif is_integer(context) or context.shape[-1] != self.context_size:
             raise ValueError(

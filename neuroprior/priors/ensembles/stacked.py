@@ -167,7 +167,7 @@ class StackedPrior(Prior):
         if len(learned) == 1:
             learned = in_parts(learned, min(PARTS, int(learned.mask().sum())))
         if len(learned) < FEWEST_UNITS:
-            raise ValueError("plans: at least two plans with an action are needed to train a stacked prior")
+            raise ValueError("plans: a stacked prior needs at least two actions to learn from, beside those held out")
         learned = divisible(learned)
         stacked = self._stacked(learned, self._forecasts(learned, generator))
         self.recount(plans)

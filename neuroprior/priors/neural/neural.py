@@ -349,7 +349,7 @@ class NeuralPrior(Prior):
                 module.learn_from(plans)
         lengths = plans.mask().sum(1)
         if len(plans) < 2 and int(lengths.sum()) < 2:
-            raise ValueError("plans: at least two plans with an action are needed to train a neural prior")
+            raise ValueError("plans: a neural prior needs at least two actions to learn from, beside those held out")
         self._sized = True
         longest = int(lengths.max())
         self.set_training_window(window if longest > window else None)
