@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import neuroprior
 from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, StackedPrior, TabularWorld, UniformPrior
 from neuroprior.__main__ import main
 from neuroprior.analysis import forecast, infer
@@ -216,3 +217,20 @@ def test_weights_are_learned_from_plans_that_are_known(kind) -> None:
             prior.learn_weights(none)
     with refuses("2 actions are expected", "5"):
         prior.learn_weights(Plans(torch.zeros(3, 4, dtype=torch.long), 5))
+
+
+def test_plans_of_vectors_are_fitted_by_priors_over_vectors() -> None:
+    plans = VectorPlans(torch.rand(6, 5, 1), [0.0], [1.0])
+    with refuses("of vectors", "neuroprior.priors.VectorGRU(plans.action_low, plans.action_high).fit(plans)"):
+        neuroprior.fit(plans)  # type: ignore[arg-type]
+    prior = neuroprior.priors.VectorGRU(plans.action_low, plans.action_high, width=4)
+    assert prior.fit(plans, max_steps=1, progress=False).log_prob(plans).isfinite().all()
+
+
+def test_a_fit_that_does_not_return_the_prior_is_named() -> None:
+    class Forgetful(UniformPrior):
+        def fit(self, plans, *, generator=None):  # type: ignore[override]
+            pass
+
+    with refuses("Forgetful.fit returned None"):
+        neuroprior.fit(torch.tensor([[0, 1]]), Forgetful)

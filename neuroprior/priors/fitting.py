@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, VectorPlans
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
 from neuroprior.priors.durations import SemiMarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
@@ -58,6 +58,12 @@ def fit(
         raise ValueError(
             f"prior: a class, a function or a name is expected, not a {type(prior).__name__} that is made already; use"
             " its own fit(plans)"
+        )
+    given: object = plans
+    if isinstance(given, VectorPlans):
+        raise ValueError(
+            "plans: these are of vectors, which priors over vectors learn, such as"
+            " neuroprior.priors.VectorGRU(plans.action_low, plans.action_high).fit(plans)"
         )
     if not isinstance(plans, Plans):
         actions = as_actions(plans)
