@@ -130,17 +130,18 @@ def check_same_names(
         raise ValueError(f"{name}: {', '.join(found)} in {where}, {', '.join(expected)} in {whose}; {remedy}")
 
 
-def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str) -> None:
-    """Raise ValueError unless all that have names of actions have the same ones; see `check_same_names`.
+def check_alike_named(named: Mapping[str, Sequence[str] | None], remedy: str, what: str = "action_names") -> None:
+    """Raise ValueError unless all that have names have the same ones; see `check_same_names`.
 
     Args:
         named: the names of each, by what has them.
         remedy: the end of the message.
+        what: the names are, "action_names" or "context_names".
     """
     known = {where: names for where, names in named.items() if names is not None}
     first = next(iter(known), "")
     for where, names in known.items():
-        check_same_names("action_names", known[first], names, where, first, remedy)
+        check_same_names(what, known[first], names, where, first, remedy)
 
 
 def check_level(level: object) -> None:

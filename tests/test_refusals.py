@@ -190,12 +190,46 @@ def test_plans_that_are_numbered_otherwise_are_not_counted_in_again(make) -> Non
         prior.recount(named(contexts="RL"))
     with refuses("one per plan is expected"):
         prior.recount(named(per="step"))
-    with refuses("4"):
+    with refuses("3 actions are expected", "not 4"):
         prior.recount(named(end=True))
     with refuses("at least one with an action"):
         prior.recount(named().steps(0, 0))
     assert prior.log_prob(named()).equal(before)
     assert prior.recount(named()).log_prob(named()).isfinite().all()
+
+
+@pytest.mark.parametrize("plans", [named(), named(per="step"), named(end=True)], ids=["plan", "step", "end"])
+@pytest.mark.parametrize("kind", [CombinedPrior, MixturePrior])
+def test_what_fitted_experts_know_need_not_be_learned_again(kind, plans) -> None:
+    """A mixture that was never fitted itself is for plans like those of its experts, or else learns what they are."""
+    size = plans.num_actions
+    fitted = [UniformPrior(size).fit(plans), MarkovPrior(size, 1, num_contexts=2).fit(plans)]
+    prior = kind(size, fitted, num_contexts=2)
+    assert (prior.end, prior.context_per, prior.context_names) == (plans.end, fitted[1].context_per, ("L", "R"))
+    prior.learn_weights(plans)
+    assert prior.recount(plans).log_prob(plans).isfinite().all()
+    with refuses("context_names", "R, L", "L, R"):
+        prior.learn_weights(replace(plans, context_names=("R", "L")))
+    alone = kind(size, [UniformPrior(size), MarkovPrior(size, 1, num_contexts=2)], num_contexts=2)
+    assert alone.recount(plans).log_prob(plans).isfinite().all()
+    assert (alone.end, alone.context_per) == (plans.end, fitted[1].context_per)
+
+
+def test_experts_that_know_other_contexts_are_refused() -> None:
+    experts = [
+        MarkovPrior(3, order, num_contexts=2).fit(named(contexts=names)) for order, names in enumerate(["LR", "RL"])
+    ]
+    with refuses("context_names", "R, L", "experts[1]", "fit them to plans that are numbered alike"):
+        MixturePrior(3, experts)
+
+
+@pytest.mark.parametrize("kind", [CombinedPrior, MixturePrior])
+def test_validation_plans_are_refused_before_anything_is_learned(kind) -> None:
+    plans, prior = named(), kind(3, [MarkovPrior(3, 1, num_contexts=2)], num_contexts=2)
+    with refuses("validation: context_names", "R, L"):
+        prior.fit(plans, validation=named(contexts="RL"))
+    with refuses("validation: at least one plan with an action"):
+        prior.fit(plans, validation=plans.steps(0, 0))
 
 
 def test_an_end_is_that_of_the_plans_that_were_learned_from() -> None:
@@ -228,9 +262,9 @@ def test_plans_of_vectors_are_fitted_by_priors_over_vectors() -> None:
 
 
 def test_a_fit_that_does_not_return_the_prior_is_named() -> None:
-    class Forgetful(UniformPrior):
+    class ReturnsNothing(UniformPrior):
         def fit(self, plans, *, generator=None):  # type: ignore[override]
             pass
 
-    with refuses("Forgetful.fit returned None"):
-        neuroprior.fit(torch.tensor([[0, 1]]), Forgetful)
+    with refuses("ReturnsNothing.fit returned NoneType"):
+        neuroprior.fit(torch.tensor([[0, 1]]), ReturnsNothing)

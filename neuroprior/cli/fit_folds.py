@@ -13,7 +13,7 @@ from neuroprior._jobs import JobRun
 from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits
 from neuroprior.cli.fit_recipe import PlansData
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import divisible, folds
+from neuroprior.plans.folds import divisible, fair_split, folds
 from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import Prior
 from neuroprior.report.fits import ACTIONS, CONTEXT, Arrays
@@ -79,7 +79,7 @@ def _fit_and_score(
     generator = torch.Generator().manual_seed(seed * 1000 + fold)
     prior = deepcopy(fresh).fit(learned, generator=generator, **settings)
     found = _arrays(TRAINED, prior, held_out)
-    for baseline in baselines(*learned.split(validation, generator), num_contexts):
+    for baseline in baselines(*fair_split(learned, validation, generator), num_contexts):
         if baseline.prior is not None:
             # Its settings were chosen on the validation plans; then these are learned from as well.
             found |= _arrays(baseline.model, baseline.prior.fit(learned), held_out)

@@ -150,10 +150,10 @@ class PlansData(PlansModule):
         rest, share = self.plans, validation
         self.held_out = self.plans
         if self.folds == 1:
-            rest, self.held_out = self.plans.split(held_out, generator)
+            rest, self.held_out = fair_split(self.plans, held_out, generator)
             share = validation / (1 - held_out)
         two = num_units(self.plans) == 2 and rest is self.plans
-        self.learned_from, self.chosen_on = (_split_two if two else Plans.split)(rest, share, generator)
+        self.learned_from, self.chosen_on = (_split_two if two else fair_split)(rest, share, generator)
         for name, part in (("validation", self.chosen_on), ("held_out", self.held_out)):
             if int(part.mask().sum()) < LEAST_ACTIONS:
                 raise ValueError(

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
-from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.plans import Columns, Missing, Plans, is_per_step, read_plans
 from neuroprior.plans.columns import listed
 from neuroprior.priors import Prior, load
 from neuroprior.priors.matching import learned_names, match_plans
@@ -113,9 +114,12 @@ def _with_contexts_of(prior: Prior, plans: Plans, is_table: bool) -> tuple[Plans
     if known is None:
         order = listed([f"{name} = {number}" for number, name in enumerate(names or ())])
         return plans, [f"the prior knows contexts by number, so the file's were numbered: {order}"]
-    values, number = context.unique(return_inverse=True)
-    if is_table and {str(value) for value in values.tolist()} <= set(known):
-        return replace(plans, context=number, context_names=tuple(map(str, values.tolist()))), []
+    occurring = (context[plans.mask()] if is_per_step(context) else context).unique()
+    names = tuple(map(str, occurring.tolist()))
+    if is_table and names and set(names) <= set(known):
+        # What stands behind the end of a plan is none of them.
+        number = torch.searchsorted(occurring, context).clamp(max=len(names) - 1)
+        return replace(plans, context=number, context_names=names), []
     order = listed([f"{number} = {name}" for number, name in enumerate(known)])
     return plans, [f"the contexts are numbers, which are taken for those of the prior's names: {order}"]
 

@@ -56,29 +56,38 @@ def longest_cut(plans: AnyPlans, share: float) -> tuple[AnyPlans, AnyPlans]:
     return replace(plans, lengths=lengths), plans[row : row + 1].steps(cut, longest)  # type: ignore[type-var]
 
 
-def fair_split(plans: AnyPlans, share: float, generator: torch.Generator | None = None) -> tuple[AnyPlans, AnyPlans]:
+def fair_split(
+    plans: AnyPlans, share: float, generator: torch.Generator | None = None, *, divide_groups: bool = False
+) -> tuple[AnyPlans, AnyPlans]:
     """Plans to learn from, and plans that are held out at random: about a share of all actions.
 
-    Groups stay together. Where these, or plans, are so unequal that those drawn are no such share, others are drawn;
-    where that does not help, plans are drawn in place of groups, and in the end the last actions of the longest plan
-    are held out.
+    Where groups, or plans without groups, are so unequal that those drawn are no such share, others are drawn. Where
+    that does not help, of groups those are held out that came nearest; of plans the end of the longest.
 
     Args:
         plans: of actions or of vectors.
         share: between 0 and 1.
         generator: draws the plans.
+        divide_groups: plans are drawn in place of groups where no groups are such a share.
 
     Raises:
         ValueError: `share` is not between 0 and 1, or the plans cannot be split, see `Plans.split`.
     """
-    total = int(plans.mask().sum())
-    for some in (plans,) if plans.group is None else (plans, ungrouped(plans)):
-        for _ in range(DRAWS):
-            learned, held_out = some.split(share, generator)
-            if share / 2 * total <= int(held_out.mask().sum()) <= (1 + share) / 2 * total:
-                return learned, held_out
-    rest, end = longest_cut(plans, share)
-    return (learned, held_out) if int(end.mask().sum()) < share / 2 * total else (rest, end)
+    total, nearest = int(plans.mask().sum()), None
+    for _ in range(DRAWS):
+        drawn = plans.split(share, generator)
+        held_out = int(drawn[1].mask().sum())
+        if share / 2 * total <= held_out <= (1 + share) / 2 * total:
+            return drawn
+        away = abs(held_out - share * total) if 0 < held_out < total else total
+        if nearest is None or away < nearest[0]:
+            nearest = away, drawn
+    assert nearest is not None
+    if plans.group is not None:
+        return fair_split(ungrouped(plans), share, generator) if divide_groups else nearest[1]
+    longest = int(plans.mask().sum(1).max())
+    too_short = longest < 2 or (longest // 2 < share / 2 * total and nearest[0] < total)
+    return nearest[1] if too_short else longest_cut(plans, share)
 
 
 def num_units(plans: Sequences) -> int:
@@ -148,7 +157,7 @@ def pieces(plans: Plans, most: int) -> Plans:
 
     Example:
         >>> pieces(Plans(torch.arange(10).view(2, 5) % 3, 3, lengths=torch.tensor([5, 1])), 3).actions.tolist()
-        [[0, 1, 2], [0, 1, 1], [2, 2, 2]]
+        [[0, 1, 2], [0, 1, 0], [2, 0, 0]]
     """
     check_sizes(most=most)
     lengths = plans.mask().sum(1)

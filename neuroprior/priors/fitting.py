@@ -81,9 +81,9 @@ def fit(
             raise ValueError("effort: for the combined prior alone; leave it out, or leave prior out")
         prior = partial(CombinedPrior, effort=effort)
     made = make_prior(plans, prior)
-    fitted: Prior | None = made.fit(plans, generator=generator, **settings)
-    if fitted is None:
-        raise ValueError(f"prior: {type(made).__name__}.fit returned None; it must return the prior")
+    fitted: object = made.fit(plans, generator=generator, **settings)
+    if not isinstance(fitted, Prior):
+        raise ValueError(f"prior: {type(made).__name__}.fit returned {type(fitted).__name__}; it must return the prior")
     return fitted
 
 

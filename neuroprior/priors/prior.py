@@ -71,6 +71,7 @@ class Prior(SavedModule):
         self.num_patterns = num_patterns
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
         self.end: int | None = None
+        self.has_learned = False  # so that `end` and `context_per` are those of plans
         self.action_names: tuple[str, ...] | None = None
         self.context_names: tuple[str, ...] | None = None
         self.past_durations: PastDurations | None = None
@@ -119,7 +120,7 @@ class Prior(SavedModule):
         context_per = learned["context_per"]
         if context_per not in (("plan", "step") if self.takes_context else (None,)):
             raise ValueError(f"context_per: {context_per!r} does not fit this prior")
-        self.context_per = context_per
+        self.context_per, self.has_learned = context_per, True
         end = learned["end"]
         if end is not None and (not isinstance(end, int) or not 0 <= end < self.num_actions):
             raise ValueError(f"end: one of the {self.num_actions} actions is expected, not {end!r}")
@@ -367,7 +368,7 @@ class Prior(SavedModule):
         self._check_actions(plans)
         known = None if self.learns_anew else self.action_names
         check_same_names("action_names", known, plans.action_names, "the plans", "this prior, which learns further")
-        self.end = plans.end
+        self.end, self.has_learned = plans.end, True
         self.action_names = known if plans.action_names is None else tuple(plans.action_names)
         self.context_names = None
         if not self.takes_context:
@@ -384,12 +385,12 @@ class Prior(SavedModule):
         Raises:
             ValueError: another number of actions, or a context of another kind than this prior takes.
         """
-        kept = self.end, self.action_names, self.context_names, self.context_per
+        kept = self.end, self.action_names, self.context_names, self.context_per, self.has_learned
         self.action_names = None  # they are compared with those of the plans that are learned from
         try:
             return self.training_plans(plans)
         finally:
-            self.end, self.action_names, self.context_names, self.context_per = kept
+            self.end, self.action_names, self.context_names, self.context_per, self.has_learned = kept
 
     def known_plans(self, plans: Plans | Tensor) -> Plans:
         """`plans` with the actions and contexts that this prior knows, numbered alike; it keeps nothing of them.
@@ -410,11 +411,15 @@ class Prior(SavedModule):
     def counted_plans(self, plans: Plans | Tensor) -> Plans:
         """As `known_plans`, of plans in which `recount` counts: their ends and contexts are like those it learned from.
 
+        A prior that has not learned yet keeps their names, end and kind of context, as `training_plans` says.
+
         Raises:
             ValueError: see `known_plans`; or plans with another end, or whose context is given per step if that of the
                 plans it learned from was given per plan, or the other way round.
         """
         plans = self.known_plans(plans)
+        if not self.has_learned:
+            return self.training_plans(plans)
         if plans.end != self.end:
             raise ValueError(f"plans: end={self.end} is expected, as in those it learned from, not {plans.end}")
         if self.takes_context and is_per_step(plans.context) != (self.context_per == "step"):

@@ -165,11 +165,11 @@ def test_names_that_look_like_numbers_are_names(names, said, tmp_path, capsys):
 
 
 def of_contexts(path, contexts):
-    """A table of ten plans of four actions: "a" in the first of two contexts, "b" in the second, now and then not."""
+    """A table of ten plans of three or four actions: "a" in one of two contexts, "b" in the other, now and then not."""
     rows = ["plan,action,context"]
     for plan in range(10):
         number = plan % 2
-        rows += [f"{plan},{'ab'[number ^ (t == plan % 7)]},{contexts[number]}" for t in range(4)]
+        rows += [f"{plan},{'ab'[number ^ (t == plan % 7)]},{contexts[number]}" for t in range(4 - plan % 3 // 2)]
     path.write_text("\n".join(rows) + "\n")
     return str(path)
 
@@ -191,7 +191,7 @@ TAKEN = "contexts are numbers, which are taken for those of the prior's names: 0
 def test_contexts_are_matched_by_name_or_it_is_said_how_they_are_numbered(learned, names, file, said, tmp_path, capsys):
     plans = read_plans(of_contexts(tmp_path / "learned.csv", learned))
     if learned == (1, 2):  # numbers in a table, which another file names
-        plans = replace(plans, context=plans.context - 1, context_names=names)
+        plans = replace(plans, context=(plans.context - 1).clamp(min=0), context_names=names)
     prior = MarkovPrior(2, 0, num_contexts=2).fit(plans)
     folder = save(prior, tmp_path / "prior")
     assert main(["score", str(folder), of_contexts(tmp_path / "new.csv", file), "--out", str(tmp_path / "out")]) == 0

@@ -96,7 +96,7 @@ def totals(prior, length, number):
         (spoiled(score=lambda score: score[:, None]), "shapes"),
         (spoiled(final_state=lambda state: (state + 1) % 12), "final_state"),
         (spoiled(model_steps=lambda steps: steps - 1), "model_steps"),
-        (totals, "simulator steps were taken for 8"),
+        (totals, "are given of 8 starts, at most"),
         (spoiled(plan=lambda plan: 1 - plan), "score|not legal"),
         (spoiled(plan=lambda plan: plan.float()), "plan: integers"),
         (lambda prior, length, number: SamplingPlanner, "make: a Planner"),

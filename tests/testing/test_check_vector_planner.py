@@ -17,6 +17,7 @@ PLANNERS = {
     "mppi": MPPIPlanner,
     "plain": partial(MPPIPlanner, normalise=False, control_cost=True, iterations=3),
     "value": partial(ICEMPlanner, discount=0.8, value=lambda state: state[:, 0]),
+    "far": partial(ShootingPlanner, value=lambda state: 50 * state.norm(dim=-1)),
 }
 
 

@@ -71,19 +71,28 @@ class MixturePrior(Prior):
         for number, expert in enumerate(made):
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")
-        names = {f"experts[{number}]": e.action_names for number, e in enumerate(made)}
-        check_alike_named(names, "fit them to plans whose actions are numbered alike")
+        for what in ("action_names", "context_names"):
+            names = {f"experts[{number}]": getattr(e, what) for number, e in enumerate(made)}
+            check_alike_named(names, "fit them to plans that are numbered alike", what)
         given = {(num_contexts, context_size)} - {(None, None)}
         contexts = given | {(e.num_contexts, e.context_size) for e in made if e.takes_context} or {(None, None)}
         if len(contexts) > 1:
             raise ValueError(f"experts: those with a context must have the same, not {sorted(map(str, contexts))}")
         super().__init__(num_actions, *contexts.pop())
-        named = next((e for e in made if e.action_names is not None), None)
-        if named is not None:
-            self.action_names, self.end = named.action_names, named.end
+        self._take_over([e for e in made if e.has_learned])
         self.experts = nn.ModuleList(made)
         self.share = float(share)
         self.register_buffer("first", torch.full((len(made),), 1 / len(made)).log())
+
+    def _take_over(self, learned: Sequence[Prior]) -> None:
+        """Know what experts know that have learned: the names, the end, and the kind of context."""
+        takers = [e for e in learned if e.takes_context]
+        for e in reversed(takers):
+            self.context_per, self.context_names = e.context_per, e.context_names or self.context_names
+        for e in reversed(learned):
+            self.action_names, self.end = e.action_names or self.action_names, e.end
+        # What counts without a context says nothing of that of the plans.
+        self.has_learned = bool(takers if self.takes_context else learned)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -254,15 +263,18 @@ def divided(plans: Plans, validation: Plans | float | None, generator: torch.Gen
         ValueError: there are too few plans, or the validation plans have other names.
     """
     if isinstance(validation, Plans):
-        names = plans.action_names, validation.action_names
-        check_same_names("validation: action_names", *names, "these plans", "those that are learned from")
+        for what in ("action_names", "context_names"):
+            names = getattr(plans, what), getattr(validation, what)
+            check_same_names(f"validation: {what}", *names, "these plans", "those that are learned from")
+        if not bool(validation.mask().any()):
+            raise ValueError("validation: at least one plan with an action is expected")
         return plans, validation
     plans = plans[plans.mask().any(1)]
     if validation is None:
         validation = min(MOST, max(LARGEST / max(int(plans.mask().sum()), 1), LEAST))
     if plans.group is not None and 1 / len(plans.group.unique()) > 2 * validation:
         plans = ungrouped(plans)
-    return fair_split(plans, validation, generator)
+    return fair_split(plans, validation, generator, divide_groups=True)
 
 
 def mixed(weights: Tensor, forecasts: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.plans.folds import num_units
+from neuroprior.plans.folds import fair_split, num_units
 from neuroprior.priors.patterns.minibatches import train
 from neuroprior.priors.prior import Prior
 
@@ -121,7 +121,7 @@ class BoardNetwork(Prior):
             check_alike(plans, share)
             held_out = share
         elif share is not None and num_units(plans) > 1:
-            training, held_out = plans.split(share, generator)
+            training, held_out = fair_split(plans, share, generator)
         self._begin(generator)
         boards, actions = _boards(training)
         if not len(actions):

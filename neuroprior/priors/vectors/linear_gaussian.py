@@ -332,7 +332,7 @@ def held_out_split(
     """
     check_validation(share)
     plans = divisible(plans[plans.mask().any(1)])
-    return fair_split(plans, share, generator) if int(plans.mask().sum()) > 1 else (plans, plans)
+    return fair_split(plans, share, generator, divide_groups=True) if int(plans.mask().sum()) > 1 else (plans, plans)
 
 
 @torch.no_grad()

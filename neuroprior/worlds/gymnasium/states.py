@@ -7,7 +7,7 @@ import pickle
 import random
 from collections.abc import Callable, Iterator
 from enum import Enum
-from functools import cache, lru_cache
+from functools import lru_cache
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType, NoneType
 from typing import Any, NamedTuple
 
@@ -305,7 +305,7 @@ class _Writer:
             self.value(list(part) if isinstance(part, Iterator) else part)
 
 
-@cache
+@lru_cache(1000)
 def _way(kind: type) -> str:
     """How values of a type are written; one that is made of others, "compound"."""
     if issubclass(kind, (NoneType, int, float, str, bytes, complex)):
@@ -327,7 +327,7 @@ def _written(names: tuple[str, ...]) -> list[str]:
     return sorted(name for name in names if name not in IGNORED)
 
 
-@cache
+@lru_cache(1000)
 def _is_plain(kind: type) -> bool:
     """Whether values of a type are their attributes, and nothing else."""
     if any(getattr(kind, name) is not getattr(object, name) for name in ("__reduce__", "__reduce_ex__")):

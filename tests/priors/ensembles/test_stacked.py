@@ -137,8 +137,8 @@ def test_long_plans_and_a_single_one():
 @pytest.mark.parametrize(
     ("plans", "word"),
     [
-        (Plans(torch.zeros(0, 5, dtype=torch.long), A), "at least two plans"),
-        (Plans(torch.zeros(1, 1, dtype=torch.long), A), "at least two plans"),
+        (Plans(torch.zeros(0, 5, dtype=torch.long), A), "at least two actions"),
+        (Plans(torch.zeros(1, 1, dtype=torch.long), A), "at least two actions"),
         (Plans(torch.zeros(4, 5, dtype=torch.long), 5), "not 5"),
     ],
 )

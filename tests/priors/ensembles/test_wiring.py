@@ -123,8 +123,8 @@ def test_where_few_are_held_out_all_others_are_forecast_part_by_part(shape):
 @pytest.mark.parametrize(
     ("lengths", "groups", "parts"),
     [
-        ([200, 4], None, 1),  # what is left to count in without the long plan is next to nothing
-        ([200, 4, 4, 4], None, 1),
+        ([200, 4], None, 6),  # without the long plan next to nothing would be left to count in: it is cut
+        ([200, 4, 4, 4], None, 6),
         ([10] * 30, [0] * 28 + [1, 2], 6),  # the groups are taken apart
         ([10] * 30, [0] * 10 + [1] * 10 + [2] * 10, 4),
         ([10] * 3000, None, 1),  # enough are held out of so many, or too few by intent
