@@ -35,8 +35,8 @@ class Plans(Sequences):
         context: what is known when actions are chosen, such as the agent's observations: indices (integers), one per
             plan `[N]` or per step `[N, L]`; several per step, `[N, L, F]`, stored as int32: the patterns that are
             active in each state; or features (floating point) `[N, C]` or `[N, L, C]`; None for no context.
-        group: integers `[N]` (subject, session, world): the plans of a group are not independent, and never split
-            between training and validation; None if each plan is independent.
+        group: integers `[N]` (subject, session, world): the plans of a group are not independent, and are held out
+            together (see `CombinedPrior` for an exception); None if each plan is independent.
         context_names: names of the context indices, numbered from 0, or None.
         group_names: names of the groups, numbered from 0, or None.
         end: the action that stands for the end of the plan (see `with_end`), or None. It may only be a plan's last.

@@ -23,8 +23,8 @@ class VectorPlans(Sequences):
         lengths: integers `[N]`, the number of vectors of each plan; None where all have L.
         context: features of the states in which actions were chosen, floating point, one row per plan `[N, C]` or per
             step `[N, L, C]`; stored as float32. None for no context.
-        group: integers `[N]` (subject, session, run): the plans of a group are not independent, and never split between
-            training and validation; None if each plan is independent.
+        group: integers `[N]` (subject, session, run): the plans of a group are not independent, and are held out
+            together, unless there are few or very unequal ones; None if each plan is independent.
         action_names: names of the D dimensions, or None.
 
     Raises:

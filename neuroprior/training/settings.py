@@ -38,8 +38,8 @@ class Settings:
         learning_rate: of AdamW, after the first tenth of the steps.
         weight_decay: of AdamW.
         gradient_clip: the largest norm of a gradient.
-        validation: share of plans (of groups, where there are any) held out for early stopping; or other plans
-            for it, and all plans are learned from.
+        validation: share of plans (of groups, where there are any) held out for early stopping, where plans are unequal
+            about of their actions; or other plans for it, and all plans are learned from.
         check_every: steps between two validations (on the held-out plans); None: two passes through the plans, but at
             least `FEWEST_STEPS` and at most `MOST_STEPS`, so that small data sets are not overfitted before the first.
         patience: steps without a lower validation loss after which training stops. None: `PATIENCE` of all steps.

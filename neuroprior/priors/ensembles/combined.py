@@ -210,8 +210,9 @@ class CombinedPrior(MixturePrior):
         Args:
             plans: `Plans`, or integers `[N, L]` for plans without context.
             generator: draws the held-out plans and the seeds of networks, and is passed on to the experts.
-            settings: `validation`: `Plans` that are held out, or their share. It and all others, see
-                `neuroprior.training.Settings`, are passed on to the experts that have them.
+            settings: `validation`: `Plans` that are held out, or their share; groups stay together, unless there are
+                few or very unequal ones. It and all others, see `neuroprior.training.Settings`, are passed on to the
+                experts that have them.
 
         Raises:
             ValueError: plans that the experts cannot learn from, too few of them, or an unknown setting.
