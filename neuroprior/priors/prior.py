@@ -39,6 +39,7 @@ class Prior(SavedModule):
         end: the action that ends a plan, as it was in the plans that the prior learned from (see `Plans.with_end`), or
             None. After it, it has probability 1 in `log_prob` and in samples.
         action_names, context_names: names of the actions and contexts, as they were in these plans, or None.
+        has_learned: whether the prior has learned from plans, so that these attributes are theirs.
         past_durations: how the durations of the last actions became features of the context in training, or None;
             `neuroprior.priors.match_plans` then adds the same features to other plans. The caller of `fit` sets it.
 
@@ -71,7 +72,7 @@ class Prior(SavedModule):
         self.num_patterns = num_patterns
         self.context_per: Literal["plan", "step"] | None = "step" if self.takes_context else None
         self.end: int | None = None
-        self.has_learned = False  # so that `end` and `context_per` are those of plans
+        self.has_learned = False
         self.action_names: tuple[str, ...] | None = None
         self.context_names: tuple[str, ...] | None = None
         self.past_durations: PastDurations | None = None
