@@ -1,6 +1,6 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -84,13 +84,9 @@ def score(
         )
     notes = [*plans.notes, *notes]
     if plans.action_names and action_names is None and prior.action_names is None:
-        order = listed([f"{name} = {number}" for number, name in enumerate(plans.action_names)])
-        notes.append(
-            f"the prior knows actions by number, so the file's were numbered: {order}; --action_names orders them"
-        )
+        notes.append(f"{_numbered('actions', plans.action_names)}; --action_names orders them")
     if by_number and known is not None:
-        order = listed([f"{number} = {name}" for number, name in enumerate(known)])
-        notes.append(f"the actions are numbers, which are taken for those of the prior's names: {order}")
+        notes.append(_taken_for_names("actions", known))
     place.mkdir(parents=True, exist_ok=True)
     console = Console()
     for note in notes:
@@ -112,16 +108,26 @@ def _with_contexts_of(prior: Prior, plans: Plans, is_table: bool) -> tuple[Plans
     if prior.num_contexts is None or context is None or (known is None) == (names is None):
         return plans, []
     if known is None:
-        order = listed([f"{name} = {number}" for number, name in enumerate(names or ())])
-        return plans, [f"the prior knows contexts by number, so the file's were numbered: {order}"]
+        return plans, [_numbered("contexts", names or ())]
     occurring = (context[plans.mask()] if is_per_step(context) else context).unique()
     names = tuple(map(str, occurring.tolist()))
     if is_table and names and set(names) <= set(known):
         # What stands behind the end of a plan is none of them.
         number = torch.searchsorted(occurring, context).clamp(max=len(names) - 1)
         return replace(plans, context=number, context_names=names), []
+    return plans, [_taken_for_names("contexts", known)]
+
+
+def _numbered(what: str, names: Sequence[str]) -> str:
+    """The note on actions or contexts of which the file alone has names."""
+    order = listed([f"{name} = {number}" for number, name in enumerate(names)])
+    return f"the prior knows {what} by number, so the file's were numbered: {order}"
+
+
+def _taken_for_names(what: str, known: Sequence[str]) -> str:
+    """The note on actions or contexts of which the prior alone has names."""
     order = listed([f"{number} = {name}" for number, name in enumerate(known)])
-    return plans, [f"the contexts are numbers, which are taken for those of the prior's names: {order}"]
+    return f"the {what} are numbers, which are taken for those of the prior's names: {order}"
 
 
 def _by_number(plans: Plans, file: str, how: Mapping[str, Any]) -> bool:

@@ -73,7 +73,8 @@ def fair_split(
     Raises:
         ValueError: `share` is not between 0 and 1, or the plans cannot be split, see `Plans.split`.
     """
-    total, nearest = int(plans.mask().sum()), None
+    lengths, nearest = plans.mask().sum(1), None
+    total, longest = int(lengths.sum()), int(lengths.max()) if len(lengths) else 0
     for _ in range(DRAWS):
         drawn = plans.split(share, generator)
         held_out = int(drawn[1].mask().sum())
@@ -85,7 +86,6 @@ def fair_split(
     assert nearest is not None
     if plans.group is not None:
         return fair_split(ungrouped(plans), share, generator) if divide_groups else nearest[1]
-    longest = int(plans.mask().sum(1).max())
     too_short = longest < 2 or (longest // 2 < share / 2 * total and nearest[0] < total)
     return nearest[1] if too_short else longest_cut(plans, share)
 

@@ -182,7 +182,6 @@ def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int)
         experts = list(fitted_experts(training, validation, sizes, design.effort, generator, design.training))
         combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
         assert isinstance(combined, CombinedPrior)
-        combined.training_plans(learned)
         combined.learn_weights(validation, number_tried(experts), training)
         names = {type_: name for name, type_ in NETWORKS.items()}
         for expert in [expert.recount(learned) for expert in experts]:

@@ -168,6 +168,7 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
     assert tree["more"] == pytest.approx(tree["bits_per_action"] - combined["bits_per_action"])
     assert tree["more_low"] < tree["more"] < tree["more_high"]
     assert f"{tree['more']:+.4f} ±" in said
+    assert said.count("times as long as markov, context-tree, gru, stacked together") == 2
     assert SOURCES[0].name in said
     alone = tmp_path / "alone"
     assert main(["quality", "--num-plans", "0", "--num-sequences", "4", "--out", str(alone)]) == 0
