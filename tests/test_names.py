@@ -147,7 +147,7 @@ def test_a_refused_fit_keeps_what_was_learned():
     assert stacked.action_names == tuple(NAMES)
     assert noise.action_names == HIP
     first = GRUPrior(4, 4)
-    with pytest.raises(ValueError, match=r"^validation: its action_names are not those of the plans"):
+    with pytest.raises(ValueError, match=r"^validation: action_names: .+ in these plans, .+ in those that are"):
         first.fit(PLANS, validation=OTHERS, **SHORT)
 
 

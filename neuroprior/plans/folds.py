@@ -6,7 +6,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_seed, check_sizes
+from neuroprior._checks import check_same_names, check_seed, check_sizes
 from neuroprior.plans.plans import Plans, check_are_plans
 from neuroprior.plans.sequences import Sequences, is_per_step
 from neuroprior.plans.vector_plans import VectorPlans
@@ -88,6 +88,19 @@ def fair_split(
         return fair_split(ungrouped(plans), share, generator) if divide_groups else nearest[1]
     too_short = longest < 2 or (longest // 2 < share / 2 * total and nearest[0] < total)
     return nearest[1] if too_short else longest_cut(plans, share)
+
+
+def check_alike(training: Sequences, validation: Sequences) -> None:
+    """Raise ValueError unless the actions and contexts of both are the same ones, numbered alike."""
+    if type(training) is not type(validation):
+        raise ValueError(f"validation: {type(training).__name__} are expected, not {type(validation).__name__}")
+    if isinstance(training, Plans) and isinstance(validation, Plans) and validation.num_actions != training.num_actions:
+        raise ValueError(f"validation: {training.num_actions} actions are expected, not {validation.num_actions}")
+    for what in ("action_names", "context_names"):
+        names = getattr(training, what, None), getattr(validation, what, None)
+        check_same_names(f"validation: {what}", *names, "these plans", "those that are learned from")
+    if is_per_step(training.context) != is_per_step(validation.context):
+        raise ValueError("validation: a context per step, or one a plan, is expected, as in the plans learned from")
 
 
 def num_units(plans: Sequences) -> int:

@@ -86,6 +86,15 @@ def _random_context(prior: Prior, kind: str | None, num: int, length: int, gener
 def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None:
     """`start` and `step` give what `forward` gives; reordering the state reorders the logits."""
     num, length = plans.shape
+    if context is not None and not is_per_step(context):
+        _, state = prior.start(num, context)
+        try:
+            prior.step(plans[:, 0], state, None)
+        except Exception as error:
+            raise AssertionError(
+                f"step: {error}; where plans have one context each, `start` is given it, and `step` None:"
+                " what is needed later has to be kept in the state"
+            ) from error
     whole = prior(plans, context)
     # On a GPU cuDNN reads sequences with 10 bits of mantissa (TF32), unless that is switched off.
     rounding = 1e-4 if plans.device.type == "cpu" else 1e-3

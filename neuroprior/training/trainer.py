@@ -22,8 +22,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from neuroprior._files import write_whole
 from neuroprior._threads import one_thread
-from neuroprior.plans import Plans, is_per_step
-from neuroprior.plans.folds import fair_split
+from neuroprior.plans.folds import check_alike, fair_split
 from neuroprior.plans.sequences import Sequences
 from neuroprior.training.batches import PlansModule
 from neuroprior.training.module import PriorModule
@@ -91,20 +90,6 @@ def train(prior: nn.Module, plans: Sequences, settings: Settings, seed: int) -> 
         best = run_training(trainer, module, data)
         module.to(device)
     return best
-
-
-def check_alike(training: Sequences, validation: Sequences) -> None:
-    """Raise ValueError unless the actions and contexts of both are the same ones."""
-    if type(training) is not type(validation):
-        raise ValueError(f"validation: {type(training).__name__} are expected, not {type(validation).__name__}")
-    if isinstance(training, Plans) and isinstance(validation, Plans) and validation.num_actions != training.num_actions:
-        raise ValueError(f"validation: {training.num_actions} actions are expected, not {validation.num_actions}")
-    for what in ("action_names", "context_names"):
-        expected, given = getattr(training, what, None), getattr(validation, what, None)
-        if expected is not None and given is not None and list(expected) != list(given):
-            raise ValueError(f"validation: its {what} are not those of the plans that are learned from, in their order")
-    if is_per_step(training.context) != is_per_step(validation.context):
-        raise ValueError("validation: a context per step, or one a plan, is expected, as in the plans learned from")
 
 
 def make_trainer(

@@ -211,6 +211,20 @@ class Forgetful(Broken):
         pass
 
 
+class ReadsContext(Prior):
+    """Reads a context in each step, also where there is one for the whole plan."""
+
+    def __init__(self) -> None:
+        super().__init__(3, context_size=3)
+
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        assert context is not None
+        return context, torch.zeros(batch_size, 1)
+
+    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        return context * 2, state  # type: ignore[operator]
+
+
 class Unsavable(Broken):
     """Its `config` is not what its constructor takes."""
 
@@ -228,6 +242,7 @@ class Unsavable(Broken):
         (WrongSamples, "do not fit log_prob"),
         (GlobalRandomness, "same seed gave other plans|global generator"),
         (partial(Forgetful, bonus=1.0), "saved, loaded"),
+        (ReadsContext, "step: .* `start` is given it, and `step` None"),
         (Unsavable, "cannot be saved and loaded"),
     ],
 )

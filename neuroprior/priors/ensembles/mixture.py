@@ -6,10 +6,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from neuroprior._checks import check_alike_named, check_same_names, check_share
+from neuroprior._checks import check_alike_named, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
-from neuroprior.plans.folds import fair_split, ungrouped
+from neuroprior.plans.folds import check_alike, fair_split, ungrouped
 from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.prior import Prior, as_prior, described, taken_of
@@ -150,10 +150,15 @@ class MixturePrior(Prior):
         self.check_settings(settings)
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
-        learned, held_out = divided(plans, settings.pop("validation", None), generator)
+        learned, held_out = divided(plans, self.validation_of(settings), generator)
         self.fit_experts(learned, held_out, generator, settings)
         self.learn_weights(held_out)
         return self.recount(plans)
+
+    def validation_of(self, settings: dict[str, Any]) -> Plans | float | None:
+        """What is held out, which is taken from the settings of `fit`: as plans that this prior can predict."""
+        given: Plans | float | None = settings.pop("validation", None)
+        return self.validation_plans(given) if isinstance(given, Plans) else given
 
     def fit_experts(
         self, learned: Plans, held_out: Plans, generator: torch.Generator, settings: Mapping[str, Any]
@@ -260,12 +265,10 @@ def divided(plans: Plans, validation: Plans | float | None, generator: torch.Gen
     Groups stay together where there are so many that few actions are lost; see `fair_split`.
 
     Raises:
-        ValueError: there are too few plans, or the validation plans have other names.
+        ValueError: there are too few plans, or the validation plans are not numbered alike.
     """
     if isinstance(validation, Plans):
-        for what in ("action_names", "context_names"):
-            names = getattr(plans, what), getattr(validation, what)
-            check_same_names(f"validation: {what}", *names, "these plans", "those that are learned from")
+        check_alike(plans, validation)
         if not bool(validation.mask().any()):
             raise ValueError("validation: at least one plan with an action is expected")
         return plans, validation

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from neuroprior._checks import check_count, check_memory, check_seed, check_sizes, is_number
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans.folds import check_alike
 from neuroprior.priors import recordings
 from neuroprior.priors.neural.features import UNSCALED, Standardise
 from neuroprior.priors.prior import Prior
@@ -321,7 +322,6 @@ class NeuralPrior(Prior):
         """
         self.check_settings(settings)
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
-        from neuroprior.training.trainer import check_alike
 
         how = Settings(**settings)
         if isinstance(how.validation, Plans):  # refused before anything is kept of the plans

@@ -11,7 +11,7 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.plans.folds import fair_split, num_units
+from neuroprior.plans.folds import check_alike, fair_split, num_units
 from neuroprior.priors.patterns.minibatches import train
 from neuroprior.priors.prior import Prior
 
@@ -116,8 +116,6 @@ class BoardNetwork(Prior):
             raise ValueError(f"learning_rate: a finite number above 0 is expected, not {learning_rate}")
         training, held_out = plans, None
         if isinstance(share, Plans):
-            from neuroprior.training.trainer import check_alike  # loads Lightning, which takes seconds
-
             check_alike(plans, share)
             held_out = share
         elif share is not None and num_units(plans) > 1:

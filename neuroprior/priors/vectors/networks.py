@@ -13,6 +13,7 @@ from torch.nn import functional
 from neuroprior._checks import check_memory, check_seed, check_sizes, is_number
 from neuroprior._compiled import compiled
 from neuroprior._random import draw_seed, generator_on
+from neuroprior.plans.folds import check_alike
 from neuroprior.plans.sequences import Sequences
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.neural.features import Standardise
@@ -428,7 +429,6 @@ class VectorNetwork(VectorPrior):
         """
         self.check_settings(settings)
         from neuroprior.training import Settings, train  # lightning takes seconds to import: only where it is needed
-        from neuroprior.training.trainer import check_alike
 
         how, first = Settings(**(DEFAULTS | settings)), self.learns_anew
         known, memory = self.action_names, self.memory
