@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Self
 
 import numpy as np
 import pytest
@@ -223,6 +224,9 @@ class ReadsContext(Prior):
 
     def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         return context * 2, state  # type: ignore[operator]
+
+    def fit(self, plans: Plans | Tensor, **settings: object) -> Self:
+        return self
 
 
 class Unsavable(Broken):
