@@ -220,7 +220,7 @@ class CombinedPrior(MixturePrior):
         self.check_settings(settings)
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
-        learned, held_out = divided(plans, self.validation_of(settings), generator)
+        learned, held_out = divided(plans, self._validation_of(settings), generator)
         self.spare = nn.ModuleList()
         if self.given:
             self.experts = nn.ModuleList(*self.given).to(self.device)

@@ -150,12 +150,12 @@ class MixturePrior(Prior):
         self.check_settings(settings)
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
-        learned, held_out = divided(plans, self.validation_of(settings), generator)
+        learned, held_out = divided(plans, self._validation_of(settings), generator)
         self.fit_experts(learned, held_out, generator, settings)
         self.learn_weights(held_out)
         return self.recount(plans)
 
-    def validation_of(self, settings: dict[str, Any]) -> Plans | float | None:
+    def _validation_of(self, settings: dict[str, Any]) -> Plans | float | None:
         """What is held out, which is taken from the settings of `fit`: as plans that this prior can predict."""
         given: Plans | float | None = settings.pop("validation", None)
         return self.validation_plans(given) if isinstance(given, Plans) else given

@@ -256,7 +256,7 @@ def sizes_of_networks():
         prior = kind(3).fit(plans, generator=seeded(0), max_steps=4, check_every=1, progress=False)
         found[kind.__name__] = {"config": prior.config, "log_prob": prior.log_prob(plans)}
     prior = GRUPrior(3, 8, window=3, seed=1).fit(
-        plans, generator=seeded(0), max_steps=40, check_every=5, patience=10, learning_rate=0.3, progress=False
+        plans, generator=seeded(0), max_steps=40, check_every=5, patience=10, learning_rate=0.1, progress=False
     )
     found["best"] = prior.log_prob(plans).mean()
     prior = GRUPrior(3, 8, window=3, seed=1).fit(
