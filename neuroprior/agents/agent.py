@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes, is_number
+from neuroprior._checks import check_memory, check_sizes, is_number, kind_of
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
@@ -15,7 +15,7 @@ from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior
 from neuroprior.sampling.stepping import check_actions
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, check_is_world
 
 
 class Agent:
@@ -29,7 +29,7 @@ class Agent:
 
     Args:
         world: the world.
-        planner: its plans have at least `replan_every` actions.
+        planner: its plans have at least `replan_every` actions, or end where the world terminates.
         prior: the prior that learns, usually the planner's. It also continues the rest of the last plan.
         state: `[B, ...]`: the states of the agents; None: one agent in a state that `world.reset` draws.
         replan_every: actions that are executed before replanning.
@@ -79,8 +79,11 @@ class Agent:
     ) -> None:
         learns = {} if learn_every is None else {"learn_every": learn_every}
         check_sizes(replan_every=replan_every, plan_length=plan_length, num_rollouts=num_rollouts, **learns)
+        if not isinstance(planner, Planner):
+            raise ValueError(f"planner: a Planner is expected, not {kind_of(planner)}")
         if not isinstance(prior, Prior):
             raise ValueError(f"prior: a Prior is expected, not a {type(prior).__name__}")
+        check_is_world(world)
         if plan_length % replan_every:
             raise ValueError(f"plan_length: a multiple of replan_every = {replan_every} is expected, not {plan_length}")
         if learn_every is not None and learn_every % plan_length:
@@ -138,7 +141,7 @@ class Agent:
 
     def _rest(self, decision: Decision) -> Decision:
         """The rest of a plan of which `replan_every` actions were executed."""
-        lengths = None if decision.lengths is None else decision.lengths - self.replan_every
+        lengths = None if decision.lengths is None else (decision.lengths - self.replan_every).clamp(min=0)
         return decision._replace(plan=decision.plan[:, self.replan_every :], lengths=lengths)
 
     def _learn(self, done: Execution) -> None:

@@ -150,7 +150,10 @@ class BestFirstPlanner(Planner):
         if world.stochastic:
             raise ValueError("world: a deterministic one is expected: a search reaches each state by the same actions")
         if not world.has_goal:
-            raise ValueError(f"world: one with goals is expected (World.solved), not {type(world).__name__}")
+            kind = type(world).__name__
+            raise ValueError(
+                f"world: one with goals (has_goal is True, and `solved` says where) is expected, not {kind}"
+            )
         if self.reroot and not hasattr(world, "lower_bound"):
             kind = type(world).__name__
             raise ValueError(f"reroot: a world with lower_bound(state), the steps left, is expected, not {kind}")

@@ -43,7 +43,5 @@ class DistinctPlanner(PriorPlanner):
         beams.extend(self.num_plans, self.length)
         score, ends = self.score_rollout(beams.rollout(state, keep_states=self.any_prefix))
         possible = beams.log_prob > -torch.inf
-        if not possible.any(1).all():
-            raise ValueError("prior: from some start, every plan of legal actions has probability 0")
         plans = beams.plans.view(*possible.shape, self.length)
         return decide(plans, score, ends, steps, generator, possible[..., None] if self.any_prefix else possible)

@@ -44,7 +44,7 @@ def execute(
     """Plan, execute the first actions, replan from the state that they led to, and so on.
 
     Args:
-        planner: its plans have at least `replan_every` actions.
+        planner: its plans have at least `replan_every` actions, or end where the world terminates.
         world: the world in which plans are executed, and tried by the planner.
         state: `[B, ...]`.
         num_steps: T, at least 1.
@@ -156,11 +156,19 @@ def follow(
     change: Change | None = None,
 ) -> Execution:
     """Execute the first `num_steps` actions of a decision for `state [B, ...]`; see `execute`."""
-    plan, lengths = decision.plan, decision.lengths
-    if plan.shape[1] < num_steps or (lengths is not None and (lengths < num_steps).any()):
-        raise ValueError(f"replan_every: {num_steps} actions are to be executed, but a plan has fewer; replan sooner")
+    plan = torch.nn.functional.pad(decision.plan, (0, max(num_steps - decision.plan.shape[1], 0)))
     actions = plan[:, :num_steps].long()
     rewards, states = _step_through(world, state, actions, generator, change)
+    lengths = actions.new_tensor(decision.plan.shape[1]) if decision.lengths is None else decision.lengths
+    short = (lengths.expand(len(state)) < num_steps).nonzero()[:, 0]
+    if len(short):  # a plan may be shorter where the episode ends with it
+        last = lengths.expand(len(state))[short].long()
+        ended = world.terminated(torch.cat([state[:, None], states], 1)[short, last])
+        if not ended.all():
+            raise ValueError(
+                f"replan_every: {num_steps} actions are to be executed, but a plan has fewer,"
+                f" {int(last[~ended][0])}, and its episode goes on"
+            )
     return Execution(actions, rewards, states, decision.model_steps)
 
 

@@ -275,7 +275,7 @@ class _Trees:
         """`logits [N, A]`, -inf for actions that are not legal in `state [N, ...]`."""
         logits = legal_logits(self.world, state, logits)
         if not self.world.all_legal and (logits == -torch.inf).all(1).any():
-            raise ValueError("prior: in some state, all legal actions have probability 0")
+            raise ValueError("prior: in some state all legal actions have probability 0, or the world has none there")
         if logits.isnan().any():
             raise ValueError("prior: its logits are NaN")
         return logits

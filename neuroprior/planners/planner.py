@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes, is_number
+from neuroprior._checks import check_memory, check_sizes, is_number, kind_of
 from neuroprior._random import generator_on
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
@@ -76,6 +76,8 @@ class Planner(ABC):
         any_prefix: bool = False,
     ) -> None:
         check_objective(objective, discount)
+        if value is not None and not callable(value):
+            raise ValueError(f"value: a function of states [N, ...] is expected, not {value!r}")
         self.objective, self.discount, self.value, self.any_prefix = objective, discount, value, any_prefix
 
     @property
@@ -103,13 +105,14 @@ class Planner(ABC):
 
     def score(self, rewards: Tensor, final_state: Tensor) -> Tensor:
         """The scores `[...]` of plans with `rewards [..., L]` that end in `final_state` (`[...]` and its own shape)."""
-        length = rewards.shape[-1]
+        length, rewards = rewards.shape[-1], as_floats(rewards)
         if self.objective == "terminal":
             return self._add_value(rewards[..., -1], final_state)
         return self._add_value((rewards * self._weights(rewards)).sum(-1), final_state, self.discount**length)
 
     def prefix_scores(self, rewards: Tensor, states: Tensor) -> Tensor:
         """The scores `[..., L]` of all prefixes of plans that have `rewards [..., L]` and lead to `states [..., L]`."""
+        rewards = as_floats(rewards)
         if self.objective == "terminal":
             return self._add_value(rewards, states)
         weights = self._weights(rewards)
@@ -136,7 +139,8 @@ class Planner(ABC):
         return parts
 
     def _weights(self, rewards: Tensor) -> Tensor:
-        return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=rewards.dtype)
+        dtype = as_floats(rewards[..., :0]).dtype
+        return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=dtype)
 
     def _add_value(self, score: Tensor, state: Tensor, weight: Tensor | float = 1.0) -> Tensor:
         """`score [...]` plus the weighted value of `state` (`[...]` and its own shape)."""
@@ -182,9 +186,18 @@ class PriorPlanner(Planner):
         return generator_on(generator, state.device)
 
 
+def as_floats(rewards: Tensor) -> Tensor:
+    """The same rewards; integers and truth values in single precision."""
+    return rewards if rewards.is_floating_point() else rewards.float()
+
+
 def value_of(value: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
     """The values `[N]` of `state [N, ...]`; raises ValueError unless there are N of them and none is NaN."""
     values = value(state)
+    if not isinstance(values, Tensor):
+        raise ValueError(
+            f"value: a tensor [{len(state)}] of the values of {len(state)} states is expected, not {kind_of(values)}"
+        )
     if values.numel() != len(state) or values.isnan().any():
         raise ValueError(
             f"value: one number for each of {len(state)} states is expected, none NaN; got {values.numel()}"
@@ -213,13 +226,18 @@ def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | Non
         allowed: bool `[B, P]`: the scores that count, at least one in each row; None: all.
 
     Raises:
-        ValueError: a score is NaN.
+        ValueError: a score is NaN, or none of a row counts.
 
     Example:
         >>> random_best(torch.tensor([[0.0, 2.0, 1.0]]), torch.Generator().manual_seed(0)).tolist()
         [1]
     """
     # Scores are often one column of many, which is slow to read more than once.
+    if allowed is not None and not allowed.any(1).all():
+        raise ValueError(
+            "plans: from some start there is no plan of legal actions alone; a world's `legal_actions` are at least one"
+            " in each state, and a prior's probability is not 0 for all of these"
+        )
     score = score.contiguous() if allowed is None else score.masked_fill(~allowed, -torch.inf)
     highest = score.amax(1, keepdim=True)
     if highest.isnan().any():

@@ -25,10 +25,11 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     not change its arguments and treats each state of a batch independently; the same seed gives the same trajectory;
     `rollout` equals stepping and raises ValueError for plans of a wrong shape, dtype or range. A stochastic world
     says so, and its rollouts have the distribution of its steps (chi-square tests, with a false-alarm probability of
-    1e-6 together); those of a table use common random numbers for all plans of a start.
+    1e-6 together); those of a table use common random numbers for all plans of a start. Terminated states among those
+    that random plans reach stay as they are, and give a reward of 0.
 
     Of a `ContinuousWorld` also: its bounds are finite and in order, its names one a dimension; `rollout` refuses
-    vectors beyond the bounds, NaN in plans and NaN in states; terminated states stay, and give a reward of 0.
+    vectors beyond the bounds, NaN in plans and NaN in states.
 
     Args:
         world: the world to check.
@@ -60,9 +61,7 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     else:
         plans, wrong_plans = _numbers(world, state, length, generator)
     _check_step(world, state, plans[:, 0, 0], seed)
-    _check_queries(world, state)
-    if isinstance(world, ContinuousWorld):
-        _check_ends(world, state, plans, generator)
+    _check_reached(world, state, plans, generator)
     by_steps, rewards, random = _step_through(world, state, plans, seed)
     rollout = world.rollout(state, plans, torch.Generator().manual_seed(seed))
     require(
@@ -83,6 +82,14 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     wrong_plans["plans for too few starts"] = plans[1:]
     for what, wrong in wrong_plans.items():
         require(raises(partial(world.rollout, state, wrong)), f"rollout must raise ValueError for {what}")
+    try:
+        kept = world.rollout(state, plans, torch.Generator().manual_seed(seed), keep_states=True).states
+    except TypeError as error:
+        raise AssertionError(f"rollout: with keep_states=True: {error}") from error
+    require(
+        kept is not None and same(kept[:, :, -1], rollout.final_state),
+        "rollout: with keep_states=True the last of the states is not the final one",
+    )
 
 
 def _numbers(world: World, state: Tensor, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
@@ -118,17 +125,21 @@ def _vectors(
     }
 
 
-def _check_ends(world: ContinuousWorld, state: Tensor, plans: Tensor, generator: torch.Generator) -> None:
-    """States of NaN are refused; terminated states stay, and give nothing."""
-    if state.is_floating_point():
+def _check_reached(world: World | ContinuousWorld, state: Tensor, plans: Tensor, generator: torch.Generator) -> None:
+    """In the states that plans lead to: queries; terminated ones stay, and give nothing. NaN in states is refused."""
+    if isinstance(world, ContinuousWorld) and state.is_floating_point():
         wrong = torch.full_like(state, torch.nan)
         require(raises(partial(world.rollout, wrong, plans)), "rollout must raise ValueError for states of NaN")
-    ends = world.rollout(state, plans, torch.Generator().manual_seed(0), keep_states=True).states
-    require(ends is not None, "rollout: no states, though keep_states is True")
-    ends = torch.cat([state, ends.flatten(0, 2)]) if ends is not None else state
-    ends = ends[world.terminated(ends)]
+    found = [state]
+    for t in range(plans.shape[2]):
+        found.append(world.step(found[-1], plans[:, 0, t], generator)[0])
+    reached = torch.cat(found)
+    _check_queries(world, reached)
+    ends = reached[world.terminated(reached)]
     if len(ends):
-        after, reward = world.step(ends, plans[:1, 0, 0].expand(len(ends), -1), generator)
+        action = plans[:, 0, 0]
+        action = action[torch.randint(len(action), (len(ends),), generator=generator).to(action.device)]
+        after, reward = world.step(ends, action, generator)
         require(after.equal(ends), "step: terminated states must stay as they are")
         require(not reward.any(), "step: the reward from terminated states must be 0")
 

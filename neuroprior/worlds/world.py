@@ -134,7 +134,11 @@ class World(ABC):
         return torch.ones(state.shape[0], self.num_actions, dtype=torch.bool, device=state.device)
 
     def terminated(self, state: Tensor) -> Tensor:
-        """Which of `state [N, ...]` are final, so that no action is executed there: `[N]` bool. Default: none."""
+        """In which of `state [N, ...]` the episode is over: `[N]` bool. Default: none.
+
+        Planners go on with plans that end such episodes: `step` has to leave these states as they are, and give a
+        reward of 0 there. What is executed there is not learned from.
+        """
         return torch.zeros(state.shape[0], dtype=torch.bool, device=state.device)
 
     def solved(self, state: Tensor) -> Tensor:
@@ -162,6 +166,8 @@ def check_is_world(world: object) -> None:
     """Raise ValueError unless it is a `World`."""
     if not isinstance(world, World):
         raise ValueError(f"world: a World, whose actions are numbered, is expected, not {kind_of(world)}")
+    if not hasattr(world, "num_actions"):
+        raise ValueError(f"num_actions: {type(world).__name__} does not say how many actions it has")
 
 
 def check_plans(plans: Tensor, batch_size: int, num_actions: int) -> None:

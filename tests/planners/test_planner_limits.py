@@ -3,7 +3,124 @@
 import pytest
 import torch
 
-from neuroprior import ExhaustivePlanner, Planner, SamplingPlanner, UniformPrior, World, gridworld, oracle
+from neuroprior import (
+    ExhaustivePlanner,
+    MarkovPrior,
+    Planner,
+    SamplingPlanner,
+    UniformPrior,
+    World,
+    execute,
+    gridworld,
+    oracle,
+)
+from neuroprior.agents import Agent
+from neuroprior.planners import (
+    CrossEntropyPlanner,
+    DistinctPlanner,
+    FrontierPlanner,
+    LevinPlanner,
+    MCTSPlanner,
+)
+from neuroprior.worlds import sliding_tiles
+
+MAKERS = {
+    "exhaustive": lambda **goal: ExhaustivePlanner(3, **goal),
+    "sampling": lambda **goal: SamplingPlanner(UniformPrior(3), 3, 64, **goal),
+    "distinct": lambda **goal: DistinctPlanner(UniformPrior(3), 3, 27, **goal),
+    "frontier": lambda **goal: FrontierPlanner(UniformPrior(3), 3, 27, **goal),
+    "mcts": lambda **goal: MCTSPlanner(UniformPrior(3), 3, 40, **goal),
+    "cross-entropy": lambda **goal: CrossEntropyPlanner(UniformPrior(3), 3, 64, **goal),
+}
+PLANNERS = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+
+
+class Walk(World):
+    """A walk in the plane, by vectors that differ, with rewards of a dtype, for being on one side."""
+
+    num_actions = 3
+
+    def __init__(self, dtype: torch.dtype) -> None:
+        self.dtype = dtype
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> torch.Tensor:
+        return torch.randn(batch_size, 2, generator=generator)
+
+    def step(self, state, action, generator=None):
+        after = state + torch.tensor([[1.0, 0.3], [-0.4, 0.9], [-0.7, -1.1]])[action]
+        return after, (after[:, 0] > 0).to(self.dtype)
+
+
+@PLANNERS
+@pytest.mark.parametrize("dtype", [torch.long, torch.bool])
+@pytest.mark.parametrize(
+    "goal",
+    [
+        {},
+        {"value": lambda state: torch.cos(state.sum(1))},
+        {"objective": "return", "discount": 0.5, "value": lambda state: torch.cos(state.sum(1)), "any_prefix": True},
+    ],
+    ids=["terminal", "value", "return"],
+)
+def test_rewards_of_another_dtype_are_the_same_numbers(make, dtype, goal):
+    state = Walk(torch.float).reset(20, torch.Generator().manual_seed(0))
+    one, other = (
+        make(**goal).plan(Walk(kind), state, torch.Generator().manual_seed(1)) for kind in (torch.float, dtype)
+    )
+    assert one.plan.equal(other.plan)
+    assert one.score.equal(other.score)
+
+
+class DeadEnd(Walk):
+    all_legal = False
+
+    def legal_actions(self, state: torch.Tensor) -> torch.Tensor:
+        return (state[:, :1] < 2).expand(-1, 3)
+
+
+@PLANNERS
+def test_a_start_without_any_legal_plan_is_refused(make):
+    with pytest.raises(ValueError, match="legal"):
+        make().plan(DeadEnd(torch.float), torch.tensor([[0.0, 0.0], [3.0, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (3, "^value: a function .* not 3$"),
+        (lambda state: 3.0, "a tensor .* not float"),
+        (lambda state: state, "got 6$"),
+    ],
+)
+def test_values_that_are_none(value, message):
+    with pytest.raises(ValueError, match=message):
+        ExhaustivePlanner(1, value=value).plan(Walk(torch.float), torch.zeros(1, 2))
+
+
+def test_a_plan_may_be_shorter_where_the_episode_ends_with_it():
+    """Puzzles some of which are solved already, and others sooner than the actions that are to be executed."""
+    world, prior = sliding_tiles(shape=(2, 2), scramble=4), MarkovPrior(4, 1).fit(torch.tensor([[0, 1, 2, 3]]))
+    state = world.reset(40, torch.Generator().manual_seed(0))
+    planner = LevinPlanner(None, 200)
+    lengths = planner.plan(world, state).lengths
+    assert lengths is not None
+    assert {0, 2, 4} <= set(lengths.tolist())
+    for every in (1, 2, 3):
+        assert world.solved(execute(planner, world, state, 6, replan_every=every).states[:, -1]).all()
+        agent = Agent(world, planner, prior, state, replan_every=every, plan_length=6, learn_every=None)
+        assert world.solved(agent.run(6).states[:, -1]).all()
+
+
+@pytest.mark.parametrize(
+    ("world", "planner", "message"),
+    [
+        (gridworld(5, 5), MarkovPrior(4, 1), "planner: a Planner is expected, not MarkovPrior"),
+        (Planner, ExhaustivePlanner(2), "world: a World, .* is expected, not the class Planner"),
+    ],
+)
+def test_what_an_agent_is_made_of(world, planner, message):
+    with pytest.raises(ValueError, match=message):
+        Agent(world, planner, MarkovPrior(4, 1))
 
 
 def test_chunks_are_put_together_with_lengths() -> None:

@@ -361,12 +361,51 @@ class Stuck(Line):
         return torch.zeros(len(state), 2, dtype=torch.bool)
 
 
+class Ending(Line):
+    """Over beyond 2: a right world, where nothing happens after the end."""
+
+    def terminated(self, state: Tensor) -> Tensor:
+        return state[:, 0].abs() > 2
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        after, reward = super().step(state, action)
+        over = self.terminated(state)
+        return torch.where(over[:, None], state, after), reward.masked_fill(over, 0)
+
+
+class GoesOn(Ending):
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        after, reward = Line.step(self, state, action)
+        return after, reward.masked_fill(self.terminated(state), 0)
+
+
+class PaysOn(Ending):
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        return super().step(state, action)[0], Line.step(self, state, action)[1]
+
+
+class Unmarked(Line):
+    """Says where its goal is, which `reset` never draws, but not that it has one."""
+
+    def solved(self, state: Tensor) -> Tensor:
+        return state[:, 0] > 2
+
+
+class KeepsStarts(Line):
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        found = super().rollout(state, plans, generator)
+        kept = state[:, None, None].expand(*plans.shape, 1)
+        return found._replace(states=kept if keep_states else None)
+
+
 class Unsaid(Line):
     def legal_actions(self, state: Tensor) -> Tensor:
         return torch.tensor([True, False]).expand(len(state), 2)
 
 
-@pytest.mark.parametrize("world", [Line, Noisy])
+@pytest.mark.parametrize("world", [Line, Noisy, Ending])
 def test_worlds_of_ones_own_conform(world: type[World]) -> None:
     check_world(world())
 
@@ -385,6 +424,10 @@ def test_worlds_of_ones_own_conform(world: type[World]) -> None:
         (Biased, "do not fit those of steps"),
         (Stuck, "without any legal action"),
         (Unsaid, "all_legal is True"),
+        (GoesOn, "terminated states must stay"),
+        (PaysOn, "reward from terminated states must be 0"),
+        (Unmarked, "has_goal is False"),
+        (KeepsStarts, "last of the states is not the final one"),
     ],
 )
 def test_a_broken_world_fails_with_a_message(broken: type[World], message: str) -> None:
