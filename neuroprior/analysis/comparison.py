@@ -67,11 +67,9 @@ def score(model: str, prior: Prior, plans: Plans) -> Score:
         >>> round(score("uniform", UniformPrior(3), plans).bits_per_action().mean, 3)
         1.585
     """
-    if not isinstance(prior, Prior):
-        raise ValueError(f"prior: a fitted prior is expected, not {type(prior).__name__}")
-    check_are_plans(plans)
+    bits = action_bits(prior, plans)
     inputs = "actions and context" if prior.takes_context else "actions"
-    return score_bits(model, inputs, action_bits(prior, plans), plans)
+    return score_bits(model, inputs, bits, plans)
 
 
 def score_bits(model: str, inputs: str, bits: Tensor, plans: Plans, mask: Tensor | None = None) -> Score:
@@ -126,6 +124,9 @@ def action_bits(prior: Prior, plans: Plans) -> Tensor:
         >>> action_bits(UniformPrior(3), plans).round(decimals=2).tolist()
         [[1.58, 1.58, 1.58]]
     """
+    if not isinstance(prior, Prior):
+        raise ValueError(f"prior: a fitted prior is expected, not {type(prior).__name__}")
+    check_are_plans(plans)
     given = plans if prior.takes_context else plans.without_context()
     with torch.no_grad():
         return -prior.action_log_probs(given).double().cpu() / log(2)

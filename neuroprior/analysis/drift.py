@@ -19,9 +19,13 @@ from neuroprior.analysis.comparison import units
 from neuroprior.analysis.statistics import Difference, Interval, holm, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
+from neuroprior.plans.plans import check_are_plans
 
 FEWEST_RANKED = 3
 """Plans without which there is no rank correlation to test."""
+
+DIGITS = 7
+"""To so many digits bits per action are compared: a prior's are in single precision."""
 
 EXACT = 7
 """Plans up to which the p-value of a rank correlation is computed from all their orders."""
@@ -177,7 +181,7 @@ def by_plan(plans: Plans, bits: Tensor, mask: Tensor) -> PlanDrift:
     sizes = inverse.bincount(minlength=len(numbers))[starts].tolist()
     for number, part in zip(numbers[starts].tolist(), surprisal.split(sizes), strict=True):
         if len(part) >= FEWEST_RANKED:
-            correlations[number] = _rank_correlation(part.numpy())
+            correlations[number] = _rank_correlation(_rounded(part.numpy()))
     means = [one.mean for one in correlations.values()]
     trend = next(iter(correlations.values()), None)
     if len(means) >= FEWEST_UNITS:
@@ -206,9 +210,11 @@ def by_group(plans: Plans, bits: Tensor, mask: Tensor) -> GroupDrift:
     several = [(total / size).numpy() for total, size in parts if len(size) > 1]
     if len(several) < FEWEST_UNITS:
         return GroupDrift(found, None)
-    together = np.concatenate(several)
-    constant = bool((together == together[0]).all())
-    return GroupDrift(found, 1.0 if constant else float(stats.kruskal(*several).pvalue))
+    together = _rounded(np.concatenate(several))
+    if (together == together[0]).all():
+        return GroupDrift(found, 1.0)
+    ends = np.cumsum([len(part) for part in several])[:-1]
+    return GroupDrift(found, float(stats.kruskal(*np.split(together, ends)).pvalue))
 
 
 def action_drift(plans: Plans) -> list[ActionDrift]:
@@ -232,6 +238,7 @@ def action_drift(plans: Plans) -> list[ActionDrift]:
         >>> [found.action for found in action_drift(plans)]
         [0, 1]
     """
+    check_are_plans(plans)
     length, step = plans.mask().sum(1)[:, None], torch.arange(plans.max_length, device=plans.actions.device)
     half = length // 2
     late = step >= length - half
@@ -259,6 +266,7 @@ def action_drift(plans: Plans) -> list[ActionDrift]:
 
 def _counted(plans: Plans, bits: Tensor, mask: Tensor) -> _Counted:
     """The actions that count, after checks; on the device of `bits`."""
+    check_are_plans(plans)
     shape = plans.actions.shape
     for name, values in (("bits", bits), ("mask", mask)):
         if values.shape != shape:
@@ -314,6 +322,12 @@ def _ratio(totals: Tensor, sizes: Tensor) -> Interval:
     if len(sizes) < FEWEST_UNITS:
         return Interval(float(totals.sum() / sizes.sum()), nan, nan)
     return Interval(*ratio_difference(totals, sizes)[:3])
+
+
+def _rounded(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values to be ranked, rounded to `DIGITS` digits of the largest: means of the same bits are equal then."""
+    largest = float(np.abs(values).max())
+    return np.round(values / largest, DIGITS) if largest > 0 else values
 
 
 def _rank_correlation(values: NDArray[np.float64]) -> Difference:

@@ -12,6 +12,7 @@ from neuroprior._random import generator_on
 from neuroprior.analysis.comparison import Score, action_bits, unit_name, units
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import BLOCKS
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import Prior
 
 MOST_BLOCKS = 200
@@ -88,6 +89,7 @@ def mutual_information(
         ... ]
         [1.0, 1.0]
     """
+    check_are_plans(plans)
     check_sizes(max_lag=max_lag)
     check_count("skip", skip, 0)
     found, generator = [], generator_on(generator, plans.actions.device)

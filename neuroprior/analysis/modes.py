@@ -14,7 +14,7 @@ from neuroprior._checks import check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.plans.folds import divisible, folds, num_units
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, num_units
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.fitting import make_prior
@@ -123,6 +123,8 @@ def choose_modes(
     # Features and patterns cannot be counted.
     given = plans if use_context and "num_contexts" in context_arguments(plans) else plans.without_context()
     generator = generator_on(generator, "cpu")
+    if num_units(given) < FEWEST_UNITS:
+        raise ValueError("plans: at least two are expected, to learn from some and hold out others; see in_parts")
     if number_of_folds is None:
         number_of_folds = min(FOLDS, num_units(given))
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)

@@ -31,6 +31,10 @@ ENOUGH_UNITS = 5
 """Independent units below which no verdict is drawn: intervals are given, and nothing is called significant."""
 
 
+ROUNDING = 2.0**-40
+"""Values that differ by less than this share of the largest number that they are made from are equal."""
+
+
 class Interval(NamedTuple):
     """An estimate with its confidence interval."""
 
@@ -242,8 +246,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     if len(a) != len(b):
         raise ValueError(f"second: {len(a)} values are expected, as many as in first, not {len(b)}")
     mean, low, high = mean_interval(a - b, level)
-    if np.ptp(a - b) == 0:
-        return Difference(mean, low, high, 1.0 if mean == 0 else 2.0 ** (1 - len(a)))
+    largest = max(np.abs(a).max(), np.abs(b).max())
+    if np.ptp(a - b) <= rounding(first, second) * largest:
+        return _without_spread(mean, rounding(first, second) * largest, len(a))
     return Difference(mean, low, high, float(stats.ttest_rel(a, b).pvalue))
 
 
@@ -275,11 +280,25 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
         raise ValueError("sizes: numbers of at least 0 with a positive sum are expected")
     units, ratio = len(above), float(above.sum() / below.sum())
     error = float(np.sqrt(units / (units - 1) * ((above - ratio * below) ** 2).sum()) / below.sum())
+    if error == 0 or np.abs(above - ratio * below).max() <= rounding(totals) * np.abs(above).max():
+        return _without_spread(ratio, 0.0, units)
     half = float(special.stdtrit(units - 1, (1 + level) / 2)) * error
-    if error == 0:
-        # Without spread Student's test would be certain: a sign test, as few units may agree at random.
-        return Difference(ratio, ratio, ratio, 1.0 if ratio == 0 else 2.0 ** (1 - units))
     return Difference(ratio, ratio - half, ratio + half, float(2 * special.stdtr(units - 1, -abs(ratio) / error)))
+
+
+def rounding(*values: Any) -> float:
+    """`ROUNDING`, or where some of the values are in single precision as many times more as this is less precise."""
+    single = any("float32" in str(getattr(one, "dtype", "")) for one in values)
+    return ROUNDING * 2.0**20 if single else ROUNDING
+
+
+def _without_spread(mean: float, near: float, units: int) -> Difference:
+    """A mean of equal values, of which Student's test would be certain: a sign test, as few may agree at random.
+
+    A mean that is `near` 0 is 0.
+    """
+    mean = 0.0 if abs(mean) <= near else mean
+    return Difference(mean, mean, mean, 1.0 if mean == 0 else 2.0 ** (1 - units))
 
 
 def holm(p_values: ArrayLike, tests: int | None = None) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

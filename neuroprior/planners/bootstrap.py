@@ -15,7 +15,7 @@ from torch import Tensor
 
 from neuroprior._checks import check_sizes
 from neuroprior._files import read_json, write_json, written_whole
-from neuroprior.planners.best_first import BestFirstPlanner, LevinPlanner, Search
+from neuroprior.planners.best_first import BestFirstPlanner, Heuristic, LevinPlanner, Search
 from neuroprior.plans import Plans, action_dtype
 from neuroprior.plans.sequences import Sequences, plans_digest
 from neuroprior.priors import PatternPrior, Prior, load, save
@@ -29,6 +29,9 @@ ENOUGH = 0.75
 
 MORE = 4
 """Factor by which the number of problems rises then."""
+
+WALKS, WALK = 64, 32
+"""Problems and random actions by which the world of a folder is recognised."""
 
 NEW = 0.25
 """Where less than this share of the solutions is new, the budget doubles."""
@@ -126,7 +129,9 @@ def bootstrap(
     generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
     digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
     asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
-    asked |= {"max_actions": max_actions, "teacher": teacher and [type(teacher).__name__, teacher.max_nodes]}
+    walked = _walked(world, problems[:WALKS])
+    asked |= {"max_actions": max_actions, "teacher": teacher and _described(teacher, world, walked)}
+    asked["world"] = [type(world).__name__, _digest(world, walked, world.lower_bound if guided else None)]  # type: ignore[attr-defined]
     asked["settings"] = {
         name: plans_digest(value) if isinstance(value, Sequences) else repr(value)
         for name, value in sorted(settings.items())
@@ -155,6 +160,34 @@ def bootstrap(
             f"problems: none of {last.problems} was solved within {last.max_nodes} expansions; give a larger max_nodes,"
             " more sweeps, a teacher or easier problems"
         )
+
+
+def _walked(world: World, state: Tensor) -> list[Tensor]:
+    """The states of `state [N, ...]`, and after each of `WALK` random legal actions, always the same ones."""
+    generator, found = torch.Generator().manual_seed(0), [state]
+    for _ in range(WALK):
+        legal = world.legal_actions(found[-1]).cpu().double()
+        action = legal.multinomial(1, generator=generator)[:, 0].to(state.device)
+        found.append(world.step(found[-1], action)[0])
+    return found
+
+
+def _digest(world: World, walked: list[Tensor], heuristic: Heuristic | None) -> str:
+    """Of the states on walks, of where goals are among them, and of a heuristic there."""
+    given, hashed = torch.cat(walked), sha256()
+    shown = [given, world.solved(given), world.terminated(given)]
+    for values in shown if heuristic is None else [*shown, heuristic(given)]:
+        rounded = (values.double() * 1e4).round().long() if values.is_floating_point() else values.long()
+        hashed.update(rounded.cpu().contiguous().numpy().tobytes())
+    return hashed.hexdigest()
+
+
+def _described(teacher: BestFirstPlanner, world: World, walked: list[Tensor]) -> dict[str, Any]:
+    """What distinguishes a teacher: its class, its settings, and its heuristic in some states."""
+    plain = {name: one for name, one in vars(teacher).items() if isinstance(one, bool | int | float | str)}
+    kind, heuristic = type(teacher).__name__, teacher.heuristic
+    about = {"class": kind, "prior": type(teacher.prior).__name__}
+    return plain | about | {"heuristic": heuristic and _digest(world, walked, heuristic)}
 
 
 class _Bootstrap:

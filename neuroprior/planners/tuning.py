@@ -22,7 +22,7 @@ from neuroprior.priors.ensembles.mixture import MixturePrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.draws import check_temperature
-from neuroprior.sampling.stepping import Steppable
+from neuroprior.sampling.stepping import Steppable, check_in_world
 from neuroprior.worlds.world import World
 
 TEMPERATURES = (1.0, 1.5, 2.0)
@@ -109,6 +109,7 @@ def best_sampling(
         1.0
     """
     check_tried(temperatures, uniform_shares)
+    check_in_world(prior, world, state)
     if len(state) == 0:
         raise ValueError("state: at least one start is expected; from none, no setting is better than another")
     generator = generator_on(generator, state.device)

@@ -273,3 +273,29 @@ def test_bad_input():
     for wrong in (plans_of(3, 1), plans_of(1, 3), plans_of(0, 3)):
         with refuses("plans", "at least"):
             action_drift(wrong)
+
+
+def test_plans_that_are_equal_but_for_rounding_do_not_differ():
+    """All actions have log2(3) bits: their means over plans differ in the last digit, by the length of the plan."""
+    lengths = torch.arange(5, 29)
+    plans = Plans(torch.zeros(24, 28, dtype=torch.long), 3, lengths=lengths, group=torch.arange(24) // 8)
+    bits = torch.full((24, 28), math.log2(3), dtype=torch.double)
+    means = (bits * plans.mask()).sum(1) / lengths
+    assert len(means.unique()) > 1
+    assert by_group(plans, bits, plans.mask()).p_value == 1
+    found = by_plan(plans, bits, plans.mask())
+    assert [one[0::3] for one in found.correlations.values()] == [(0, 1)] * 3
+
+
+def test_small_bits_are_ranked_too():
+    """A thousandth of them as well as all: what is compared are digits of the largest."""
+    bits = torch.arange(1.0, 9).double()[:, None].expand(-1, 4)
+    plans = Plans(torch.zeros(8, 4, dtype=torch.long), 2)
+    found = [by_plan(plans, bits * scale, plans.mask()).correlations[0] for scale in (1, 1e-3, 1e-12)]
+    assert [one.mean for one in found] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("analysis", [by_position, by_plan, by_group, lambda plans, *_: action_drift(plans)])
+def test_plans_are_expected(analysis):
+    with refuses("plans: Plans are expected"):
+        analysis(torch.zeros(4, 3), torch.zeros(4, 3), torch.ones(4, 3, dtype=torch.bool))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -211,3 +212,18 @@ def test_aggregates_refuse_other_values(values: list[float]) -> None:
 def test_improvement_needs_equal_shapes() -> None:
     with pytest.raises(ValueError, match="second: shape"):
         probability_of_improvement(np.zeros((3, 2)), np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("kind", [list, torch.tensor, lambda values: torch.tensor(values, dtype=torch.double)])
+def test_differences_that_are_equal_but_for_rounding_have_no_spread(kind: Callable[[list[float]], Any]) -> None:
+    """Student's test would be certain of three of them; a sign test is not."""
+    one, other = kind([0.7, 0.8, 0.9]), kind([0.6, 0.7, 0.8])
+    found = paired_difference(one, other)
+    assert found == (pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.1), 0.25)
+    assert paired_difference(one, one) == (0, 0, 0, 1)
+    ratio = ratio_difference(kind([0.1, 0.2, 0.3]), kind([1.0, 2.0, 3.0]))
+    assert ratio == (pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.1), 0.25)
+    # a spread that is small but there is tested as ever
+    apart = paired_difference(kind([0.7, 0.8, 0.9001]), other)
+    expected = stats.ttest_rel(np.asarray([0.7, 0.8, 0.9001]), np.asarray([0.6, 0.7, 0.8])).pvalue
+    assert apart.p_value == pytest.approx(expected, rel=0.05)

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
-from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior
+from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, World
 from neuroprior.planners import AStarPlanner, LevinPlanner, bootstrap
 from neuroprior.planners.bootstrap import read_solutions, solution_plans, solution_steps, with_symmetries
 from neuroprior.priors import LogLinearPrior
@@ -117,6 +118,52 @@ def test_fewer_sweeps_of_a_folder_are_those_of_a_call_with_fewer(tmp_path: Path)
     again = list(bootstrap(world, first, world.boards, sweeps=1, folder=tmp_path, **how))
     assert [sweep.solutions for sweep in again] == [sweep.solutions for sweep in once]
     assert first.weights.equal(short.weights)
+
+
+class Line(World):
+    """A walk on a line to a place; all such worlds have the same states."""
+
+    num_actions, has_goal = 2, True
+
+    def __init__(self, goal: int) -> None:
+        self.goal = goal
+
+    def reset(self, batch_size: int, generator: torch.Generator | None = None) -> Tensor:
+        return torch.randint(10, (batch_size,), generator=generator)
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        after = torch.where(self.solved(state), state, (state + 2 * action - 1).clamp(0, 20))
+        return after, (after == self.goal).float() * ~self.solved(state)
+
+    def solved(self, state: Tensor) -> Tensor:
+        return state == self.goal
+
+    def terminated(self, state: Tensor) -> Tensor:
+        return self.solved(state)
+
+
+def test_another_world_or_teacher_is_another_call(tmp_path: Path) -> None:
+    start, zero = torch.arange(3, 9), torch.zeros_like
+
+    def call(goal: int, teacher: AStarPlanner | None, folder: Path) -> list[Any]:
+        how: dict[str, Any] = {"sweeps": 2, "first": 6, "max_nodes": 500, "folder": folder, "teacher": teacher}
+        return list(bootstrap(Line(goal), MarkovPrior(2, 1), start, generator=seeded(), **how))
+
+    first = AStarPlanner(lambda state: state.double(), max_nodes=50)
+    for teacher, folder in ((None, tmp_path / "alone"), (first, tmp_path / "taught")):
+        done = call(0, teacher, folder)
+        assert call(0, teacher, folder) == done
+        with pytest.raises(ValueError, match="another call"):
+            call(12, teacher, folder)
+    for other in (
+        None,
+        AStarPlanner(lambda state: zero(state).double(), max_nodes=50),
+        AStarPlanner(lambda state: state.double(), max_nodes=50, weight=3.0),
+        AStarPlanner(lambda state: state.double(), max_nodes=60),
+        AStarPlanner(None, max_nodes=50),
+    ):
+        with pytest.raises(ValueError, match="another call"):
+            call(0, other, tmp_path / "taught")
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"asked": {}, "sweeps": [], "generator": []}', '{"sweeps": [3]}'])

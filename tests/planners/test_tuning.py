@@ -298,6 +298,8 @@ def test_weights_at_the_ends():
 def test_nothing_to_try():
     world, plans, prior = bandit(), Plans(torch.zeros(2, 1, dtype=torch.long), 2), UniformPrior(2)
     state = torch.zeros(2, dtype=torch.long)
+    with refuses("prior: it has 3 actions, and the world 4"):
+        best_sampling(UniformPrior(3), gridworld(4, 4), torch.arange(16), 4, 8)
     with refuses("temperatures: at least one"):
         best_sampling(prior, world, state, 1, 4, temperatures=())
     with refuses("uniform_shares: at least one"):

@@ -84,7 +84,7 @@ def write_minari(plans: Plans, dataset_id: str) -> None:
     episodes ("group").
 
     Args:
-        plans: at least one, each with at least one action.
+        plans: at least one, each with at least one action. Their own names are not written.
         dataset_id: such as "mice/open-field-v0", not there yet.
 
     Raises:
