@@ -8,7 +8,7 @@ from math import inf, log, log2
 import torch
 from torch import Tensor
 
-from neuroprior.analysis.statistics import ENOUGH_UNITS, Difference, ratio_difference
+from neuroprior.analysis.statistics import ENOUGH_UNITS, ROUNDING, Difference, ratio_difference
 from neuroprior.plans import Plans
 from neuroprior.plans.columns import never_occur
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS
@@ -48,7 +48,9 @@ class Score:
         """
         if self.digest != other.digest or not self.actions.equal(other.actions):
             raise ValueError(f"{self.model}, {other.model}: scores on the same plans are expected, and these are not")
-        return ratio_difference(self.bits - other.bits, self.actions)
+        gap = self.bits - other.bits
+        noise = gap.abs() <= ROUNDING * torch.maximum(self.bits.abs(), other.bits.abs())
+        return ratio_difference(gap.masked_fill(noise, 0), self.actions)
 
 
 def score(model: str, prior: Prior, plans: Plans) -> Score:

@@ -32,7 +32,7 @@ ENOUGH_UNITS = 5
 
 
 ROUNDING = 2.0**-40
-"""Values that differ by less than this share of the largest number that they are made from are equal."""
+"""Differences of less than this share of the numbers that they are between are rounding errors; see `rounding`."""
 
 
 class Interval(NamedTuple):
@@ -246,9 +246,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     if len(a) != len(b):
         raise ValueError(f"second: {len(a)} values are expected, as many as in first, not {len(b)}")
     mean, low, high = mean_interval(a - b, level)
-    largest = max(np.abs(a).max(), np.abs(b).max())
-    if np.ptp(a - b) <= rounding(first, second) * largest:
-        return _without_spread(mean, rounding(first, second) * largest, len(a))
+    near = rounding(first, second) * max(np.abs(a).max(), np.abs(b).max())
+    if np.ptp(a - b) <= near:
+        return _without_spread(0.0 if np.ptp(a - b) > 0 and abs(mean) <= near else mean, len(a))
     return Difference(mean, low, high, float(stats.ttest_rel(a, b).pvalue))
 
 
@@ -280,24 +280,28 @@ def ratio_difference(totals: ArrayLike, sizes: ArrayLike, level: float = 0.95) -
         raise ValueError("sizes: numbers of at least 0 with a positive sum are expected")
     units, ratio = len(above), float(above.sum() / below.sum())
     error = float(np.sqrt(units / (units - 1) * ((above - ratio * below) ** 2).sum()) / below.sum())
-    if error == 0 or np.abs(above - ratio * below).max() <= rounding(totals) * np.abs(above).max():
-        return _without_spread(ratio, 0.0, units)
+    if error == 0 or np.abs(above - ratio * below).max() <= rounding(totals, sizes) * np.abs(above).max():
+        return _without_spread(ratio, units)
     half = float(special.stdtrit(units - 1, (1 + level) / 2)) * error
     return Difference(ratio, ratio - half, ratio + half, float(2 * special.stdtr(units - 1, -abs(ratio) / error)))
 
 
 def rounding(*values: Any) -> float:
-    """`ROUNDING`, or where some of the values are in single precision as many times more as this is less precise."""
-    single = any("float32" in str(getattr(one, "dtype", "")) for one in values)
-    return ROUNDING * 2.0**20 if single else ROUNDING
+    """The share of numbers to which differences between them are rounding errors: two units of their last place.
 
-
-def _without_spread(mean: float, near: float, units: int) -> Difference:
-    """A mean of equal values, of which Student's test would be certain: a sign test, as few may agree at random.
-
-    A mean that is `near` 0 is 0.
+    It is `ROUNDING` in double precision, for what is a sum of many such numbers.
     """
-    mean = 0.0 if abs(mean) <= near else mean
+    kinds = [one.dtype if isinstance(one, torch.Tensor) else np.asarray(one).dtype for one in values]
+    places = [
+        torch.finfo(kind).eps if isinstance(kind, torch.dtype) else np.finfo(kind).eps
+        for kind in kinds
+        if (kind.is_floating_point if isinstance(kind, torch.dtype) else kind.kind == "f")
+    ]
+    return float(max([ROUNDING, *(2 * place for place in places)]))
+
+
+def _without_spread(mean: float, units: int) -> Difference:
+    """A mean of equal values, of which Student's test would be certain: a sign test, as few may agree at random."""
     return Difference(mean, mean, mean, 1.0 if mean == 0 else 2.0 ** (1 - units))
 
 

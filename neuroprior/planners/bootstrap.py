@@ -129,8 +129,8 @@ def bootstrap(
     generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
     digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
     asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
-    walked = _walked(world, problems[:WALKS])
-    asked |= {"max_actions": max_actions, "teacher": teacher and _described(teacher, world, walked)}
+    walked = [] if folder is None else _walked(world, problems[:WALKS])
+    asked |= {"max_actions": max_actions, "teacher": teacher and _described(teacher, world, walked, prior)}
     asked["world"] = [type(world).__name__, _digest(world, walked, world.lower_bound if guided else None)]  # type: ignore[attr-defined]
     asked["settings"] = {
         name: plans_digest(value) if isinstance(value, Sequences) else repr(value)
@@ -163,17 +163,27 @@ def bootstrap(
 
 
 def _walked(world: World, state: Tensor) -> list[Tensor]:
-    """The states of `state [N, ...]`, and after each of `WALK` random legal actions, always the same ones."""
+    """The states of `state [N, ...]`, and after each of `WALK` random legal actions, always the same ones.
+
+    A walk stays where the episode ends, or no action is legal.
+    """
     generator, found = torch.Generator().manual_seed(0), [state]
     for _ in range(WALK):
-        legal = world.legal_actions(found[-1]).cpu().double()
-        action = legal.multinomial(1, generator=generator)[:, 0].to(state.device)
-        found.append(world.step(found[-1], action)[0])
+        now = found[-1].clone()
+        legal = world.legal_actions(now) & ~world.terminated(now)[:, None]
+        going = legal.any(1)
+        weights = (legal | ~going[:, None]).cpu().double()
+        action = weights.multinomial(1, generator=generator)[:, 0].to(state.device)
+        if going.any():
+            now[going] = world.step(now[going], action[going])[0]
+        found.append(now)
     return found
 
 
 def _digest(world: World, walked: list[Tensor], heuristic: Heuristic | None) -> str:
-    """Of the states on walks, of where goals are among them, and of a heuristic there."""
+    """Of the states on walks, of where goals are among them, and of a heuristic there; "" without walks."""
+    if not walked:
+        return ""
     given, hashed = torch.cat(walked), sha256()
     shown = [given, world.solved(given), world.terminated(given)]
     for values in shown if heuristic is None else [*shown, heuristic(given)]:
@@ -182,11 +192,17 @@ def _digest(world: World, walked: list[Tensor], heuristic: Heuristic | None) -> 
     return hashed.hexdigest()
 
 
-def _described(teacher: BestFirstPlanner, world: World, walked: list[Tensor]) -> dict[str, Any]:
-    """What distinguishes a teacher: its class, its settings, and its heuristic in some states."""
+def _described(teacher: BestFirstPlanner, world: World, walked: list[Tensor], prior: Prior) -> dict[str, Any]:
+    """What distinguishes a teacher: its class and settings, its prior, and its heuristic in some states."""
+    own = [type(teacher.prior).__name__]
+    if teacher.prior is not prior and isinstance(teacher.prior, Prior):
+        hashed = sha256(repr(teacher.prior.config).encode())
+        for name, values in teacher.prior.state_dict().items():
+            hashed.update(name.encode() + values.cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        own.append(hashed.hexdigest())
     plain = {name: one for name, one in vars(teacher).items() if isinstance(one, bool | int | float | str)}
     kind, heuristic = type(teacher).__name__, teacher.heuristic
-    about = {"class": kind, "prior": type(teacher.prior).__name__}
+    about = {"class": kind, "prior": own}
     return plain | about | {"heuristic": heuristic and _digest(world, walked, heuristic)}
 
 

@@ -233,6 +233,7 @@ def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | Non
         [1]
     """
     # Scores are often one column of many, which is slow to read more than once.
+    allowed = None if allowed is None else allowed.expand(score.shape)
     if allowed is not None and not allowed.any(1).all():
         raise ValueError(
             "plans: from some start there is no plan of legal actions alone; a world's `legal_actions` are at least one"

@@ -376,3 +376,13 @@ def test_only_units_that_count_are_counted():
     mask = plans.mask()
     mask[:4] = False
     assert too_few(plans, mask) == "4 groups are too few for a verdict"
+
+
+def test_scores_that_are_equal_but_for_rounding_do_not_differ():
+    """The sums of the same bits in another order."""
+    plans = Plans(torch.zeros(4, 50, dtype=torch.long), 2)
+    bits = torch.rand(4, 50, dtype=torch.double, generator=seeded(0))
+    totals = score_bits("one", "actions", bits, plans)
+    other = replace(totals, bits=totals.bits * (1 + 2.0**-50))
+    assert not other.bits.equal(totals.bits)
+    assert totals.minus(other) == (0, 0, 0, 1)

@@ -223,7 +223,12 @@ def test_differences_that_are_equal_but_for_rounding_have_no_spread(kind: Callab
     assert paired_difference(one, one) == (0, 0, 0, 1)
     ratio = ratio_difference(kind([0.1, 0.2, 0.3]), kind([1.0, 2.0, 3.0]))
     assert ratio == (pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.1), 0.25)
-    # a spread that is small but there is tested as ever
+    # a spread that is small but there is tested as ever, and so are small differences between large numbers
+    large = kind([2.0**20 + k for k in range(20)])
+    assert paired_difference([one + 1 for one in large], large)[::3] == (1, 2.0**-19)
+    some = kind([1e6 + 10 * k + 0.75 * (k % 2) for k in range(20)])
+    mean, *_, p_value = paired_difference(some, kind([1e6 + 10 * k for k in range(20)]))
+    assert (mean, p_value) == (pytest.approx(0.375), pytest.approx(0.00034, rel=0.05))
     apart = paired_difference(kind([0.7, 0.8, 0.9001]), other)
     expected = stats.ttest_rel(np.asarray([0.7, 0.8, 0.9001]), np.asarray([0.6, 0.7, 0.8])).pvalue
     assert apart.p_value == pytest.approx(expected, rel=0.05)

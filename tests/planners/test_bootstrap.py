@@ -161,9 +161,29 @@ def test_another_world_or_teacher_is_another_call(tmp_path: Path) -> None:
         AStarPlanner(lambda state: state.double(), max_nodes=50, weight=3.0),
         AStarPlanner(lambda state: state.double(), max_nodes=60),
         AStarPlanner(None, max_nodes=50),
+        LevinPlanner(MarkovPrior(2, 1), max_nodes=50),
     ):
         with pytest.raises(ValueError, match="another call"):
             call(0, other, tmp_path / "taught")
+    one, same, other = (MarkovPrior(2, 0).fit(torch.tensor([row])) for row in ([0, 0, 1], [0, 0, 1], [1, 1, 0]))
+    done = call(0, LevinPlanner(one, 60), tmp_path / "by a prior")
+    assert call(0, LevinPlanner(same, 60), tmp_path / "by a prior") == done
+    with pytest.raises(ValueError, match="another call"):
+        call(0, LevinPlanner(other, 60), tmp_path / "by a prior")
+
+
+class DeadEnds(Line):
+    """No action is legal at the left end, or where the goal is reached."""
+
+    all_legal = False
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        return ((state > 0) & ~self.solved(state))[:, None].expand(-1, 2)
+
+
+def test_dead_ends_do_not_matter(tmp_path: Path) -> None:
+    sweeps = bootstrap(DeadEnds(4), MarkovPrior(2, 1), torch.arange(1, 9), sweeps=1, folder=tmp_path)
+    assert [sweep.solved for sweep in sweeps] == [1.0]
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"asked": {}, "sweeps": [], "generator": []}', '{"sweeps": [3]}'])
