@@ -1,10 +1,10 @@
 """Checks of arguments, each of which names the argument that is wrong."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from numbers import Real
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -76,6 +76,14 @@ def _extremes(values: Tensor) -> tuple[int, int]:
 def kind_of(value: object) -> str:
     """The name of its class; of a class that stands where an object should, that it is one."""
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
+
+
+def listed(name: str, values: Any) -> list[Any]:
+    """A list of the values, numpy's and torch's as Python's numbers; raises ValueError for a single one."""
+    found = values.tolist() if hasattr(values, "tolist") else values
+    if not isinstance(found, Iterable) or isinstance(found, str):
+        raise ValueError(f"{name}: a list of numbers is expected, not {values!r}")
+    return [one.item() if hasattr(one, "item") else one for one in found]
 
 
 def check_sizes(**sizes: object) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_sizes, listed
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, is_per_step
@@ -114,7 +114,7 @@ def choose_modes(
         >>> choose_modes(plans, [1, 2], number_of_folds=2, **how).chosen
         2
     """
-    numbers = sorted(set(num_modes))
+    numbers = sorted(set(listed("num_modes", num_modes)))
     if not numbers:
         raise ValueError("num_modes: at least one number is expected, not an empty list")
     for number in numbers:

@@ -69,6 +69,7 @@ def best_of(scores: Tensor, baselines: Sequence[int] | None = None) -> Tensor:
         >>> best_of(torch.tensor([[0.9, 0.5], [0.8, 0.7]])).tolist()
         [[True, False], [False, True]]
     """
+    scores = torch.as_tensor(scores)
     numbers = range(len(scores)) if baselines is None else list(baselines)
     if not len(numbers) or not all(0 <= number < len(scores) for number in numbers):
         raise ValueError(f"baselines: one or more of 0 to {len(scores) - 1} are expected, not {list(numbers)}")
@@ -332,6 +333,7 @@ def holm(p_values: ArrayLike, tests: int | None = None) -> np.ndarray[tuple[int]
     if len(wrong):
         raise ValueError(f"p_values[{wrong[0]}]: a probability between 0 and 1 is expected, not {values[wrong[0]]}")
     tests = len(values) if tests is None else tests
+    check_count("tests", tests, 0)
     if tests < len(values):
         raise ValueError(f"tests: at least {len(values)}, the number of p-values, is expected, not {tests}")
     order = np.argsort(values, kind="stable")
@@ -365,7 +367,10 @@ def _alike(first: ArrayLike, second: ArrayLike) -> list[np.ndarray[tuple[int, in
 def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     if isinstance(values, torch.Tensor):
         values = values.cpu().numpy()
-    vector = np.asarray(values, dtype=np.float64)
+    try:
+        vector = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: numbers, shape [G], are expected ({error})") from error
     if vector.ndim != 1 or len(vector) < 2:
         raise ValueError(f"{name}: at least two values, shape [G], are expected, not {list(vector.shape)}")
     wrong = np.flatnonzero(np.isnan(vector))

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes
+from neuroprior._checks import check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner
 from neuroprior.plans import Plans, is_per_step
@@ -117,6 +117,8 @@ def collect(
         raise ValueError("num_plans, state: one of the two is expected, not both or neither")
     if context not in (None, "plan", "step"):
         raise ValueError(f'context: "plan", "step" or None is expected, not {context!r}')
+    if min_score is not None and not is_number(min_score):
+        raise ValueError(f"min_score: a number is expected, not {min_score!r}")
     if state is None:
         check_sizes(num_plans=num_plans)
         assert num_plans is not None

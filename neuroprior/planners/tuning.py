@@ -270,6 +270,7 @@ def search_weights(log_prob: Tensor, num_plans: int) -> Tensor:
         torch.Size([2])
     """
     check_sizes(num_plans=num_plans)
+    log_prob = torch.as_tensor(log_prob)
     if not bool((log_prob <= 0).all()):
         raise ValueError("log_prob: logarithms of probabilities, at most 0, are expected")
     log_prob = log_prob.double()

@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from dataclasses import astuple
 
+import numpy as np
 import pytest
 import torch
 from scipy import stats
@@ -314,3 +315,10 @@ def test_bad_input():
         motifs(plans, ())
     with refuses("top", "0"):
         motifs(plans, top=0)
+
+
+def test_lengths_are_a_list():
+    plans = Plans(torch.arange(60).view(6, 10) % 3, 3)
+    assert motifs(plans, lengths=np.array([3])) == motifs(plans, lengths=[3])
+    with refuses("lengths: a list of numbers is expected, not 3"):
+        motifs(plans, lengths=3)

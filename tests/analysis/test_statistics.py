@@ -12,6 +12,7 @@ from scipy import stats
 
 from neuroprior.analysis.statistics import (
     best_of,
+    holm,
     interquartile_gap,
     interquartile_mean,
     mean_interval,
@@ -232,3 +233,21 @@ def test_differences_that_are_equal_but_for_rounding_have_no_spread(kind: Callab
     apart = paired_difference(kind([0.7, 0.8, 0.9001]), other)
     expected = stats.ttest_rel(np.asarray([0.7, 0.8, 0.9001]), np.asarray([0.6, 0.7, 0.8])).pvalue
     assert apart.p_value == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: mean_interval(["a", "b"]), "^values: numbers, shape .G., are expected"),
+        (lambda: paired_difference([1, 2], {}), "^second: "),
+        (lambda: holm([0.01], tests=2.5), "^tests: an integer"),  # type: ignore[arg-type]
+        (lambda: holm([0.01], tests="a"), "^tests: an integer"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_are_no_numbers_is_said(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_scores_in_a_list() -> None:
+    assert best_of([[0.9, 0.5], [0.8, 0.7]]).tolist() == [[True, False], [False, True]]  # type: ignore[arg-type]
