@@ -78,7 +78,7 @@ def kind_of(value: object) -> str:
     return f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
 
 
-def listed(name: str, values: Any) -> list[Any]:
+def as_list(name: str, values: Any) -> list[Any]:
     """A list of the values, numpy's and torch's as Python's numbers; raises ValueError for a single one."""
     found = values.tolist() if hasattr(values, "tolist") else values
     if not isinstance(found, Iterable) or isinstance(found, str):

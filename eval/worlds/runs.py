@@ -13,7 +13,6 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 from jsonargparse.typing import extend_base_type, restricted_number_type
 
@@ -137,11 +136,9 @@ def paired_differences(pairs: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
         A row for each group of at least two seeds: the columns `by`, `difference`, `low`, `high`, `p_value` of the
         two-sided test, and `p_holm`, corrected for all tests in the same world.
     """
-    # Rounded, so that differences that are equal but for rounding errors have no spread.
-    pairs = pairs.assign(gap=(pairs["first"] - pairs["second"]).round(12))
     rows = [
-        (*place, *paired_difference(own, np.zeros(len(own))))
-        for place, own in pairs.groupby(list(by), sort=False)["gap"]
+        (*place, *paired_difference(own["first"], own["second"]))
+        for place, own in pairs.groupby(list(by), sort=False)
         if len(own) > 1
     ]
     found = pd.DataFrame(rows, columns=[*by, "difference", "low", "high", "p_value"])

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_sizes, listed
+from neuroprior._checks import as_list, check_sizes
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.analysis.comparison import Score, action_bits, score_bits
 from neuroprior.plans import Plans, is_per_step
@@ -114,7 +114,7 @@ def choose_modes(
         >>> choose_modes(plans, [1, 2], number_of_folds=2, **how).chosen
         2
     """
-    numbers = sorted(set(listed("num_modes", num_modes)))
+    numbers = sorted(set(as_list("num_modes", num_modes)))
     if not numbers:
         raise ValueError("num_modes: at least one number is expected, not an empty list")
     for number in numbers:
@@ -124,7 +124,9 @@ def choose_modes(
     given = plans if use_context and "num_contexts" in context_arguments(plans) else plans.without_context()
     generator = generator_on(generator, "cpu")
     if num_units(given) < FEWEST_UNITS:
-        raise ValueError("plans: at least two are expected, to learn from some and hold out others; see in_parts")
+        raise ValueError(
+            "plans: at least two are expected, to learn from some and hold out others; `in_parts` cuts a single one"
+        )
     if number_of_folds is None:
         number_of_folds = min(FOLDS, num_units(given))
     parts = folds(given, number_of_folds, draw_seed(generator) % 2**31)

@@ -10,7 +10,7 @@ import torch
 from scipy.special import stdtrit, xlogy
 from torch import Tensor
 
-from neuroprior._checks import check_sizes, listed
+from neuroprior._checks import as_list, check_sizes
 from neuroprior.analysis.comparison import units
 from neuroprior.analysis.flat import FlatPlans, ranks
 from neuroprior.analysis.statistics import holm
@@ -113,7 +113,7 @@ def motifs(
         [(3, 1, 0)]
     """
     check_sizes(chunk_size=chunk_size)
-    lengths = listed("lengths", lengths)
+    lengths = as_list("lengths", lengths)
     least = 3 if collapse_repeats else 2
     for n in lengths:
         if not isinstance(n, int) or isinstance(n, bool) or n < least:

@@ -247,9 +247,9 @@ def paired_difference(first: ArrayLike, second: ArrayLike, level: float = 0.95) 
     if len(a) != len(b):
         raise ValueError(f"second: {len(a)} values are expected, as many as in first, not {len(b)}")
     mean, low, high = mean_interval(a - b, level)
-    near = rounding(first, second) * max(np.abs(a).max(), np.abs(b).max())
-    if np.ptp(a - b) <= near:
-        return _without_spread(0.0 if np.ptp(a - b) > 0 and abs(mean) <= near else mean, len(a))
+    spread, near = np.ptp(a - b), rounding(first, second) * max(np.abs(a).max(), np.abs(b).max())
+    if spread <= near:
+        return _without_spread(0.0 if spread > 0 and abs(mean) <= near else mean, len(a))
     return Difference(mean, low, high, float(stats.ttest_rel(a, b).pvalue))
 
 
@@ -292,13 +292,8 @@ def rounding(*values: Any) -> float:
 
     It is `ROUNDING` in double precision, for what is a sum of many such numbers.
     """
-    kinds = [one.dtype if isinstance(one, torch.Tensor) else np.asarray(one).dtype for one in values]
-    places = [
-        torch.finfo(kind).eps if isinstance(kind, torch.dtype) else np.finfo(kind).eps
-        for kind in kinds
-        if (kind.is_floating_point if isinstance(kind, torch.dtype) else kind.kind == "f")
-    ]
-    return float(max([ROUNDING, *(2 * place for place in places)]))
+    kinds = [np.asarray(_on_cpu(one)).dtype for one in values]
+    return max([ROUNDING, *(2 * float(np.finfo(kind).eps) for kind in kinds if kind.kind == "f")])
 
 
 def _without_spread(mean: float, units: int) -> Difference:
@@ -326,7 +321,7 @@ def holm(p_values: ArrayLike, tests: int | None = None) -> np.ndarray[tuple[int]
         >>> holm([0.01, 0.04, 0.03]).tolist()
         [0.03, 0.06, 0.06]
     """
-    values = np.asarray(p_values.cpu().numpy() if isinstance(p_values, torch.Tensor) else p_values, dtype=np.float64)
+    values = np.asarray(_on_cpu(p_values), dtype=np.float64)
     if values.ndim != 1:
         raise ValueError(f"p_values: shape [M] is expected, not {list(values.shape)}")
     wrong = np.flatnonzero(~((values >= 0) & (values <= 1)))
@@ -342,10 +337,13 @@ def holm(p_values: ArrayLike, tests: int | None = None) -> np.ndarray[tuple[int]
     return corrected
 
 
+def _on_cpu(values: Any) -> Any:
+    """An array in place of a tensor; all else as it is."""
+    return values.cpu().numpy() if isinstance(values, torch.Tensor) else values
+
+
 def _matrix(name: str, values: ArrayLike) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    if isinstance(values, torch.Tensor):
-        values = values.cpu().numpy()
-    matrix = np.asarray(values, dtype=np.float64)
+    matrix = np.asarray(_on_cpu(values), dtype=np.float64)
     if matrix.ndim != 2 or matrix.shape[0] < 1 or matrix.shape[1] < 2:
         raise ValueError(
             f"{name}: shape [W, G] is expected, with one world and two seeds at least, not {list(matrix.shape)}"
@@ -365,10 +363,8 @@ def _alike(first: ArrayLike, second: ArrayLike) -> list[np.ndarray[tuple[int, in
 
 
 def _vector(name: str, values: ArrayLike) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    if isinstance(values, torch.Tensor):
-        values = values.cpu().numpy()
     try:
-        vector = np.asarray(values, dtype=np.float64)
+        vector = np.asarray(_on_cpu(values), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: numbers, shape [G], are expected ({error})") from error
     if vector.ndim != 1 or len(vector) < 2:

@@ -20,6 +20,7 @@ from neuroprior.plans import Plans, action_dtype
 from neuroprior.plans.sequences import Sequences, plans_digest
 from neuroprior.priors import PatternPrior, Prior, load, save
 from neuroprior.priors.patterns import Steps
+from neuroprior.priors.serialization import written_state
 from neuroprior.sampling.stepping import Stepper
 from neuroprior.worlds.puzzles import PuzzleWorld
 from neuroprior.worlds.world import World
@@ -128,10 +129,19 @@ def bootstrap(
     Stepper(prior).start_in(world, problems[:1])  # a teacher would ask it for nothing before it has searched
     generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
     digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
-    asked = {"problems": len(problems), "max_nodes": max_nodes, "first": first, "guided": guided, "digest": digest}
-    walked = [] if folder is None else _walked(world, problems[:WALKS])
-    asked |= {"max_actions": max_actions, "teacher": teacher and _described(teacher, world, walked, prior)}
-    asked["world"] = [type(world).__name__, _digest(world, walked, world.lower_bound if guided else None)]  # type: ignore[attr-defined]
+    asked: dict[str, Any] = {
+        "problems": len(problems),
+        "max_nodes": max_nodes,
+        "first": first,
+        "guided": guided,
+        "digest": digest,
+        "max_actions": max_actions,
+    }
+    if folder is not None:
+        walked = _walked(world, problems[:WALKS])
+        asked["teacher"] = teacher and _described(teacher, world, walked, prior)
+        heuristic = world.lower_bound if guided else None  # type: ignore[attr-defined]
+        asked["world"] = [type(world).__name__, _digest(world, walked, heuristic)]
     asked["settings"] = {
         name: plans_digest(value) if isinstance(value, Sequences) else repr(value)
         for name, value in sorted(settings.items())
@@ -181,9 +191,7 @@ def _walked(world: World, state: Tensor) -> list[Tensor]:
 
 
 def _digest(world: World, walked: list[Tensor], heuristic: Heuristic | None) -> str:
-    """Of the states on walks, of where goals are among them, and of a heuristic there; "" without walks."""
-    if not walked:
-        return ""
+    """Of the states on walks, of where goals are among them, and of a heuristic there."""
     given, hashed = torch.cat(walked), sha256()
     shown = [given, world.solved(given), world.terminated(given)]
     for values in shown if heuristic is None else [*shown, heuristic(given)]:
@@ -196,10 +204,7 @@ def _described(teacher: BestFirstPlanner, world: World, walked: list[Tensor], pr
     """What distinguishes a teacher: its class and settings, its prior, and its heuristic in some states."""
     own = [type(teacher.prior).__name__]
     if teacher.prior is not prior and isinstance(teacher.prior, Prior):
-        hashed = sha256(repr(teacher.prior.config).encode())
-        for name, values in teacher.prior.state_dict().items():
-            hashed.update(name.encode() + values.cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
-        own.append(hashed.hexdigest())
+        own.append(sha256(repr(teacher.prior.config).encode() + written_state(teacher.prior)).hexdigest())
     plain = {name: one for name, one in vars(teacher).items() if isinstance(one, bool | int | float | str)}
     kind, heuristic = type(teacher).__name__, teacher.heuristic
     about = {"class": kind, "prior": own}

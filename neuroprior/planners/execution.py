@@ -162,9 +162,10 @@ def follow(
     actions = plan[:, :num_steps].long()
     rewards, states = _step_through(world, state, actions, generator, change)
     lengths = actions.new_tensor(decision.plan.shape[1]) if decision.lengths is None else decision.lengths
-    short = (lengths.expand(len(state)) < num_steps).nonzero()[:, 0]
+    lengths = lengths.expand(len(state)).long()
+    short = (lengths < num_steps).nonzero()[:, 0]
     if len(short):  # a plan may be shorter where the episode ends with it
-        last = lengths.expand(len(state))[short].long()
+        last = lengths[short]
         ended = world.terminated(torch.cat([state[:, None], states], 1)[short, last])
         if not ended.all():
             raise ValueError(

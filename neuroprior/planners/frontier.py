@@ -7,7 +7,7 @@ from torch import Tensor
 
 from neuroprior._hashing import row_hashes
 from neuroprior._random import gumbel
-from neuroprior.planners.planner import Decision, Objective, PriorPlanner, join_decisions, random_best
+from neuroprior.planners.planner import Decision, Objective, PriorPlanner, as_floats, join_decisions, random_best
 from neuroprior.plans import action_dtype
 from neuroprior.sampling.distinct import child_log_probs, parents
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
@@ -93,7 +93,8 @@ class FrontierPlanner(PriorPlanner):
             if self.any_prefix or t + 1 == self.length:
                 found.append(self._best(front, generator))
             if t + 1 < self.length:
-                gained = front.rewards.double() @ self._weights(front.rewards).double()
+                rewards = as_floats(front.rewards)
+                gained = rewards.double() @ self._weights(rewards).double()
                 front = front.merge(gained if self.objective == "return" else None)
                 logits, hidden = stepper.step_in(world, action, hidden.index_select(0, row), front.state)
         score = torch.stack([decision.score for decision in found], 1)

@@ -5,7 +5,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 
-from neuroprior._checks import listed
+from neuroprior._checks import as_list
 from neuroprior.planners.execution import collect
 from neuroprior.planners.planner import Objective
 from neuroprior.planners.sampling import SamplingPlanner
@@ -87,7 +87,7 @@ def extend_horizon(
         >>> [one.plans.max_length for one in rounds]
         [2, 3, 4]
     """
-    lengths = listed("lengths", lengths)
+    lengths = as_list("lengths", lengths)
     if any(length < 1 for length in lengths):
         raise ValueError(f"lengths: integers of at least 1 are expected, not {list(lengths)}")
     check_tried(temperatures, uniform_shares)

@@ -139,8 +139,7 @@ class Planner(ABC):
         return parts
 
     def _weights(self, rewards: Tensor) -> Tensor:
-        dtype = as_floats(rewards[..., :0]).dtype
-        return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=dtype)
+        return self.discount ** torch.arange(rewards.shape[-1], device=rewards.device, dtype=rewards.dtype)
 
     def _add_value(self, score: Tensor, state: Tensor, weight: Tensor | float = 1.0) -> Tensor:
         """`score [...]` plus the weighted value of `state` (`[...]` and its own shape)."""
@@ -232,13 +231,13 @@ def random_best(score: Tensor, generator: torch.Generator, allowed: Tensor | Non
         >>> random_best(torch.tensor([[0.0, 2.0, 1.0]]), torch.Generator().manual_seed(0)).tolist()
         [1]
     """
-    # Scores are often one column of many, which is slow to read more than once.
     allowed = None if allowed is None else allowed.expand(score.shape)
     if allowed is not None and not allowed.any(1).all():
         raise ValueError(
             "plans: from some start there is no plan of legal actions alone; a world's `legal_actions` are at least one"
             " in each state, and a prior's probability is not 0 for all of these"
         )
+    # Scores are often one column of many, which is slow to read more than once.
     score = score.contiguous() if allowed is None else score.masked_fill(~allowed, -torch.inf)
     highest = score.amax(1, keepdim=True)
     if highest.isnan().any():

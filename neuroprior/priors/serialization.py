@@ -57,7 +57,7 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
         raise ValueError(f"prior: a Prior is expected, not {type(prior).__name__}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    data = write_tensors({name: value.detach().cpu().clone() for name, value in prior.state_dict().items()})
+    data = written_state(prior)
     config = {
         "format": FORMAT,
         "version": VERSION,
@@ -72,6 +72,11 @@ def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
     for name in contents:
         os.replace(folder / f".{name}.partial", folder / name)
     return folder
+
+
+def written_state(prior: SavedModule) -> bytes:
+    """The tensors of its state, as a file of safetensors holds them."""
+    return write_tensors({name: value.detach().cpu().clone() for name, value in prior.state_dict().items()})
 
 
 @overload

@@ -130,9 +130,9 @@ def _check_reached(world: World | ContinuousWorld, state: Tensor, plans: Tensor,
     if isinstance(world, ContinuousWorld) and state.is_floating_point():
         wrong = torch.full_like(state, torch.nan)
         require(raises(partial(world.rollout, wrong, plans)), "rollout must raise ValueError for states of NaN")
-    found = [state]
-    for t in range(plans.shape[2]):
-        found.append(world.step(found[-1], plans[:, 0, t], generator)[0])
+    found = [state.repeat_interleave(plans.shape[1], 0)]
+    for actions in plans.flatten(0, 1).unbind(1):
+        found.append(world.step(found[-1], actions, generator)[0])
     reached = torch.cat(found)
     _check_queries(world, reached)
     ends = reached[world.terminated(reached)]
