@@ -6,6 +6,7 @@ from functools import cache
 from numbers import Real
 from typing import Any, TypeGuard
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -109,6 +110,13 @@ def check_seed(seed: object) -> None:
     """Raise ValueError unless it is an integer that torch takes as a seed."""
     if not isinstance(seed, int) or isinstance(seed, bool) or not -(2**63) <= seed < 2**63:
         raise ValueError(f"seed: an integer from -2**63 to 2**63 - 1 is expected, not {seed!r}")
+
+
+def check_flags(**flags: object) -> None:
+    """Raise ValueError, naming the argument, unless all are True or False."""
+    for name, flag in flags.items():
+        if not isinstance(flag, bool | np.bool_):
+            raise ValueError(f"{name}: True or False is expected, not {flag!r}")
 
 
 def check_share(name: str, share: object) -> None:

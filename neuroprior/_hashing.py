@@ -11,9 +11,9 @@ def row_hashes(rows: Tensor) -> Tensor:
     """
     if rows.dim() == 1 and not rows.is_floating_point():
         return rows.long()
-    # Numbers are compared by their bits; rows are hashed by a sum with random odd weights.
+    # Numbers are compared by their bits (the sum makes 0.0 of -0.0); rows are hashed by a sum with random odd weights.
     flat = rows[:, None] if rows.dim() == 1 else rows.flatten(1)
-    bits = flat.double().view(torch.int64) if flat.is_floating_point() else flat.long()
+    bits = (flat.double() + 0.0).view(torch.int64) if flat.is_floating_point() else flat.long()
     weight = torch.Generator().manual_seed(0)
     factors = torch.randint(-(2**62), 2**62, (bits.shape[1],), generator=weight).to(bits.device) * 2 + 1
     mixed = (bits ^ _shifted(bits, 29)) * factors

@@ -27,6 +27,12 @@ def test_numbers_and_their_complements_have_different_hashes():
     assert len(row_hashes(torch.arange(-4, 5)[:, None]).unique()) == 9
 
 
+def test_zero_has_no_sign():
+    rows = torch.tensor([[0.0, 1.0], [-0.0, 1.0]])
+    for some in (rows, rows.double(), rows[:, 0]):
+        assert len(row_hashes(some).unique()) == 1
+
+
 def test_fractions_count():
     """All pairs of eighths from 0 to 1, of either precision."""
     rows = torch.cartesian_prod(*[torch.arange(8) / 8] * 2)

@@ -6,11 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes, is_number, kind_of
+from neuroprior._checks import check_flags, check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
 from neuroprior.planners.execution import Change, executed_steps, follow, join_executions, observations
+from neuroprior.planners.planner import check_is_planner
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior
@@ -79,8 +80,12 @@ class Agent:
     ) -> None:
         learns = {} if learn_every is None else {"learn_every": learn_every}
         check_sizes(replan_every=replan_every, plan_length=plan_length, num_rollouts=num_rollouts, **learns)
-        if not isinstance(planner, Planner):
-            raise ValueError(f"planner: a Planner is expected, not {kind_of(planner)}")
+        check_flags(warm_start=warm_start)
+        check_is_planner(planner)
+        if change is not None and not callable(change):
+            raise ValueError(f"change: a function of states and a generator is expected, not {change!r}")
+        if not isinstance(training, Mapping | None):
+            raise ValueError(f"training: a dictionary of settings is expected, not {training!r}")
         if not isinstance(prior, Prior):
             raise ValueError(f"prior: a Prior is expected, not a {type(prior).__name__}")
         check_is_world(world)

@@ -400,7 +400,7 @@ class _Trees:
         legal = self.world.legal_actions(state) & ~self.world.terminated(state)[:, None]
         left, of_children = self._left(tree, state, legal)
         if self.lower_bound is not None:
-            bound = value_of(self.lower_bound, state).double()
+            bound = value_of(self.lower_bound, state, "lower_bound").double()
             rooted = bound < path["least"]
             path |= {name: path[name].masked_fill(rooted, 0) for name in ("since", "log_prob")}
             path["least"] = path["least"].minimum(bound)
@@ -429,10 +429,10 @@ class _Trees:
         reached, _ = self.world.step(state[where], action)
         self.steps.index_add_(0, tree[where], torch.ones_like(where))
         children = torch.zeros(legal.shape, dtype=torch.float64, device=state.device)
-        children[where, action] = value_of(heuristic, reached).double()
+        children[where, action] = value_of(heuristic, reached, "heuristic").double()
         if bool((children < 0).any()):
             raise ValueError("heuristic: numbers of at least 0, of steps that are left, are expected")
-        return value_of(heuristic, state).double(), children
+        return value_of(heuristic, state, "heuristic").double(), children
 
     def _insert(self, tree: Tensor, hashes: Tensor) -> Tensor:
         """Enter states, by their `hashes [M]`, into the hash tables: which of them are new, bool `[M]`.

@@ -13,8 +13,9 @@ from safetensors.torch import load as read_tensors
 from safetensors.torch import save as write_tensors
 from torch import Tensor
 
-from neuroprior._checks import check_sizes
+from neuroprior._checks import check_flags, check_sizes, kind_of
 from neuroprior._files import read_json, write_json, written_whole
+from neuroprior._random import generator_on
 from neuroprior.planners.best_first import BestFirstPlanner, Heuristic, LevinPlanner, Search
 from neuroprior.plans import Plans, action_dtype
 from neuroprior.plans.sequences import Sequences, plans_digest
@@ -23,7 +24,7 @@ from neuroprior.priors.patterns import Steps
 from neuroprior.priors.serialization import written_state
 from neuroprior.sampling.stepping import Stepper
 from neuroprior.worlds.puzzles import PuzzleWorld
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, check_is_world
 
 ENOUGH = 0.75
 """Where this share of the problems tried is solved, more are tried in the next sweep."""
@@ -120,6 +121,12 @@ def bootstrap(
         [1.0]
     """
     check_sizes(max_nodes=max_nodes, sweeps=sweeps, first=first, max_actions=max_actions)
+    check_flags(guided=guided)
+    check_is_world(world)
+    if not isinstance(prior, Prior):
+        raise ValueError(f"prior: a Prior is expected, not {kind_of(prior)}")
+    if not isinstance(teacher, BestFirstPlanner | None):
+        raise ValueError(f"teacher: a BestFirstPlanner, such as AStarPlanner(), is expected, not {kind_of(teacher)}")
     world.check_state(problems)
     if len(problems) == 0:
         raise ValueError("problems: at least one is expected")
@@ -127,7 +134,7 @@ def bootstrap(
         raise ValueError(f"guided: a world with a lower_bound is expected, not {type(world).__name__}")
     prior.check_settings(settings)
     Stepper(prior).start_in(world, problems[:1])  # a teacher would ask it for nothing before it has searched
-    generator = torch.Generator().manual_seed(torch.Generator().seed()) if generator is None else generator
+    generator = generator_on(generator, "cpu")
     digest = sha256(problems.cpu().contiguous().view(torch.uint8).numpy().tobytes()).hexdigest()
     asked: dict[str, Any] = {
         "problems": len(problems),

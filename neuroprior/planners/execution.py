@@ -6,11 +6,11 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes, is_number
+from neuroprior._checks import check_memory, check_sizes, is_number, kind_of
 from neuroprior._random import generator_on
-from neuroprior.planners.planner import Decision, Planner
+from neuroprior.planners.planner import Decision, Planner, check_is_planner
 from neuroprior.plans import Plans, is_per_step
-from neuroprior.worlds.world import World
+from neuroprior.worlds.world import World, check_is_world
 
 Change = Callable[[Tensor, torch.Generator | None], Tensor]
 """A change of states `[B, ...]` that is not caused by the agents' own steps, such as `ForagingWorld.regrow`."""
@@ -63,6 +63,9 @@ def execute(
     """
     check_sizes(num_steps=num_steps, replan_every=replan_every)
     check_memory(8 * num_steps, num_steps=num_steps)
+    check_is_planner(planner)
+    check_is_world(world)
+    world.check_state(state)
     generator = generator_on(generator, state.device)
     parts = []
     for at in range(0, num_steps, replan_every):
@@ -119,6 +122,8 @@ def collect(
         raise ValueError(f'context: "plan", "step" or None is expected, not {context!r}')
     if min_score is not None and not is_number(min_score):
         raise ValueError(f"min_score: a number is expected, not {min_score!r}")
+    check_is_planner(planner)
+    check_is_world(world)
     if state is None:
         check_sizes(num_plans=num_plans)
         assert num_plans is not None
@@ -203,6 +208,15 @@ def executed_steps(world: World, before: Tensor) -> Tensor:
     return going.long().cumprod(1).sum(1)
 
 
+def _changed(change: Change, state: Tensor, generator: torch.Generator | None) -> Tensor:
+    """The states after a change; raises ValueError where these are no such states."""
+    after: object = change(state, generator)
+    if not isinstance(after, Tensor) or after.shape != state.shape or after.dtype != state.dtype:
+        found = f"{after.dtype} {list(after.shape)}" if isinstance(after, Tensor) else kind_of(after)
+        raise ValueError(f"change: {state.dtype} {list(state.shape)}, states as given, are expected, not {found}")
+    return after
+
+
 def _step_through(
     world: World, state: Tensor, plans: Tensor, generator: torch.Generator | None, change: Change | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -212,7 +226,7 @@ def _step_through(
         return torch.zeros(plans.shape, device=state.device), state[:, None][:, :0]
     for t in range(plans.shape[1]):
         state, reward = world.step(state, plans[:, t].long(), generator)
-        state = state if change is None else change(state, generator)
+        state = state if change is None else _changed(change, state, generator)
         rewards.append(reward)
         states.append(state)
     return torch.stack(rewards, 1), torch.stack(states, 1)

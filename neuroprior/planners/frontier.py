@@ -5,6 +5,7 @@ from typing import NamedTuple, Unpack
 import torch
 from torch import Tensor
 
+from neuroprior._checks import check_flags
 from neuroprior._hashing import row_hashes
 from neuroprior._random import gumbel
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, as_floats, join_decisions, random_best
@@ -56,6 +57,7 @@ class FrontierPlanner(PriorPlanner):
         **goal: Unpack[Objective],
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
+        check_flags(noise=noise)
         self.noise = noise
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:

@@ -11,6 +11,7 @@ from neuroprior.planners.planner import Objective
 from neuroprior.planners.sampling import SamplingPlanner
 from neuroprior.planners.tuning import best_sampling, check_tried
 from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors.prior import Prior
 from neuroprior.worlds.world import World
 
@@ -88,9 +89,10 @@ def extend_horizon(
         [2, 3, 4]
     """
     lengths = as_list("lengths", lengths)
-    if any(length < 1 for length in lengths):
-        raise ValueError(f"lengths: integers of at least 1 are expected, not {list(lengths)}")
+    if not all(isinstance(length, int) and length >= 1 for length in lengths):
+        raise ValueError(f"lengths: integers of at least 1 are expected, not {lengths}")
     check_tried(temperatures, uniform_shares)
+    check_are_plans(plans)
     goal: Objective = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
     prior.fit(plans, generator=generator, **settings)
     yield HorizonRound(plans.max_length, plans)

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_sizes, is_number, kind_of
+from neuroprior._checks import check_flags, check_memory, check_sizes, is_number, kind_of
 from neuroprior._random import generator_on
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, Stepper, check_in_world
@@ -78,6 +78,7 @@ class Planner(ABC):
         check_objective(objective, discount)
         if value is not None and not callable(value):
             raise ValueError(f"value: a function of states [N, ...] is expected, not {value!r}")
+        check_flags(any_prefix=any_prefix)
         self.objective, self.discount, self.value, self.any_prefix = objective, discount, value, any_prefix
 
     @property
@@ -190,16 +191,24 @@ def as_floats(rewards: Tensor) -> Tensor:
     return rewards if rewards.is_floating_point() else rewards.float()
 
 
-def value_of(value: Callable[[Tensor], Tensor], state: Tensor) -> Tensor:
-    """The values `[N]` of `state [N, ...]`; raises ValueError unless there are N of them and none is NaN."""
+def check_is_planner(planner: object) -> None:
+    """Raise ValueError unless it is a `Planner`."""
+    if not isinstance(planner, Planner):
+        raise ValueError(f"planner: a Planner is expected, not {kind_of(planner)}")
+
+
+def value_of(value: Callable[[Tensor], Tensor], state: Tensor, name: str = "value") -> Tensor:
+    """The values `[N]` of `state [N, ...]`; raises ValueError, which begins with the `name`, unless there are N of them
+    and none is NaN.
+    """
     values = value(state)
     if not isinstance(values, Tensor):
         raise ValueError(
-            f"value: a tensor [{len(state)}] of the values of {len(state)} states is expected, not {kind_of(values)}"
+            f"{name}: a tensor [{len(state)}] of the values of {len(state)} states is expected, not {kind_of(values)}"
         )
     if values.numel() != len(state) or values.isnan().any():
         raise ValueError(
-            f"value: one number for each of {len(state)} states is expected, none NaN; got {values.numel()}"
+            f"{name}: one number for each of {len(state)} states is expected, none NaN; got {values.numel()}"
         )
     return values.view(-1)
 

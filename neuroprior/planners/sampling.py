@@ -5,7 +5,7 @@ from typing import Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_share, check_sizes
+from neuroprior._checks import check_flags, check_share, check_sizes
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
 from neuroprior.planners.rollouts import halved_scores, halving_rounds, mean_scores
 from neuroprior.priors.uniform import UniformPrior
@@ -60,6 +60,7 @@ class SamplingPlanner(PriorPlanner):
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
         check_sizes(num_rollouts=num_rollouts)
+        check_flags(halving=halving)
         check_share("uniform_share", uniform_share)
         self.num_rollouts, self.halving, self.uniform_share = num_rollouts, halving, uniform_share
 

@@ -12,12 +12,13 @@ from typing import Any, NamedTuple, Unpack
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_share, check_sizes
+from neuroprior._checks import as_list, check_share, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Objective
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner, uniform_plans
 from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors.ensembles.mixture import MixturePrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
@@ -225,6 +226,7 @@ def sampling_for(
     """
     check_tried(temperatures, uniform_shares)
     check_sizes(num_plans=num_plans)
+    check_are_plans(plans)
     if len(plans) == 0:
         raise ValueError("plans: at least one is expected; from none, no setting is better than another")
     parts: dict[float, list[Tensor]] = {heat: [] for heat in temperatures}
@@ -295,7 +297,7 @@ def _log_mean(values: Tensor) -> float:
 def check_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) -> None:
     """Raise ValueError where there are no temperatures or shares to try, or one is out of range."""
     for name, values in (("temperatures", temperatures), ("uniform_shares", uniform_shares)):
-        if not len(values):
+        if not as_list(name, values):
             raise ValueError(f"{name}: at least one is expected, not an empty list")
     for temperature in temperatures:
         check_temperature(temperature)

@@ -1,5 +1,6 @@
 """The conformance suite of worlds."""
 
+from collections.abc import Callable
 from functools import partial
 from numbers import Integral
 from typing import cast
@@ -60,6 +61,8 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
         plans, wrong_plans = _vectors(world, state, length, generator)
     else:
         plans, wrong_plans = _numbers(world, state, length, generator)
+    if isinstance(world, World):
+        _check_illegal(world, state, generator)
     _check_step(world, state, plans[:, 0, 0], seed)
     _check_reached(world, state, plans, generator)
     by_steps, rewards, random = _step_through(world, state, plans, seed)
@@ -90,6 +93,10 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
         kept is not None and same(kept[:, :, -1], rollout.final_state),
         "rollout: with keep_states=True the last of the states is not the final one",
     )
+    assert kept is not None
+    if not random:
+        shorter = world.rollout(state, plans[:, :, : length // 2], torch.Generator().manual_seed(seed)).final_state
+        require(same(kept[:, :, length // 2 - 1], shorter), "rollout: states on the way are not those of shorter plans")
 
 
 def _numbers(world: World, state: Tensor, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
@@ -144,6 +151,25 @@ def _check_reached(world: World | ContinuousWorld, state: Tensor, plans: Tensor,
         require(not reward.any(), "step: the reward from terminated states must be 0")
 
 
+def _legal_actions(world: World, state: Tensor) -> Tensor:
+    """What `legal_actions` returns, of the right shape."""
+    legal, shape = world.legal_actions(state), [len(state), world.num_actions]
+    require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal_actions must be bool {shape}")
+    return legal
+
+
+def _check_illegal(world: World, state: Tensor, generator: torch.Generator) -> None:
+    """`step` takes actions that are not legal, which planners may try before they leave the plan out."""
+    where, action = (~_legal_actions(world, state)).nonzero(as_tuple=True)
+    if len(where):
+        try:
+            world.step(state[where], action, generator)
+        except Exception as error:
+            raise AssertionError(
+                f"step: it stops at actions that are not legal ({error}); planners may try these, and leave them out"
+            ) from error
+
+
 def _check_step(world: World | ContinuousWorld, state: Tensor, action: Tensor, seed: int) -> None:
     """`step`: shapes, dtypes, seeds, and no change to what it was given."""
     kept = state.clone(), action.clone()
@@ -159,8 +185,9 @@ def _check_step(world: World | ContinuousWorld, state: Tensor, action: Tensor, s
     require(reward.is_floating_point(), f"step: reward of {reward.dtype}, not floating point")
     require(not reward.isnan().any(), "step: NaN in the reward")
     require(not after.isnan().any(), "step: NaN in the next state")
-    again, _ = world.step(state, action, torch.Generator().manual_seed(seed))
+    again, gained = world.step(state, action, torch.Generator().manual_seed(seed))
     require(after.equal(again), "step: the same seed gave other states")
+    require(same(reward, gained), "step: the same seed gave other rewards")
 
 
 def _check_queries(world: World | ContinuousWorld, state: Tensor) -> None:
@@ -174,24 +201,35 @@ def _check_queries(world: World | ContinuousWorld, state: Tensor) -> None:
         f" not {observed.dtype} {list(observed.shape)}",
     )
     require(not observed.isnan().any(), "observe: NaN in the observations")
-    half = len(state) // 2
-    alone = same(world.observe(state[half:]), observed[half:])
-    require(alone, "observe: what is observed in a state depends on its batch")
+    _check_batch("observe", world.observe, state)
     ended = world.terminated(state)
     require(isinstance(ended, Tensor), f"terminated must return a tensor, not {type(ended).__name__}")
     require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
+    _check_batch("terminated", world.terminated, state)
     if isinstance(world, ContinuousWorld):
         require(observed.is_floating_point(), f"observe must give floating point features, not {observed.dtype}")
         return
     solved = world.solved(state)
     require(solved.dtype == torch.bool and solved.shape == state.shape[:1], f"solved must be bool [{len(state)}]")
+    _check_batch("solved", world.solved, state)
     require(world.has_goal or not solved.any(), "solved: a goal is reached, but has_goal is False")
-    legal = world.legal_actions(state)
-    shape = [len(state), world.num_actions]
-    require(legal.dtype == torch.bool and list(legal.shape) == shape, f"legal_actions must be bool {shape}")
+    legal = _legal_actions(world, state)
+    _check_batch("legal_actions", world.legal_actions, state)
     require(bool(legal.any(1).all()), "legal_actions: a state without any legal action")
     if world.all_legal:
         require(bool(legal.all()), "all_legal is True, but legal_actions leaves some out")
+    group = world.group(state)
+    if group is not None:
+        fits = isinstance(group, Tensor) and group.dtype == torch.int64 and group.shape == state.shape[:1]
+        require(fits, f"group must return int64 [{len(state)}], or None")
+        _check_batch("group", lambda some: cast(Tensor, world.group(some)), state)
+
+
+def _check_batch(name: str, query: Callable[[Tensor], Tensor], state: Tensor) -> None:
+    """What is found in a state does not depend on the other states of the batch, nor on its place there."""
+    for some in (slice(len(state) // 2, None), slice(1, None), slice(0, 1)):
+        alone = same(query(state[some]), query(state)[some])
+        require(alone, f"{name}: what is found in a state depends on its batch")
 
 
 def _step_through(

@@ -102,6 +102,7 @@ class ForagingWorld(World):
         return self.table.legal_actions(state[:, 0])
 
     def check_state(self, state: Tensor) -> None:
+        super().check_state(state)
         if state.dim() != 2 or state.shape[1] != 2 + self.num_items:
             raise ValueError(f"state: shape [B, {2 + self.num_items}] is expected, not {list(state.shape)}")
         if state.dtype != torch.int64:

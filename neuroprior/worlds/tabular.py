@@ -240,6 +240,7 @@ class TabularWorld(World):
         return ended
 
     def check_state(self, state: Tensor) -> None:
+        super().check_state(state)
         if state.dim() != 1:
             raise ValueError(f"state: shape [B] is expected, not {list(state.shape)}")
         if state.dtype != torch.int64:

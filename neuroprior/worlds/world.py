@@ -81,6 +81,9 @@ class World(ABC):
     def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """One step.
 
+        It is also given actions that are not legal, since some planners try plans of all actions and leave out those
+        with an illegal one afterwards: it must not raise an error then, and what it returns does not count.
+
         Args:
             state: `[N, ...]`.
             action: int64 `[N]` between 0 and A - 1.

@@ -7,20 +7,27 @@ from neuroprior import (
     ExhaustivePlanner,
     MarkovPrior,
     Planner,
+    Plans,
     SamplingPlanner,
     UniformPrior,
     World,
+    collect,
     execute,
     gridworld,
     oracle,
 )
 from neuroprior.agents import Agent
 from neuroprior.planners import (
+    AStarPlanner,
     CrossEntropyPlanner,
     DistinctPlanner,
     FrontierPlanner,
     LevinPlanner,
     MCTSPlanner,
+    best_sampling,
+    bootstrap,
+    extend_horizon,
+    sampling_for,
 )
 from neuroprior.worlds import sliding_tiles
 
@@ -171,3 +178,63 @@ def test_states_of_another_dtype_are_refused(dtype: torch.dtype) -> None:
     for call in (ExhaustivePlanner(2).plan, lambda w, s: oracle(w, s, 3)):
         with pytest.raises(ValueError, match="state"):
             call(world, torch.tensor([250]).to(dtype))
+
+
+GRID, PUZZLE = gridworld(5, 5, seed=0), sliding_tiles(shape=(2, 2), scramble=6)
+CHAIN, STARTS = MarkovPrior(4, 1), torch.tensor([0, 12])
+SHORT = Plans(torch.zeros(4, 3, dtype=torch.long), 4)
+
+
+def agent(**settings):
+    return Agent(GRID, SamplingPlanner(CHAIN, 4, 4), CHAIN, STARTS, **settings).run(2)
+
+
+def learn(world=PUZZLE, prior=CHAIN, **settings):
+    return list(bootstrap(world, prior, PUZZLE.reset(3, torch.Generator().manual_seed(0)), sweeps=1, **settings))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ExhaustivePlanner(2, any_prefix="no"), "any_prefix: True or False is expected, not 'no'"),
+        (lambda: SamplingPlanner(CHAIN, 3, 4, halving="no"), "halving: True or False"),
+        (lambda: FrontierPlanner(CHAIN, 3, 4, noise="no"), "noise: True or False"),
+        (lambda: agent(warm_start="no"), "warm_start: True or False"),
+        (lambda: agent(change=3), "change: a function of states and a generator"),
+        (lambda: agent(change=lambda state, generator: None), r"change: torch.int64 \[2\], states .*, not NoneType"),
+        (lambda: agent(change=lambda state, generator: state[:1]), r"not torch.int64 \[1\]"),
+        (lambda: agent(training=[1]), "training: a dictionary of settings"),
+        (lambda: ExhaustivePlanner(2).plan(GRID, [0, 12]), "state: a tensor of shape"),
+        (lambda: collect(ExhaustivePlanner(2), GRID, state=[0, 12]), "state: a tensor of shape"),
+        (lambda: execute(ExhaustivePlanner(2), GRID, [0, 12], 3), "state: a tensor of shape"),
+        (lambda: execute("x", GRID, STARTS, 3), "planner: a Planner is expected, not str"),
+        (lambda: execute(ExhaustivePlanner(2), None, STARTS, 3), "world: a World"),
+        (lambda: collect(None, GRID, 3), "planner: a Planner is expected"),
+        (lambda: collect(ExhaustivePlanner(2), None, 3), "world: a World"),
+        (lambda: best_sampling(CHAIN, GRID, STARTS, 3, 4, temperatures=1.5), "temperatures: a list of numbers"),
+        (lambda: sampling_for(CHAIN, SHORT, 4, uniform_shares=0.1), "uniform_shares: a list of numbers"),
+        (lambda: sampling_for(CHAIN, SHORT.actions, 4), "plans: Plans are expected"),
+        (
+            lambda: list(extend_horizon(CHAIN, SHORT, GRID, ["3"], num_starts=4, num_plans=4)),
+            "lengths: integers of at least 1 .*'3'",
+        ),
+        (
+            lambda: list(extend_horizon(CHAIN, SHORT, GRID, [3.5], num_starts=4, num_plans=4)),
+            "lengths: integers of at least 1",
+        ),
+        (
+            lambda: list(extend_horizon(CHAIN, SHORT.actions, GRID, [3], num_starts=4, num_plans=4)),
+            "plans: Plans are expected",
+        ),
+        (lambda: learn(generator=0), "generator: a torch.Generator"),
+        (lambda: learn(teacher=SamplingPlanner(CHAIN, 3, 4)), "teacher: a BestFirstPlanner"),
+        (lambda: learn(prior=None), "prior: a Prior is expected"),
+        (lambda: learn(world=None), "world: a World"),
+        (lambda: learn(guided=1), "guided: True or False"),
+        (lambda: AStarPlanner(lambda state: None).search(PUZZLE, PUZZLE.reset(2)), "heuristic: a tensor .2. of"),
+    ],
+)
+def test_bad_arguments_are_named(call, message) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        call()
+    assert "\n" not in str(error.value)

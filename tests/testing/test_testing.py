@@ -405,6 +405,60 @@ class Unsaid(Line):
         return torch.tensor([True, False]).expand(len(state), 2)
 
 
+class ByPlace(Line):
+    """Which action is legal depends on the place of a state in its batch."""
+
+    all_legal = False
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        legal = torch.ones(len(state), 2, dtype=torch.bool)
+        legal[::2, 0] = False
+        return legal
+
+
+class SolvedByPlace(Line):
+    has_goal = True
+
+    def solved(self, state: Tensor) -> Tensor:
+        return torch.arange(len(state)) % 2 == 0
+
+
+class OneGroup(Line):
+    def group(self, state: Tensor) -> Tensor:
+        return torch.zeros(1, dtype=torch.long)
+
+
+class UnseededReward(Line):
+    stochastic = True
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        return super().step(state, action)[0], torch.rand(len(state))
+
+
+class Strict(Line):
+    """A simulator that stops at actions that are not legal."""
+
+    all_legal = False
+
+    def legal_actions(self, state: Tensor) -> Tensor:
+        return torch.tensor([True, False]).expand(len(state), 2)
+
+    def step(self, state: Tensor, action: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        if (action == 1).any():
+            raise RuntimeError("illegal move")
+        return super().step(state, action)
+
+
+class OtherStatesOnTheWay(Line):
+    def rollout(
+        self, state: Tensor, plans: Tensor, generator: torch.Generator | None = None, keep_states: bool = False
+    ) -> Rollout:
+        found = super().rollout(state, plans, generator, keep_states)
+        if found.states is None:
+            return found
+        return found._replace(states=found.states[:, :, -1:].expand_as(found.states))
+
+
 @pytest.mark.parametrize("world", [Line, Noisy, Ending])
 def test_worlds_of_ones_own_conform(world: type[World]) -> None:
     check_world(world())
@@ -428,6 +482,12 @@ def test_worlds_of_ones_own_conform(world: type[World]) -> None:
         (PaysOn, "reward from terminated states must be 0"),
         (Unmarked, "has_goal is False"),
         (KeepsStarts, "last of the states is not the final one"),
+        (ByPlace, "legal_actions: what is found in a state depends on its batch"),
+        (SolvedByPlace, "solved: what is found in a state depends on its batch"),
+        (OneGroup, "group must return int64"),
+        (UnseededReward, "the same seed gave other rewards"),
+        (Strict, "stops at actions that are not legal .illegal move."),
+        (OtherStatesOnTheWay, "states on the way are not those of shorter plans"),
     ],
 )
 def test_a_broken_world_fails_with_a_message(broken: type[World], message: str) -> None:

@@ -48,8 +48,10 @@ RIDGE_OF_FEW = 5.0
 networks, on all plans.
 """
 
-GAIN = 2.0
-"""Nats in all by which few held-out plans have to be likelier for a network to be kept."""
+GAIN = 4.0
+"""Where no experts are given: nats in all by which held-out plans have to be likelier for a network to be kept, since
+its training was stopped where these plans were likeliest.
+"""
 
 MOST_NUMBERS = 2**25
 """The most numbers of forecasts of plans that are not held out."""
@@ -76,11 +78,11 @@ class CombinedPrior(MixturePrior):
     Their weights follow Bayes' rule, from initial weights that are learned on held-out plans. None of these is below
     1 / K, where K forecasts were tried: on every sequence whatever, the negative log-likelihood is at most log K above
     that of the best of those that are kept (Cesa-Bianchi and Lugosi 2006, section 9.2). An expert is left out where
-    held-out plans are predicted as well without it. Where no experts are given and fewer than a thousand actions are
-    held out, chains and trees are chosen and combined on all plans, most of them forecast part by part from the others,
-    and a network is kept only where the held-out plans are clearly likelier with it. In other worlds than those of the
-    plans an expert that was left out may be the better one: so chains and context trees whose tables are small are kept
-    aside, in `spare`, for planners that try (`neuroprior.planners.best_sampling`).
+    held-out plans are predicted as well without it. Where no experts are given, a network is kept only where the
+    held-out plans are clearly likelier with it; and if fewer than a thousand actions are held out, chains and trees are
+    chosen and combined on all plans, most of them forecast part by part from the others. In other worlds than those of
+    the plans an expert that was left out may be the better one: so chains and context trees whose tables are small are
+    kept aside, in `spare`, for planners that try (`neuroprior.planners.best_sampling`).
 
     Args:
         num_actions: A.
@@ -245,9 +247,9 @@ class CombinedPrior(MixturePrior):
         Args:
             plans: held-out plans.
             tried: how many experts there were, where these are the best of more; None: these.
-            learned: the plans that the experts learned from. Where few are held out, experts that count are combined
-                on these as well, part by part, fitted anew to the others; and those that are trained are kept only if
-                they are clearly better. None: all are chosen on the held-out plans alone.
+            learned: the plans that the experts learned from. Those that are trained are kept only if they are clearly
+                better then; and where few plans are held out, experts that count are combined on these as well, part by
+                part, fitted anew to the others. None: all are chosen on the held-out plans alone.
 
         Raises:
             ValueError: plans of other actions or contexts than this prior's, or without any action.
@@ -263,7 +265,7 @@ class CombinedPrior(MixturePrior):
         if share:
             tracked = taken_of(mixed(weights_before(taken, tracking, share), members)[:, :, None], actions)
             tracked = torch.cat([taken, tracked.masked_fill(~mask[..., None], 0)], 2)
-            if held_out.loss(tracked) > held_out.loss(taken) - held_out.tolerance:
+            if held_out.loss(tracked) > held_out.loss(taken) - held_out.tolerance():
                 share = 0.0
         self.experts = nn.ModuleList([experts[number] for number in kept])
         left = [e for number, e in enumerate(experts) if number not in kept]
@@ -323,11 +325,12 @@ def chosen_on(
     """
     costs = [sum(weight.numel() for weight in e.parameters()) for e in experts]
     counting = [number for number, e in enumerate(experts) if _counts(e)]
+    gains = [IN_ALL if learned is None or number in counting else GAIN for number in range(len(experts))]
     forecasts = _forecasts(experts, plans)
     held_out = HeldOut(forecasts, plans.actions, plans.mask(), tried)
     parts = [] if learned is None or not counting else counting_parts(learned, plans)
     if len(parts) < 2 or sum(part.actions.numel() for _, part in parts) * forecasts[0, 0].numel() > MOST_NUMBERS:
-        kept, powers = held_out.choose(costs)
+        kept, powers = held_out.choose(costs, gains)
         return held_out.of(kept), kept, powers
     found = [(forecasts[:, :, counting], plans.actions, held_out.mask)]
     for rest, left_out in parts[1:]:
@@ -339,7 +342,7 @@ def chosen_on(
     chosen = [counting[number] for number in best]
     both = chosen + [number for number in range(len(experts)) if number not in counting]
     few = held_out.of(both, torch.cat([powers, powers.new_zeros(len(both) - len(chosen))]))
-    kept, new_powers = few.choose([costs[number] for number in both], len(chosen))
+    kept, new_powers = few.choose([costs[number] for number in both], [gains[number] for number in both], len(chosen))
     if len(kept) == len(chosen):
         return known.of(best), chosen, powers
     return few.of(kept), [both[number] for number in kept], new_powers
@@ -376,7 +379,6 @@ class HeldOut:
         self.forecasts, self.actions, self.mask, self.tried, self.anchor = forecasts, actions, mask, tried, anchor
         self.taken = taken_of(forecasts, actions).masked_fill(~mask[..., None], 0)
         self.count = max(int(mask.sum()), 1)
-        self.tolerance = max(TOLERANCE, (IN_ALL if anchor is None else GAIN) / self.count)
         # Some actions, evenly spread, are enough for a few powers.
         self.every = -(-self.count * forecasts[0, 0].numel() // NUMBERS)
 
@@ -396,17 +398,24 @@ class HeldOut:
             anchor = self.anchor[kept]
         return HeldOut(self.forecasts[:, :, kept], self.actions, self.mask, self.tried, anchor)
 
-    def choose(self, costs: Sequence[int], fixed: int = 0) -> tuple[list[int], Tensor]:
+    def tolerance(self, gain: float = IN_ALL) -> float:
+        """Nats per action that do not count, where `gain` nats in all do not."""
+        return max(TOLERANCE, gain / self.count)
+
+    def choose(
+        self, costs: Sequence[int], gains: Sequence[float] | None = None, fixed: int = 0
+    ) -> tuple[list[int], Tensor]:
         """The experts that are kept, and their powers `[K]`, float64, in the pool.
 
-        One expert after the other is left out: the dearest of those without which no more than the tolerance is lost.
+        One expert after the other is left out: the dearest of those without which no more is lost than it has to add.
 
         Args:
             costs: of each expert, such as its number of weights. (Seconds differ from run to run, and so would what is
                 chosen.)
+            gains: nats in all by which these plans have to be likelier with each; None: `IN_ALL`.
             fixed: the first so many are kept.
         """
-        kept = list(range(len(costs)))
+        kept, gains = list(range(len(costs))), gains or [IN_ALL] * len(costs)
         powers, best = self.combined(kept)
         while len(kept) > 1:
             found = []
@@ -414,12 +423,12 @@ class HeldOut:
                 rest = [number for number in kept if number != out]
                 rest_powers, loss = self.combined(rest)
                 best = min(best, loss)
-                found.append((costs[out], loss, rest, rest_powers))
-            spared = [entry for entry in found if entry[1] <= best + self.tolerance]
+                found.append((out, loss, rest, rest_powers))
+            spared = [entry for entry in found if entry[1] <= best + self.tolerance(gains[entry[0]])]
             if not spared:
                 break
             # The dearest; among those that count, which cost the same, the one that is missed least.
-            _, _, kept, powers = max(spared, key=lambda entry: (entry[0], -entry[1]))
+            _, _, kept, powers = max(spared, key=lambda entry: (costs[entry[0]], -entry[1]))
         return kept, powers
 
     def combined(self, kept: list[int]) -> tuple[Tensor, float]:
