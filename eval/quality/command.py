@@ -5,8 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import log
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 import torch
@@ -14,11 +15,12 @@ from jsonargparse.typing import NonNegativeInt, PositiveInt
 from torch import Tensor
 
 from eval.quality.sequences import CONDITIONS, Sequences, sequences
-from eval.worlds.runs import plus_minus
+from eval.worlds.runs import Seed, plus_minus
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, fit
-from neuroprior._jobs import Progress
+from neuroprior._jobs import JobRun, Progress
 from neuroprior._random import draw_seed
 from neuroprior.analysis.comparison import Score, score
+from neuroprior.analysis.statistics import paired_difference
 from neuroprior.priors.ensembles.candidates import best_chain
 from neuroprior.report.document import Column, Document, publish, table
 from neuroprior.report.page import Section, Table
@@ -43,6 +45,20 @@ PARTS = (MARKOV, "context-tree", "gru", "stacked")
 
 OF_SEQUENCES = (*PARTS, "transformer", "combined")
 """Priors that learn long sequences, as `neuroprior.fit` knows them, with their default settings."""
+
+GAP = ("more", "more_low", "more_high", "p_value")
+"""Columns: how many bits per action more than the combined prior's."""
+
+
+class LongJob(NamedTuple):
+    """One of the kinds of `sequences`, by its number, and the seed of its sequences and of the priors."""
+
+    kind: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"sequences-{self.kind}-{self.seed}"
 
 
 @dataclass(frozen=True)
@@ -123,36 +139,44 @@ def quality(
     num_plans: NonNegativeInt = 100_000,
     held_out: PositiveInt = 5_000,
     num_sequences: NonNegativeInt = 40,
-    seed: NonNegativeInt = 0,
+    seed: Seed = 0,
+    seeds: PositiveInt = 1,
+    processes: PositiveInt | None = None,
     out: str = "runs/quality",
 ) -> None:
     """Fit priors to sources whose entropy is known, and to long sequences of many kinds of action.
 
     Printed are how many bits more than the source they take, bits per action, and the seconds that they learn.
+    Interrupted, the same command goes on with the long sequences that are left.
 
     Args:
         num_plans: plans of 32 actions to learn from, at least 100; 0 leaves the sources of known entropy out.
         held_out: plans to score, at least 100.
         num_sequences: long sequences to learn from, of 1,000 actions each; half as many are scored; 0 for none.
         seed: draws sources and plans.
-        out: folder for `quality.csv`, `sequences.csv` and `results.json`.
+        seeds: long sequences are drawn with so many seeds, from `seed` on; of several, intervals are over seeds.
+        processes: how many kinds of long sequences and seeds are learned at a time; all cores by default. For seconds
+            that can be compared, 1.
+        out: folder for `quality.csv`, `sequences.csv`, `results.json` and finished jobs.
     """
     if 0 < num_plans < 100 or held_out < 100:
         raise ValueError(f"num_plans and held_out: at least 100 are needed, not {num_plans} and {held_out}")
     if not num_plans and not num_sequences:
         raise ValueError("num_plans and num_sequences: one of them above 0 is expected")
     generator = torch.Generator().manual_seed(seed)
-    every, long = sources(generator) if num_plans else [], sequences(num_sequences, torch.Generator().manual_seed(seed))
-    rows, of_long, jobs = [], [], len(every) * len(OF_SOURCES) + len(long) * len(OF_SEQUENCES)
-    with Progress("quality", jobs, jobs) as progress:
+    number = len(sequences(num_sequences, torch.Generator().manual_seed(seed)))
+    asked = {"command": "quality", "num_sequences": num_sequences}
+    run = JobRun(partial(long_rows, number=num_sequences), Path(out) / "runs", asked, name=attrgetter("name"))
+    jobs = [LongJob(kind, one) for one in range(seed, seed + seeds) for kind in range(number)]
+    of_long = sum(run.do(jobs, processes=processes, title="sequences"), list[dict[str, Any]]())
+    every, rows = sources(generator) if num_plans else [], []
+    with Progress("sources", len(every) * len(OF_SOURCES), len(every) * len(OF_SOURCES)) as progress:
         for source in every:
             training, _ = source.draw(num_plans, generator)
             test, true = source.draw(held_out, generator)
             for name in OF_SOURCES:
                 rows.append(_fit(source, name, training, test, true, seed))
                 progress.advance(f"{source.name}: {rows[-1]['model']} {rows[-1]['excess_percent']:+.2f} %")
-        for given in long:
-            of_long += _long_rows(given, seed, progress)
     sections, frames, lead = [], {}, ""
     if rows:
         frames["quality"] = pd.DataFrame(rows)
@@ -162,7 +186,8 @@ def quality(
         frames["sequences"] = pd.DataFrame(of_long)
         tables = [_table_of_long(rows) for _, rows in frames["sequences"].groupby("source", sort=False)]
         sections.append(Section("Bits per action of long sequences", tables=tables))
-    settings = {"num_plans": num_plans, "held_out": held_out, "num_sequences": num_sequences, "seed": seed}
+    settings = {"num_plans": num_plans, "held_out": held_out, "num_sequences": num_sequences}
+    settings |= {"seed": seed, "seeds": seeds}
     publish(Document("Sources of known entropy", lead, sections, frames, settings, keys={"quality": "rows"}), Path(out))
 
 
@@ -193,18 +218,21 @@ def _fit(source: Source, name: str, training: Plans, test: Plans, true: Tensor, 
     }
 
 
-def _long_rows(given: Sequences, seed: int, progress: Progress) -> list[dict[str, Any]]:
-    """A row a prior: bits per action of the test sequences, and how many more they are than the combined prior's."""
-    found: dict[str, tuple[Score, float]] = {}
-    for name in OF_SEQUENCES:
-        found[name] = _fit_long(given, name, seed)
-        progress.advance(f"{given.name}: {name} {found[name][0].bits_per_action().mean:.4f} bits")
+def long_rows(job: LongJob, number: int) -> list[dict[str, Any]]:
+    """A row a prior: bits per action of the test sequences, and how many more they are than the combined prior's.
+
+    Args:
+        job: the kind of sequences, and the seed.
+        number: of sequences to learn from.
+    """
+    given = sequences(number, torch.Generator().manual_seed(job.seed))[job.kind]
+    found = {name: _fit_long(given, name, job.seed) for name in OF_SEQUENCES}
     rows = []
     for name, (own, seconds) in found.items():
-        row = {"source": given.name, "model": name, "entropy": given.entropy}
+        row = {"source": given.name, "seed": job.seed, "model": name, "entropy": given.entropy}
         row |= {"bits_per_action": own.bits_per_action().mean, "seconds": seconds}
         gap = own.minus(found["combined"][0])
-        rows.append(row | dict(zip(("more", "more_low", "more_high", "p_value"), gap, strict=True)))
+        rows.append(row | dict(zip(GAP, gap, strict=True)))
     return rows
 
 
@@ -222,14 +250,29 @@ def _fit_long(given: Sequences, name: str, seed: int) -> tuple[Score, float]:
     return score(name, prior, given.test), seconds
 
 
+def _over_seeds(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row a model: of several seeds the means, and intervals over these."""
+    if rows["seed"].nunique() == 1:
+        return rows
+    bits = rows.pivot(index="seed", columns="model", values="bits_per_action")
+    found = []
+    for name, own in rows.groupby("model", sort=False):
+        gap = paired_difference(bits[name], bits["combined"])
+        means = own[["entropy", "bits_per_action", "seconds"]].mean().to_dict()
+        found.append({"model": name} | means | dict(zip(GAP, gap, strict=True)))
+    return pd.DataFrame(found)
+
+
 def _price(rows: pd.DataFrame) -> float:
     """How long the combined prior of a source takes to fit, as a multiple of its parts."""
-    seconds = rows.set_index("model")["seconds"]
+    seconds = rows.groupby("model")["seconds"].mean()
     return float(seconds["combined"] / seconds[list(PARTS)].sum())
 
 
 def _table_of_long(rows: pd.DataFrame) -> Table:
     """A row a model of one source: bits per action, how many more than those of the combined prior, and seconds."""
+    units = "predicted sequences" if rows["seed"].nunique() == 1 else f"{rows['seed'].nunique()} seeds"
+    source_name, rows = rows["source"].iloc[0], _over_seeds(rows)
     columns: dict[str, Column] = {
         "prior": "model",
         "bits per action": "bits_per_action:.4f",
@@ -244,11 +287,11 @@ def _table_of_long(rows: pd.DataFrame) -> Table:
     )
     caption = (
         f"{source}. markov: of the order that predicts a tenth of the training sequences best. more: than the combined"
-        " prior; ±: 95 % interval over the predicted sequences, paired. seconds: of fitting; the combined prior takes"
+        f" prior; ±: 95 % interval over the {units}, paired. seconds: of fitting; the combined prior takes"
         f" {_price(rows):.2f} times as long as {', '.join(PARTS)} together."
     )
     shown = rows.assign(more=rows["more"].where(rows["model"] != "combined"))
-    return table(shown, columns, caption, rows["source"].iloc[0])
+    return table(shown, columns, caption, source_name)
 
 
 def _tables(rows: pd.DataFrame) -> list[Table]:

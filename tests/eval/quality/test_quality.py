@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -145,17 +146,15 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
     monkeypatch.setattr("eval.quality.command.sources", lambda generator: SOURCES[:1])
     for kind in ("GRUPrior", "TransformerPrior", "CombinedPrior"):
         monkeypatch.setattr(f"eval.quality.command.{kind}.fit", untrained)
-    assert (
-        main(["quality", "--num-plans", "100", "--held-out", "100", "--num-sequences", "4", "--out", str(tmp_path)])
-        == 0
-    )
+    few = ["--num-sequences", "4", "--processes", "1"]
+    assert main(["quality", "--num-plans", "100", "--held-out", "100", *few, "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "results.json").read_text())
     assert [row["model"] for row in found["rows"]] == ["markov", "gru", "transformer", "combined", "combined, full"]
-    assert fitted[:4] == ["GRUPrior", "TransformerPrior", "standard", "full"]
+    assert fitted[-4:] == ["GRUPrior", "TransformerPrior", "standard", "full"]
     rows = found["sequences"]
     names = ["markov", "context-tree", "gru", "stacked", "transformer", "combined"]
     assert [row["model"] for row in rows] == names * 2
-    assert fitted[4:] == names[1:] * 2
+    assert fitted[:-4] == names[1:] * 2
     for row in rows:
         assert row["seconds"] > 0
         kinds = KINDS if row["entropy"] else len(CHARACTERS)
@@ -171,12 +170,24 @@ def test_long_sequences_have_a_table_of_their_own(tmp_path, capsys, monkeypatch)
     assert said.count("times as long as markov, context-tree, gru, stacked together") == 2
     assert SOURCES[0].name in said
     alone = tmp_path / "alone"
-    assert main(["quality", "--num-plans", "0", "--num-sequences", "4", "--out", str(alone)]) == 0
-    assert SOURCES[0].name not in capsys.readouterr().out
+    assert main(["quality", "--num-plans", "0", *few, "--seeds", "3", "--out", str(alone)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert SOURCES[0].name not in said
     again = json.loads((alone / "results.json").read_text())
     assert "rows" not in again
-    for row, before in zip(again["sequences"], rows, strict=True):
+    assert [row["seed"] for row in again["sequences"]] == [0] * 12 + [1] * 12 + [2] * 12
+    for row, before in zip(again["sequences"], rows, strict=False):
         assert row["bits_per_action"] == before["bits_per_action"]
+    every = pd.DataFrame(again["sequences"])
+    bits = every[every["source"] == rows[0]["source"]].pivot(index="seed", columns="model", values="bits_per_action")
+    gap = stats.ttest_rel(bits["context-tree"], bits["combined"])
+    mean, half = (bits["context-tree"] - bits["combined"]).mean(), np.ptp(gap.confidence_interval()) / 2
+    assert f"{bits['context-tree'].mean():.4f} {mean:+.4f} ±{half:.4f}" in said
+    assert said.count("95 % interval over the 3 seeds, paired") == 2
+    before = len(fitted)
+    assert main(["quality", "--num-plans", "0", *few, "--seeds", "2", "--out", str(alone)]) == 0
+    assert len(fitted) == before  # these were learned
+    capsys.readouterr()
     assert main(["quality", "--num-plans", "0", "--num-sequences", "0"]) == 2
     assert "one of them above 0" in capsys.readouterr().err
 
@@ -186,6 +197,8 @@ def test_the_price_of_the_combined_prior_is_that_of_its_parts():
     seconds = {"markov": 1, "context-tree": 2, "gru": 8, "stacked": 9, "transformer": 80, "combined": 30}
     rows = pd.DataFrame([{"source": "text", "model": name, "seconds": value} for name, value in seconds.items()])
     assert _price(rows) == 1.5
+    slower = rows.assign(seconds=[2, 2, 10, 11, 0, 50])  # a second seed: 40 s in the mean, of 22.5
+    assert _price(pd.concat([rows, slower])) == pytest.approx(40 / 22.5)
 
 
 def context_at(source, plans: Plans, t: int) -> torch.Tensor | int:
