@@ -313,7 +313,7 @@ def test_bad_input_is_refused() -> None:
         LevinPlanner(UniformPrior(4), 10**12)
     with pytest.raises(ValueError, match="heuristic: a function"):
         AStarPlanner("manhattan")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="value"):
+    with pytest.raises(ValueError, match="heuristic: one number for each"):
         LevinPlanner(UniformPrior(9), heuristic=lambda state: state.double() * math.nan).search(
             cube(), torch.tensor([5])
         )
