@@ -1,20 +1,17 @@
 """`neuroprior score`: how probable plans are under a saved prior."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch
 from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
-from neuroprior.plans import Columns, Missing, Plans, is_per_step, read_plans
-from neuroprior.plans.columns import listed
-from neuroprior.priors import Prior, load
-from neuroprior.priors.matching import learned_names, match_plans
+from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.priors import load
+from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
 from neuroprior.priors.scoring import learned_from, scores_by
 from neuroprior.report.document import printed, table, write_frames
 
@@ -58,7 +55,7 @@ def score(
     plans = read_plans(file, action_names=action_names or (known if is_table else None), **how)
     by_number = plans.action_names is None or (is_table and action_names is None and _by_number(plans, file, how))
     plans = plans if plans.end is None else plans.without_end()
-    plans, notes = _with_contexts_of(prior, plans, is_table)
+    plans, notes = with_contexts_of(prior, plans, is_table)
     own = match_plans(plans, prior, folder)
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()
@@ -84,9 +81,9 @@ def score(
         )
     notes = [*plans.notes, *notes]
     if plans.action_names and action_names is None and prior.action_names is None:
-        notes.append(f"{_numbered('actions', plans.action_names)}; --action_names orders them")
+        notes.append(f"{numbered_note('actions', plans.action_names)}; --action_names orders them")
     if by_number and known is not None:
-        notes.append(_taken_for_names("actions", known))
+        notes.append(taken_note("actions", known))
     place.mkdir(parents=True, exist_ok=True)
     console = Console()
     for note in notes:
@@ -100,34 +97,6 @@ def score(
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True
     )
-
-
-def _with_contexts_of(prior: Prior, plans: Plans, is_table: bool) -> tuple[Plans, list[str]]:
-    """The plans, whose contexts have names if they are numbers in a table that are names of the prior; and notes."""
-    known, names, context = prior.context_names, plans.context_names, plans.context
-    if prior.num_contexts is None or context is None or (known is None) == (names is None):
-        return plans, []
-    if known is None:
-        return plans, [_numbered("contexts", names or ())]
-    occurring = (context[plans.mask()] if is_per_step(context) else context).unique()
-    names = tuple(map(str, occurring.tolist()))
-    if is_table and names and set(names) <= set(known):
-        # What stands behind the end of a plan is none of them.
-        number = torch.searchsorted(occurring, context).clamp(max=len(names) - 1)
-        return replace(plans, context=number, context_names=names), []
-    return plans, [_taken_for_names("contexts", known)]
-
-
-def _numbered(what: str, names: Sequence[str]) -> str:
-    """The note on actions or contexts of which the file alone has names."""
-    order = listed([f"{name} = {number}" for number, name in enumerate(names)])
-    return f"the prior knows {what} by number, so the file's were numbered: {order}"
-
-
-def _taken_for_names(what: str, known: Sequence[str]) -> str:
-    """The note on actions or contexts of which the prior alone has names."""
-    order = listed([f"{number} = {name}" for number, name in enumerate(known)])
-    return f"the {what} are numbers, which are taken for those of the prior's names: {order}"
 
 
 def _by_number(plans: Plans, file: str, how: Mapping[str, Any]) -> bool:

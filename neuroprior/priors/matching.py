@@ -6,7 +6,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans
+from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans.columns import listed
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors.prior import Prior, as_actions
 
@@ -113,3 +114,37 @@ def numbers(known: Sequence[str], names: Sequence[str], before: str, after: str)
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"{before} {unknown[0]!r}{after} {', '.join(known)}")
     return torch.tensor([known.index(name) for name in names])
+
+
+def with_contexts_of(prior: Prior, plans: Plans, is_table: bool) -> tuple[Plans, list[str]]:
+    """The plans, whose contexts have names if they are numbers in a table that are names of the prior; and notes.
+
+    Args:
+        prior: that is to score them.
+        plans: as they were read.
+        is_table: whether they were read from a table (CSV), in which names may be numbers.
+    """
+    known, names, context = prior.context_names, plans.context_names, plans.context
+    if prior.num_contexts is None or context is None or (known is None) == (names is None):
+        return plans, []
+    if known is None:
+        return plans, [numbered_note("contexts", names or ())]
+    occurring = (context[plans.mask()] if is_per_step(context) else context).unique()
+    names = tuple(map(str, occurring.tolist()))
+    if is_table and names and set(names) <= set(known):
+        # What stands behind the end of a plan is none of them.
+        number = torch.searchsorted(occurring, context).clamp(max=len(names) - 1)
+        return replace(plans, context=number, context_names=names), []
+    return plans, [taken_note("contexts", known)]
+
+
+def numbered_note(what: str, names: Sequence[str]) -> str:
+    """The note on actions or contexts of which the file alone has names."""
+    order = listed([f"{name} = {number}" for number, name in enumerate(names)])
+    return f"the prior knows {what} by number, so the file's were numbered: {order}"
+
+
+def taken_note(what: str, known: Sequence[str]) -> str:
+    """The note on actions or contexts of which the prior alone has names."""
+    order = listed([f"{number} = {name}" for number, name in enumerate(known)])
+    return f"the {what} are numbers, which are taken for those of the prior's names: {order}"

@@ -141,8 +141,9 @@ def report(
         if not priors:
             raise ValueError("priors: at least one is expected")
         loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
-        names = action_names or (learned_names(next(iter(loaded.values()))) if file[-4:].lower() in CSV else None)
-        found = evaluate_saved(loaded, _read(plans, reading | {"action_names": names}), skip)
+        is_table = file[-4:].lower() in CSV
+        names = action_names or (learned_names(next(iter(loaded.values()))) if is_table else None)
+        found = evaluate_saved(loaded, _read(plans, reading | {"action_names": names}), skip, is_table)
         same = {} if isinstance(priors, Mapping) else {one: sum(learned_from(Path(one), found.plans)) for one in priors}
         if any(same.values()):
             found = replace(found, settings=found.settings | {"training data": {k: n for k, n in same.items() if n}})

@@ -1,7 +1,7 @@
 """Models scored on held-out plans: by cross-validation, or saved priors on plans that they have not learned from."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from math import log
 from pathlib import Path
@@ -21,7 +21,7 @@ from neuroprior.plans import Plans
 from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import Prior
 from neuroprior.priors.ensembles.candidates import ORDERS
-from neuroprior.priors.matching import match_plans
+from neuroprior.priors.matching import match_plans, numbered_note, with_contexts_of
 from neuroprior.report import fits
 from neuroprior.report.fits import (
     ACTIONS,
@@ -197,15 +197,25 @@ def _gains(arrays: Arrays, inputs: str) -> list[dict[str, Any]]:
     return rows
 
 
-def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Evaluation:
-    """Fitted priors, scored on plans whose actions and contexts they know by name, else by number.
+def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int, is_table: bool = False) -> Evaluation:
+    """Fitted priors, scored on plans whose actions and contexts they know by name, else by number, which is noted.
+
+    Args:
+        priors: by name.
+        plans: to score.
+        skip: actions at the beginning of each plan that do not count.
+        is_table: whether the plans were read from a table (CSV), in which names of contexts may be numbers.
 
     Raises:
         ValueError: a prior does not know these actions or contexts; the message has its name.
     """
-    models = []
+    models, notes = [], list(plans.notes)
     for name, prior in priors.items():
-        own = match_plans(plans, prior, name)
+        given, said = with_contexts_of(prior, plans, is_table)
+        if plans.action_names and prior.action_names is None:
+            said.append(numbered_note("actions", plans.action_names))
+        notes += [f"{name}: {one}" for one in said]
+        own = match_plans(given, prior, name)
         mask, inputs = counted(own, skip), CONTEXT if prior.takes_context else ACTIONS
         inputs = inputs if prior.past_durations is None else DURATIONS
         try:
@@ -213,7 +223,7 @@ def evaluate_saved(priors: Mapping[str, Prior], plans: Plans, skip: int) -> Eval
             models.append(_model(name, inputs, type(prior).__name__, [arrays], [torch.arange(len(own))], own, mask))
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
-    mask = counted(plans, skip)
+    plans, mask = replace(plans, notes=notes), counted(plans, skip)
     settings = {"priors": ", ".join(priors), "skip": skip, "unit": unit_name(plans, mask)}
     return Evaluation(plans, plans, mask, models, (models[0], models[0].name), plans, pd.DataFrame(), settings)
 

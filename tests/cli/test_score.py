@@ -1,5 +1,6 @@
 """`neuroprior score`: the scores of the library, by plan and by group, in files."""
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -13,6 +14,7 @@ from neuroprior.__main__ import main
 from neuroprior.cli import score as command
 from neuroprior.plans import read_plans, write_plans
 from neuroprior.priors.scoring import keep_learned
+from neuroprior.report import report
 from tests.support.sources import seeded
 
 
@@ -200,6 +202,14 @@ def test_contexts_are_matched_by_name_or_it_is_said_how_they_are_numbered(learne
     assert said is None or said in shown
     found = pd.read_csv(tmp_path / "out" / "plans.csv")["log_likelihood"]
     assert found.tolist() == pytest.approx(prior.log_prob(plans).tolist(), rel=1e-5)
+    report(tmp_path / "new.csv", out=tmp_path / "report", priors=[str(folder)], sections=["scores"])
+    reported = json.loads((tmp_path / "report" / "results.json").read_text())
+    bits = -float(prior.log_prob(plans).sum()) / math.log(2) / int(plans.mask().sum())
+    assert reported["rows"][0]["bits_per_action"] == pytest.approx(bits, rel=1e-5)
+    notes = reported["file"]["notes"]
+    assert said is None or f"{folder}: the" in notes[-1]
+    assert said is None or said in notes[-1]
+    assert (said is not None) == any("the contexts are" in note or "knows contexts" in note for note in notes)
 
 
 def test_a_folder_that_cannot_be_made_is_said_before_the_table(tmp_path, capsys):

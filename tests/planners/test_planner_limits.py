@@ -231,7 +231,10 @@ def learn(world=PUZZLE, prior=CHAIN, **settings):
         (lambda: learn(prior=None), "prior: a Prior is expected"),
         (lambda: learn(world=None), "world: a World"),
         (lambda: learn(guided=1), "guided: True or False"),
-        (lambda: AStarPlanner(lambda state: None).search(PUZZLE, PUZZLE.reset(2)), "heuristic: a tensor .*, not NoneType"),
+        (
+            lambda: AStarPlanner(lambda state: None).search(PUZZLE, PUZZLE.reset(2)),
+            "heuristic: a tensor .*, not NoneType",
+        ),
     ],
 )
 def test_bad_arguments_are_named(call, message) -> None:
