@@ -141,7 +141,7 @@ def quality(
     num_sequences: NonNegativeInt = 40,
     seed: Seed = 0,
     seeds: PositiveInt = 1,
-    processes: PositiveInt | None = None,
+    processes: PositiveInt = 1,
     out: str = "runs/quality",
 ) -> None:
     """Fit priors to sources whose entropy is known, and to long sequences of many kinds of action.
@@ -154,9 +154,10 @@ def quality(
         held_out: plans to score, at least 100.
         num_sequences: long sequences to learn from, of 1,000 actions each; half as many are scored; 0 for none.
         seed: draws sources and plans.
-        seeds: long sequences are drawn with so many seeds, from `seed` on; of several, intervals are over seeds.
-        processes: how many kinds of long sequences and seeds are learned at a time; all cores by default. For seconds
-            that can be compared, 1.
+        seeds: long sequences are drawn with so many seeds, from `seed` on (texts always from the same one); of several,
+            intervals are over seeds. The sources of known entropy have one seed.
+        processes: how many kinds of long sequences and seeds are learned at a time. With more than one, seconds are
+            longer, and less reliable.
         out: folder for `quality.csv`, `sequences.csv`, `results.json` and finished jobs.
     """
     if 0 < num_plans < 100 or held_out < 100:
@@ -281,7 +282,7 @@ def _table_of_long(rows: pd.DataFrame) -> Table:
     }
     entropy = rows["entropy"].iloc[0]
     source = (
-        "characters of Python's own documentation"
+        "characters of Python's own documentation, of which each seed draws other parts"
         if pd.isna(entropy)
         else f"a chain under {CONDITIONS} hidden conditions; {entropy:.4f} bits under the source itself"
     )

@@ -10,11 +10,12 @@ from neuroprior._checks import check_flags, check_memory, check_sizes, is_number
 from neuroprior._random import generator_on
 from neuroprior.agents.replay import Replay
 from neuroprior.planners import Decision, Execution, Planner
-from neuroprior.planners.execution import Change, executed_steps, follow, join_executions, observations
+from neuroprior.planners.execution import Change, check_change, executed_steps, follow, join_executions, observations
 from neuroprior.planners.planner import check_is_planner
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
 from neuroprior.priors import Prior
+from neuroprior.priors.prior import check_is_prior
 from neuroprior.sampling.stepping import check_actions
 from neuroprior.worlds.world import World, check_is_world
 
@@ -82,12 +83,10 @@ class Agent:
         check_sizes(replan_every=replan_every, plan_length=plan_length, num_rollouts=num_rollouts, **learns)
         check_flags(warm_start=warm_start)
         check_is_planner(planner)
-        if change is not None and not callable(change):
-            raise ValueError(f"change: a function of states and a generator is expected, not {change!r}")
+        check_change(change)
         if not isinstance(training, Mapping | None):
             raise ValueError(f"training: a dictionary of settings is expected, not {training!r}")
-        if not isinstance(prior, Prior):
-            raise ValueError(f"prior: a Prior is expected, not a {type(prior).__name__}")
+        check_is_prior(prior)
         check_is_world(world)
         if plan_length % replan_every:
             raise ValueError(f"plan_length: a multiple of replan_every = {replan_every} is expected, not {plan_length}")

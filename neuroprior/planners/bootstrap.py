@@ -21,6 +21,7 @@ from neuroprior.plans import Plans, action_dtype
 from neuroprior.plans.sequences import Sequences, plans_digest
 from neuroprior.priors import PatternPrior, Prior, load, save
 from neuroprior.priors.patterns import Steps
+from neuroprior.priors.prior import check_is_prior
 from neuroprior.priors.serialization import written_state
 from neuroprior.sampling.stepping import Stepper
 from neuroprior.worlds.puzzles import PuzzleWorld
@@ -123,8 +124,7 @@ def bootstrap(
     check_sizes(max_nodes=max_nodes, sweeps=sweeps, first=first, max_actions=max_actions)
     check_flags(guided=guided)
     check_is_world(world)
-    if not isinstance(prior, Prior):
-        raise ValueError(f"prior: a Prior is expected, not {kind_of(prior)}")
+    check_is_prior(prior)
     if not isinstance(teacher, BestFirstPlanner | None):
         raise ValueError(f"teacher: a BestFirstPlanner, such as AStarPlanner(), is expected, not {kind_of(teacher)}")
     world.check_state(problems)

@@ -65,6 +65,7 @@ def execute(
     check_memory(8 * num_steps, num_steps=num_steps)
     check_is_planner(planner)
     check_is_world(world)
+    check_change(change)
     world.check_state(state)
     generator = generator_on(generator, state.device)
     parts = []
@@ -206,6 +207,12 @@ def executed_steps(world: World, before: Tensor) -> Tensor:
     """How many actions are executed until the world terminates, `[N]`; `before [N, L, ...]`: the states before them."""
     going = ~world.terminated(before.flatten(0, 1)).view(before.shape[:2])
     return going.long().cumprod(1).sum(1)
+
+
+def check_change(change: object) -> None:
+    """Raise ValueError unless it is a function, or None."""
+    if change is not None and not callable(change):
+        raise ValueError(f"change: a function of states and a generator is expected, not {change!r}")
 
 
 def _changed(change: Change, state: Tensor, generator: torch.Generator | None) -> Tensor:

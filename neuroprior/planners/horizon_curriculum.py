@@ -9,10 +9,10 @@ from neuroprior._checks import as_list
 from neuroprior.planners.execution import collect
 from neuroprior.planners.planner import Objective
 from neuroprior.planners.sampling import SamplingPlanner
-from neuroprior.planners.tuning import best_sampling, check_tried
+from neuroprior.planners.tuning import as_tried, best_sampling
 from neuroprior.plans import Plans
 from neuroprior.plans.plans import check_are_plans
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, check_is_prior
 from neuroprior.worlds.world import World
 
 STARTS_TRIED = 128
@@ -91,7 +91,8 @@ def extend_horizon(
     lengths = as_list("lengths", lengths)
     if not all(isinstance(length, int) and length >= 1 for length in lengths):
         raise ValueError(f"lengths: integers of at least 1 are expected, not {lengths}")
-    check_tried(temperatures, uniform_shares)
+    temperatures, uniform_shares = as_tried(temperatures, uniform_shares)
+    check_is_prior(prior)
     check_are_plans(plans)
     goal: Objective = {"objective": objective, "discount": discount, "any_prefix": any_prefix}
     prior.fit(plans, generator=generator, **settings)

@@ -20,7 +20,7 @@ from neuroprior.planners.sampling import SamplingPlanner, uniform_plans
 from neuroprior.plans import Plans
 from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors.ensembles.mixture import MixturePrior
-from neuroprior.priors.prior import Prior
+from neuroprior.priors.prior import Prior, check_is_prior
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, check_in_world
@@ -109,7 +109,7 @@ def best_sampling(
         ... ).temperature
         1.0
     """
-    check_tried(temperatures, uniform_shares)
+    temperatures, uniform_shares = as_tried(temperatures, uniform_shares)
     check_in_world(prior, world, state)
     if len(state) == 0:
         raise ValueError("state: at least one start is expected; from none, no setting is better than another")
@@ -224,8 +224,9 @@ def sampling_for(
         >>> sampling_for(MarkovPrior(3, 1).fit(plans), plans, num_plans=16)
         (1.0, 0.0)
     """
-    check_tried(temperatures, uniform_shares)
+    temperatures, uniform_shares = as_tried(temperatures, uniform_shares)
     check_sizes(num_plans=num_plans)
+    check_is_prior(prior)
     check_are_plans(plans)
     if len(plans) == 0:
         raise ValueError("plans: at least one is expected; from none, no setting is better than another")
@@ -294,12 +295,14 @@ def _log_mean(values: Tensor) -> float:
     return float(values.logsumexp(0)) - log(len(values))
 
 
-def check_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) -> None:
-    """Raise ValueError where there are no temperatures or shares to try, or one is out of range."""
+def as_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) -> tuple[list[float], list[float]]:
+    """The temperatures and shares to try, as lists; raises ValueError where there are none, or one is out of range."""
+    temperatures, uniform_shares = as_list("temperatures", temperatures), as_list("uniform_shares", uniform_shares)
     for name, values in (("temperatures", temperatures), ("uniform_shares", uniform_shares)):
-        if not as_list(name, values):
+        if not values:
             raise ValueError(f"{name}: at least one is expected, not an empty list")
     for temperature in temperatures:
         check_temperature(temperature)
     for share in uniform_shares:
         check_share("uniform_share", share)
+    return temperatures, uniform_shares

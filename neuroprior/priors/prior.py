@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer
+from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer, kind_of
 from neuroprior.plans import PastDurations, Plans, check_context, check_patterns, has_patterns, is_per_step
 from neuroprior.priors.saved import SavedModule
 from neuroprior.sampling import ancestral as sampling
@@ -435,6 +435,12 @@ class Prior(SavedModule):
                 raise ValueError(
                     f"{name}: not a setting of {type(self).__name__}.fit, which takes {', '.join(known) or 'none'}"
                 )
+
+
+def check_is_prior(prior: object) -> None:
+    """Raise ValueError unless it is a `Prior`."""
+    if not isinstance(prior, Prior):
+        raise ValueError(f"prior: a Prior is expected, not {kind_of(prior)}")
 
 
 def as_prior(given: Prior | Mapping[str, Any]) -> Prior:

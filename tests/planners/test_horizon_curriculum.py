@@ -265,6 +265,6 @@ def test_settings_are_tried_as_they_are_planned_with(monkeypatch):
     world, generator = FromTheMiddle(), seeded(0)
     plans = collect(ExhaustivePlanner(2), world, 20, generator=generator)
     goal = {"objective": "return", "discount": 0.9, "any_prefix": True}
-    how = {"temperatures": (1.0, 2.0), "uniform_shares": (0.0, 0.5), "num_rollouts": 3, "generator": generator}
+    how = {"temperatures": [1.0, 2.0], "uniform_shares": [0.0, 0.5], "num_rollouts": 3, "generator": generator}
     list(extend_horizon(MarkovPrior(2, 1), plans, world, (4, 6), num_starts=30, num_plans=8, **how, **goal))
     assert seen == [(30, length, 8, how | goal) for length in (4, 6)]

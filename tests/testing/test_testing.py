@@ -462,6 +462,7 @@ class OtherStatesOnTheWay(Line):
 @pytest.mark.parametrize("world", [Line, Noisy, Ending])
 def test_worlds_of_ones_own_conform(world: type[World]) -> None:
     check_world(world())
+    check_world(world(), length=1)
 
 
 @pytest.mark.parametrize(

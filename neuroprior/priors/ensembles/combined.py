@@ -49,8 +49,8 @@ networks, on all plans.
 """
 
 GAIN = 4.0
-"""Where no experts are given: nats in all by which held-out plans have to be likelier for a network to be kept, since
-its training was stopped where these plans were likeliest.
+"""Where no experts are given: nats in all (or `TOLERANCE` per action, if that is more) by which held-out plans have to
+be likelier for a network to be kept, since its training was stopped where these plans were likeliest.
 """
 
 MOST_NUMBERS = 2**25
@@ -412,23 +412,26 @@ class HeldOut:
         Args:
             costs: of each expert, such as its number of weights. (Seconds differ from run to run, and so would what is
                 chosen.)
-            gains: nats in all by which these plans have to be likelier with each; None: `IN_ALL`.
+            gains: nats in all by which these plans have to be likelier with each, see `tolerance`; None: `IN_ALL`.
             fixed: the first so many are kept.
         """
         kept, gains = list(range(len(costs))), gains or [IN_ALL] * len(costs)
         powers, best = self.combined(kept)
+        since = best  # the least loss since an expert went that had to add more: what the others add is judged by it
         while len(kept) > 1:
             found = []
             for out in kept[fixed:]:
                 rest = [number for number in kept if number != out]
                 rest_powers, loss = self.combined(rest)
-                best = min(best, loss)
+                best, since = min(best, loss), min(since, loss)
                 found.append((out, loss, rest, rest_powers))
-            spared = [entry for entry in found if entry[1] <= best + self.tolerance(gains[entry[0]])]
+            least = {out: best if gains[out] > IN_ALL else since for out, *_ in found}
+            spared = [entry for entry in found if entry[1] <= least[entry[0]] + self.tolerance(gains[entry[0]])]
             if not spared:
                 break
             # The dearest; among those that count, which cost the same, the one that is missed least.
-            _, _, kept, powers = max(spared, key=lambda entry: (costs[entry[0]], -entry[1]))
+            gone, loss, kept, powers = max(spared, key=lambda entry: (costs[entry[0]], -entry[1]))
+            since = loss if gains[gone] > IN_ALL else since
         return kept, powers
 
     def combined(self, kept: list[int]) -> tuple[Tensor, float]:

@@ -313,6 +313,19 @@ def test_what_is_lost_is_counted_from_the_least_loss_so_far():
     assert held_out.choose([1, 1, 1])[0] == [1, 2]
 
 
+def test_what_counts_is_judged_without_the_network_that_went():
+    """In nats: the third expert, a network, adds 2 of the 4 that it has to; of the others one is of no use."""
+
+    class ByHand(HeldOut):
+        def combined(self, kept: list[int]) -> tuple[torch.Tensor, float]:
+            nats = {(0, 1, 2): 0.0, (0, 1): 2.0, (0, 2): 0.0, (1, 2): 5.0, (0,): 1.9}.get(tuple(kept), 9.0)
+            return torch.ones(len(kept)), 1 + nats / self.count
+
+    held_out = ByHand(torch.zeros(500, 4, 3, 1), torch.zeros(500, 4, dtype=torch.long), torch.ones(500, 4).bool(), 3)
+    assert held_out.choose([0, 0, 9], [0.1, 0.1, 4.0])[0] == [0]
+    assert held_out.choose([0, 0, 9], [0.1, 0.1, 1.0])[0] == [0, 2]
+
+
 @pytest.mark.parametrize(("gain", "kept"), [(0.9, [0, 1]), (1.1, [0])])
 def test_an_expert_has_to_add_its_gain(gain, kept):
     """Losses by hand: without the second expert ten plans of two actions are a nat less likely in all."""
