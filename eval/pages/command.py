@@ -25,7 +25,7 @@ HOURS = {
     "control": "7.5+",
     "macro-actions": "2",
     "agents": "0.5",
-    "quality": "1.3",
+    "quality": "2.1",
     "speed": "0.8+",
 }
 """By page: the hours that it states, on one or two cores; + where it states them for some of its commands only."""
