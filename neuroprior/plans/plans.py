@@ -210,8 +210,9 @@ class Plans(Sequences):
                 event_type).
             missing: what rows without a label do: a "gap" ends the plan, and another one begins after it; as "label"
                 they count as an action, "missing"; "error" refuses them. Without groups the parts of a plan become one.
-            merge_repeats: take the same label in successive rows for one action, as in tables with a row a frame; it
-                lasts as long as they do together, or as many rows as they are where no times are known.
+            merge_repeats: take the same label in successive rows for one action, as in tables with a row a frame; its
+                context is that of the first of these rows, and it lasts as long as they do together, or as many rows as
+                they are where no times are known.
             max_gap: a longer pause between the end of an action and the start of the next one ends the plan, too; in
                 the unit of `start` (seconds, for times of day and dates). An unknown end counts as the action's start.
                 None: no pause does.

@@ -350,6 +350,14 @@ def fields_of(
     plan, codes, without = plan[row], codes[row], without[row]
     begin = np.diff(plan, prepend=-1) != 0
     seconds, ends = _durations(table, start, row, begin)
+    if start is not None:
+        ties = ~begin[1:] & (start[row][1:] == start[row][:-1])
+        if ties.any():
+            twice = int((ties & (codes[1:] == codes[:-1])).sum())
+            notes.append(
+                f"{int(ties.sum()):,} actions begin at the same time as the one before them; they are in the order of"
+                f" the file ({twice:,} are the same action: perhaps rows that are there twice)"
+            )
     if "stop" in table.at and ends is not None and start is not None:
         early = ~begin[1:] & (start[row][1:] < ends[:-1] - _rounded(start[row][1:], ends[:-1]))
         if early.any():
@@ -612,6 +620,9 @@ def _context(table: Table, row: Integers, lengths: Integers, notes: list[str]) -
                 f"{place(int(row[(codes < 0).argmax()]))}: context: an empty cell ({int((codes < 0).sum())} in all); a"
                 " context is expected, such as a name of its own where it is not known"
             )
+        if table.decimal == ",":
+            points = [COMMA.sub(r"\1.\2", label) for label in labels]
+            labels = labels if None in map(number_in, points) else points  # a comma may be part of a name
         try:
             numbers, names = _numbered("context", codes, labels, None, None, lambda i: place(int(row[i])))
         except ValueError as error:
@@ -663,8 +674,8 @@ def _alike(labels: list[str], what: str) -> list[str]:
         if number is None:
             plain = unicodedata.normalize("NFC", label.casefold())  # a letter may be written as one character or as two
             alike.setdefault(re.sub(r"[\s_-]", "", plain), []).append(label)
-        elif not named and label.isdecimal():
-            alike.setdefault(str(number), []).append(label)
+        elif not named:
+            alike.setdefault(f"= {number:.17g}", []).append(label)
     sets = ", ".join(" and ".join(map(repr, each)) for key, each in alike.items() if key and len(each) > 1)
     means = "nearly the same; rename them if they mean the same" if named else "the same number, and count as the same"
     return [f"{what}s {sets} are {means}"] if sets else []

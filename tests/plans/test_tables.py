@@ -654,3 +654,28 @@ def test_a_pause_of_just_max_gap_is_none_whatever_is_rounded():
     frame = pd.DataFrame({"plan": 1, "action": ["a", "b"], "start": [0.0, 1035.9], "stop": [35.9, 1036.9]})
     assert len(Plans.from_dataframe(frame, max_gap=1000)) == 1
     assert len(Plans.from_dataframe(frame, max_gap=999.999)) == 2
+
+
+def test_decimal_commas_are_features_as_points_are(tmp_path):
+    """Where semicolons part the columns; a comma in names stays one."""
+    for cells, features in ((["0,64", "0,04", "1"], True), (["0,64", "0,04 m", "1,5 m"], False)):
+        (tmp_path / "t.csv").write_text("plan;action;context\n" + "".join(f"{i};a;{c}\n" for i, c in enumerate(cells)))
+        plans = read_plans(tmp_path / "t.csv")
+        assert plans.context.is_floating_point() == features
+        if features:
+            assert plans.context.flatten().tolist() == pytest.approx([0.64, 0.04, 1.0])
+
+
+def test_animals_whose_numbers_are_the_same_are_noted(tmp_path):
+    (tmp_path / "t.csv").write_text("group,action\n1E2,a\n100,b\n+7,a\n007,a\n12,b\n")
+    (said,) = [note for note in read_plans(tmp_path / "t.csv").notes if "the same number" in note]
+    assert "'1E2' and '100'" in said
+    assert "'+7' and '007'" in said or "'007' and '+7'" in said
+    assert "12" not in said
+
+
+def test_actions_that_begin_together_are_noted(tmp_path):
+    (tmp_path / "t.csv").write_text("plan,action,start\n1,a,1\n1,b,1\n1,b,1\n1,c,5\n2,a,5\n")
+    (said,) = [note for note in read_plans(tmp_path / "t.csv").notes if "same time" in note]
+    assert said.startswith("2 actions begin at the same time as the one before them")
+    assert "1 are the same action" in said
