@@ -187,11 +187,11 @@ def test_in_the_labyrinth(tmp_path):
     assert main(["intentions", *how, "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "results.json").read_text())
     kinds = ["node", "node, move"]
-    kinds += [f"{kind}, posterior" for kind in kinds]
+    more = [(f"{kind}, {what}", kind) for kind in kinds for what in ("posterior", "modes")]
     loss = {row["kind"]: row["value"] for row in results["rows"] if row["score"] == "loss"}
-    assert sorted(loss) == sorted(kinds)
+    assert sorted(loss) == sorted([*kinds, *(kind for kind, _ in more)])
     assert loss["node, move"] < loss["node"]  # on the way in, or out
-    assert {(row["kind"], row["minus"]) for row in results["paired"]} == {(f"{k}, posterior", k) for k in kinds[:2]}
+    assert {(row["kind"], row["minus"]) for row in results["paired"]} == set(more)
 
 
 @pytest.mark.parametrize(
