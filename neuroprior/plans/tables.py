@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuroprior._checks import is_number, precision_lost
+from neuroprior._checks import check_flags, is_number, precision_lost
 from neuroprior.plans.columns import (
     Column,
     Floats,
@@ -320,8 +320,7 @@ def fields_of(
         raise ValueError(f"missing: one of {', '.join(MISSING)} is expected, not {missing!r}")
     if max_gap is not None and (not is_number(max_gap) or not 0 <= max_gap < np.inf):
         raise ValueError(f"max_gap: a time of at least 0 is expected, not {max_gap!r}")
-    if not isinstance(merge_repeats, bool | np.bool_):
-        raise ValueError(f"merge_repeats: True or False is expected, not {merge_repeats!r}")
+    check_flags(merge_repeats=merge_repeats)
     names = check_names(num_actions, action_names)
     table = Table(frame, columns, place, of, decimal)
     if not len(frame):
