@@ -36,7 +36,8 @@ def report(
     console = Console()
     prior, name = model.prior.cpu().eval(), name_of(model.prior)
     save(prior, folder)
-    keep_learned(folder, data.learned_from, data.chosen_on)
+    held_out = data.held_out if data.folds == 1 else None
+    keep_learned(folder, data.learned_from, data.chosen_on, held_out=held_out, plans=data.plans)
     contexts = data.num_contexts if prior.takes_context else None
     scores: dict[str, Score] = {}
     if fresh is not None:

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
 from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.plans.io import is_table
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
 from neuroprior.priors.scoring import learned_from, scores_by
@@ -50,12 +51,12 @@ def score(
     how: dict[str, Any] = {"num_actions": num_actions, "columns": columns, "missing": missing}
     how |= {"merge_repeats": merge_repeats, "max_gap": max_gap}
     known = learned_names(prior)
-    is_table = file.lower().endswith((".csv", ".tsv"))
+    table = is_table(file)
     # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
-    plans = read_plans(file, action_names=action_names or (known if is_table else None), **how)
-    by_number = plans.action_names is None or (is_table and action_names is None and _by_number(plans, file, how))
+    plans = read_plans(file, action_names=action_names or (known if table else None), **how)
+    by_number = plans.action_names is None or (table and action_names is None and _by_number(plans, file, how))
     plans = plans if plans.end is None else plans.without_end()
-    plans, notes = with_contexts_of(prior, plans, is_table)
+    plans, notes = with_contexts_of(prior, plans, table)
     own = match_plans(plans, prior, folder)
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()

@@ -1,5 +1,6 @@
 """Executed plans in memory: actions with lengths, contexts and groups."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import log2
@@ -20,6 +21,9 @@ MOST_BITS = 48
 
 MOST_ACTIONS = 2**31
 """The most actions; larger numbers are unlikely to be indices of actions."""
+
+HALF_PAIR = re.compile("[\ud800-\udfff]")
+"""Half of a surrogate pair, which UTF-8 has no bytes for."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -439,11 +443,13 @@ def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
 
 
 def _check_texts(what: str, names: Sequence[str] | None) -> bool:
-    """Whether there are names; ValueError unless they are texts."""
+    """Whether there are names; ValueError unless they are texts that a file can hold."""
     if names is not None and (
         not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names)
     ):
         raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
+    for name in filter(HALF_PAIR.search, names or ()):
+        raise ValueError(f"{what}: {name!r} has half of a surrogate pair, which no file can hold")
     return names is not None
 
 

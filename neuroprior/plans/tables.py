@@ -39,6 +39,9 @@ EVENT_TYPES = ("START", "STOP", "POINT")
 ROUNDING = 4
 """Of the last binary digits: so far may the sum of a start and a duration be from the time that it stands for."""
 
+ALIKE = 0.01
+"""A duration may be so much longer or shorter than from start to stop, as a part of it and of the usual one."""
+
 UNLABELLED = "missing"
 """The action of rows without a label, where these are to count as one."""
 
@@ -209,7 +212,7 @@ class Table:
             self._check_kind(what, (ZONED_DATES if column.dt.tz is not None else DATES) if dates else CLOCKS)
             return _seconds(column)
         if self.decimal == ",":
-            column = column.map(lambda value: COMMA.sub(r"\1.\2", value) if isinstance(value, str) else value)
+            column = column.map(_with_point)
         missing = column.isna() | column.map(lambda value: isinstance(value, str) and is_missing(value))
         values = pd.to_numeric(column.where(~missing), errors="coerce")
         if times and values[~missing].isna().any():
@@ -271,6 +274,11 @@ class Table:
 
 def _text(value: Any) -> str:
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+
+
+def _with_point(value: Any) -> Any:
+    """A number with a point in place of its decimal comma; all else as it is."""
+    return COMMA.sub(r"\1.\2", value) if isinstance(value, str) else value
 
 
 def _dates(texts: Any) -> Any:
@@ -348,29 +356,38 @@ def fields_of(
     row = order
     plan, codes, without = plan[row], codes[row], without[row]
     begin = np.diff(plan, prepend=-1) != 0
-    seconds, ends = _durations(table, start, row, begin)
-    if start is not None:
-        ties = ~begin[1:] & (start[row][1:] == start[row][:-1])
+    when = None if start is None else start[row]
+    seconds, ends = _durations(table, when, row, begin)
+    if when is not None:
+        ties = ~begin[1:] & (when[1:] == when[:-1])
         if ties.any():
             twice = int((ties & (codes[1:] == codes[:-1])).sum())
             notes.append(
                 f"{int(ties.sum()):,} actions begin at the same time as the one before them; they are in the order of"
                 f" the file ({twice:,} are the same action: perhaps rows that are there twice)"
             )
-    if "stop" in table.at and ends is not None and start is not None:
-        early = ~begin[1:] & (start[row][1:] < ends[:-1] - _rounded(start[row][1:], ends[:-1]))
+    if "stop" in table.at and seconds is not None and ends is not None and when is not None:
+        early = ~begin[1:] & (when[1:] < ends[:-1] - _rounded(when[1:], ends[:-1]))
         if early.any():
             notes.append(f"{int(early.sum()):,} actions begin before the one before them ended")
+        if "duration" in table.at and not np.isnan(seconds).all():
+            apart = np.abs(table.numbers("stop", table.at["stop"], times=True)[row] - ends)
+            other = np.flatnonzero(apart > ALIKE * (seconds + np.nanmedian(seconds)))
+            if other.size:
+                notes.append(
+                    f"{other.size:,} durations, the first in {place(int(row[other[0]]))}, are not the time from start to"
+                    " stop; the column of durations counts"
+                )
     pause = np.zeros(len(row), bool)
     if max_gap is not None:
-        if start is None or ends is None or not {"stop", "duration"} & table.at.keys():
+        if when is None or ends is None or not {"stop", "duration"} & table.at.keys():
             raise ValueError("max_gap: the columns start, and stop or duration, are expected with it")
         endless = np.isnan(ends)
         if endless.any():
             notes.append(f"{int(endless.sum()):,} actions without an end count for max_gap as ended when they began")
-        latest = _running_maximum(np.where(endless, start[row], ends), plan)
-        error = _rounded(start[row][1:], latest[:-1], max_gap)
-        pause[1:] = ~begin[1:] & (start[row][1:] - latest[:-1] > max_gap + error)
+        latest = _running_maximum(np.where(endless, when, ends), plan)
+        error = _rounded(when[1:], latest[:-1], max_gap)
+        pause[1:] = ~begin[1:] & (when[1:] - latest[:-1] > max_gap + error)
     if without.all():
         raise ValueError(f"{of}: no row has an action")
     # A gap is a run of rows without a label between actions of one plan, or a pause.
@@ -540,10 +557,9 @@ def _order(
 
 
 def _durations(
-    table: Table, start: NDArray[np.float64] | None, row: Integers, begin: NDArray[np.bool_]
+    table: Table, when: NDArray[np.float64] | None, row: Integers, begin: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """The duration and the end of each action, in the order of `row`; NaN where not known, None where none is."""
-    when = None if start is None else start[row]
     for what in ("duration", "stop"):
         if what in table.at:
             values = table.numbers(what, table.at[what], times=True)[row]
@@ -620,7 +636,7 @@ def _context(table: Table, row: Integers, lengths: Integers, notes: list[str]) -
                 " context is expected, such as a name of its own where it is not known"
             )
         if table.decimal == ",":
-            points = [COMMA.sub(r"\1.\2", label) for label in labels]
+            points = list(map(_with_point, labels))
             labels = labels if None in map(number_in, points) else points  # a comma may be part of a name
         try:
             numbers, names = _numbered("context", codes, labels, None, None, lambda i: place(int(row[i])))

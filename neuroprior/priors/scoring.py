@@ -99,13 +99,27 @@ def plan_digests(plans: Plans) -> list[str]:
     names = plans.action_names or tuple(map(str, range(plans.num_actions)))
     rows = zip(plans.actions.tolist(), plans.mask().sum(1).tolist(), strict=True)
     texts = ("\0".join(names[action] for action in row[:length]) for row, length in rows)
-    return [hashlib.sha256(text.encode(errors="surrogatepass")).hexdigest()[:16] for text in texts]
+    return [hashlib.sha256(text.encode()).hexdigest()[:16] for text in texts]
 
 
-def keep_learned(folder: Path, *parts: Plans) -> None:
-    """Write down, in the folder of a saved prior, which plans it has learned from."""
-    without_end = (part if part.end is None else part.without_end() for part in parts)
-    write_json(folder / LEARNED, {"plans": sorted({one for part in without_end for one in plan_digests(part)})})
+def keep_learned(folder: Path, *parts: Plans, held_out: Plans | None = None, plans: Plans | None = None) -> None:
+    """Write down, in the folder of a saved prior, which plans it has learned from.
+
+    Args:
+        folder: of the prior.
+        parts: what it has learned from.
+        held_out: what it has not learned from.
+        plans: those that all this was taken from; of a plan that was cut, and so is in no part, a part was learned.
+    """
+    learned = {one for part in parts for one in _whole_digests(part)}
+    if plans is not None:
+        rest = set(() if held_out is None else _whole_digests(held_out))
+        learned |= set(_whole_digests(plans)) - rest
+    write_json(folder / LEARNED, {"plans": sorted(learned)})
+
+
+def _whole_digests(plans: Plans) -> list[str]:
+    return plan_digests(plans if plans.end is None else plans.without_end())
 
 
 def learned_from(folder: Path, plans: Plans) -> list[bool]:

@@ -12,6 +12,7 @@ from neuroprior._checks import check_count, check_sizes
 from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
 from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.plans.io import is_table
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
 from neuroprior.priors import Prior, load
 from neuroprior.priors.ensembles.candidates import Effort, check_effort
@@ -31,9 +32,6 @@ INPUTS: tuple[InputName, ...] = ("actions", "context", "durations")
 
 MOST_ACTIONS = 10_000
 """Kinds of actions beyond which they are thought to be names that look like numbers."""
-
-CSV = (".csv", ".tsv")
-"""Files whose actions may be numbers without names."""
 
 FOLDS = 5
 """Folds where their number is not given; fewer where there are fewer groups."""
@@ -141,9 +139,9 @@ def report(
         if not priors:
             raise ValueError("priors: at least one is expected")
         loaded = dict(priors) if isinstance(priors, Mapping) else {folder: load(folder) for folder in priors}
-        is_table = file[-4:].lower() in CSV
-        names = action_names or (learned_names(next(iter(loaded.values()))) if is_table else None)
-        found = evaluate_saved(loaded, _read(plans, reading | {"action_names": names}), skip, is_table)
+        table = is_table(file)
+        names = action_names or (learned_names(next(iter(loaded.values()))) if table else None)
+        found = evaluate_saved(loaded, _read(plans, reading | {"action_names": names}), skip, table)
         same = {} if isinstance(priors, Mapping) else {one: sum(learned_from(Path(one), found.plans)) for one in priors}
         if any(same.values()):
             found = replace(found, settings=found.settings | {"training data": {k: n for k, n in same.items() if n}})

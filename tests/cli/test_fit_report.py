@@ -70,6 +70,21 @@ def test_all_is_scored_on_held_out_plans_and_chosen_on_others(tmp_path, monkeypa
     ]
 
 
+@pytest.mark.parametrize(
+    ("sizes", "known"), [([900], [True]), ([900, 300], [True, True]), ([3, 4, 2000], [..., ..., True])]
+)
+def test_of_a_plan_that_was_cut_a_part_was_learned(sizes, known, tmp_path, monkeypatch):
+    """One plan is cut in three; of two plans, or of three that are as unequal, the longer is cut."""
+    actions = torch.randint(3, (len(sizes), max(sizes)), generator=seeded(0))
+    data = data_of(monkeypatch, Plans(actions, 3, torch.tensor(sizes)))
+    model = PriorModel(lambda n: MarkovPrior(n, 1), data=data)
+    model.prior.fit(data.learned_from)
+    report(tmp_path, model, data)
+    marked = learned_from(tmp_path, data.source)
+    assert [due in (..., found) for found, due in zip(marked, known, strict=True)] == [True] * len(sizes)
+    assert sum(learned_from(tmp_path, data.held_out)) == (len(data.held_out) if data.folds > 1 else 0)
+
+
 def test_intervals_in_the_table_are_not_negative(tmp_path, monkeypatch, capsys):
     data = data_of(monkeypatch, chain(60, context=torch.arange(60) % 2))
     model = PriorModel(lambda n, **size: MarkovPrior(n, 1, **size), data=data)

@@ -286,8 +286,14 @@ def test_an_old_file_is_replaced_or_stays(tmp_path):
     path = tmp_path / "a.jsonl"
     write_plans(Plans(torch.tensor([[0]]), 2), path)
     before = path.read_bytes()
-    with pytest.raises(UnicodeEncodeError):  # in the middle of writing: half of a surrogate pair is no UTF-8
-        write_plans(Plans(torch.tensor([[1]]), 2, action_names=["a", "\ud800"]), path)
+    resource = pytest.importorskip("resource")  # not on Windows
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # in the middle of writing, as on a full disk
+    try:
+        with pytest.raises(OSError, match="too large"):
+            write_plans(Plans(torch.ones(5000, 1, dtype=torch.long), 2), path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 

@@ -251,7 +251,11 @@ def test_plans_keep_their_names():
     assert plans.with_end().plan_names == plans.steps(1).plan_names == plans.plan_names
     for part in plans.split(0.4, torch.Generator().manual_seed(0)):
         assert [("a", "b", "a")[int(first) // 2] for first in part.actions[:, 0]] == list(part.plan_names)
-    for wrong, words in ((["a", "b"], "3 are expected, one a plan, not 2"), ("abc", "a list of texts")):
+    for wrong, words in (
+        (["a", "b"], "3 are expected, one a plan, not 2"),
+        ("abc", "a list of texts"),
+        (["a", "b", "\ud83d"], ".*surrogate"),
+    ):
         with pytest.raises(ValueError, match=f"plan_names: {words}"):
             Plans(plans.actions, 6, plan_names=wrong)
 

@@ -42,6 +42,10 @@ def test_dates_whose_day_may_be_their_month(dates, tmp_path):
     [
         ("action,start\na,23:59:50\nb,00:00:10\n", "times of day go back from 23:59:50 to 00:00:10"),
         ("action,start,stop\na,0,10\nb,5,6\na,7,9\n", "1 actions begin before the one before them ended"),
+        (
+            "action,start,stop,duration\na,0,1,1.001\nb,5,6,1\na,7,9,3\n",
+            "line 4, are not the time from start to stop; the column of durations counts",
+        ),
         (",action\n0,a\n1,b\n", "columns that are not used: (without a name, column 1)"),
         ("action\nGr\u00fcn\nGru\u0308n\n", "are nearly the same"),
         (

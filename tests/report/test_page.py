@@ -40,7 +40,7 @@ from neuroprior.report.page import INK, PAPER, FigureBox, Section, Table, clean,
 from tests.support.browser import check_in_browser
 from tests.support.sources import refuses
 
-HOSTILE = ["<b>\"&'", "</svg><script>alert(1)</script>", "$x$ $\\frac{$", "\x00\x1b\ud800", "http://evil.org", "_x"]
+HOSTILE = ["<b>\"&'", "</svg><script>alert(1)</script>", "$x$ $\\frac{$", "\x00\x1b", "http://evil.org", "_x"]
 MANY = [f"groom left forepaw while rearing {n}" for n in range(57)]
 MODELS = ["uniform", "markov-0", "markov-3", "context tree", "gru", "gru, context", "combined"]
 SVG = "{http://www.w3.org/2000/svg}"

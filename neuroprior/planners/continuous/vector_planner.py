@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, TypedDict
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_same_names, check_share, check_sizes
+from neuroprior._checks import check_flags, check_same_names, check_share, check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.continuous.shares import Shares
 from neuroprior.planners.planner import check_objective, value_of
@@ -137,8 +137,7 @@ class VectorPlanner(ABC):
         check_share("prior_share", share)
         if share and prior is None:
             raise ValueError("prior_share: there is no prior; give prior=")
-        if not isinstance(adapt_share, bool):
-            raise ValueError(f"adapt_share: True or False is expected, not {adapt_share!r}")
+        check_flags(adapt_share=adapt_share)
         if prior_as not in ("plans", "noise"):
             raise ValueError(f'prior_as: "plans" or "noise" is expected, not {prior_as!r}')
         self.length, self.num_plans, self.discount, self.value = length, num_plans, discount, value

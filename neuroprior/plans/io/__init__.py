@@ -14,7 +14,15 @@ from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
 from neuroprior.plans.plans import Plans, check_are_plans, has_patterns
 from neuroprior.plans.tables import Columns, Missing
 
-__all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
+__all__ = [
+    "from_trajectories",
+    "is_table",
+    "read_minari",
+    "read_plans",
+    "to_trajectories",
+    "write_minari",
+    "write_plans",
+]
 
 MINARI = "minari:"
 """Before the name of a Minari dataset, where a file may be given."""
@@ -152,6 +160,12 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
         write_csv(plans, place, layout)
     else:
         FILES[suffix].write(plans, place)
+
+
+def is_table(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is read as a table, in which names of actions, contexts and groups may be numbers, by its suffix."""
+    kind = FILES.get(Path(path).suffix.lower())
+    return kind is not None and kind.read is read_csv
 
 
 def _suffix(path: Path) -> str:
