@@ -212,7 +212,7 @@ class Column(dict[str, int]):
         return None
 
     def _in_range(self, values: Integers, place: Place) -> Integers:
-        lowest, stop = (0 if self.what != "group" or self.names else -LARGEST_INTEGER), self.count or LARGEST_INTEGER
+        lowest, stop = (0 if self.what not in NAMED or self.names else -LARGEST_INTEGER), self.count or LARGEST_INTEGER
         if values.size and (values.min() < lowest or values.max() >= stop):
             wrong = int(((values < lowest) | (values >= stop)).argmax())
             expected = f"0 to {stop - 1} are expected" if self.count else "0 or more is expected"

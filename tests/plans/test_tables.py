@@ -396,9 +396,11 @@ def test_decimal_commas_where_semicolons_part_columns(tmp_path):
         read(tmp_path, 'plan,action,start\n1,a,"0,0"\n1,b,"1,5"\n')
 
 
-def test_doses_and_days_are_conditions(tmp_path):
+def test_doses_changes_and_days_are_conditions(tmp_path):
     plans = read(tmp_path, "plan,action,condition\n1,a,0\n2,b,0.5\n3,b,10\n")
     assert [plans.condition_names[c] for c in plans.condition] == ["0", "0.5", "10"]
+    changes = read(tmp_path, "plan,action,condition\n1,a,-1\n2,b,0\n3,b,1\n")
+    assert (changes.condition.tolist(), changes.condition_names) == ([-1, 0, 1], None)
     days = read(tmp_path, "day,action\n1,a\n2,b\n", columns={"plan": "day", "condition": "day", "action": "action"})
     assert days.condition.tolist() == [1, 2]
     with refuses("columns", "'day'", "plan and group"):
