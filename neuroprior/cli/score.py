@@ -51,12 +51,12 @@ def score(
     how: dict[str, Any] = {"num_actions": num_actions, "columns": columns, "missing": missing}
     how |= {"merge_repeats": merge_repeats, "max_gap": max_gap}
     known = learned_names(prior)
-    table = is_table(file)
+    tabular = is_table(file)
     # Numbers in a CSV file are the prior's own; its names make sure that there are as many.
-    plans = read_plans(file, action_names=action_names or (known if table else None), **how)
-    by_number = plans.action_names is None or (table and action_names is None and _by_number(plans, file, how))
+    plans = read_plans(file, action_names=action_names or (known if tabular else None), **how)
+    by_number = plans.action_names is None or (tabular and action_names is None and _by_number(plans, file, how))
     plans = plans if plans.end is None else plans.without_end()
-    plans, notes = with_contexts_of(prior, plans, table)
+    plans, notes = with_contexts_of(prior, plans, tabular)
     own = match_plans(plans, prior, folder)
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()

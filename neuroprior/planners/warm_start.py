@@ -66,7 +66,8 @@ def with_rest(
 
     The rest competes with the best of the planner's plans, not with each of them: where all are equally good, an agent
     keeps to its last plan every other time, however many plans there are. In a stochastic world both are scored by new
-    rollouts with common random numbers, because the score of the best of many plans is biased upwards.
+    rollouts with common random numbers, because the score of the best of many plans is biased upwards. Where the
+    planner's plans end by themselves, as those of a best-first search do, its decision stands.
 
     Args:
         planner: the planner that decided.
@@ -78,6 +79,8 @@ def with_rest(
     Returns:
         The better decision; its model steps are those of both.
     """
+    if decision.lengths is not None and not planner.any_prefix:
+        return decision
     generator = generator_on(generator, state.device)
     length = decision.plan.shape[1]
     plans, rollout = continue_plans(prior, world, state, rest, left, length, generator)

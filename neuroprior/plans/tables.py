@@ -374,9 +374,10 @@ def fields_of(
             apart = np.abs(table.numbers("stop", table.at["stop"], times=True)[row] - ends)
             other = np.flatnonzero(apart > ALIKE * (seconds + np.nanmedian(seconds)))
             if other.size:
+                first = place(int(row[other[0]]))
                 notes.append(
-                    f"{other.size:,} durations, the first in {place(int(row[other[0]]))}, are not the time from start to"
-                    " stop; the column of durations counts"
+                    f"{other.size:,} durations, the first in {first}, are not the time from start to stop; the column"
+                    " of durations counts"
                 )
     pause = np.zeros(len(row), bool)
     if max_gap is not None:

@@ -12,8 +12,8 @@ from neuroprior._checks import check_count, check_sizes
 from neuroprior._jobs import Progress
 from neuroprior._threads import one_thread
 from neuroprior.plans import Columns, Missing, Plans, read_plans
-from neuroprior.plans.io import is_table
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, in_parts
+from neuroprior.plans.io import is_table
 from neuroprior.priors import Prior, load
 from neuroprior.priors.ensembles.candidates import Effort, check_effort
 from neuroprior.priors.matching import learned_names, renumbered

@@ -15,12 +15,14 @@ from neuroprior import (
     SamplingPlanner,
     TabularWorld,
     UniformPrior,
+    World,
     execute,
     gridworld,
     load,
     save,
 )
 from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
+from neuroprior.planners import AStarPlanner
 from neuroprior.worlds import ForagingWorld, patches
 from tests.support.sources import corridor, every_plan, refuses, seeded, stochastic_world
 
@@ -67,6 +69,52 @@ def test_in_a_stochastic_world_both_are_rolled_out_so_often(num_rollouts):
     one = Agent(world, planner, prior, replan_every=2, learn_every=None, num_rollouts=num_rollouts, generator=seeded(0))
     alone = planner.plan(world, one.state, seeded(0)).model_steps
     assert one.run(6).model_steps == 3 * alone + 2 * (4 + 2 * num_rollouts * 4)
+
+
+class Line(World):
+    """Cells 0 to 9, of which the last is the goal; actions go back and forth."""
+
+    num_actions, has_goal = 2, True
+
+    def reset(self, number, generator=None):
+        return torch.randint(10, (number,), generator=generator)
+
+    def step(self, state, action, generator=None):
+        return torch.where(state == 9, state, (state + 2 * action.long() - 1).clamp(0, 9)), torch.zeros(len(state))
+
+    def solved(self, state):
+        return state == 9
+
+    def terminated(self, state):
+        return state == 9
+
+    def dip(self, state):
+        """What is left, too low in 4: a short search goes there, and finds nothing better."""
+        return torch.where(state == 4, 1, 9 - state).float()
+
+
+def test_plans_that_end_by_themselves_are_executed_as_they_are():
+    """Those of best-first searches: with a warm start as without, and from each start as from it alone."""
+    world = Line()
+
+    def run(starts, max_nodes, steps, **more):
+        searcher = AStarPlanner(world.dip, max_nodes=max_nodes)
+        one = Agent(
+            world, searcher, UniformPrior(2), torch.tensor(starts), learn_every=None, generator=seeded(0), **more
+        )
+        return one.run(steps)
+
+    together = run([2, 7, 0], 50, 8)
+    cold = run([2, 7, 0], 50, 8, warm_start=False)
+    assert together.states[:, -1].tolist() == [9, 9, 8]
+    assert (together.actions.equal(cold.actions), together.model_steps) == (True, cold.model_steps)
+    for number, start in enumerate([2, 7, 0]):
+        assert run([start], 50, 8).states[0].equal(together.states[number])
+    for starts in ([2], [2, 0]):  # after two steps one of them is in the dip
+        with refuses("replan_every", "a plan has fewer, 0"):
+            run(starts, 3, 5)
+    jumping = {"change": lambda state, _: torch.full_like(state, 9)}
+    assert run([2], 50, 2, **jumping).states.unique().tolist() == [9]
 
 
 def rhythm():

@@ -292,7 +292,7 @@ def test_a_tree_evaluates_each_prefix_once():
 @given(
     num=st.integers(-3, 4),
     length=st.integers(-3, 4),
-    temperature=st.sampled_from([1.0, 0.0, -1.0, float("nan"), float("inf")]),
+    temperature=st.sampled_from([1.0, 0.0, -1.0, 1e-300, float("nan"), float("inf")]),
     method=st.sampled_from([*METHODS, "beam", None]),
     context=st.sampled_from([None, torch.zeros(5).long(), torch.zeros(4, 1).long()]),
 )

@@ -163,7 +163,7 @@ def write_plans(plans: Plans, path: str | os.PathLike[str], *, layout: str | Non
 
 
 def is_table(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is read as a table, in which names of actions, contexts and groups may be numbers, by its suffix."""
+    """Whether a file is read as a table, in which names may be numbers; by its suffix."""
     kind = FILES.get(Path(path).suffix.lower())
     return kind is not None and kind.read is read_csv
 

@@ -127,6 +127,7 @@ class CombinedPrior(MixturePrior):
         # `fit` begins with these each time; in a list, so that experts that it leaves out are no submodules.
         self.given = None if experts is None else [self._experts()]
         self.spare = nn.ModuleList()
+        self.left_out = nn.ModuleList()
         self.tried = 0
         self._allocate()
 
@@ -144,8 +145,15 @@ class CombinedPrior(MixturePrior):
 
     @property
     def learned(self) -> dict[str, Any]:
-        own = {"tried": self.tried, "given": self.given is not None, "kept": self.config["experts"]}
-        return super().learned | own | {"spare": [described(e) | {"learned": e.learned} for e in priors_in(self.spare)]}
+        every = [*self.alternatives, *self.left_out]
+        given = None if self.given is None else [[e is one for one in every].index(True) for e in self.given[0]]
+        own = {"tried": self.tried, "given": given, "kept": self.config["experts"]}
+        aside = {"spare": self.spare, "left_out": self.left_out}
+        return (
+            super().learned
+            | own
+            | {name: [described(e) | {"learned": e.learned} for e in priors_in(some)] for name, some in aside.items()}
+        )
 
     def restore(self, learned: dict[str, Any]) -> None:
         if "kept" in learned:
@@ -155,14 +163,17 @@ class CombinedPrior(MixturePrior):
         if not isinstance(learned["tried"], int) or learned["tried"] < 0:
             raise ValueError(f"tried: an integer of at least 0 is expected, not {learned['tried']!r}")
         self.tried = learned["tried"]
-        if not learned.get("given", True):
-            self.given = None  # `fit` chose them, and will choose again
-        spare = [(as_prior(e), e["learned"]) for e in learned.get("spare", [])]
-        for e, own in spare:
-            e.restore(own)
-        self.spare = nn.ModuleList([e for e, _ in spare]).to(self.device)
-        if self.given is not None:
-            self.given = [[*self.alternatives]]
+        for name in ("spare", "left_out"):
+            aside = [as_prior(e) for e in learned.get(name, [])]
+            for e, own in zip(aside, learned.get(name, []), strict=True):
+                e.restore(own["learned"])
+            setattr(self, name, nn.ModuleList(aside).to(self.device))
+        # In files of older versions a flag: whether `fit` begins with those that are there, or chooses anew.
+        every, given = [*self.alternatives, *priors_in(self.left_out)], learned.get("given", True)
+        order = list(range(len(every))) if given is True else given or None
+        if order is not None and sorted(order) != list(range(len(every))):
+            raise ValueError(f"given: the numbers of {len(every)} experts are expected, not {given!r}")
+        self.given = None if order is None else [[every[number] for number in order]]
         self._allocate()
 
     def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -223,7 +234,7 @@ class CombinedPrior(MixturePrior):
         plans = self.training_plans(plans)
         generator = generator_on(generator, "cpu")
         learned, held_out = divided(plans, self._validation_of(settings), generator)
-        self.spare = nn.ModuleList()
+        self.spare, self.left_out = nn.ModuleList(), nn.ModuleList()
         if self.given:
             self.experts = nn.ModuleList(*self.given).to(self.device)
             self.fit_experts(learned, held_out, generator, settings)
@@ -270,6 +281,7 @@ class CombinedPrior(MixturePrior):
         self.experts = nn.ModuleList([experts[number] for number in kept])
         left = [e for number, e in enumerate(experts) if number not in kept]
         self.spare = nn.ModuleList([e for e in left if _can_be_spare(e)])
+        self._leave_out()
         self.share, self.tried = share, held_out.tried
         self._allocate()
         self.powers = powers.float()
@@ -285,7 +297,13 @@ class CombinedPrior(MixturePrior):
             except TooLargeError:  # it fitted before only just
                 continue
         self.spare = nn.ModuleList(counted)
+        self._leave_out()
         return super().recount(plans)
+
+    def _leave_out(self) -> None:
+        """Keep those of the given experts that are neither combined nor spare, for the next `fit`."""
+        there = set(map(id, self.alternatives))
+        self.left_out = nn.ModuleList([e for e in (self.given or [[]])[0] if id(e) not in there])
 
     @property
     def alternatives(self) -> tuple[Prior, ...]:

@@ -68,6 +68,11 @@ class AutoregressivePrior(LinearGaussianPrior):
 
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         orders = self.orders if self.order is None else (self.order,)
+        if self.order is not None and self.order >= plans.max_length:
+            raise ValueError(
+                f"order: {self.order} steps before each are read, and the longest plan has {plans.max_length};"
+                " less is expected"
+            )
         parts = self._parts(plans, generator)
         total = sum(int(held_out.mask()[:, skip:].sum()) for _, held_out, skip in parts)
         scores: dict[tuple[int, float, float], float] = {}

@@ -1,5 +1,6 @@
 """The combined prior: its bound, the pool's powers, initial weights against a search, which experts are kept."""
 
+import json
 import math
 from functools import cache
 
@@ -29,7 +30,7 @@ from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.testing import check_prior
-from tests.support.sources import every_plan, seeded
+from tests.support.sources import every_plan, refuses, seeded
 
 A, C = 3, 4
 QUICK = {"max_steps": 3, "progress": False}
@@ -260,11 +261,33 @@ def test_experts_that_were_left_out_are_saved_and_count_all_plans(tmp_path):
         assert one.log_prob(other).equal(same.log_prob(other))
     # It tries them again when it is fitted again.
     assert [type(e) for e in again.fit(plans, generator=seeded(0)).spare] == [MarkovPrior]
-    # Files of earlier versions have none.
-    learned = prior.learned
-    del learned["spare"]
+    # Files of earlier versions have none, and say only whether experts were given.
+    learned = prior.learned | {"given": True}
+    del learned["spare"], learned["left_out"]
     again.restore(learned)
     assert len(again.spare) == 0
+
+
+def test_all_given_experts_are_saved_for_the_next_fit(tmp_path):
+    """Also those that are neither kept nor spare, a network with its weights among them, and in their order."""
+    ordered = Plans(torch.tensor([[0, 1] * 5, [1, 0] * 5]).repeat(20, 1), 2)
+    random = Plans(torch.randint(2, (40, 10), generator=seeded(0)), 2)
+    prior = CombinedPrior(2, [UniformPrior(2), GRUPrior(2, 4), MarkovPrior(2, 2), MarkovPrior(2, 1)])
+    prior.fit(ordered, generator=seeded(0), **QUICK)
+    assert {UniformPrior, GRUPrior} == {type(e) for e in prior.left_out}
+    folder = save(prior, tmp_path / "combined")
+    again, whole = load(folder), prior.log_prob(ordered)
+    assert again.log_prob(ordered).equal(whole)
+    for one in (prior, again):
+        one.fit(random, generator=seeded(0), **QUICK)
+    assert prior.learned == again.learned
+    assert [UniformPrior] == [type(e) for e in prior.experts]
+    assert prior.log_prob(random).equal(again.log_prob(random))
+    saved = json.loads((folder / "config.json").read_text())
+    saved["learned"]["given"][0] = 9
+    (folder / "config.json").write_text(json.dumps(saved))
+    with refuses("config.json", "given: the numbers of 4 experts"):
+        load(folder)
 
 
 @pytest.mark.parametrize("most", [10, 1000])

@@ -326,6 +326,7 @@ def test_what_few_windows_do_not_show_is_not_taken_for_impossible(size):
         (lambda: NoisePrior([-1.0], [1.0], 1.0, scale=float("nan")), "scale"),
         (lambda: AutoregressivePrior([-1.0], [1.0], -1), "order"),
         (lambda: AutoregressivePrior([-1.0], [1.0], 1.5), "order"),
+        (lambda: AutoregressivePrior(LOW, HIGH, 10**7).fit(source(3, 7)), "order: 10000000 .* the longest plan has 7"),
         (lambda: WindowSynergies([-1.0], [1.0], 0), "num_components"),
         (lambda: WindowSynergies([-1.0], [1.0], window=1), "window: .*at least 2 is expected, not 1"),
         (lambda: StepSynergies([-1.0], [1.0], 2), "at most 1"),
