@@ -36,8 +36,8 @@ class Agent:
         state: `[B, ...]`: the states of the agents; None: one agent in a state that `world.reset` draws.
         replan_every: actions that are executed before replanning.
         change: applied to the states after each step, such as `ForagingWorld.regrow`; planners do not foresee it.
-        warm_start: the rest of the last plan, continued by the prior, is one of the candidates; not of best-first
-            searches, whose plans end by themselves.
+        warm_start: the rest of the last plan, continued by the prior, is one of the candidates. Without effect for
+            best-first searches, whose plans end by themselves.
         num_rollouts: of this candidate and of the planner's best one in a stochastic world, where they are compared.
         learn_every: steps after which the prior is fitted; a multiple of `plan_length`. None: never.
         plan_length: actions in a stored plan; a multiple of `replan_every`.

@@ -78,7 +78,8 @@ def score(
     caption = f"the first {MOST_ROWS} of {len(frame):,}; all are in the CSV file. " if len(frame) > MOST_ROWS else ""
     if any(learned):
         caption += (
-            f"Training data: {sum(learned):,} of {len(learned):,} plans are the same as plans that it has learned from."
+            f"Training data: {sum(learned):,} of {len(learned):,} plans are plans that it has learned from, at least in"
+            " part."
         )
     notes = [*plans.notes, *notes]
     if plans.action_names and action_names is None and prior.action_names is None:

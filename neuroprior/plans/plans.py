@@ -443,13 +443,13 @@ def _check_shape(name: str, values: Tensor, shape: tuple[int, ...]) -> None:
 
 
 def _check_texts(what: str, names: Sequence[str] | None) -> bool:
-    """Whether there are names; ValueError unless they are texts that a file can hold."""
+    """Whether there are names; ValueError unless they are texts, and names such as a file can hold."""
     if names is not None and (
         not isinstance(names, Sequence) or isinstance(names, str) or not all(isinstance(name, str) for name in names)
     ):
         raise ValueError(f"{what}: a list of texts is expected, not {names!r}")
-    for name in filter(HALF_PAIR.search, names or ()):
-        raise ValueError(f"{what}: {name!r} has half of a surrogate pair, which no file can hold")
+    for name in filter(HALF_PAIR.search, names or () if what != "notes" else ()):
+        raise ValueError(f"{what}: {name!r} has a broken character, half of a surrogate pair, which no file can hold")
     return names is not None
 
 

@@ -40,7 +40,9 @@ ROUNDING = 4
 """Of the last binary digits: so far may the sum of a start and a duration be from the time that it stands for."""
 
 ALIKE = 0.01
-"""A duration may be so much longer or shorter than from start to stop, as a part of it and of the usual one."""
+"""A duration and the time from start to stop are taken for the same where they differ by at most this share of the
+duration and the median duration together.
+"""
 
 UNLABELLED = "missing"
 """The action of rows without a label, where these are to count as one."""
@@ -76,7 +78,7 @@ class Columns:
         condition: what is to be compared, such as the treatment or the genotype; one for each plan.
         start: when the action began: numbers, times of day or dates; the rows of a plan are put in this order.
         stop: when it ended, as `start`.
-        duration: how long it took, in place of `stop`.
+        duration: how long it took, in place of `stop`; where both are there, it counts.
         event_type: START, STOP or POINT, where the start and the stop of an action are rows of their own, as in the
             tabular export of BORIS; `start` is the time of each row then.
 
@@ -371,14 +373,7 @@ def fields_of(
         if early.any():
             notes.append(f"{int(early.sum()):,} actions begin before the one before them ended")
         if "duration" in table.at and not np.isnan(seconds).all():
-            apart = np.abs(table.numbers("stop", table.at["stop"], times=True)[row] - ends)
-            other = np.flatnonzero(apart > ALIKE * (seconds + np.nanmedian(seconds)))
-            if other.size:
-                first = place(int(row[other[0]]))
-                notes.append(
-                    f"{other.size:,} durations, the first in {first}, are not the time from start to stop; the column"
-                    " of durations counts"
-                )
+            notes += _contradictions(table, row, seconds, ends)
     pause = np.zeros(len(row), bool)
     if max_gap is not None:
         if when is None or ends is None or not {"stop", "duration"} & table.at.keys():
@@ -580,6 +575,22 @@ def _durations(
     until: NDArray[np.float64] = np.append(when[1:], np.nan).astype(np.float64)
     until[np.append(begin[1:], True)] = np.nan
     return until - when, until
+
+
+def _contradictions(table: Table, row: Integers, seconds: NDArray[np.float64], ends: NDArray[np.float64]) -> list[str]:
+    """A note where durations are not the time from start to stop, or the stops are no times at all."""
+    try:
+        apart = np.abs(table.numbers("stop", table.at["stop"], times=True)[row] - ends)
+    except ValueError:
+        return ["the stops are not read as times; the column of durations counts"]
+    other = row[apart > ALIKE * (seconds + np.nanmedian(seconds))]
+    if not other.size:
+        return []
+    first = table.place(int(other.min()))
+    return [
+        f"{other.size:,} durations, the first in {first}, are not the time from start to stop; the column of durations"
+        " counts"
+    ]
 
 
 def _rounded(*times: Any) -> Any:

@@ -84,6 +84,11 @@ class Prior(SavedModule):
         return not (self.num_contexts is None and self.context_size is None and self.num_patterns is None)
 
     @property
+    def num_weights(self) -> int:
+        """How many trained numbers its predictions are computed from; 0 for priors that count."""
+        return sum(weights.numel() for weights in self.parameters())
+
+    @property
     def device(self) -> torch.device:
         """Where the prior computes."""
         anchor = self._anchor

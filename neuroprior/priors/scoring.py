@@ -17,7 +17,7 @@ from neuroprior.priors.matching import match_plans
 from neuroprior.priors.prior import Prior
 
 LEARNED = "learned.json"
-"""In the folder of a saved prior: the digests of the plans that it has learned from."""
+"""In the folder of a saved prior: the digests of the plans that it has learned from, at least in part."""
 
 
 def score(prior: Prior, plans: Plans, by: Literal["plan", "group", "condition", "action"] = "plan") -> Any:
@@ -123,11 +123,14 @@ def _whole_digests(plans: Plans) -> list[str]:
 
 
 def learned_from(folder: Path, plans: Plans) -> list[bool]:
-    """Which plans are the same as plans that the prior saved in a folder has learned from; none where it is not known.
+    """Which plans the prior saved in a folder has learned from, at least in part; none where it is not known.
+
+    Plans are known by their actions; those without any are never among them.
 
     Raises:
         ValueError: the file is damaged.
     """
     place = folder / LEARNED
     known = set(read_json(place).get("plans", ())) if place.is_file() else set()
-    return [digest in known for digest in plan_digests(plans)]
+    digests, taken = plan_digests(plans), plans.mask().any(1).tolist()
+    return [any_taken and digest in known for digest, any_taken in zip(digests, taken, strict=True)]

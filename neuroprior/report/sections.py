@@ -139,7 +139,7 @@ def score_section(found: Evaluation) -> Part:
     caption += f" {never[:1].upper()}{never[1:]}." if never else ""
     if learned:
         same = "; ".join(f"{number:,} of {len(found.plans):,} plans for {name}" for name, number in learned.items())
-        caption += f" Training data: plans that are the same as plans which the prior has learned from ({same})."
+        caption += f" Training data: plans that the prior has learned from, at least in part ({same})."
     held_out = "" if saved else " for actions that it has not learned from"
     text = [
         f"The bits of each model{held_out}: the fewer, the more of the structure it predicts; a nat is 1.44 bits."

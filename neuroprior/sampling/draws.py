@@ -12,8 +12,8 @@ FEW = {"cuda": 2**15}
 """On devices of a kind, the number of plans up to which those that begin alike are not looked for."""
 
 
-LEAST_TEMPERATURE = 1e-40
-"""By less than this logits cannot be divided in single precision; it draws the likeliest actions alone."""
+LEAST_TEMPERATURE = 1e-30
+"""What is divided by less than this may be infinite in single precision; it draws the likeliest actions alone."""
 
 
 def check_temperature(temperature: Any) -> None:
@@ -21,9 +21,7 @@ def check_temperature(temperature: Any) -> None:
     if isinstance(temperature, str | bool | None) or not 0 < temperature < float("inf"):
         raise ValueError(f"temperature: a positive finite number is expected, not {temperature!r}")
     if temperature < LEAST_TEMPERATURE:
-        raise ValueError(
-            f"temperature: {temperature!r} is too small to divide logits by; {LEAST_TEMPERATURE} is enough"
-        )
+        raise ValueError(f"temperature: {temperature!r} is too small to divide by; {LEAST_TEMPERATURE} is enough")
 
 
 def after_end(logits: Tensor, before: Tensor, end: int | None) -> Tensor:

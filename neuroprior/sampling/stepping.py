@@ -96,8 +96,10 @@ class Stepper:
         """The most plans that are stepped on one thread."""
         if not isinstance(self._prior, torch.nn.Module):
             return 0.0
-        parameters = sum(weights.numel() for weights in self._prior.parameters())
-        return WORTH_THREADS / parameters if parameters else float("inf")
+        numbers = getattr(self._prior, "num_weights", None)
+        if numbers is None:
+            numbers = sum(weights.numel() for weights in self._prior.parameters())
+        return WORTH_THREADS / numbers if numbers else float("inf")
 
     def threads_for(self, num_plans: int) -> AbstractContextManager[None]:
         """torch on one thread, until the block ends, where more do not pay for so many plans."""

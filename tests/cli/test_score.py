@@ -99,7 +99,9 @@ def test_plans_that_were_learned_from_are_marked(tmp_path, capsys):
     plans = drawn(8)
     _, frames = scored(tmp_path, plans.with_end(), [plans[:3]])
     assert frames["plans"]["training_data"].tolist() == [True] * 3 + [False] * 5
-    assert "3 of 8 plans are the same" in " ".join(capsys.readouterr().out.split())
+    assert "3 of 8 plans are plans that it has learned from, at least in part" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
 def test_how_a_file_is_read_is_passed_on(tmp_path, monkeypatch, capsys):

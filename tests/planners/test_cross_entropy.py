@@ -6,6 +6,7 @@ import torch
 from neuroprior import GRUPrior, MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior
 from neuroprior.planners import CrossEntropyPlanner
 from neuroprior.planners.cross_entropy import RefittedPrior, _places
+from neuroprior.sampling.draws import LEAST_TEMPERATURE
 from neuroprior.worlds import cube
 from tests.support.sources import every_plan, fits, random_world, refuses, seeded, stochastic_world
 
@@ -103,6 +104,14 @@ def test_all_candidates_are_tried_in_rounds_of_nearly_as_many(monkeypatch):
     decision = CrossEntropyPlanner(UniformPrior(3), 2, 11, rounds=4).plan(world, world.reset(3, seeded(0)), seeded(0))
     assert tried == [2, 3, 3, 3]
     assert decision.model_steps == 11 * 2
+
+
+def test_the_least_temperature_draws_the_likeliest():
+    prior = MarkovPrior(3, 1).fit(torch.tensor([[0, 1, 2, 0, 1, 2]] * 5))
+    planner = CrossEntropyPlanner(prior, 4, 8, rounds=2, temperature=LEAST_TEMPERATURE)
+    assert planner.plan(random_world(0), torch.tensor([0]), seeded(0)).plan.shape == (1, 4)
+    with refuses("temperature", "too small to divide by"):
+        CrossEntropyPlanner(prior, 4, 8, temperature=LEAST_TEMPERATURE / 2)
 
 
 def test_candidates_are_drawn_at_the_temperature():

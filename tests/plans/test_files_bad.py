@@ -45,6 +45,7 @@ OK = '{"actions": [0, 1]}'
         ([OK, "[0, 1]"], ["line 2", "is no plan"]),
         ([OK, '{"actions": [0], "actions": [1]}'], ["line 2", "the key 'actions' is given twice"]),
         ([OK, '{"action": [0]}'], ["line 2", '"actions"', "nothing"]),
+        (['{"actions": [0], "plan": "\\ud83d"}'], ["a.jsonl", "plan_names", "half of a surrogate pair"]),
         ([OK, '{"actions": 3}'], ["line 2", "a list is expected, not 3"]),
         ([OK, '{"actions": [0, true]}'], ["line 2", "action True"]),
         ([OK, '{"actions": [0, 1.0]}'], ["line 2", "action 1.0"]),

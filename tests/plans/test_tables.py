@@ -510,6 +510,11 @@ def test_times_of_day_are_minutes_and_seconds_where_that_is_sure(tmp_path, start
     assert read(tmp_path, f"plan;action;start\n1;a;{starts[0]}\n1;b;{starts[1]}\n").durations[0, 0] == seconds
 
 
+def test_a_broken_character_in_a_column_that_is_not_used_is_no_harm():
+    frame = pd.DataFrame({"action": ["a", "b"], "x\ud800": [1, 2]})
+    assert any("not used" in note for note in Plans.from_dataframe(frame).notes)
+
+
 def test_times_of_python_are_times_of_day():
     times = [datetime.time(10, 0, 5), datetime.time(10, 0, 7, 500_000)]
     assert Plans.from_dataframe(pd.DataFrame({"action": ["a", "b"], "start": times})).durations[0, 0] == 2.5

@@ -46,6 +46,10 @@ def test_dates_whose_day_may_be_their_month(dates, tmp_path):
             "action,start,stop,duration\na,0,1,1.001\nb,5,6,1\na,7,9,3\n",
             "line 4, are not the time from start to stop; the column of durations counts",
         ),
+        ("action,start,stop,duration\na,0,yes,1\nb,5,no,1\n", "the stops are not read as times"),
+        ("action,start,stop,duration\na,0,0:00:01,1\nb,5,0:00:06,1\n", "the stops are not read as times"),
+        # In the order of the file, not of time.
+        ("action,start,stop,duration\na,8,9,3\nb,5,6,1\na,1,3,4\n", "line 2, are not the time from start to stop"),
         (",action\n0,a\n1,b\n", "columns that are not used: (without a name, column 1)"),
         ("action\nGr\u00fcn\nGru\u0308n\n", "are nearly the same"),
         (

@@ -92,6 +92,10 @@ def test_plans_that_were_learned_from_are_known_again(tmp_path):
     longer = Plans(torch.nn.functional.pad(TRAINING.actions, (0, 2)), 3, torch.full((40,), 8), action_names=NAMES)
     assert learned_from(tmp_path, longer) == known
     assert sum(learned_from(tmp_path, Plans(TRAINING.actions, 3))) == 0
+    # Plans without any action say nothing of where they are from.
+    nothing = Plans(TRAINING.actions[:2], 3, torch.tensor([0, 6]), action_names=NAMES)
+    keep_learned(tmp_path, nothing)
+    assert learned_from(tmp_path, nothing) == [False, True]
 
 
 def test_plans_with_an_end_symbol_are_scored_by_priors_that_learned_one():

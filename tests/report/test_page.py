@@ -183,7 +183,7 @@ def page(boxes, tmp_path_factory) -> str:
 
 
 @settings(max_examples=30, deadline=None)
-@given(name=st.one_of(st.text(max_size=30), st.sampled_from(HOSTILE)))
+@given(name=st.one_of(st.text(max_size=30), st.sampled_from([*HOSTILE, "\ud800"])))
 def test_no_text_changes_what_the_page_is_made_of(name, tmp_path_factory):
     """The same tags with the same names of attributes as with a harmless name, and the text to be read as it was."""
     folder, name = tmp_path_factory.mktemp("page"), f"{name}~x~"
@@ -194,7 +194,7 @@ def test_no_text_changes_what_the_page_is_made_of(name, tmp_path_factory):
 
 
 @settings(max_examples=30, deadline=None)
-@given(name=st.one_of(st.text(min_size=1, max_size=25), st.sampled_from(HOSTILE)))
+@given(name=st.one_of(st.text(min_size=1, max_size=25), st.sampled_from([*HOSTILE, "\ud800"])))
 def test_names_stand_in_figures_as_they_are(name):
     @drawn
     def figure() -> Figure:

@@ -76,7 +76,7 @@ def test_temperature(method, temperature):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("temperature", [1e-3, 1e-40])
+@pytest.mark.parametrize("temperature", [1e-3, draws.LEAST_TEMPERATURE])
 def test_a_low_temperature_takes_the_most_probable(method, temperature):
     prior = TablePrior([torch.tensor([[[-300.0, -1.0, -2.0]]])])
     plans = sample(prior, 1000, 1, temperature=temperature, generator=seeded(0), method=method)

@@ -257,7 +257,10 @@ class _Rows:
             numbers = torch.from_numpy(condition.astype(np.int64))
             plans = replace(plans, condition=numbers, condition_names=condition_names)
         if self.plan_names:
-            plans = replace(plans, plan_names=self.plan_names)
+            try:
+                plans = replace(plans, plan_names=self.plan_names)
+            except ValueError as error:
+                raise ValueError(f"{self.path}: {error}") from None
         notes = feature_notes(plans.context, plans.max_length)
         if self.unused:
             notes.append(f"keys that are not used: {listed(sorted(self.unused))}")

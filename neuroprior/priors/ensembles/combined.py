@@ -82,7 +82,8 @@ class CombinedPrior(MixturePrior):
     held-out plans are clearly likelier with it; and if fewer than a thousand actions are held out, chains and trees are
     chosen and combined on all plans, most of them forecast part by part from the others. In other worlds than those of
     the plans an expert that was left out may be the better one: so chains and context trees whose tables are small are
-    kept aside, in `spare`, for planners that try (`neuroprior.planners.best_sampling`).
+    kept aside, in `spare`, for planners that try (`neuroprior.planners.best_sampling`). All given experts are saved,
+    since the next `fit` begins with them; those that are neither kept nor spare are in `left_out`.
 
     Args:
         num_actions: A.
@@ -124,7 +125,7 @@ class CombinedPrior(MixturePrior):
         made = [UniformPrior(num_actions)] if experts is None else experts
         super().__init__(num_actions, made, share, num_contexts, context_size)
         self.effort: Effort = effort
-        # `fit` begins with these each time; in a list, so that experts that it leaves out are no submodules.
+        # `fit` begins with these each time; in a list, since each is also a submodule: kept, spare or left out.
         self.given = None if experts is None else [self._experts()]
         self.spare = nn.ModuleList()
         self.left_out = nn.ModuleList()
@@ -330,7 +331,7 @@ def _can_be_spare(expert: Prior) -> bool:
 
 def _counts(expert: Prior) -> bool:
     """Whether an expert is not trained: it takes little time to count anew."""
-    return not expert.fit_settings and not any(True for _ in expert.parameters())
+    return not expert.fit_settings and not expert.num_weights
 
 
 def chosen_on(
@@ -341,7 +342,7 @@ def chosen_on(
     Returns:
         What the K experts kept forecast for the plans on which they were chosen; their numbers; their powers `[K]`.
     """
-    costs = [sum(weight.numel() for weight in e.parameters()) for e in experts]
+    costs = [e.num_weights for e in experts]
     counting = [number for number, e in enumerate(experts) if _counts(e)]
     gains = [IN_ALL if learned is None or number in counting else GAIN for number in range(len(experts))]
     forecasts = _forecasts(experts, plans)

@@ -69,6 +69,8 @@ class MixturePrior(Prior):
         check_share("share", share)
         made = [as_prior(e) for e in experts]
         for number, expert in enumerate(made):
+            if any(expert is other for other in made[:number]):
+                raise ValueError(f"experts[{number}]: the same prior is given twice; give another, or a copy")
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")
         for what in ("action_names", "context_names"):
@@ -93,6 +95,10 @@ class MixturePrior(Prior):
             self.action_names, self.end = e.action_names or self.action_names, e.end
         # What counts without a context says nothing of that of the plans.
         self.has_learned = bool(takers if self.takes_context else learned)
+
+    @property
+    def num_weights(self) -> int:
+        return sum(e.num_weights for e in self._experts())
 
     @property
     def config(self) -> dict[str, Any]:

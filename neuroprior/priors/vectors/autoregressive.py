@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count
+from neuroprior._checks import check_count, check_memory
 from neuroprior._random import draw_seed
 from neuroprior.plans.folds import divisible, folds, num_units, ungrouped
 from neuroprior.plans.vector_plans import VectorPlans
@@ -43,7 +43,7 @@ class AutoregressivePrior(LinearGaussianPrior):
             so and, with few vectors, how much of the covariances between dimensions is taken over.
 
     Raises:
-        ValueError: an argument is out of range.
+        ValueError: an argument is out of range, or (from `fit`) the order is not below the length of the longest plan.
 
     Example:
         >>> plans = VectorPlans(torch.linspace(-1, 1, 20).expand(8, 20)[..., None], [-1.0], [1.0])
@@ -60,6 +60,7 @@ class AutoregressivePrior(LinearGaussianPrior):
         super().__init__(action_low, action_high)
         if order is not None:
             check_count("order", order)
+            check_memory(8 * ((order + 1) * self.action_size) ** 2, order=order)
         self.order = order
 
     @property
@@ -68,10 +69,11 @@ class AutoregressivePrior(LinearGaussianPrior):
 
     def learn(self, plans: VectorPlans, generator: torch.Generator) -> None:
         orders = self.orders if self.order is None else (self.order,)
-        if self.order is not None and self.order >= plans.max_length:
+        longest = int(plans.mask().sum(1).max())
+        if self.order and self.order >= longest:
             raise ValueError(
-                f"order: {self.order} steps before each are read, and the longest plan has {plans.max_length};"
-                " less is expected"
+                f"order: {self.order} vectors before each are read, and the longest plan has {longest}; a lower one is"
+                " expected"
             )
         parts = self._parts(plans, generator)
         total = sum(int(held_out.mask()[:, skip:].sum()) for _, held_out, skip in parts)

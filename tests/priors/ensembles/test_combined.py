@@ -25,7 +25,7 @@ from neuroprior import (
     load,
     save,
 )
-from neuroprior.priors import SwitchingNetwork
+from neuroprior.priors import MixturePrior, SwitchingNetwork
 from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, TooLargeError
 from neuroprior.priors.ensembles.candidates import ORDERS, best_chain
 from neuroprior.priors.ensembles.combined import HeldOut
@@ -275,6 +275,7 @@ def test_all_given_experts_are_saved_for_the_next_fit(tmp_path):
     prior = CombinedPrior(2, [UniformPrior(2), GRUPrior(2, 4), MarkovPrior(2, 2), MarkovPrior(2, 1)])
     prior.fit(ordered, generator=seeded(0), **QUICK)
     assert {UniformPrior, GRUPrior} == {type(e) for e in prior.left_out}
+    assert prior.num_weights == 0  # sampling does not count those that forecast nothing
     folder = save(prior, tmp_path / "combined")
     again, whole = load(folder), prior.log_prob(ordered)
     assert again.log_prob(ordered).equal(whole)
@@ -288,6 +289,13 @@ def test_all_given_experts_are_saved_for_the_next_fit(tmp_path):
     (folder / "config.json").write_text(json.dumps(saved))
     with refuses("config.json", "given: the numbers of 4 experts"):
         load(folder)
+
+
+@pytest.mark.parametrize("kind", [CombinedPrior, MixturePrior])
+def test_a_prior_is_given_once(kind):
+    twice = MarkovPrior(A, 1)
+    with refuses("experts[2]", "the same prior is given twice"):
+        kind(A, [twice, UniformPrior(A), twice])
 
 
 @pytest.mark.parametrize("most", [10, 1000])

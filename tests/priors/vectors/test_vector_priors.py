@@ -54,6 +54,10 @@ def source(num: int = 12, length: int = 40, low=LOW, high=HIGH, seed: int = 0) -
     return VectorPlans(low + share * (high - low), low, high)
 
 
+SHORT = replace(source(3, 7), lengths=torch.tensor([3, 2, 3]))
+"""Plans that are padded far beyond the longest."""
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("size", "fitted"),
@@ -326,7 +330,13 @@ def test_what_few_windows_do_not_show_is_not_taken_for_impossible(size):
         (lambda: NoisePrior([-1.0], [1.0], 1.0, scale=float("nan")), "scale"),
         (lambda: AutoregressivePrior([-1.0], [1.0], -1), "order"),
         (lambda: AutoregressivePrior([-1.0], [1.0], 1.5), "order"),
-        (lambda: AutoregressivePrior(LOW, HIGH, 10**7).fit(source(3, 7)), "order: 10000000 .* the longest plan has 7"),
+        (lambda: AutoregressivePrior(LOW, HIGH, 7).fit(source(3, 7)), "order: 7 .* the longest plan has 7"),
+        (
+            lambda: AutoregressivePrior(LOW, HIGH, 3).fit(replace(source(3, 7), lengths=torch.tensor([3, 2, 3]))),
+            "order: 3 .* the longest plan has 3",
+        ),
+        (lambda: AutoregressivePrior(LOW, HIGH, 10**7), "order: 10000000 would need"),
+        (lambda: StepSynergies(LOW, HIGH, order=10**7), "order: 10000000 would need"),
         (lambda: WindowSynergies([-1.0], [1.0], 0), "num_components"),
         (lambda: WindowSynergies([-1.0], [1.0], window=1), "window: .*at least 2 is expected, not 1"),
         (lambda: StepSynergies([-1.0], [1.0], 2), "at most 1"),
