@@ -14,15 +14,7 @@ from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
 from neuroprior.plans.plans import Plans, check_are_plans, has_patterns
 from neuroprior.plans.tables import Columns, Missing
 
-__all__ = [
-    "from_trajectories",
-    "is_table",
-    "read_minari",
-    "read_plans",
-    "to_trajectories",
-    "write_minari",
-    "write_plans",
-]
+__all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
 
 MINARI = "minari:"
 """Before the name of a Minari dataset, where a file may be given."""
