@@ -95,7 +95,8 @@ def _names(plans: Plans, what: str) -> list[Any] | None:
 
 
 def plan_digests(plans: Plans) -> list[str]:
-    """A digest of the actions of each plan, by their names where they have any: equal for equal plans."""
+    """A digest of the actions of each plan without its end, by their names if they have any: equal for equal plans."""
+    plans = plans if plans.end is None else plans.without_end()
     names = plans.action_names or tuple(map(str, range(plans.num_actions)))
     rows = zip(plans.actions.tolist(), plans.mask().sum(1).tolist(), strict=True)
     texts = ("\0".join(names[action] for action in row[:length]) for row, length in rows)
@@ -111,15 +112,10 @@ def keep_learned(folder: Path, *parts: Plans, held_out: Plans | None = None, pla
         held_out: what it has not learned from.
         plans: those that all this was taken from; of a plan that was cut, and so is in no part, a part was learned.
     """
-    learned = {one for part in parts for one in _whole_digests(part)}
+    learned = {one for part in parts for one in plan_digests(part)}
     if plans is not None:
-        rest = set(() if held_out is None else _whole_digests(held_out))
-        learned |= set(_whole_digests(plans)) - rest
+        learned |= {*plan_digests(plans)} - {*(() if held_out is None else plan_digests(held_out))}
     write_json(folder / LEARNED, {"plans": sorted(learned)})
-
-
-def _whole_digests(plans: Plans) -> list[str]:
-    return plan_digests(plans if plans.end is None else plans.without_end())
 
 
 def learned_from(folder: Path, plans: Plans) -> list[bool]:

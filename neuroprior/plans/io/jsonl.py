@@ -249,18 +249,16 @@ class _Rows:
             group_names,
             self.end,
         )
+        more: dict[str, Any] = {"plan_names": self.plan_names or None}
         if self.durations is not None:
-            times = torch.from_numpy(padded(np.array(self.durations), lengths, str(self.path)))
-            plans = replace(plans, durations=times)
+            more["durations"] = torch.from_numpy(padded(np.array(self.durations), lengths, str(self.path)))
         condition, condition_names = own["condition"]
         if len(condition):
-            numbers = torch.from_numpy(condition.astype(np.int64))
-            plans = replace(plans, condition=numbers, condition_names=condition_names)
-        if self.plan_names:
-            try:
-                plans = replace(plans, plan_names=self.plan_names)
-            except ValueError as error:
-                raise ValueError(f"{self.path}: {error}") from None
+            more |= {"condition": torch.from_numpy(condition.astype(np.int64)), "condition_names": condition_names}
+        try:
+            plans = replace(plans, **more)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from None
         notes = feature_notes(plans.context, plans.max_length)
         if self.unused:
             notes.append(f"keys that are not used: {listed(sorted(self.unused))}")

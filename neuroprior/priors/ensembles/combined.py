@@ -147,14 +147,11 @@ class CombinedPrior(MixturePrior):
     @property
     def learned(self) -> dict[str, Any]:
         every = [*self.alternatives, *self.left_out]
-        given = None if self.given is None else [[e is one for one in every].index(True) for e in self.given[0]]
+        given = None if self.given is None else [every.index(e) for e in self.given[0]]
         own = {"tried": self.tried, "given": given, "kept": self.config["experts"]}
-        aside = {"spare": self.spare, "left_out": self.left_out}
-        return (
-            super().learned
-            | own
-            | {name: [described(e) | {"learned": e.learned} for e in priors_in(some)] for name, some in aside.items()}
-        )
+        for name, some in (("spare", self.spare), ("left_out", self.left_out)):
+            own[name] = [described(e) | {"learned": e.learned} for e in priors_in(some)]
+        return super().learned | own
 
     def restore(self, learned: dict[str, Any]) -> None:
         if "kept" in learned:
@@ -303,8 +300,8 @@ class CombinedPrior(MixturePrior):
 
     def _leave_out(self) -> None:
         """Keep those of the given experts that are neither combined nor spare, for the next `fit`."""
-        there = set(map(id, self.alternatives))
-        self.left_out = nn.ModuleList([e for e in (self.given or [[]])[0] if id(e) not in there])
+        there = self.alternatives
+        self.left_out = nn.ModuleList([e for e in (self.given or [[]])[0] if e not in there])
 
     @property
     def alternatives(self) -> tuple[Prior, ...]:

@@ -69,7 +69,7 @@ class MixturePrior(Prior):
         check_share("share", share)
         made = [as_prior(e) for e in experts]
         for number, expert in enumerate(made):
-            if any(expert is other for other in made[:number]):
+            if expert in made[:number]:
                 raise ValueError(f"experts[{number}]: the same prior is given twice; give another, or a copy")
             if expert.num_actions != num_actions:
                 raise ValueError(f"experts[{number}]: has {expert.num_actions} actions, the mixture {num_actions}")

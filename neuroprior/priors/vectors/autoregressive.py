@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory
 from neuroprior._random import draw_seed
 from neuroprior.plans.folds import divisible, folds, num_units, ungrouped
 from neuroprior.plans.vector_plans import VectorPlans
@@ -15,6 +14,7 @@ from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
     WindowMoments,
     best_of,
+    check_order,
     held_out_split,
     moments_or_white,
 )
@@ -59,8 +59,7 @@ class AutoregressivePrior(LinearGaussianPrior):
     def __init__(self, action_low: Any, action_high: Any, order: int | None = None) -> None:
         super().__init__(action_low, action_high)
         if order is not None:
-            check_count("order", order)
-            check_memory(8 * ((order + 1) * self.action_size) ** 2, order=order)
+            check_order(order, self.action_size)
         self.order = order
 
     @property

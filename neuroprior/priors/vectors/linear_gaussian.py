@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuroprior._checks import check_count
+from neuroprior._checks import check_count, check_memory
 from neuroprior._compiled import compiled
 from neuroprior._random import generator_on
 from neuroprior.plans.folds import divisible, fair_split
@@ -320,6 +320,12 @@ def linear_nats(tables: LinearTables, values: Tensor, half_range: Tensor) -> Ten
         late = scores(values[:, depth:].flatten(0, 1), windows.flatten(0, 1).flatten(1), depth)
         nats[:, :, depth:] = late.view(len(nats), num, length - depth)
     return nats
+
+
+def check_order(order: int, action_size: int) -> None:
+    """Raise ValueError unless vectors can depend on so many before them, in the memory of this machine."""
+    check_count("order", order)
+    check_memory(8 * ((order + 1) * action_size) ** 2, order=order)
 
 
 def held_out_split(

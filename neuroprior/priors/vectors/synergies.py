@@ -7,12 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_count, check_memory, check_sizes
+from neuroprior._checks import check_sizes
 from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.priors.vectors.linear_gaussian import (
     LinearGaussianPrior,
     WindowMoments,
     best_of,
+    check_order,
     held_out_split,
     is_constant,
     moments_or_white,
@@ -131,8 +132,7 @@ class StepSynergies(LinearGaussianPrior):
 
     def __init__(self, action_low: Any, action_high: Any, num_components: int | None = None, order: int = 1) -> None:
         super().__init__(action_low, action_high)
-        check_count("order", order)
-        check_memory(8 * ((order + 1) * self.action_size) ** 2, order=order)
+        check_order(order, self.action_size)
         if num_components is not None:
             check_sizes(num_components=num_components)
             if num_components > self.action_size:
