@@ -1,17 +1,19 @@
 """`python -m eval compare`: do neural priors help a planner more than Markov chains, in many worlds at equal budget?"""
 
 from collections.abc import Mapping, Sequence
+from functools import partial, reduce
 from typing import Any, Literal
 
 import torch
 from jsonargparse.typing import NonNegativeInt, PositiveInt, restricted_number_type
 
+from eval.compare.beside import Result, finished_runs, put_beside
 from eval.compare.planners import PlannerName, PlannerSettings, check_planners, planner_document, planner_run
 from eval.compare.priors import COMBINED, NEURAL, load_for
 from eval.compare.report import document
 from eval.compare.results import Results
 from eval.compare.run import Settings, compare_run
-from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, run_experiment
+from eval.worlds.runs import PowerOfTwo, Seed, check_distinct, run_experiment, runs_of
 from eval.worlds.suite import TASKS, Context, WorldName, check_contexts
 from neuroprior.report.document import Document
 
@@ -28,6 +30,7 @@ def compare(
     num_plans: Sequence[PowerOfTwo] = (16, 64, 256, 1024, 4096),
     priors: Sequence[str] | None = None,
     kinds: Sequence[Kind] | None = None,
+    beside: Sequence[str] | None = None,
     planners: Sequence[PlannerName] | None = None,
     context: Sequence[Context] | None = None,
     rounds: NonNegativeInt = 4,
@@ -54,6 +57,8 @@ def compare(
         kinds: kinds of priors that are fitted: markov, macro (a chain of order 2 over actions and 16 macro-actions,
             without context), gru, transformer, combined (of the chains and a GRU); all by default, but none if there
             are saved ones.
+        beside: folders (--out) of finished comparisons in the same worlds, with the same seeds and settings, whose
+            other priors are put into the tables too.
         planners: some of sampling, distinct, frontier, mcts, cross-entropy, halving and replanning (these two in
             stochastic worlds): they are compared, not priors, at as many model steps, with uniform plans, a chain of
             order 3 and the networks of --kinds, after the horizon curriculum.
@@ -82,16 +87,22 @@ def compare(
     how = (tuple(num_plans), fitted, tuple(context or ()), rounds, steps, starts, training_starts, seed, saved)
     where = (worlds, seeds, out, processes, dask)
     if planners is None:
-        run_experiment("compare", compare_run, report, Settings(*how), *where)
+        settings = Settings(*how)
+        others = [finished_runs(folder, settings, runs_of(worlds, seeds)) for folder in beside or ()]
+        run_experiment("compare", compare_run, partial(report, others=others), settings, *where)
+    elif beside:
+        raise ValueError("beside: priors are compared with those of another run, planners are not; leave it out")
     else:
         check_planners(planners, worlds)
-        settings = PlannerSettings(*how, planners=tuple(planners))
-        run_experiment("compare --planners", planner_run, planner_document, settings, *where)
+        asked = PlannerSettings(*how, planners=tuple(planners))
+        run_experiment("compare --planners", planner_run, planner_document, asked, *where)
 
 
-def report(runs: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], line: str) -> Document:
-    """The document of a comparison of priors."""
-    return document(Results(runs, settings["num_plans"]), settings, line)
+def report(
+    runs: Sequence[Result], settings: Mapping[str, Any], line: str, others: Sequence[Sequence[Result]] = ()
+) -> Document:
+    """The document of a comparison of priors, with those of other comparisons."""
+    return document(Results(reduce(put_beside, others, runs), settings["num_plans"]), settings, line)
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,48 @@ def test_all_worlds_and_kinds_by_default(tmp_path):
     assert found["settings"]["num_plans"] == [16, 64, 256, 1024, 4096]
     assert found["settings"]["context"] == []  # as suits each world
     assert len(list(tmp_path.glob("runs/*/*-*.json"))) == len(TASKS)
+
+
+def made_up_by_kind(asked, settings) -> dict:
+    """A made-up run whose network has the name of the first kind, and whose random plans are always the same."""
+    found = made_up(asked, replace(settings, kinds=(), context=()))
+    for entry in [*found["entries"], *found["curriculum"]]:
+        if entry["prior"] == "gru":
+            entry["prior"] = settings.kinds[0]
+    return found
+
+
+def test_priors_of_a_finished_comparison_are_put_beside(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "compare_run", made_up_by_kind)
+    options = ("--worlds", "maze", "--num-plans", "4")
+    one = run(tmp_path / "one", *options, "--kinds", "gru", "--context", "initial")["rows"]
+    both = run(tmp_path / "both", *options, "--kinds", "transformer", "--beside", str(tmp_path / "one"))["rows"]
+    assert [row["prior"] for row in both] == ["uniform", "markov-1", "transformer", "gru"]
+    assert both[-1] == next(row for row in one if row["prior"] == "gru")
+    more = [*options, "--kinds", "transformer", "--out", str(tmp_path / "more"), "--beside", str(tmp_path / "one")]
+    capsys.readouterr()
+    for changed, said in [
+        (["--seeds", "3"], "1 of 3 runs are not finished in"),
+        (["--worlds", "maze", "grid", "--seeds", "2"], "2 of 4 runs are not finished in"),
+        (["--starts", "5"], "has no comparison of the same settings"),
+        (["--planners", "sampling"], "beside: priors are compared"),
+    ]:
+        assert main(["compare", *more, *changed]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ")
+        assert error.count("\n") == 1
+        assert said in error
+    assert not (tmp_path / "more").exists()
+    run(tmp_path / "one", *options, "--kinds", "markov")
+    assert main(["compare", *more, "--seeds", "2"]) == 2
+    assert "has 2 comparisons of these settings; keep one of" in capsys.readouterr().err
+
+
+def test_runs_from_other_starts_are_not_put_beside(tmp_path, monkeypatch, capsys):
+    options = ("--worlds", "maze", "--num-plans", "4")
+    run(tmp_path / "one", *options, "--kinds", "gru")  # its random plans depend on the kinds
+    assert main(["compare", *options, "--seeds", "2", "--kinds", "markov", "--beside", str(tmp_path / "one")]) == 2
+    assert "beside: maze, seed 0: random plans do not reach the same" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("kinds", "fitted"), [([], []), (["--kinds", "gru"], ["gru"])])

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from eval.compare import run as run_module
+from eval.compare.beside import put_beside
 from eval.compare.curves import (
     SETTINGS,
     Sampling,
@@ -273,6 +274,18 @@ def test_numbers_of_states_are_no_initial_context():
     settings = replace(SMALL, kinds=("markov",), context=("none", "initial", "per-step"), rounds=0)
     for task, contexts in ((TASKS["cliff"], {"none", "per-step"}), (TINY, {"none", "initial", "per-step"})):
         assert {one.context for one in Contest(Run("tiny", 0), task, settings, orders=(0,)).contestants()} == contexts
+
+
+def test_priors_of_other_runs_plan_from_the_same_starts(run):
+    chains = run_in(TINY, 0, replace(SMALL, kinds=("markov",)))
+    [both] = put_beside([chains], [run])
+    assert both["entries"][: len(chains["entries"])] == chains["entries"]
+    more = both["entries"][len(chains["entries"]) :]
+    assert more == [entry for entry in run["entries"] if entry["prior"] == "gru"]
+    assert {entry["prior"] for entry in both["curriculum"]} == {entry["prior"] for entry in run["curriculum"]}
+    assert both["transitions"] == run["transitions"] | chains["transitions"]
+    with refuses("beside: tiny, seed 0: random plans do not reach the same"):
+        put_beside([chains], [run_in(TINY, 0, replace(SMALL, seed=1, kinds=()))])
 
 
 def test_saved_priors_are_compared_as_they_are(tmp_path):

@@ -1,0 +1,73 @@
+"""Finished runs of other comparisons beside those of this one: other priors, from the same starts."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from eval.compare.run import Settings
+from eval.worlds.runs import Run
+from neuroprior._files import read_json
+
+FREE = ("kinds", "priors", "digests", "context")
+"""What may differ between comparisons: it says which priors they have, not where these plan."""
+
+PLACE = ("planner", "prior", "context", "rounds")
+"""What names an entry of a run."""
+
+Result = Mapping[str, Any]
+
+
+def finished_runs(folder: str, settings: Settings, runs: Sequence[Run]) -> list[Result]:
+    """The results of `runs` in the folder of another comparison, which was made with the same settings.
+
+    Raises:
+        ValueError: the folder does not have them all, or has them several times (other priors, or another version of
+            the code); or one is damaged.
+    """
+    asked = _where({"command": "compare"} | settings.asked)
+    known = [path.parent for path in sorted(Path(folder).glob("runs/*/asked.json")) if _where(read_json(path)) == asked]
+    if not known:
+        raise ValueError(f"beside: {folder} has no comparison of the same settings (but for kinds, priors and context)")
+    if len(known) > 1:
+        several = ", ".join(map(str, known))
+        raise ValueError(f"beside: {folder} has {len(known)} comparisons of these settings; keep one of {several}")
+    paths = [known[0] / f"{run.name}.json" for run in runs]
+    if missing := [path for path in paths if not path.exists()]:
+        raise ValueError(f"beside: {len(missing)} of {len(paths)} runs are not finished in {folder}: {missing[0]} ...")
+    return [read_json(path) for path in paths]
+
+
+def _where(asked: Mapping[str, Any]) -> Any:
+    """What was asked, as JSON has it, but for what may differ."""
+    return json.loads(json.dumps({name: value for name, value in asked.items() if name not in FREE}))
+
+
+def put_beside(results: Sequence[Result], others: Sequence[Result]) -> list[dict[str, Any]]:
+    """Results with the entries that others have of the same worlds and seeds, and they lack.
+
+    Raises:
+        ValueError: random plans reach something else in the others: these did not plan from the same starts.
+    """
+    return [_with(mine, other) for mine, other in zip(results, others, strict=True)]
+
+
+def _with(mine: Result, other: Result) -> dict[str, Any]:
+    if _starts(mine) != _starts(other):
+        where = f"{mine['world']}, seed {mine['seed']}"
+        raise ValueError(f"beside: {where}: random plans do not reach the same; the worlds or starts were others")
+    known = {tuple(entry[name] for name in PLACE) for entry in mine["entries"]}
+    rounds = {(entry["prior"], entry["context"]) for entry in mine["curriculum"]}
+    more = [entry for entry in other["entries"] if tuple(entry[name] for name in PLACE) not in known]
+    later = [entry for entry in other["curriculum"] if (entry["prior"], entry["context"]) not in rounds]
+    return dict(mine) | {
+        "entries": [*mine["entries"], *more],
+        "curriculum": [*mine["curriculum"], *later],
+        "transitions": other.get("transitions", {}) | mine.get("transitions", {}),
+    }
+
+
+def _starts(result: Result) -> Any:
+    """What is the same from the same starts, whatever the priors: what plans without a prior reach."""
+    random = [entry["share"] for entry in result["entries"] if entry["prior"] in (None, "uniform")]
+    return json.loads(json.dumps([result["length"], result["num_starts"], result["budgets"], random]))
