@@ -219,7 +219,7 @@ def _cluster(address: str | None) -> Iterator[None]:
     try:
         client = Client(address, timeout=SCHEDULER_SECONDS)
     except (OSError, ValueError) as error:
-        raise ValueError(f"dask: no scheduler answers at {address}") from error
+        raise ValueError(f"dask: no scheduler answers at {address!r}; tcp://host:8786, say, is expected") from error
     try:
         yield
     finally:

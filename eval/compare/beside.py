@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.compare.run import Settings
-from eval.worlds.runs import Run
+from eval.worlds.runs import Run, read_run
 from neuroprior._files import read_json
 
 FREE = ("kinds", "priors", "digests", "context")
@@ -35,11 +35,13 @@ def finished_runs(folder: str, settings: Settings, runs: Sequence[Run]) -> list[
     paths = [known[0] / f"{run.name}.json" for run in runs]
     if missing := [path for path in paths if not path.exists()]:
         raise ValueError(f"beside: {len(missing)} of {len(paths)} runs are not finished in {folder}: {missing[0]} ...")
-    return [read_json(path) for path in paths]
+    return [read_run(path) for path in paths]
 
 
-def _where(asked: Mapping[str, Any]) -> Any:
+def _where(asked: Any) -> Any:
     """What was asked, as JSON has it, but for what may differ."""
+    if not isinstance(asked, Mapping):
+        return None
     return json.loads(json.dumps({name: value for name, value in asked.items() if name not in FREE}))
 
 

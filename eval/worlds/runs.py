@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 from jsonargparse.typing import extend_base_type, restricted_number_type
 
+from neuroprior._files import read_json
 from neuroprior._jobs import JobRun
 from neuroprior.analysis.statistics import (
     holm,
@@ -62,6 +63,19 @@ def runs_of(worlds: Sequence[str], seeds: int) -> list[Run]:
     return [Run(world, seed) for seed in range(seeds) for world in worlds]
 
 
+def read_run(path: Path) -> dict[str, Any]:
+    """The result of a finished run.
+
+    Raises:
+        ValueError: the file holds something else.
+        OSError: it cannot be read.
+    """
+    result = read_json(path)
+    if not isinstance(result, dict) or path.stem != f"{result.get('world')}-{result.get('seed')}":
+        raise ValueError(f"{path}: the result of another run, or of none")
+    return result
+
+
 def run_experiment(
     name: str,
     work: Callable[..., dict[str, Any]],
@@ -86,7 +100,7 @@ def run_experiment(
     """
     asked = {"command": name, **(settings.asked if hasattr(settings, "asked") else asdict(settings))}
     run = partial(work, settings=settings)
-    jobs = JobRun(run, Path(out) / "runs", asked, name=attrgetter("name"), packages=MAKERS)
+    jobs = JobRun(run, Path(out) / "runs", asked, name=attrgetter("name"), load=read_run, packages=MAKERS)
     results = jobs.do(runs_of(worlds, seeds), processes=processes, dask=dask, title=name)
     shown = {"worlds": list(worlds), "seeds": seeds} | asdict(settings)
     document = report(results, shown, command_line(name.split()[0]))

@@ -113,10 +113,11 @@ def kept_in(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.rglob("*-*.json")}
 
 
-def test_a_damaged_file_is_named(tmp_path, capsys):
+@pytest.mark.parametrize("text", ['{"world": ', "[]", '{"world": "maze", "seed": 2}'])
+def test_a_damaged_file_is_named(text, tmp_path, capsys):
     assert finish(tmp_path) == 0
     (path,) = tmp_path.rglob("maze-1.json")
-    path.write_text('{"world": ')
+    path.write_text(text)
     assert finish(tmp_path) == 2
     assert f"{path}: damaged" in capsys.readouterr().err
 
