@@ -12,7 +12,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import cache, lru_cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -167,7 +166,10 @@ def _unordered(
     call: Callable[..., tuple[int, Any]], jobs: Sequence[Any], processes: int, dask: str | None
 ) -> Iterator[tuple[int, Any]]:
     """The results of all jobs, each as soon as it is there."""
-    if dask is None and (processes == 1 or len(jobs) == 1):
+    if dask is not None:
+        yield from _on_cluster(call, jobs, dask)
+        return
+    if processes == 1 or len(jobs) == 1:
         yield from (call(job, index) for index, job in enumerate(jobs))
         return
     from joblib import Parallel, delayed, parallel_config
@@ -176,21 +178,43 @@ def _unordered(
     if threading.excepthook is threading.__excepthook__:
         threading.excepthook = _unless_given_up
     tasks = (delayed(call)(job, index) for index, job in enumerate(jobs))
-    with _cluster(dask):
-        how: dict[str, Any] = {"backend": "dask"} if dask else {"backend": "loky", "inner_max_num_threads": 1}
-        with parallel_config(**how):
-            number = -1 if dask else min(processes, len(jobs))
-            parallel = Parallel(n_jobs=number, batch_size=1, pre_dispatch="all", return_as="generator_unordered")
-            results = parallel(tasks)
-            try:
-                with warnings.catch_warnings():
-                    warnings.filterwarnings("ignore", module="joblib")  # it remarks on jobs that are given up
-                    yield from results
-            except TerminatedWorkerError as error:
-                raise MemoryError("a process was killed, probably for want of memory; try --processes 1") from error
-            finally:
-                if not dask:
-                    _stop_workers()
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        number = min(processes, len(jobs))
+        parallel = Parallel(n_jobs=number, batch_size=1, pre_dispatch="all", return_as="generator_unordered")
+        results = parallel(tasks)
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", module="joblib")  # it remarks on jobs that are given up
+                yield from results
+        except TerminatedWorkerError as error:
+            raise MemoryError("a process was killed, probably for want of memory; try --processes 1") from error
+        finally:
+            _stop_workers()
+
+
+def _on_cluster(call: Callable[..., tuple[int, Any]], jobs: Sequence[Any], address: str) -> Iterator[tuple[int, Any]]:
+    """The results of all jobs, done by the workers of a Dask cluster."""
+    try:
+        from distributed import Client, KilledWorker, as_completed
+    except ImportError as error:
+        raise ImportError("dask: install it with pip install 'neuroprior[dask]'") from error
+    try:
+        client = Client(address, timeout=SCHEDULER_SECONDS)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"dask: no scheduler answers at {address!r}; tcp://host:8786, say, is expected") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=SCHEDULER_SECONDS)
+        except TimeoutError as error:
+            raise ValueError(f"dask: the scheduler at {address} has no workers; start some (dask worker)") from error
+        tasks = [client.submit(call, job, index, pure=False) for index, job in enumerate(jobs)]
+        try:
+            for task in as_completed(tasks):
+                yield task.result()
+        except KilledWorker as error:
+            raise MemoryError(f"a worker was killed several times, probably for want of memory ({error})") from error
+        finally:
+            client.cancel(tasks)
 
 
 def _stop_workers() -> None:
@@ -204,26 +228,6 @@ def _unless_given_up(error: threading.ExceptHookArgs) -> None:
     """Print the error of a thread, but for that of joblib's own, which misses the jobs that were given up."""
     if error.thread is None or error.thread.name != "ExecutorManagerThread" or error.exc_type is not KeyError:
         threading.__excepthook__(error)
-
-
-@contextmanager
-def _cluster(address: str | None) -> Iterator[None]:
-    """A connection to a Dask cluster, while it is needed."""
-    if address is None:
-        yield
-        return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ImportError("dask: install it with pip install 'neuroprior[dask]'") from error
-    try:
-        client = Client(address, timeout=SCHEDULER_SECONDS)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"dask: no scheduler answers at {address!r}; tcp://host:8786, say, is expected") from error
-    try:
-        yield
-    finally:
-        client.close()
 
 
 class Progress:

@@ -151,6 +151,11 @@ PLANS = Plans(torch.tensor([[0, 1, 1], [1, 0, 1]]), 2)
         (lambda: analysis.best_of(torch.tensor([[0.0, torch.nan]])), ["scores[0, 1]", "NaN"]),
         (lambda: report(PLANS, models="counts"), ["models", "a list", "['counts']"]),
         (lambda: report(PLANS, priors=UniformPrior(2)), ["priors", "a dict"]),
+        (
+            lambda: report(PLANS, priors={"a": UniformPrior(2)}, folds=2, models=["counts"], max_steps=3),
+            ["priors", "leave folds, models, max_steps out"],
+        ),
+        (lambda: report(PLANS, priors={"a": UniformPrior(2)}, inputs=["actions"]), ["priors", "leave inputs out"]),
         (lambda: report(PLANS, priors=[UniformPrior(2)]), ["priors", "a dict"]),
         (lambda: SamplingPlanner(UniformPrior(2), 2, 4).plan(ARM, torch.zeros(1, 4)), ["numbered", "not PlanarArm"]),
         (lambda: ExhaustivePlanner(2).plan(PlanarArm, torch.zeros(1, 4)), ["a World", "not the class PlanarArm"]),

@@ -262,6 +262,29 @@ def test_a_cluster_does_the_jobs_though_a_worker_is_killed(cluster, tmp_path: Pa
     assert workers[1].pid in {result["process"] for result in found}
 
 
+def test_a_worker_of_one_thread_does_the_jobs(tmp_path: Path) -> None:
+    """Joblib's own way to use a cluster of one thread is to do without it."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as one:
+        found = JobRun(jobs.square, tmp_path, {}).do(list(range(3)), dask=one.scheduler_address)
+        assert [result["square"] for result in found] == [0, 1, 4]
+        assert os.getpid() not in {result["process"] for result in found}
+        # A single job is done there, too.
+        assert (
+            JobRun(jobs.square, tmp_path / "one", {}).do([5], dask=one.scheduler_address)[0]["process"] != os.getpid()
+        )
+
+
+def test_a_cluster_without_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(_jobs, "SCHEDULER_SECONDS", 1)
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address=None) as empty,
+        pytest.raises(ValueError, match="has no workers"),
+    ):
+        JobRun(jobs.square, tmp_path, {}).do([1, 2], dask=empty.scheduler_address)
+
+
 def test_a_cluster_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(_jobs, "SCHEDULER_SECONDS", 1)

@@ -14,7 +14,7 @@ from neuroprior.planners.execution import Change, check_change, executed_steps, 
 from neuroprior.planners.planner import check_is_planner
 from neuroprior.planners.warm_start import with_rest
 from neuroprior.plans import Plans
-from neuroprior.priors import Prior
+from neuroprior.priors import CombinedPrior, Prior
 from neuroprior.priors.prior import check_is_prior
 from neuroprior.sampling.stepping import check_actions
 from neuroprior.worlds.world import World, check_is_world
@@ -94,6 +94,13 @@ class Agent:
         if learn_every is not None and learn_every % plan_length:
             raise ValueError(f"learn_every: a multiple of plan_length = {plan_length} is expected, not {learn_every}")
         check_actions(prior, world)
+        own = getattr(planner, "prior", None)
+        replaced = isinstance(prior, CombinedPrior) and own is not prior and any(own is e for e in prior.modules())
+        if learn_every is not None and replaced:
+            raise ValueError(
+                "planner: it samples from an expert of the prior, which is replaced when the prior learns; a planner"
+                " that samples from the prior itself is expected, or learn_every=None"
+            )
         if min_score is not None and (not is_number(min_score) or min_score != min_score):
             raise ValueError(f"min_score: a number is expected, not {min_score!r}")
         self.generator = generator_on(generator, prior.device)

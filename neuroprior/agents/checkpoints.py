@@ -98,6 +98,10 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
     document = _read(folder / "agent.json")
     own, saved = _settings(agent), document["agent"]
     saved = saved | {"training": saved.get("training") or {}}  # was None for some priors
+    if "seed" in own["config"] and "seed" not in saved["config"]:
+        # Networks that had not learned were described by sizes that `fit` would change, and without their seed.
+        chosen = {name: value for name, value in own["config"].items() if name == "seed" or value is None}
+        saved = saved | {"config": saved["config"] | chosen}
     if saved != own:
         other = [name for name, value in own.items() if saved.get(name) != value]
         raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; give this one the same")
@@ -189,6 +193,8 @@ def _read(path: Path) -> dict[str, Any]:
     for key, kind in kinds.items():
         if not isinstance(document.get(key), kind):
             raise ValueError(f"{path}: {key!r} is missing or of a wrong type")
+    if document["time"] < 0:
+        raise ValueError(f"{path}: 'time': at least 0 is expected, not {document['time']}")
     if not all(isinstance(steps, int) for steps in document["recent"]):
         raise ValueError(f"{path}: 'recent': integers are expected")
     return document

@@ -166,6 +166,8 @@ class FitCLI(LightningCLI):
                 raise ValueError(
                     f"{self.folder}: holds a run already; --resume {self.folder} goes on with it, or give another --out"
                 )
+            if other := [name for name in (PLANS, *FILES) if (self.folder / name).exists()]:
+                raise ValueError(f"out: {self.folder / other[0]} is there, and of no run; give another folder")
             self.folder.mkdir(parents=True, exist_ok=True)
 
     def instantiate_trainer(self, **more: Any) -> Trainer:

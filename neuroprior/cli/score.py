@@ -16,6 +16,9 @@ from neuroprior.priors.matching import learned_names, match_plans, numbered_note
 from neuroprior.priors.scoring import learned_from, scores_by
 from neuroprior.report.document import printed, table, write_frames
 
+UNITS = ("plan", "group", "condition")
+"""What has a table of its own, if the plans have it."""
+
 MOST_ROWS = 20
 """Rows that are printed; the CSV files have all."""
 
@@ -58,13 +61,16 @@ def score(
     plans = plans if plans.end is None else plans.without_end()
     plans, notes = with_contexts_of(prior, plans, tabular)
     own = match_plans(plans, prior, folder)
+    for path in (place / f"{by}s.csv" for by in UNITS if by == "plan" or getattr(plans, by) is not None):
+        if path.exists() and not _is_of_scores(path):
+            raise ValueError(f"out: {path} is there, and holds no scores; give another folder")
     bits = action_bits(prior, own)
     whole = score_bits(folder, "", bits, own).bits_per_action()
     scores = scores_by(bits, plans, "plan")
     learned = learned_from(Path(folder), plans)
     scores.insert(1, "training_data", learned)
     frames = {"plans": scores}
-    for by in ("group", "condition"):
+    for by in UNITS[1:]:
         if getattr(plans, by) is not None:
             frames[f"{by}s"] = scores_by(bits, plans, by)
     name = "groups" if "groups" in frames else "plans"
@@ -94,7 +100,7 @@ def score(
     interval = f"95 % interval {whole.low:.4f} to {whole.high:.4f} over {unit_name(plans)}"
     few = too_few(plans)
     console.print(f"{whole.mean:.4f} bits per action, {interval}{few and f'; {few}'}", highlight=False)
-    earlier = [name for name in ("groups", "conditions") if name not in frames and _is_of_scores(place / f"{name}.csv")]
+    earlier = [f"{by}s" for by in UNITS if f"{by}s" not in frames and _is_of_scores(place / f"{by}s.csv")]
     write_frames(place, dict.fromkeys(earlier, pd.DataFrame()) | frames)
     console.print(
         f"tables: {', '.join(str(place / f'{name}.csv') for name in frames)}", highlight=False, soft_wrap=True

@@ -474,13 +474,16 @@ def construct(make: Callable[..., Prior], num_actions: int, contexts: Mapping[st
     """A prior from its class, or a function that makes it.
 
     Args:
-        make: called with the number of actions, and those of `contexts` that it takes.
+        make: called with the number of actions, and those of `contexts` that it takes; of a `functools.partial`, what
+            it was given itself stands: there may be more contexts than occur in some plans.
         num_actions: A.
         contexts: `num_contexts`, `context_size` or `num_patterns`, or none.
     """
     parameters = inspect.signature(make).parameters
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    return make(num_actions, **{name: c for name, c in contexts.items() if takes_any or name in parameters})
+    given = {name for name, value in getattr(make, "keywords", {}).items() if value is not None}
+    wanted = {name: c for name, c in contexts.items() if (takes_any or name in parameters) and name not in given}
+    return make(num_actions, **wanted)
 
 
 def context_arguments(*some: Plans) -> dict[str, int]:

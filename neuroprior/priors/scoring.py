@@ -127,6 +127,10 @@ def learned_from(folder: Path, plans: Plans) -> list[bool]:
         ValueError: the file is damaged.
     """
     place = folder / LEARNED
-    known = set(read_json(place).get("plans", ())) if place.is_file() else set()
+    content = read_json(place) if place.is_file() else {"plans": []}
+    known = content.get("plans") if isinstance(content, dict) else None
+    if not isinstance(known, list) or not all(isinstance(one, str) for one in known):
+        raise ValueError(f"{place}: damaged; it does not say which plans were learned from")
+    known = set(known)
     digests, taken = plan_digests(plans), plans.mask().any(1).tolist()
     return [any_taken and digest in known for digest, any_taken in zip(digests, taken, strict=True)]

@@ -3,7 +3,7 @@
 Needs pandas, matplotlib, jinja2 and rich (`neuroprior[report]`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +21,9 @@ from neuroprior._files import read_json, versions, write_json, written_whole
 from neuroprior.report.page import Section, Table, write_page
 
 Column = str | Callable[[Any], str]
+
+RESULTS, PAGE = "results.json", "report.html"
+"""Files of a document, beside those of its frames."""
 
 
 @dataclass(frozen=True)
@@ -108,26 +111,48 @@ def show(document: Document, console: Console) -> None:
     console.print(document.lead, highlight=False, markup=False)
 
 
+def check_place(folder: Path, frames: Iterable[str], read: Iterable[str | Path] = ()) -> None:
+    """Raise ValueError if a document that is written to a folder would replace what is no document's.
+
+    Args:
+        folder: where it is written.
+        frames: the names of its frames.
+        read: files that it is made of; no CSV file of these may lie in the folder, whatever its name.
+    """
+    for file in map(Path, read):
+        if file.suffix == ".csv" and file.is_file() and file.resolve().parent == folder.resolve():
+            raise ValueError(f"out: {file} lies in this folder, where tables are written; give another one")
+    if _earlier(folder) is None:
+        for name in (RESULTS, PAGE, *(f"{frame}.csv" for frame in frames)):
+            if (folder / name).exists():
+                raise ValueError(f"out: {folder / name} is there, and of no earlier report; give another folder")
+
+
+def _earlier(folder: Path) -> dict[str, Any] | None:
+    """The results of an earlier document in a folder, or None."""
+    with suppress(OSError, ValueError):
+        content = read_json(folder / RESULTS)
+        return content if isinstance(content, dict) and {"settings", "versions"} <= content.keys() else None
+    return None
+
+
 def write_document(document: Document, folder: Path) -> None:
     """Write `report.html`, `results.json` and a CSV file for each frame to a folder, which is made if it is not there.
 
     CSV files of an earlier document there, whose frames this one does not have, are removed.
 
     Raises:
+        ValueError: see `check_place`.
         OSError: the files cannot be written.
     """
+    check_place(folder, document.frames)
     folder.mkdir(parents=True, exist_ok=True)
-    results = folder / "results.json"
-    with suppress(OSError, ValueError):
-        names, content = {key: name for name, key in document.keys.items()}, read_json(results)
-        ours = isinstance(content, dict) and {"settings", "versions"} <= content.keys()
-        tables = [key for key, rows in content.items() if isinstance(rows, list)] if ours else []
-        earlier = {names.get(key, key) for key in tables} - {*document.frames}
-        write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()))
-    write_frames(folder, document.written)
-    write_json(results, results_of(document))
+    names, content = {key: name for name, key in document.keys.items()}, _earlier(folder) or {}
+    earlier = {names.get(key, key) for key, rows in content.items() if isinstance(rows, list)} - {*document.frames}
+    write_json(folder / RESULTS, results_of(document))  # first: it says whose the other files are
+    write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()) | document.written)
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
-    write_page(folder / "report.html", document.title, document.lead, document.sections, shown, document.command)
+    write_page(folder / PAGE, document.title, document.lead, document.sections, shown, document.command)
 
 
 def results_of(document: Document) -> dict[str, Any]:

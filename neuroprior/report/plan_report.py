@@ -18,7 +18,7 @@ from neuroprior.priors import Prior, load
 from neuroprior.priors.ensembles.candidates import Effort, check_effort
 from neuroprior.priors.matching import learned_names, renumbered
 from neuroprior.priors.scoring import learned_from
-from neuroprior.report.document import Document, write_document
+from neuroprior.report.document import Document, check_place, write_document
 from neuroprior.report.fits import ACTIONS, CONTEXT, DURATIONS, LAGS, OF_FEATURES, Design, counted
 from neuroprior.report.scores import Evaluation, cross_validation, evaluate, evaluate_saved, jobs
 from neuroprior.report.sections import SECTIONS, describe
@@ -111,6 +111,7 @@ def report(
         ['transitions']
     """
     check_effort(effort)
+    given_models = models
     models = (QUICK if effort == "fast" else MODELS) if models is None else models
     for name, given, known in (
         ("models", models, MODELS),
@@ -127,13 +128,22 @@ def report(
     for number in modes or ():
         check_sizes(modes=number)
     file = "" if isinstance(plans, Plans) else str(plans)
+    if out is not None:
+        check_place(Path(out), ["plans"], [str(one) for one in (plans, test) if isinstance(one, str | Path)])
     reading: dict[str, Any] = {"num_actions": num_actions, "action_names": action_names, "columns": columns}
     reading |= {"missing": missing, "merge_repeats": merge_repeats, "max_gap": max_gap}
     if priors is not None:
-        if test is not None or folds is not None or modes is not None or effort != "standard":
-            raise ValueError(
-                "priors: they are scored on the plans as they are; leave test, folds, modes and effort out"
-            )
+        of_fits: dict[str, Any] = {
+            "test": test,
+            "folds": folds,
+            "models": given_models,
+            "modes": modes,
+            "max_steps": max_steps,
+        }
+        of_fits |= {"inputs": None if tuple(inputs) == INPUTS[:2] else inputs}
+        of_fits |= {"effort": None if effort == "standard" else effort}
+        if without := [name for name, value in of_fits.items() if value is not None]:
+            raise ValueError(f"priors: they are scored on the plans as they are; leave {', '.join(without)} out")
         if isinstance(priors, Prior | str) or any(isinstance(one, Prior) for one in priors):
             raise ValueError("priors: a dict of fitted priors by name, or a list of folders, is expected")
         if not priors:

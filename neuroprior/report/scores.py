@@ -6,7 +6,6 @@ from functools import partial
 from math import log
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import pandas as pd
@@ -239,5 +238,7 @@ def load_arrays(path: Path) -> Arrays:
     try:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
-    except (BadZipFile, EOFError, KeyError) as error:
+    except (FileNotFoundError, PermissionError):
+        raise
+    except Exception as error:  # from wherever in the archive it is damaged: zlib's, the tokenizer's, ...
         raise ValueError(str(error)) from error

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neuroprior import (
+    CombinedPrior,
     ExhaustivePlanner,
     GRUPrior,
     MarkovPrior,
@@ -423,6 +424,7 @@ def test_damaged_checkpoints(tmp_path):
         (json.dumps(text | {"agent": []}), "agent"),
         (json.dumps(text | {"prior": 3}), "prior"),
         (json.dumps(text | {"time": "x"}), "time"),
+        (json.dumps(text | {"time": -5}), "time"),
         (json.dumps(text | {"recent": [1, "x"]}), "recent"),
         (json.dumps(text | {"recent": [1] * 9}), "recent"),
         (json.dumps(text | {"sha256": "0"}), "truncated"),
@@ -455,6 +457,29 @@ def test_damaged_checkpoints(tmp_path):
 def test_bad_agents(given, word):
     with refuses(word):
         agent(**given)
+
+
+def test_a_planner_of_an_expert_that_would_be_replaced_is_refused():
+    chain = MarkovPrior(4, 1)
+    prior = CombinedPrior(4, experts=[UniformPrior(4), chain])
+    with refuses("planner: it samples from an expert of the prior"):
+        agent(prior, planner=sampler(chain))
+    agent(prior, planner=sampler(chain), learn_every=None).run(6)
+    agent(prior).run(12)
+    agent(prior, planner=sampler(MarkovPrior(4, 1))).run(12)
+
+
+def test_a_network_goes_on_from_an_older_checkpoint(tmp_path):
+    """Of before its first fit: it had the sizes that `fit` would change, and no seed."""
+    save_agent(agent(GRUPrior(4)), tmp_path)
+    path = tmp_path / "agent.json"
+    text = json.loads(path.read_text())
+    text["agent"]["config"] |= {"hidden_size": 64, "num_layers": 1, "lags": 16, "dropout": 0.0}
+    del text["agent"]["config"]["seed"]
+    path.write_text(json.dumps(text))
+    restore_agent(agent(GRUPrior(4)), tmp_path).run(2)
+    with refuses("config"):
+        restore_agent(agent(GRUPrior(4, hidden_size=8)), tmp_path)
 
 
 def test_bad_runs():

@@ -15,7 +15,7 @@ from neuroprior.cli import score as command
 from neuroprior.plans import read_plans, write_plans
 from neuroprior.priors.scoring import keep_learned
 from neuroprior.report import report
-from tests.support.sources import seeded
+from tests.support.sources import refuses, seeded
 
 
 def test_ends_are_scored_but_are_no_actions(tmp_path):
@@ -59,6 +59,23 @@ def test_tables_of_others_are_left_alone(tmp_path):
     _, frames = scored(tmp_path, drawn(9))
     assert set(frames) == {"plans", "groups", "conditions"}
     assert frames["groups"]["weight"].tolist() == [1]
+
+
+def test_tables_of_others_are_not_written_over(tmp_path):
+    """Not even those that are scored: plans.csv is a good name for plans, too."""
+    _, frames = scored(tmp_path, drawn(9))
+    data = tmp_path / "data"
+    data.mkdir()
+    write_plans(drawn(9), data / "plans.csv")
+    before = (data / "plans.csv").read_bytes()
+    with refuses("out: ", "plans.csv is there, and holds no scores; give another folder"):
+        command.score(str(tmp_path / "prior"), str(data / "plans.csv"), out=str(data))
+    assert (data / "plans.csv").read_bytes() == before
+    assert [path.name for path in data.iterdir()] == ["plans.csv"]
+    (tmp_path / "out" / "groups.csv").write_text("group,weight\na,1\n")
+    with refuses("groups.csv is there"):
+        scored(tmp_path, drawn(9, group=torch.arange(9) % 3))
+    assert pd.read_csv(tmp_path / "out" / "plans.csv").equals(frames["plans"])
 
 
 def drawn(num, **more):

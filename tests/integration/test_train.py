@@ -266,6 +266,22 @@ def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans
     assert not list((tmp_path / "run").rglob("*.*"))
 
 
+@pytest.mark.parametrize("name", ["plans.npz", "config.json"])
+def test_files_of_others_are_not_written_over(name, plans_file, tmp_path, capsys):
+    (tmp_path / name).write_bytes(Path(plans_file).read_bytes())
+    assert main(["fit", "--config", "markov", "--data.file", plans_file, "--out", str(tmp_path)]) == 2
+    assert f"out: {tmp_path / name} is there, and of no run" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_the_number_of_contexts_of_a_recipe_may_be_more_than_occur(tmp_path):
+    plans = Plans(torch.zeros(30, 4, dtype=torch.long), 2, context=torch.arange(120).view(30, 4) % 3)
+    write_plans(plans, tmp_path / "plans.npz")
+    options = ["--data.file", str(tmp_path / "plans.npz"), "--model.prior.num_contexts", "8"]
+    assert main(["fit", "--config", "markov", *options, "--out", str(tmp_path / "run")]) == 0
+    assert load(tmp_path / "run").num_contexts == 8
+
+
 def test_a_recipe_by_name(plans_file, tmp_path, capsys, monkeypatch):
     """In any folder; where there is no such recipe the known ones are listed."""
     monkeypatch.chdir(tmp_path)

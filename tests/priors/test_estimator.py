@@ -1,11 +1,12 @@
 """A prior with scikit-learn's methods; with scikit-learn itself where it is installed."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 
-from neuroprior import GRUPrior, MarkovPrior, Plans, UniformPrior
+from neuroprior import GRUPrior, MarkovPrior, Plans, UniformPrior, fit
 from neuroprior.priors import PriorEstimator
 from tests.support.sources import refuses, seeded
 
@@ -56,6 +57,19 @@ def test_a_list_of_plans_is_these_plans() -> None:
     assert both[1].prior_.takes_context
     with refuses("list(plans)"):
         PriorEstimator("markov").fit([plans[:1], plans[:1].steps(1)])
+
+
+def test_there_may_be_more_contexts_than_occur() -> None:
+    plans = Plans(torch.zeros(20, 3, dtype=torch.long), 2, context=torch.arange(60).view(20, 3) % 4)
+    for prior in (PriorEstimator("markov", num_contexts=9), PriorEstimator("gru", num_contexts=9, max_steps=1)):
+        assert prior.fit(plans).prior_.num_contexts == 9
+        new = Plans(plans.actions, 2, context=plans.context + 5)
+        assert math.isfinite(prior.score(new))
+    assert PriorEstimator("markov").fit(plans).prior_.num_contexts == 4
+    assert fit(plans, partial(MarkovPrior, num_contexts=6)).num_contexts == 6
+    assert fit(plans, partial(MarkovPrior, num_contexts=None)).num_contexts == 4
+    with refuses("3 is out of range: there are 3 contexts"):
+        fit(plans, partial(MarkovPrior, num_contexts=3))
 
 
 def test_integers_have_as_many_actions_as_is_said() -> None:

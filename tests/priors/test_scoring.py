@@ -98,6 +98,13 @@ def test_plans_that_were_learned_from_are_known_again(tmp_path):
     assert learned_from(tmp_path, nothing) == [False, True]
 
 
+@pytest.mark.parametrize("content", ["[]", '{"plans": 5}', '{"plans": [5]}', "{}", "{"])
+def test_a_damaged_list_of_plans_is_named(content, tmp_path):
+    (tmp_path / "learned.json").write_text(content)
+    with refuses(f"{tmp_path / 'learned.json'}: "):
+        learned_from(tmp_path, TRAINING)
+
+
 def test_plans_with_an_end_symbol_are_scored_by_priors_that_learned_one():
     """As they are: to plans that were cut off before their end, such as samples, none is added."""
     ended = Plans(torch.randint(3, (50, 6), generator=seeded(0)), 3).with_end()

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TransformerPrior, UniformPrior, load, save
+from neuroprior.priors import StackedPrior
 from neuroprior.priors.saved import SavedModule
 from tests.support.sources import refuses, says, seeded
 
@@ -56,6 +57,28 @@ def test_round_trip(kind, arguments, fitted, tmp_path):
     with torch.no_grad():
         longer = Plans(longer, A, context=context)
         assert torch.equal(again.log_prob(longer), prior.eval().log_prob(longer))
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda: GRUPrior(A, seed=7),
+        lambda: GRUPrior(A, 8, lags=2),
+        lambda: TransformerPrior(A, 16, seed=7),
+        lambda: StackedPrior(A, 8, seed=7),
+        lambda: StackedPrior(A, 8, num_layers=1),
+    ],
+)
+def test_a_network_that_is_saved_before_it_learns_learns_the_same(made, tmp_path):
+    """Sizes that `fit` chooses are not fixed by saving, and the seed of the weights is kept."""
+    first, plans = made(), torch.randint(A, (40, 4), generator=seeded(0))
+    again = load(save(first, tmp_path))
+    for prior in (first, again):
+        prior.fit(plans, max_steps=3, progress=False, generator=seeded(1))
+    assert repr(again) == repr(first)
+    for name, value in first.state_dict().items():
+        assert value.equal(again.state_dict()[name]), name
+    assert repr(load(save(first, tmp_path))) == repr(first)
 
 
 @pytest.mark.parametrize("kind", [GRUPrior, TransformerPrior])

@@ -10,6 +10,7 @@ from rich.console import Console
 from neuroprior.report.document import Document, show, write_document
 from neuroprior.report.page import Section, Table
 from neuroprior.report.part import p_text
+from tests.support.sources import refuses
 
 
 def test_files_hold_renamed_columns_under_both_names(tmp_path):
@@ -65,8 +66,22 @@ def test_p_values_have_a_digit(value, text):
 
 
 @pytest.mark.parametrize("content", ['{"subjects": [1, 2]}', "[1, 2]", "{"])
-def test_what_another_program_wrote_names_no_tables(content, tmp_path):
+def test_results_of_another_program_are_not_written_over(content, tmp_path):
     (tmp_path / "results.json").write_text(content)
     (tmp_path / "subjects.csv").write_text("a\n1\n")
-    write_document(Document("", "", [], {"one": pd.DataFrame({"bits": [1.5]})}), tmp_path)
-    assert {path.name for path in tmp_path.glob("*.csv")} == {"one.csv", "subjects.csv"}
+    with refuses("out: ", "results.json is there, and of no earlier report; give another folder"):
+        write_document(Document("", "", [], {"one": pd.DataFrame({"bits": [1.5]})}), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"results.json", "subjects.csv"}
+    assert (tmp_path / "results.json").read_text() == content
+
+
+@pytest.mark.parametrize("name", ["one.csv", "empty.csv", "report.html"])
+def test_files_of_others_are_not_written_over(name, tmp_path):
+    document = Document("", "", [], {"one": pd.DataFrame({"bits": [1.5]}), "empty": pd.DataFrame()})
+    (tmp_path / name).write_text("a\n1\n")
+    with refuses("out: ", f"{name} is there, and of no earlier report; give another folder"):
+        write_document(document, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    (tmp_path / name).unlink()
+    write_document(document, tmp_path)
+    write_document(document, tmp_path)

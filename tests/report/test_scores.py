@@ -191,6 +191,15 @@ def test_results_are_written_and_read(tmp_path):
     again = load_arrays(path)
     assert again.keys() == arrays.keys()
     assert all((again[name] == array).all() for name, array in arrays.items())
+    whole = path.read_bytes()
     path.write_bytes(b"")
     with refuses(""):
         load_arrays(path)
+    refused = 0
+    for at in range(0, len(whole), 3):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :])
+        try:
+            load_arrays(path)
+        except ValueError:
+            refused += 1
+    assert refused > 50

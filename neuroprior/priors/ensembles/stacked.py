@@ -100,8 +100,11 @@ class StackedPrior(Prior):
     @property
     def config(self) -> dict[str, Any]:
         own: dict[str, Any] = {"hidden_size": self.hidden_size, "dropout": self.dropout}
-        if self.mixer.num_layers > 1:  # one, as all had before, is left out: checkpoints of agents compare settings
-            own["num_layers"] = self.mixer.num_layers
+        given = self.mixer.arguments()
+        # One layer, as all had before, is left out where it was chosen: checkpoints of agents compare settings.
+        if given["num_layers"] is not None and (given["num_layers"] > 1 or "seed" in given):
+            own["num_layers"] = given["num_layers"]
+        own |= {"seed": given["seed"]} if given.get("seed") else {}
         return super().config | own | {"orders": list(self.orders), "depth": self.depth}
 
     @property
@@ -295,7 +298,7 @@ class Mixer(NeuralPrior):
     def sizes_for(self, plans: Plans) -> Sizes:
         """As for other networks, but of one layer where the context is known: a second one gains nothing there."""
         sizes = super().sizes_for(plans)
-        return sizes if self.contexts is None else sizes._replace(layers=1)
+        return sizes if self.contexts is None else sizes._replace(num_layers=1)
 
     def build(self) -> None:
         width, forecasts = self.width, self.num_experts * self.num_actions

@@ -68,7 +68,8 @@ class GRUPrior(NeuralPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        return super().config | {"hidden_size": self.hidden_size, "num_layers": self.num_layers}
+        given = self.arguments()
+        return super().config | {"hidden_size": given.pop("width")} | given
 
     def build(self) -> None:
         width = self.hidden_size

@@ -43,13 +43,13 @@ class Sizes(NamedTuple):
         width: of its hidden state and vectors.
         lags: past actions that each input shows directly.
         dropout: share of activations that is set to 0 in training.
-        layers: of a recurrent network.
+        num_layers: of a recurrent network.
     """
 
     width: int = 64
     lags: int = 16
     dropout: float = 0.0
-    layers: int = 1
+    num_layers: int = 1
 
     @classmethod
     def of(cls, plans: Plans) -> "Sizes":
@@ -143,7 +143,14 @@ class NeuralPrior(Prior):
 
     @property
     def config(self) -> dict[str, Any]:
-        return super().config | {"window": self._given_window, "lags": self.lags, "dropout": self.dropout}
+        sizes = self.arguments()
+        return super().config | {"window": self._given_window, "lags": sizes["lags"], "dropout": sizes["dropout"]}
+
+    def arguments(self) -> dict[str, Any]:
+        """The sizes, by name; before it learns, which chooses what was not given, as they were given, and the seed."""
+        if self._sized:
+            return {name: getattr(self, name) for name in Sizes._fields}
+        return dict(zip(Sizes._fields, self._given, strict=True)) | {"seed": self._seed}
 
     @property
     def learned(self) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class TransformerPrior(NeuralPrior):
 
     @property
     def config(self) -> dict[str, Any]:
-        return super().config | {"width": self.width, "num_layers": self.num_layers, "num_heads": self.num_heads}
+        return super().config | self.arguments() | {"num_heads": self.num_heads}
 
     @property
     def learned(self) -> dict[str, Any]:
