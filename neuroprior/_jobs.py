@@ -202,19 +202,26 @@ def _on_cluster(call: Callable[..., tuple[int, Any]], jobs: Sequence[Any], addre
         client = Client(address, timeout=SCHEDULER_SECONDS)
     except (OSError, ValueError) as error:
         raise ValueError(f"dask: no scheduler answers at {address!r}; tcp://host:8786, say, is expected") from error
-    with client:
+    with client, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sending large graph")  # each job has what all need, in case workers go
+        # Before there are workers: a cluster that grows with its tasks has none yet.
+        tasks = as_completed(client.submit(call, job, index, pure=False) for index, job in enumerate(jobs))
         try:
             client.wait_for_workers(1, timeout=SCHEDULER_SECONDS)
         except TimeoutError as error:
             raise ValueError(f"dask: the scheduler at {address} has no workers; start some (dask worker)") from error
-        tasks = [client.submit(call, job, index, pure=False) for index, job in enumerate(jobs)]
-        try:
-            for task in as_completed(tasks):
-                yield task.result()
-        except KilledWorker as error:
-            raise MemoryError(f"a worker was killed several times, probably for want of memory ({error})") from error
-        finally:
-            client.cancel(tasks)
+        for task in tasks:
+            try:
+                result = task.result()
+            except KilledWorker as error:
+                raise MemoryError(f"a worker was killed several times, perhaps for want of memory ({error})") from error
+            except Exception as error:  # not of a job, which would be a result
+                raise ValueError(
+                    f"dask: the cluster at {address} failed ({type(error).__name__}: {error}); finished jobs are kept,"
+                    " and the same command goes on"
+                ) from error
+            task.release()  # the workers keep results that somebody may ask for
+            yield result
 
 
 def _stop_workers() -> None:

@@ -21,21 +21,31 @@ Result = Mapping[str, Any]
 def finished_runs(folder: str, settings: Settings, runs: Sequence[Run]) -> list[Result]:
     """The results of `runs` in the folder of another comparison, which was made with the same settings.
 
+    Args:
+        folder: its `--out`, or, where this has several comparisons, the folder below it that holds the runs of one.
+        settings: of this comparison.
+        runs: those of this comparison.
+
     Raises:
         ValueError: the folder does not have them all, or has them several times (other priors, or another version of
             the code); or one is damaged.
     """
     asked = _where({"command": "compare"} | settings.asked)
-    known = [path.parent for path in sorted(Path(folder).glob("runs/*/asked.json")) if _where(read_json(path)) == asked]
+    places = [path.parent for at in ("asked.json", "runs/*/asked.json") for path in sorted(Path(folder).glob(at))]
+    known = [place for place in places if _where(read_json(place / "asked.json")) == asked]
     if not known:
         raise ValueError(f"beside: {folder} has no comparison of the same settings (but for kinds, priors and context)")
-    if len(known) > 1:
-        several = ", ".join(map(str, known))
-        raise ValueError(f"beside: {folder} has {len(known)} comparisons of these settings; keep one of {several}")
-    paths = [known[0] / f"{run.name}.json" for run in runs]
-    if missing := [path for path in paths if not path.exists()]:
-        raise ValueError(f"beside: {len(missing)} of {len(paths)} runs are not finished in {folder}: {missing[0]} ...")
-    return [read_run(path) for path in paths]
+    missing = {place: [run for run in runs if not (place / f"{run.name}.json").exists()] for place in known}
+    whole = [place for place in known if not missing[place]]
+    if len(whole) > 1:
+        several = " or ".join(map(str, whole))
+        raise ValueError(f"beside: {folder} has {len(whole)} comparisons of these settings; give {several}")
+    if not whole:
+        fewest = min(missing.values(), key=len)
+        raise ValueError(
+            f"beside: {len(fewest)} of {len(runs)} runs are not finished in {folder}, such as {fewest[0].name}"
+        )
+    return [read_run(whole[0] / f"{run.name}.json") for run in runs]
 
 
 def _where(asked: Any) -> Any:

@@ -58,7 +58,8 @@ def compare(
             without context), gru, transformer, combined (of the chains and a GRU); all by default, but none if there
             are saved ones.
         beside: folders (--out) of finished comparisons in the same worlds, with the same seeds and settings, whose
-            other priors are put into the tables too.
+            other priors are put into the tables too. They should be of the same version of the code, which is not
+            checked; that random plans reach the same is.
         planners: some of sampling, distinct, frontier, mcts, cross-entropy, halving and replanning (these two in
             stochastic worlds): they are compared, not priors, at as many model steps, with uniform plans, a chain of
             order 3 and the networks of --kinds, after the horizon curriculum.
@@ -88,7 +89,9 @@ def compare(
     where = (worlds, seeds, out, processes, dask)
     if planners is None:
         settings = Settings(*how)
-        others = [finished_runs(folder, settings, runs_of(worlds, seeds)) for folder in beside or ()]
+        if out in (beside or ()):
+            raise ValueError(f"beside: {out} is the folder of this comparison (out); give those of others")
+        others = {folder: finished_runs(folder, settings, runs_of(worlds, seeds)) for folder in beside or ()}
         run_experiment("compare", compare_run, partial(report, others=others), settings, *where)
     elif beside:
         raise ValueError("beside: priors are compared with those of another run, planners are not; leave it out")
@@ -99,10 +102,11 @@ def compare(
 
 
 def report(
-    runs: Sequence[Result], settings: Mapping[str, Any], line: str, others: Sequence[Sequence[Result]] = ()
+    runs: Sequence[Result], settings: Mapping[str, Any], line: str, others: Mapping[str, Sequence[Result]] = {}
 ) -> Document:
-    """The document of a comparison of priors, with those of other comparisons."""
-    return document(Results(reduce(put_beside, others, runs), settings["num_plans"]), settings, line)
+    """The document of a comparison of priors, with those of other comparisons, by their folders."""
+    results = Results(reduce(put_beside, others.values(), runs), settings["num_plans"])
+    return document(results, {**settings, **({"beside": list(others)} if others else {})}, line)
 
 
 def check_saved(folders: Sequence[str], worlds: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ those of medians (of numbers of plans, some of which are infinite) are those of 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,7 @@ from scipy import optimize, stats
 
 from eval.compare.priors import COMBINED, NEURAL
 from eval.worlds.runs import across_worlds, frame_of, seed_means
+from eval.worlds.suite import Context
 from neuroprior.analysis.statistics import Difference, holm
 
 Array = NDArray[np.float64]
@@ -32,6 +33,9 @@ PRIOR = ["prior", "context", "rounds"]
 
 SAMPLING = ["temperature", "uniform_share", "alone"]
 """How candidates were drawn, `alone`: by one expert of a combined prior; in tables, the means over seeds."""
+
+MORE_CONTEXT = {context: number for number, context in enumerate(get_args(Context))}
+"""The contexts of priors, from the least to the most."""
 
 CLOSE = 1e-9
 """Normalised scores that differ by less are the same."""
@@ -300,7 +304,8 @@ class Results:
         """
         own = self.scores[self.scores["num_plans"].isin(self.num_plans) & self.scores["prior"].notna()]
         own = own[own["prior"] != "uniform"].assign(rounds=(own["rounds"] > 0).astype("int64"))
-        last = own["context"] == own.groupby("world")["context"].transform("last")
+        most = own["context"].map(MORE_CONTEXT)
+        last = most == most.groupby(own["world"]).transform("max")
         plain = own["context"] == "none"
         parts = [own[plain], own[last].assign(context="most")] if (plain != last).any() else [own[plain]]
         own = pd.concat(parts)[["world", "seed", *PRIOR, "num_plans", "share"]]

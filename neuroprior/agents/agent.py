@@ -94,12 +94,11 @@ class Agent:
         if learn_every is not None and learn_every % plan_length:
             raise ValueError(f"learn_every: a multiple of plan_length = {plan_length} is expected, not {learn_every}")
         check_actions(prior, world)
-        own = getattr(planner, "prior", None)
-        replaced = isinstance(prior, CombinedPrior) and own is not prior and any(own is e for e in prior.modules())
-        if learn_every is not None and replaced:
+        own, chooses = getattr(planner, "prior", None), isinstance(prior, CombinedPrior) and prior.given is None
+        if chooses and own is not prior and any(own is e for e in prior.modules()):
             raise ValueError(
-                "planner: it samples from an expert of the prior, which is replaced when the prior learns; a planner"
-                " that samples from the prior itself is expected, or learn_every=None"
+                "planner: it samples from an expert of the prior, which fits others in its place when it learns; a"
+                " planner that samples from the prior itself is expected"
             )
         if min_score is not None and (not is_number(min_score) or min_score != min_score):
             raise ValueError(f"min_score: a number is expected, not {min_score!r}")

@@ -98,10 +98,7 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
     document = _read(folder / "agent.json")
     own, saved = _settings(agent), document["agent"]
     saved = saved | {"training": saved.get("training") or {}}  # was None for some priors
-    if "seed" in own["config"] and "seed" not in saved["config"]:
-        # Networks that had not learned were described by sizes that `fit` would change, and without their seed.
-        chosen = {name: value for name, value in own["config"].items() if name == "seed" or value is None}
-        saved = saved | {"config": saved["config"] | chosen}
+    saved = saved | {"config": _as_described_now(saved["config"], own["config"])}
     if saved != own:
         other = [name for name, value in own.items() if saved.get(name) != value]
         raise ValueError(f"{folder}: of an agent with other {', '.join(other)}; give this one the same")
@@ -127,6 +124,17 @@ def restore_agent(agent: Agent, folder: str | os.PathLike[str]) -> Agent:
     agent.time = document["time"]
     _take(agent, tensors, document["recent"])
     return agent
+
+
+def _as_described_now(saved: Any, own: Any) -> Any:
+    """The config of a prior that had not learned, as `own` has it: networks had sizes, which `fit` would change."""
+    if isinstance(saved, list) and isinstance(own, list) and len(saved) == len(own):
+        return [_as_described_now(*both) for both in zip(saved, own, strict=True)]
+    if not isinstance(saved, dict) or not isinstance(own, dict):
+        return saved
+    chosen = {name: value for name, value in own.items() if name == "seed" or value is None}
+    same = {name: _as_described_now(value, own[name]) if name in own else value for name, value in saved.items()}
+    return same | chosen if "seed" in own and "seed" not in saved else same
 
 
 def _digest(prior: Path) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
+import pandas as pd
 import torch
 import yaml
 from jsonargparse import ArgumentError, class_from_function  # type: ignore[attr-defined]
@@ -37,6 +38,18 @@ USAGE = """{0} fit PLANS [--effort fast|standard|full] [--max-steps N] [--out FO
        {0} fit --config gru [--data.file PLANS] [--out FOLDER] [--SECTION.FIELD VALUE ...]
        {0} fit --resume FOLDER"""
 CONFIG, PLANS, MODEL = "run.yaml", "plans.npz", FILES[0]
+WRITTEN = (
+    PLANS,
+    *FILES,
+    "metrics.json",
+    "metrics.csv",
+    "modes.csv",
+    "learned.json",
+    "learning_curve.png",
+    "checkpoints",
+)
+"""What a run writes beside its configuration."""
+
 LAST, BEST = "checkpoints/last.ckpt", "checkpoints/best.ckpt"
 STATES = ("curve", "pytorch-lightning_version", "epoch", "global_step", "loops", "callbacks", "optimizer_states")
 """What a checkpoint must hold for a training to go on from it."""
@@ -166,7 +179,7 @@ class FitCLI(LightningCLI):
                 raise ValueError(
                     f"{self.folder}: holds a run already; --resume {self.folder} goes on with it, or give another --out"
                 )
-            if other := [name for name in (PLANS, *FILES) if (self.folder / name).exists()]:
+            if other := [name for name in WRITTEN if (self.folder / name).exists()]:
                 raise ValueError(f"out: {self.folder / other[0]} is there, and of no run; give another folder")
             self.folder.mkdir(parents=True, exist_ok=True)
 
@@ -184,8 +197,7 @@ class FitCLI(LightningCLI):
         """Train, or count; then compare and save."""
         neural, many = isinstance(model.prior, NeuralPrior), datamodule.folds > 1
         ProgressLines.last = time.monotonic()  # what is done at once is not commented on
-        if self.config.fit.modes:
-            self._choose_modes(model, datamodule)
+        modes = self._choose_modes(model, datamodule) if self.config.fit.modes else None
         settings = {} if neural and not many else self._settings(model, datamodule)
         fresh = deepcopy(model.prior) if many else None
         silent = {"progress": False} if "progress" in model.prior.fit_settings else {}
@@ -197,6 +209,7 @@ class FitCLI(LightningCLI):
         other = not neural and saved is None and (self.folder / MODEL).exists()
         if self.trainer.is_global_zero:
             self._keep(datamodule, options=not other)
+            write_frames(self.folder, {} if modes is None else {"modes": modes})
             for note in datamodule.source.notes:
                 print(f"note: {note}")
         if neural:
@@ -213,8 +226,8 @@ class FitCLI(LightningCLI):
             with self._saying_how_to_go_on(lambda: "the prior is saved"):
                 report(self.folder, model, datamodule, fresh, settings | silent)
 
-    def _choose_modes(self, model: PriorModel, data: PlansData) -> None:
-        """Choose the number of modes on the plans that the prior learns from; print and write what speaks for it."""
+    def _choose_modes(self, model: PriorModel, data: PlansData) -> pd.DataFrame:
+        """Choose the number of modes on the plans that the prior learns from; print and return what speaks for it."""
         prior, plans = model.prior, data.plans if data.folds > 1 else data.learned_from
         if not isinstance(prior, SwitchingPrior):
             raise ValueError(f"modes: a SwitchingPrior is expected (--config switching), not a {type(prior).__name__}")
@@ -226,9 +239,10 @@ class FitCLI(LightningCLI):
             generator=torch.Generator().manual_seed(data.seed),
             **config,
         )
-        write_frames(self.folder, {"modes": choice.frame()})
         Console().print(printed("Hidden modes", choice_table(choice)))
         model.prior = SwitchingPrior(**prior.config | {"num_modes": choice.chosen})
+        frame: pd.DataFrame = choice.frame()
+        return frame
 
     def _settings(self, model: PriorModel, data: PlansData) -> dict[str, Any]:
         """The settings of the recipe that the `fit` of a prior takes which trains networks inside, or none."""
@@ -286,15 +300,14 @@ class FitCLI(LightningCLI):
 
         Without `options` those of the trainer stay as they were written before.
         """
-        if self.config.fit.resume is None or not (self.folder / PLANS).exists():
-            write_plans(data.source, self.folder / PLANS)
-        config = self._as_written()
-        if (self.folder / CONFIG).exists():
-            if not options:
-                return
+        config, there = self._as_written(), (self.folder / CONFIG).exists()
+        if there:
             # What is resumed with other trainer options goes on with them when it is resumed again.
             config = yaml.safe_load((self.folder / CONFIG).read_text()) | {"trainer": config["trainer"]}
-        write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
+        if options or not there:  # before the plans: they are written when it is resumed, if they are missing
+            write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
+        if self.config.fit.resume is None or not (self.folder / PLANS).exists():
+            write_plans(data.source, self.folder / PLANS)
 
     def _train(self, model: PriorModel, data: PlansData) -> None:
         last = self.folder / LAST

@@ -118,5 +118,5 @@ def _by_number(plans: Plans, file: str, how: Mapping[str, Any]) -> bool:
 def _is_of_scores(file: Path) -> bool:
     """Whether a file is one of the tables that `score` writes."""
     with suppress(OSError, ValueError), file.open(encoding="utf-8") as lines:
-        return "bits_per_action" in lines.readline()
+        return {"log_likelihood", "bits_per_action"} <= {*lines.readline().strip().split(",")}
     return False

@@ -90,6 +90,7 @@ def publish(document: Document, folder: Path, console: Console | None = None) ->
         console: where to print; None: standard output.
 
     Raises:
+        ValueError: see `check_place`.
         OSError: the files cannot be written.
 
     Example:
@@ -111,29 +112,30 @@ def show(document: Document, console: Console) -> None:
     console.print(document.lead, highlight=False, markup=False)
 
 
-def check_place(folder: Path, frames: Iterable[str], read: Iterable[str | Path] = ()) -> None:
-    """Raise ValueError if a document that is written to a folder would replace what is no document's.
+def check_place(folder: Path, frames: Iterable[str], keys: Mapping[str, str] = {}) -> None:
+    """Raise ValueError if a document with these frames would replace a file that no earlier one wrote to a folder.
 
     Args:
-        folder: where it is written.
-        frames: the names of its frames.
-        read: files that it is made of; no CSV file of these may lie in the folder, whatever its name.
+        folder: where it is to be written.
+        frames, keys: the names of its frames, and its keys, see `Document`.
     """
-    for file in map(Path, read):
-        if file.suffix == ".csv" and file.is_file() and file.resolve().parent == folder.resolve():
-            raise ValueError(f"out: {file} lies in this folder, where tables are written; give another one")
-    if _earlier(folder) is None:
-        for name in (RESULTS, PAGE, *(f"{frame}.csv" for frame in frames)):
-            if (folder / name).exists():
-                raise ValueError(f"out: {folder / name} is there, and of no earlier report; give another folder")
+    earlier = _earlier(folder)
+    names = [] if earlier else [RESULTS, PAGE]
+    names += [f"{name}.csv" for name in frames if keys.get(name, name) not in earlier]
+    for path in (folder / name for name in names):
+        if path.exists():
+            raise ValueError(
+                f"out: {path} is there, and of no earlier report; give another folder, or move it away: finished jobs"
+                " are kept"
+            )
 
 
-def _earlier(folder: Path) -> dict[str, Any] | None:
-    """The results of an earlier document in a folder, or None."""
+def _earlier(folder: Path) -> dict[str, Any]:
+    """The results of an earlier document in a folder; empty if there is none."""
     with suppress(OSError, ValueError):
         content = read_json(folder / RESULTS)
-        return content if isinstance(content, dict) and {"settings", "versions"} <= content.keys() else None
-    return None
+        return content if isinstance(content, dict) and {"settings", "versions"} <= content.keys() else {}
+    return {}
 
 
 def write_document(document: Document, folder: Path) -> None:
@@ -145,12 +147,13 @@ def write_document(document: Document, folder: Path) -> None:
         ValueError: see `check_place`.
         OSError: the files cannot be written.
     """
-    check_place(folder, document.frames)
+    check_place(folder, document.frames, document.keys)
     folder.mkdir(parents=True, exist_ok=True)
-    names, content = {key: name for name, key in document.keys.items()}, _earlier(folder) or {}
+    names, content = {key: name for name, key in document.keys.items()}, _earlier(folder)
     earlier = {names.get(key, key) for key, rows in content.items() if isinstance(rows, list)} - {*document.frames}
-    write_json(folder / RESULTS, results_of(document))  # first: it says whose the other files are
-    write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()) | document.written)
+    write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()))
+    write_json(folder / RESULTS, results_of(document))  # before the tables: it says that they are its own
+    write_frames(folder, document.written)
     shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
     write_page(folder / PAGE, document.title, document.lead, document.sections, shown, document.command)
 

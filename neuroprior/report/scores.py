@@ -1,5 +1,6 @@
 """Models scored on held-out plans: by cross-validation, or saved priors on plans that they have not learned from."""
 
+import errno
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -238,7 +239,11 @@ def load_arrays(path: Path) -> Arrays:
     try:
         with np.load(path, allow_pickle=False) as file:
             return dict(file)
-    except (FileNotFoundError, PermissionError):
+    except MemoryError:
         raise
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # else a place in the file that is not there
+            raise
+        raise ValueError(str(error)) from error
     except Exception as error:  # from wherever in the archive it is damaged: zlib's, the tokenizer's, ...
         raise ValueError(str(error)) from error

@@ -12,6 +12,7 @@ from neuroprior import (
     ExhaustivePlanner,
     GRUPrior,
     MarkovPrior,
+    MixturePrior,
     Plans,
     SamplingPlanner,
     TabularWorld,
@@ -459,27 +460,48 @@ def test_bad_agents(given, word):
         agent(**given)
 
 
-def test_a_planner_of_an_expert_that_would_be_replaced_is_refused():
-    chain = MarkovPrior(4, 1)
-    prior = CombinedPrior(4, experts=[UniformPrior(4), chain])
+def test_a_planner_of_an_expert_that_the_prior_would_replace_is_refused():
+    plans = Plans(torch.randint(4, (30, 6), generator=seeded(0)), 4)
+    prior = CombinedPrior(4, effort="fast").fit(plans)
+    assert prior.given is None
     with refuses("planner: it samples from an expert of the prior"):
-        agent(prior, planner=sampler(chain))
-    agent(prior, planner=sampler(chain), learn_every=None).run(6)
-    agent(prior).run(12)
-    agent(prior, planner=sampler(MarkovPrior(4, 1))).run(12)
+        agent(prior, planner=sampler(prior.alternatives[0]))
+    agent(prior, planner=sampler(MarkovPrior(4, 1)), learn_every=None).run(6)
 
 
-def test_a_network_goes_on_from_an_older_checkpoint(tmp_path):
+@pytest.mark.parametrize("pause", [6, 18])
+def test_a_planner_of_a_given_expert_learns_along_also_after_a_pause(pause, tmp_path):
+    def one():
+        chain = MarkovPrior(4, 1)
+        prior = CombinedPrior(4, experts=[UniformPrior(4), chain, MarkovPrior(4, 2), GRUPrior(4, 8)])
+        return agent(prior, planner=sampler(chain), training={"max_steps": 2})
+
+    whole, first = one(), one()
+    done = whole.run(30)
+    first.run(pause)
+    again = restore_agent(one(), save_agent(first, tmp_path))
+    rest = again.run(30 - pause)
+    assert rest.actions.equal(done.actions[:, pause:])
+    assert again.generator.get_state().equal(whole.generator.get_state())
+    plans = torch.tensor([[0, 1, 1, 2, 3], [3, 3, 0, 0, 2]])
+    assert again.planner.prior.log_prob(plans).equal(whole.planner.prior.log_prob(plans))
+    assert not again.planner.prior.log_prob(plans).allclose(UniformPrior(4).log_prob(plans))
+
+
+@pytest.mark.parametrize("inside", [lambda gru: gru, lambda gru: MixturePrior(4, [MarkovPrior(4, 1), gru])])
+def test_a_network_goes_on_from_an_older_checkpoint(inside, tmp_path):
     """Of before its first fit: it had the sizes that `fit` would change, and no seed."""
-    save_agent(agent(GRUPrior(4)), tmp_path)
+    save_agent(agent(inside(GRUPrior(4))), tmp_path)
     path = tmp_path / "agent.json"
     text = json.loads(path.read_text())
-    text["agent"]["config"] |= {"hidden_size": 64, "num_layers": 1, "lags": 16, "dropout": 0.0}
-    del text["agent"]["config"]["seed"]
+    config = text["agent"]["config"]
+    config = config["experts"][1]["config"] if "experts" in config else config
+    config |= {"hidden_size": 64, "num_layers": 1, "lags": 16, "dropout": 0.0}
+    del config["seed"]
     path.write_text(json.dumps(text))
-    restore_agent(agent(GRUPrior(4)), tmp_path).run(2)
+    restore_agent(agent(inside(GRUPrior(4))), tmp_path).run(2)
     with refuses("config"):
-        restore_agent(agent(GRUPrior(4, hidden_size=8)), tmp_path)
+        restore_agent(agent(inside(GRUPrior(4, hidden_size=8))), tmp_path)
 
 
 def test_bad_runs():

@@ -72,6 +72,10 @@ def test_tables_of_others_are_not_written_over(tmp_path):
         command.score(str(tmp_path / "prior"), str(data / "plans.csv"), out=str(data))
     assert (data / "plans.csv").read_bytes() == before
     assert [path.name for path in data.iterdir()] == ["plans.csv"]
+    # A report's own table of that name has bits per action, too.
+    (data / "plans.csv").write_text("model,bits_per_action\nmine,1\n")
+    with refuses("out: ", "plans.csv is there"):
+        command.score(str(tmp_path / "prior"), str(tmp_path / "plans.npz"), out=str(data))
     (tmp_path / "out" / "groups.csv").write_text("group,weight\na,1\n")
     with refuses("groups.csv is there"):
         scored(tmp_path, drawn(9, group=torch.arange(9) % 3))

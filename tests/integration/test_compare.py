@@ -114,11 +114,12 @@ def test_priors_of_a_finished_comparison_are_put_beside(tmp_path, monkeypatch, c
     both = run(tmp_path / "both", *options, "--kinds", "transformer", "--beside", str(tmp_path / "one"))["rows"]
     assert [row["prior"] for row in both] == ["uniform", "markov-1", "transformer", "gru"]
     assert both[-1] == next(row for row in one if row["prior"] == "gru")
-    more = [*options, "--kinds", "transformer", "--out", str(tmp_path / "more"), "--beside", str(tmp_path / "one")]
+    more = [*options, "--seeds", "2", "--processes", "1", "--kinds", "transformer", "--out", str(tmp_path / "more")]
+    more += ["--beside", str(tmp_path / "one")]
     capsys.readouterr()
     for changed, said in [
         (["--seeds", "3"], "1 of 3 runs are not finished in"),
-        (["--worlds", "maze", "grid", "--seeds", "2"], "2 of 4 runs are not finished in"),
+        (["--worlds", "maze", "grid"], "2 of 4 runs are not finished in"),
         (["--starts", "5"], "has no comparison of the same settings"),
         (["--planners", "sampling"], "beside: priors are compared"),
     ]:
@@ -128,9 +129,17 @@ def test_priors_of_a_finished_comparison_are_put_beside(tmp_path, monkeypatch, c
         assert error.count("\n") == 1
         assert said in error
     assert not (tmp_path / "more").exists()
+    run(tmp_path / "one", *options, "--kinds", "markov", "--seeds", "1")  # not all of the runs
+    assert main(["compare", *more]) == 0
+    (first,) = (path.parent for path in (tmp_path / "one").glob("runs/*/maze-1.json"))
     run(tmp_path / "one", *options, "--kinds", "markov")
-    assert main(["compare", *more, "--seeds", "2"]) == 2
-    assert "has 2 comparisons of these settings; keep one of" in capsys.readouterr().err
+    capsys.readouterr()
+    assert main(["compare", *more]) == 2
+    assert "has 2 comparisons of these settings; give " in capsys.readouterr().err
+    assert main(["compare", *more[:-1], str(first)]) == 0
+    assert results(tmp_path / "more")["settings"]["beside"] == [str(first)]
+    assert main(["compare", *more[:-1], str(tmp_path / "more")]) == 2
+    assert "is the folder of this comparison" in capsys.readouterr().err
 
 
 def test_runs_from_other_starts_are_not_put_beside(tmp_path, monkeypatch, capsys):

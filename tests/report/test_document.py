@@ -1,6 +1,7 @@
 """The files of a document of results."""
 
 import json
+from dataclasses import replace
 from io import StringIO
 
 import pandas as pd
@@ -84,4 +85,12 @@ def test_files_of_others_are_not_written_over(name, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == [name]
     (tmp_path / name).unlink()
     write_document(document, tmp_path)
+    # Beside an earlier report, too; what the earlier one wrote is its own.
+    more = replace(document, frames={"one": document.frames["one"], "two": document.frames["one"]})
+    (tmp_path / "two.csv").write_text("a\n1\n")
+    with refuses("out: ", "two.csv is there"):
+        write_document(more, tmp_path)
+    (tmp_path / "two.csv").unlink()
+    write_document(more, tmp_path)
     write_document(document, tmp_path)
+    assert {path.name for path in tmp_path.glob("*.csv")} == {"one.csv"}

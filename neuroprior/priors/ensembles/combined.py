@@ -154,17 +154,23 @@ class CombinedPrior(MixturePrior):
         return super().learned | own
 
     def restore(self, learned: dict[str, Any]) -> None:
+        # Experts that were given stay the objects that they are: a planner may sample from one of them.
+        numbers, mine = learned.get("given"), [] if self.given is None else self.given[0]
+        own = dict(zip(numbers, mine, strict=True)) if isinstance(numbers, list) and len(numbers) == len(mine) else {}
+        place = len(learned.get("kept", self.experts))
         if "kept" in learned:
-            kept = [as_prior(e) for e in learned["kept"]]
+            kept = [_restored(own.get(number), e) for number, e in enumerate(learned["kept"])]
             self.experts = nn.ModuleList(kept).to(self.device)
         super().restore(learned)
         if not isinstance(learned["tried"], int) or learned["tried"] < 0:
             raise ValueError(f"tried: an integer of at least 0 is expected, not {learned['tried']!r}")
         self.tried = learned["tried"]
         for name in ("spare", "left_out"):
-            aside = [as_prior(e) for e in learned.get(name, [])]
-            for e, own in zip(aside, learned.get(name, []), strict=True):
-                e.restore(own["learned"])
+            described_ones = learned.get(name, [])
+            aside = [_restored(own.get(place + number), e) for number, e in enumerate(described_ones)]
+            place += len(aside)
+            for e, one in zip(aside, described_ones, strict=True):
+                e.restore(one["learned"])
             setattr(self, name, nn.ModuleList(aside).to(self.device))
         # In files of older versions a flag: whether `fit` begins with those that are there, or chooses anew.
         every, given = [*self.alternatives, *priors_in(self.left_out)], learned.get("given", True)
@@ -505,3 +511,12 @@ def with_pool(forecasts: Tensor, powers: Tensor) -> Tensor:
     """Log-probabilities `[..., E, A]`, and behind them their pool's, `[..., E + 1, A]`."""
     pooled = torch.einsum("...ea,e->...a", forecasts.clamp(min=LEAST), powers.to(forecasts)).log_softmax(-1)
     return torch.cat([forecasts, pooled[..., None, :]], -2)
+
+
+def _restored(own: Prior | None, description: Mapping[str, Any]) -> Prior:
+    """The expert that is described: that of one's own, if this is alike but for what `fit` chose, or a new one."""
+    if own is not None and type(own).__name__ == description["prior"]:
+        given = {name: value for name, value in own.config.items() if value is not None and name != "seed"}
+        if all(description["config"].get(name) == value for name, value in given.items()):
+            return own
+    return as_prior(description)

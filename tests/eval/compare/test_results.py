@@ -554,3 +554,13 @@ def test_the_middle_of_two_numbers_of_plans_one_of_which_is_infinite_is_on_the_s
     runs = [run("maze", s, [entry("uniform", curve(1)), entry("gru", curve(0.5 if s < 3 else 2))]) for s in range(6)]
     (row,) = found(Results(runs, ASKED).efficiency, prior="gru")
     assert (row["needed"], row["factor"], row["reached"]) == (None, None, 3)
+
+
+def test_the_most_context_is_not_that_of_the_last_entry():
+    """Other runs may have been put beside: their entries come last, and have less."""
+    runs = worlds(["maze", "grid"], 4, TIMES | {"combined": 32.0}, context=("none", "initial", "per-step"))
+    turned = [one | {"entries": one["entries"][::-1]} for one in runs]
+    by = ["prior", "context", "rounds", "num_plans"]
+    frames = [Results(some, ASKED).combined.sort_values(by, ignore_index=True) for some in (runs, turned)]
+    pd.testing.assert_frame_equal(*frames)
+    assert (frames[0]["context"] == "most").any()
