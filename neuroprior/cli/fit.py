@@ -180,7 +180,10 @@ class FitCLI(LightningCLI):
                     f"{self.folder}: holds a run already; --resume {self.folder} goes on with it, or give another --out"
                 )
             if other := [name for name in WRITTEN if (self.folder / name).exists()]:
-                raise ValueError(f"out: {self.folder / other[0]} is there, and of no run; give another folder")
+                raise ValueError(
+                    f"out: {self.folder / other[0]} is there, and of no run that began; move it away, or give another"
+                    " folder"
+                )
             self.folder.mkdir(parents=True, exist_ok=True)
 
     def instantiate_trainer(self, **more: Any) -> Trainer:
@@ -300,14 +303,15 @@ class FitCLI(LightningCLI):
 
         Without `options` those of the trainer stay as they were written before.
         """
-        config, there = self._as_written(), (self.folder / CONFIG).exists()
-        if there:
-            # What is resumed with other trainer options goes on with them when it is resumed again.
-            config = yaml.safe_load((self.folder / CONFIG).read_text()) | {"trainer": config["trainer"]}
-        if options or not there:  # before the plans: they are written when it is resumed, if they are missing
-            write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
         if self.config.fit.resume is None or not (self.folder / PLANS).exists():
             write_plans(data.source, self.folder / PLANS)
+        config = self._as_written()
+        if (self.folder / CONFIG).exists():
+            if not options:
+                return
+            # What is resumed with other trainer options goes on with them when it is resumed again.
+            config = yaml.safe_load((self.folder / CONFIG).read_text()) | {"trainer": config["trainer"]}
+        write_whole(self.folder / CONFIG, yaml.safe_dump(config, sort_keys=False, allow_unicode=True).encode())
 
     def _train(self, model: PriorModel, data: PlansData) -> None:
         last = self.folder / LAST

@@ -270,7 +270,7 @@ def test_options_that_networks_inside_other_priors_cannot_have_are_refused(plans
 def test_files_of_others_are_not_written_over(name, plans_file, tmp_path, capsys):
     (tmp_path / name).write_bytes(Path(plans_file).read_bytes())
     assert main(["fit", "--config", "markov", "--data.file", plans_file, "--out", str(tmp_path)]) == 2
-    assert f"out: {tmp_path / name} is there, and of no run" in capsys.readouterr().err
+    assert f"out: {tmp_path / name} is there, and of no run that began; move it away" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
