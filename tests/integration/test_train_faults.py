@@ -53,12 +53,16 @@ def test_a_mistyped_file_does_not_block_the_folder(tmp_path, capsys):
     assert main([*arguments, "--data.file", str(tmp_path / "plans.npz")]) == 0
 
 
-def test_the_plans_of_an_earlier_try_are_not_kept(tmp_path):
-    """A try that ended between the two files of a run leaves plans; the next try, with others, is of its own."""
+def test_plans_that_are_there_without_a_run_are_not_replaced(tmp_path, capsys):
+    """They are somebody's, or of a try that ended between the two files of a run: the next try is of its own."""
     write_plans(some_plans(), tmp_path / "plans.npz")
     (tmp_path / "run").mkdir()
     write_plans(some_plans(40), tmp_path / "run" / "plans.npz")
-    assert main([*small("markov", tmp_path / "run"), "--data.file", str(tmp_path / "plans.npz")]) == 0
+    arguments = [*small("markov", tmp_path / "run"), "--data.file", str(tmp_path / "plans.npz")]
+    one_line(capsys, arguments, "plans.npz is there, and of no run that began; move it away")
+    assert len(read_plans(tmp_path / "run" / "plans.npz")) == 40
+    (tmp_path / "run" / "plans.npz").rename(tmp_path / "theirs.npz")
+    assert main(arguments) == 0
     assert len(read_plans(tmp_path / "run" / "plans.npz")) == 300
     rows = metrics(tmp_path / "run")["rows"]
     assert main(["fit", "--resume", str(tmp_path / "run")]) == 0
