@@ -129,7 +129,7 @@ def report(
         check_sizes(modes=number)
     file = "" if isinstance(plans, Plans) else str(plans)
     if out is not None:
-        check_place(Path(out), ["plans"])  # before hours of work
+        check_place(Path(out), ["plans"] if "scores" in sections else [])  # before hours of work
     reading: dict[str, Any] = {"num_actions": num_actions, "action_names": action_names, "columns": columns}
     reading |= {"missing": missing, "merge_repeats": merge_repeats, "max_gap": max_gap}
     if priors is not None:
