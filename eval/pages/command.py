@@ -16,7 +16,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 HOURS = {
     "paper": "0.3+",
     "mice": "0.7",
-    "compare": "9.1",
+    "compare": "10.5",
     "planners": "0.7",
     "puzzles": "1+",
     "modes": "0.2+",
