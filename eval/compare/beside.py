@@ -5,15 +5,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from eval.compare.results import PRIOR
 from eval.compare.run import Settings
 from eval.worlds.runs import Run, read_run
 from neuroprior._files import read_json
 
 FREE = ("kinds", "priors", "digests", "context")
 """What may differ between comparisons: it says which priors they have, not where these plan."""
-
-PLACE = ("planner", "prior", "context", "rounds")
-"""What names an entry of a run."""
 
 Result = Mapping[str, Any]
 
@@ -68,18 +66,20 @@ def _with(mine: Result, other: Result) -> dict[str, Any]:
     if _starts(mine) != _starts(other):
         where = f"{mine['world']}, seed {mine['seed']}"
         raise ValueError(f"beside: {where}: random plans do not reach the same; the worlds or starts were others")
-    known = {tuple(entry[name] for name in PLACE) for entry in mine["entries"]}
-    rounds = {(entry["prior"], entry["context"]) for entry in mine["curriculum"]}
-    more = [entry for entry in other["entries"] if tuple(entry[name] for name in PLACE) not in known]
-    later = [entry for entry in other["curriculum"] if (entry["prior"], entry["context"]) not in rounds]
     return dict(mine) | {
-        "entries": [*mine["entries"], *more],
-        "curriculum": [*mine["curriculum"], *later],
+        "entries": _joined(mine["entries"], other["entries"], ("planner", *PRIOR)),
+        "curriculum": _joined(mine["curriculum"], other["curriculum"], PRIOR[:2]),
         "transitions": other.get("transitions", {}) | mine.get("transitions", {}),
     }
+
+
+def _joined(mine: Sequence[Result], others: Sequence[Result], by: Sequence[str]) -> list[Result]:
+    """Rows, and those of others that differ from all of them in `by`."""
+    known = {tuple(row[name] for name in by) for row in mine}
+    return [*mine, *(row for row in others if tuple(row[name] for name in by) not in known)]
 
 
 def _starts(result: Result) -> Any:
     """What is the same from the same starts, whatever the priors: what plans without a prior reach."""
     random = [entry["share"] for entry in result["entries"] if entry["prior"] in (None, "uniform")]
-    return json.loads(json.dumps([result["length"], result["num_starts"], result["budgets"], random]))
+    return [result["length"], result["num_starts"], result["budgets"], random]

@@ -139,9 +139,9 @@ def report(
             "models": given_models,
             "modes": modes,
             "max_steps": max_steps,
+            "inputs": None if tuple(inputs) == INPUTS[:2] else inputs,
+            "effort": None if effort == "standard" else effort,
         }
-        of_fits |= {"inputs": None if tuple(inputs) == INPUTS[:2] else inputs}
-        of_fits |= {"effort": None if effort == "standard" else effort}
         if without := [name for name, value in of_fits.items() if value is not None]:
             raise ValueError(f"priors: they are scored on the plans as they are; leave {', '.join(without)} out")
         if isinstance(priors, Prior | str) or any(isinstance(one, Prior) for one in priors):
