@@ -3,9 +3,5 @@
 # ruff: noqa: F401
 import tests.support.pinned.analysis
 import tests.support.pinned.experiments
-import tests.support.pinned.interfaces
 import tests.support.pinned.planners
-import tests.support.pinned.plans
 import tests.support.pinned.priors
-import tests.support.pinned.report
-import tests.support.pinned.worlds

@@ -50,10 +50,11 @@ from neuroprior.worlds import (
     sokoban,
 )
 from tests.support.pinned.data import behaviour
-from tests.support.pinned.worlds import LEVELS
 from tests.support.sources import TablePrior, random_world, seeded, stochastic_world
 from tests.support.unchanged import case
 from tests.support.vectors import Cart, drift
+
+LEVELS = ["#######\n#@ $ .#\n#######", "######\n#.$  #\n# +$ #\n#    #\n######"]
 
 
 def chain(num_actions: int = 3, **more: Any) -> MarkovPrior:

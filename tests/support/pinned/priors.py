@@ -10,7 +10,6 @@ from neuroprior.priors import (
     AutoregressivePrior,
     BoardNetwork,
     CombinedPrior,
-    ContextTreePrior,
     DiscretisedPrior,
     DurationModel,
     GRUPrior,
@@ -28,7 +27,6 @@ from neuroprior.priors import (
     StoredWindows,
     SwitchingPrior,
     TransformerPrior,
-    UniformPrior,
     VectorGRU,
     VectorTransformer,
     WindowSynergies,
@@ -36,7 +34,6 @@ from neuroprior.priors import (
     fit,
     learn_macros,
 )
-from neuroprior.priors.counts import BACKOFFS, BACKOFFS_TRIED, Chains
 from neuroprior.priors.durations import LAW_NAMES
 from neuroprior.priors.fitting import NAMES
 from neuroprior.priors.macros import CRITERIA
@@ -78,47 +75,6 @@ def of_prior(prior: Prior, plans: Plans, draws: bool = True) -> dict[str, Any]:
     return found
 
 
-@case
-def markov_chains():
-    found = {}
-    for context in (None, "plan", "step"):
-        plans = behaviour(context=context)
-        for order, backoff, smoothing in (
-            (0, "dirichlet", 0.5),
-            (1, "kneser-ney", 1),
-            (2, "witten-bell", 2),
-            (3, "kneser-ney", 0.5),
-        ):
-            how = {"backoff": backoff, "smoothing": smoothing, "initial": "lower" if order == 2 else "joint"}
-            prior = MarkovPrior(3, order, num_contexts=context and 3, **how).fit(plans)
-            found[f"{context}, order {order}"] = of_prior(prior, plans)
-    plans = behaviour()
-    found["matrix"] = MarkovPrior(3, 1).fit(plans).transition_matrix()
-    chains = map(Chains(plans, 2).chain, range(len(BACKOFFS_TRIED)))
-    found["chains"] = [[prior.config, float(prior.log_prob(plans).sum())] for prior in chains]
-    found["back-offs"] = {
-        name: MarkovPrior(3, 2, backoff=name).fit(plans).log_prob(behaviour(seed=1)).sum() for name in BACKOFFS
-    }
-    found["with an end"] = of_prior(MarkovPrior(4, 2).fit(plans.with_end()), plans.with_end())
-    found["more actions"] = MarkovPrior(5, 1).fit(plans.actions[:4]).transition_matrix()
-    return found
-
-
-@case
-def context_trees():
-    found = {}
-    for context in (None, "plan", "step"):
-        plans = behaviour(context=context)
-        prior = ContextTreePrior(3, 4, num_contexts=context and 3).fit(plans)
-        found[str(context)] = of_prior(prior, plans) | {"evidence": prior.log_evidence()}
-    plans = behaviour()
-    for name, how in {"rare": {"beta": 0.9}, "even": {"alpha": 0.5, "base": "uniform"}, "flat": {"depth": 0}}.items():
-        prior = ContextTreePrior(3, **how).fit(plans)
-        found[name] = {"log_prob": prior.log_prob(plans), "evidence": prior.log_evidence(), "tree": prior.map_tree()}
-    found["uniform"] = of_prior(UniformPrior(3).fit(plans), plans)
-    return found
-
-
 @case(relative=2e-3, slow=True)
 def combined():
     found = {}
@@ -128,22 +84,6 @@ def combined():
         prior = fit(plans, effort="fast", generator=generator, **QUICK)
         found[str(context)] = of_prior(prior, plans) | {"summary": prior.summary()}
         found[f"{context}, held out"] = prior.log_prob(behaviour(8, context=context, seed=3))
-    return found
-
-
-@case(relative=2e-3)
-def combined_of_chains():
-    """With experts that are given, and a share of them that changes from action to action."""
-    plans, found = behaviour(40, context="plan"), {}
-    for share in (0.0, 0.2):
-        experts = [MarkovPrior(3, 2), ContextTreePrior(3, 3, num_contexts=3), UniformPrior(3)]
-        for name, kind in (("combined", CombinedPrior), ("mixture", MixturePrior)):
-            prior = kind(3, experts, share, num_contexts=3).fit(plans, generator=seeded(0))
-            found[f"{name} {share}"] = of_prior(prior, plans)
-            weights = {key: value for key, value in prior.state_dict().items() if "expert" not in key}
-            found[f"{name} {share}"] |= {"weights": weights}
-            other = behaviour(10, context="plan", seed=4)
-            found[f"{name} {share}"]["recounted"] = prior.recount(other).log_prob(other)
     return found
 
 
