@@ -69,24 +69,20 @@ ROOMS = {
     "neuroprior.plans": "Plans",
     "neuroprior.priors": "Priors",
     "neuroprior.priors.counts": "Priors that count",
-    "neuroprior.priors.durations": "Priors with durations",
     "neuroprior.priors.ensembles": "Priors made of priors",
     "neuroprior.priors.macros": "Macro-actions",
     "neuroprior.priors.neural": "Neural priors",
-    "neuroprior.priors.patterns": "Priors of boards",
     "neuroprior.priors.switching": "Priors with hidden modes",
-    "neuroprior.priors.vectors": "Priors over vectors",
     "neuroprior.sampling": "Sampling",
     "neuroprior.worlds": "Worlds",
-    "neuroprior.worlds.continuous": "Continuous worlds",
-    "neuroprior.worlds.puzzles": "Puzzles",
     "neuroprior.values": "Values",
     "neuroprior.planners": "Planners",
-    "neuroprior.planners.continuous": "Planners of vectors",
     "neuroprior.agents": "Agents",
     "neuroprior": "The top level",
-    "neuroprior.analysis": "Analysis",
-    "neuroprior.report": "Reports",
+    "neuroprior.behaviour": "Recorded behaviour",
+    "neuroprior.behaviour.report": "Reports",
+    "neuroprior.control": "Actions that are vectors",
+    "neuroprior.puzzles": "Puzzles",
     "neuroprior.training": "Training",
     "neuroprior.testing": "Conformance suites",
 }
@@ -116,7 +112,7 @@ REFERENCE = re.compile(r"(?<![`:\w])`([^`]+)`(?![`_])")
 
 
 def target(written: str) -> str | None:
-    """The full public name that a docstring means by `MarkovPrior`, `Plans.with_end` or `neuroprior.analysis.score`."""
+    """The full public name that a docstring means by `MarkovPrior`, `Plans.with_end` or `neuroprior.sample`."""
     written = written.removesuffix("()")
     if written in NAMES or written in HOMES.values():
         return written

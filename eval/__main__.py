@@ -10,7 +10,9 @@ with ending_at_interrupts():
 
 COMMANDS = {
     "paper": Command("eval.paper.command:paper", "the paper's two simulations"),
-    "plans": Command("neuroprior.report.command:plans", "a report on a file of plans (also: neuroprior report)"),
+    "plans": Command(
+        "neuroprior.behaviour.report.command:plans", "a report on a file of plans (also: neuroprior report)"
+    ),
     "mice": Command("eval.mice.command:mice", "whether priors learned from mice in a labyrinth help a planner"),
     "compare": Command("eval.compare.command:compare", "priors, or planners, compared in many worlds at equal budget"),
     "curriculum": Command("eval.compare.curriculum:curriculum", "what priors gain from the horizon curriculum"),

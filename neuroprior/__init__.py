@@ -1,8 +1,10 @@
 """neuroprior: behavioural priors, learned from executed plans, that sample better candidate plans for a planner.
 
-Here are the names that most programs need; everything else is in its room: `neuroprior.worlds`, `neuroprior.sampling`,
-`neuroprior.priors`, `neuroprior.planners`, `neuroprior.agents`, `neuroprior.analysis`, `neuroprior.report` and
-`neuroprior.testing`. A room is imported when one of its names is first used: torch, which all need, takes seconds.
+Here are the names that most programs need. The others of the core are in its rooms: `neuroprior.plans`,
+`neuroprior.priors`, `neuroprior.sampling`, `neuroprior.worlds`, `neuroprior.planners`, `neuroprior.training`,
+`neuroprior.agents` and `neuroprior.testing`. Each wing exports its own: `neuroprior.behaviour` (recorded behaviour),
+`neuroprior.control` (actions that are vectors) and `neuroprior.puzzles` (search with a guarantee). A room is imported
+when one of its names is first used: torch, which all need, takes seconds.
 """
 
 from importlib import import_module
@@ -80,7 +82,7 @@ __all__ = [
 _ROOMS = ("plans", "worlds", "sampling", "priors", "priors.scoring", "planners")
 """Where the names above are: those that import the fewest others first."""
 
-_OTHER_ROOMS = ("agents", "analysis", "report", "testing", "training", "values")
+_OTHER_ROOMS = ("agents", "behaviour", "control", "puzzles", "testing", "training", "values")
 
 if not TYPE_CHECKING:
 

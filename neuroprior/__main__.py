@@ -10,7 +10,9 @@ with ending_at_interrupts():
 
 COMMANDS = {
     "fit": Command("neuroprior.cli.fit:run", "train a prior on executed plans and save it", raw=True),
-    "report": Command("neuroprior.report.command:plans", "report on a file of plans: structure, models, figures"),
+    "report": Command(
+        "neuroprior.behaviour.report.command:plans", "report on a file of plans: structure, models, figures"
+    ),
     "score": Command("neuroprior.cli.score:score", "log-likelihood and bits per action of plans under a saved prior"),
     "sample": Command("neuroprior.cli.sample:sample", "new plans from a saved prior"),
     "example": Command("neuroprior.cli.example:example", "write a small file of plans to try the other commands on"),

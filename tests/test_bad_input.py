@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
+import neuroprior.behaviour as analysis
 from neuroprior import (
     ExhaustivePlanner,
     FrontierPlanner,
@@ -15,7 +16,6 @@ from neuroprior import (
     Plans,
     SamplingPlanner,
     UniformPrior,
-    analysis,
     fit,
     load,
     oracle,
@@ -25,12 +25,14 @@ from neuroprior import (
     write_plans,
 )
 from neuroprior.__main__ import main
-from neuroprior.planners import ICEMPlanner, control, expected_score
+from neuroprior.behaviour.report.figures import ethogram_figure
+from neuroprior.behaviour.report.plan_report import report
+from neuroprior.control import ICEMPlanner, PlanarArm, control
+from neuroprior.planners import expected_score
 from neuroprior.plans import folds
 from neuroprior.priors import CombinedPrior, learn_macros
-from neuroprior.report import ethogram_figure, report
 from neuroprior.values import q_learning
-from neuroprior.worlds import PlanarArm, cube
+from neuroprior.worlds import cube
 from tests.support.sources import refuses, seeded
 
 ACTIONS = torch.tensor([[0, 1]])

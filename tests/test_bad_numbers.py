@@ -25,7 +25,8 @@ from neuroprior import (
     oracle,
 )
 from neuroprior.agents import Replay
-from neuroprior.analysis import (
+from neuroprior.behaviour import (
+    SemiMarkovPrior,
     choose_modes,
     interquartile_mean,
     mean_interval,
@@ -38,20 +39,12 @@ from neuroprior.analysis import (
     ratio_difference,
     share_interval,
 )
-from neuroprior.planners import AStarPlanner, CrossEntropyPlanner, ForagingOracle, HorizonPlanner, expected_score
-from neuroprior.planners.continuous import ICEMPlanner, MPPIPlanner, ShootingPlanner
-from neuroprior.plans import VectorPlans, all_plans, folds, in_parts
-from neuroprior.priors import (
-    CombinedPrior,
-    NoisePrior,
-    PatternCounts,
-    SemiMarkovPrior,
-    StackedPrior,
-    SwitchingNetwork,
-    SwitchingPrior,
-    VectorGRU,
-)
-from neuroprior.report import report
+from neuroprior.behaviour.report.plan_report import report
+from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPlanner, VectorGRU, VectorPlans
+from neuroprior.planners import CrossEntropyPlanner, ForagingOracle, HorizonPlanner, expected_score
+from neuroprior.plans import all_plans, folds, in_parts
+from neuroprior.priors import CombinedPrior, StackedPrior, SwitchingNetwork, SwitchingPrior
+from neuroprior.puzzles import AStarPlanner, PatternCounts
 from neuroprior.sampling import most_probable, sample_distinct
 from neuroprior.training import Settings
 from neuroprior.values import can_reach, q_learning, tile_approximation, value_iteration

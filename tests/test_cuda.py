@@ -27,39 +27,31 @@ from neuroprior import (
     load,
     save,
 )
-from neuroprior.planners import (
-    AStarPlanner,
-    CrossEntropyPlanner,
-    DistinctPlanner,
-    FrontierPlanner,
-    HorizonPlanner,
-    ICEMPlanner,
-    LevinPlanner,
-    MPPIPlanner,
-    ShootingPlanner,
-    control,
-    oracle,
-)
-from neuroprior.plans import VectorPlans
-from neuroprior.priors import (
+from neuroprior.control import (
     AutoregressivePrior,
-    CombinedPrior,
     DiscretisedPrior,
-    MixturePrior,
+    DoubleIntegrator,
+    ICEMPlanner,
+    MPPIPlanner,
     NoisePrior,
-    StackedPrior,
+    PlanarArm,
+    ShootingPlanner,
     StepSynergies,
     StoredWindows,
-    SwitchingPrior,
     VectorGRU,
+    VectorPlans,
     VectorPrior,
     VectorTransformer,
     WindowSynergies,
-    recordings,
+    control,
 )
+from neuroprior.planners import CrossEntropyPlanner, DistinctPlanner, FrontierPlanner, HorizonPlanner, oracle
+from neuroprior.priors import CombinedPrior, MixturePrior, StackedPrior, SwitchingPrior
+from neuroprior.priors.neural import cuda_graphs as recordings
+from neuroprior.puzzles import AStarPlanner, LevinPlanner, sliding_tiles, sokoban
 from neuroprior.sampling import most_probable, sample_distinct, sample_in_world
 from neuroprior.testing import check_prior, check_world
-from neuroprior.worlds import DoubleIntegrator, PlanarArm, cube, maze, sliding_tiles, sokoban
+from neuroprior.worlds import cube, maze
 from tests.support.sources import seeded
 
 DEVICE = torch.device("cuda")

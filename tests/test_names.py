@@ -8,20 +8,20 @@ import torch
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
 from neuroprior.agents import Agent, Replay
-from neuroprior.analysis import forecast, infer, two_sample_tests
-from neuroprior.planners.continuous import ShootingPlanner, control
-from neuroprior.plans import VectorPlans
-from neuroprior.priors import (
+from neuroprior.behaviour import SemiMarkovPrior, two_sample_tests
+from neuroprior.control import (
     DiscretisedPrior,
-    MixturePrior,
+    DoubleIntegrator,
     NoisePrior,
-    SemiMarkovPrior,
-    StackedPrior,
+    ShootingPlanner,
     VectorGRU,
+    VectorPlans,
     VectorPrior,
+    control,
 )
+from neuroprior.priors import MixturePrior, StackedPrior, forecast, infer
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import DoubleIntegrator, gridworld
+from neuroprior.worlds import gridworld
 
 WORLD = gridworld(4, 4, edges="torus", seed=0)
 NAMES, ENDS = WORLD.action_names, ([-1.0, -1.0], [1.0, 1.0])

@@ -10,20 +10,18 @@ import torch
 import neuroprior
 from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, StackedPrior, TabularWorld, UniformPrior
 from neuroprior.__main__ import main
-from neuroprior.analysis import forecast, infer
-from neuroprior.plans import VectorPlans, read_vector_plans, vector_plans_from_trajectories, write_vector_plans
-from neuroprior.priors import (
-    BoardNetwork,
-    DurationModel,
-    LogLinearPrior,
-    SemiMarkovPrior,
-    SwitchingPrior,
+from neuroprior.behaviour import DurationModel, SemiMarkovPrior
+from neuroprior.control import (
+    DoubleIntegrator,
+    VectorPlans,
     VectorTransformer,
-    load,
-    save,
+    read_vector_plans,
+    vector_plans_from_trajectories,
+    write_vector_plans,
 )
-from neuroprior.priors.patterns import Steps
-from neuroprior.worlds import DoubleIntegrator, SokobanWorld, cube, gridworld, read_sokoban, sliding_tiles, sokoban
+from neuroprior.priors import SwitchingPrior, forecast, infer, load, save
+from neuroprior.puzzles import BoardNetwork, LogLinearPrior, SokobanWorld, Steps, read_sokoban, sliding_tiles, sokoban
+from neuroprior.worlds import cube, gridworld
 from tests.support.sources import refuses, seeded
 
 ZEROS = torch.zeros(2, 3, dtype=torch.long)
@@ -255,9 +253,9 @@ def test_weights_are_learned_from_plans_that_are_known(kind) -> None:
 
 def test_plans_of_vectors_are_fitted_by_priors_over_vectors() -> None:
     plans = VectorPlans(torch.rand(6, 5, 1), [0.0], [1.0])
-    with refuses("of vectors", "neuroprior.priors.VectorGRU(plans.action_low, plans.action_high).fit(plans)"):
+    with refuses("Plans of numbered actions", "VectorPlans"):
         neuroprior.fit(plans)  # type: ignore[arg-type]
-    prior = neuroprior.priors.VectorGRU(plans.action_low, plans.action_high, width=4)
+    prior = neuroprior.control.VectorGRU(plans.action_low, plans.action_high, width=4)
     assert prior.fit(plans, max_steps=1, progress=False).log_prob(plans).isfinite().all()
 
 

@@ -3,11 +3,9 @@
 import torch
 
 from neuroprior._compiled import compiled
-from neuroprior.planners import LevinPlanner, bootstrap
-from neuroprior.priors import LogLinearPrior
-from neuroprior.worlds import sliding_tiles
+from neuroprior.puzzles import LevinPlanner, LogLinearPrior, bootstrap, sliding_tiles
 
-assert compiled("neuroprior.planners.compiled_search") is not None
+assert compiled("neuroprior.puzzles.compiled_search") is not None
 generator = torch.Generator().manual_seed(0)
 world = sliding_tiles(shape=(3, 3), scramble=8)
 prior = LogLinearPrior(world.num_actions, num_patterns=len(world.windows.windows))

@@ -2,8 +2,7 @@
 
 import torch
 
-from neuroprior.planners import ICEMPlanner
-from neuroprior.worlds import from_mujoco
+from neuroprior.control import ICEMPlanner, from_mujoco
 
 generator = torch.Generator().manual_seed(0)
 world = from_mujoco("Reacher-v5")

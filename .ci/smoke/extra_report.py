@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from neuroprior import Plans
-from neuroprior.report import report
-from neuroprior.testing.study import simulated_study
+from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.study import simulated_study
 
 names = {"action": "behaviour", "plan": "session", "group": "animal"}
 report(Plans.from_dataframe(simulated_study(0), **names), models=["counts"], processes=1, out="report")

@@ -37,12 +37,14 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-from neuroprior.planners import AStarPlanner, ICEMPlanner, MPPIPlanner
-from neuroprior.planners import control as run_control
-from neuroprior.priors import CombinedPrior, VectorGRU, recordings
+from neuroprior.control import DoubleIntegrator, ICEMPlanner, MPPIPlanner, VectorGRU
+from neuroprior.control import control as run_control
+from neuroprior.priors import CombinedPrior
 from neuroprior.priors.ensembles.candidates import DEPTH, ORDERS, networks
+from neuroprior.priors.neural import cuda_graphs as recordings
+from neuroprior.puzzles import AStarPlanner, sliding_tiles
 from neuroprior.sampling import sample_in_world
-from neuroprior.worlds import DoubleIntegrator, GridWorld, cube, maze, sliding_tiles
+from neuroprior.worlds import GridWorld, cube, maze
 
 FOUR_ROOMS = "MiniGrid-FourRooms-v0"
 
@@ -123,7 +125,7 @@ def against_peers(
 def on_device(name: str, device: torch.device, scale: float, repetitions: int) -> Iterator[dict[str, Any]]:
     """The row of a job on an accelerator, and bytes of the device at the peak.
 
-    Seconds there, also with each step ordered by itself (see `neuroprior.priors.recordings`), and on the CPU.
+    Seconds there, also with each step ordered by itself (see `neuroprior.priors.neural.cuda_graphs`), and on the CPU.
     """
     cuda = device.type == "cuda"
     job = JOBS[name](scale)

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, TensorDataset
 
 from eval.bench.timing import Run
 from neuroprior import GRUPrior, MarkovPrior, Prior, TabularWorld, World
-from neuroprior.worlds import ContinuousWorld
+from neuroprior.control import ContinuousWorld
 
 Array = NDArray[Any]
 

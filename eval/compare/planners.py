@@ -16,6 +16,8 @@ from eval.compare.run import Contest, Contestant, Settings
 from eval.worlds import runs
 from eval.worlds.starts import Starts, worth
 from eval.worlds.suite import TASKS
+from neuroprior.behaviour.report.document import Document
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
 from neuroprior.planners import (
     CrossEntropyPlanner,
     DistinctPlanner,
@@ -26,8 +28,6 @@ from neuroprior.planners import (
     execute,
 )
 from neuroprior.planners.tuning import TEMPERATURES
-from neuroprior.report.document import Document
-from neuroprior.report.page import FigureBox, Section, Table
 from neuroprior.worlds import World
 
 ORDERS = (3,)

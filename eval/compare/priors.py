@@ -22,7 +22,7 @@ from neuroprior import (
     World,
     load,
 )
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.plans import is_per_step
 from neuroprior.priors.matching import numbers
 

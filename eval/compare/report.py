@@ -11,9 +11,9 @@ from eval.compare import figures
 from eval.compare.figures import POINTS, Style
 from eval.compare.results import AGAINST, BEST, Results, grouped, kind_of
 from eval.worlds.runs import FORMER_NAMES, across_table, plus_minus, table_by
-from neuroprior.report.document import Column, Document, table
-from neuroprior.report.figures import transition_figure
-from neuroprior.report.page import FigureBox, Section, Table, breakable
+from neuroprior.behaviour.report.document import Column, Document, table
+from neuroprior.behaviour.report.figures import transition_figure
+from neuroprior.behaviour.report.page import FigureBox, Section, Table, breakable
 
 FRAMES = {name: name for name in ("rows", "paired", "efficiency", "bits", "words", "reasons", "across", "combined")}
 FRAMES |= {"growth": "curriculum"}

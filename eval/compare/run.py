@@ -22,7 +22,7 @@ from eval.worlds.starts import Starts, starts_of
 from eval.worlds.suite import TASKS, Context, Task
 from neuroprior import ExhaustivePlanner, Plans, Prior, UniformPrior, World, collect
 from neuroprior._random import draw_seed
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.planners import extend_horizon
 from neuroprior.planners.tuning import TEMPERATURES, UNIFORM_SHARES
 from neuroprior.sampling import sample_in_world

@@ -17,10 +17,10 @@ from eval.worlds import runs
 from eval.worlds.suite import TASKS, WorldName
 from neuroprior import Plans, Prior
 from neuroprior._random import draw_seed
+from neuroprior.behaviour.report.document import Document
+from neuroprior.behaviour.report.page import Section
 from neuroprior.planners import search_weights
 from neuroprior.plans.folds import folds
-from neuroprior.report.document import Document
-from neuroprior.report.page import Section
 
 WORLDS, KINDS = ("grid", "egocentric", "taxi", "cliff"), ("markov", "gru")
 """Worlds that are tried where no others are asked for, and kinds of priors."""

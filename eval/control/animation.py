@@ -13,8 +13,7 @@ from torch import Tensor
 
 from eval.control.tasks import TASKS, Condition
 from neuroprior._files import written_whole
-from neuroprior.planners import VectorPlanner, control
-from neuroprior.worlds.continuous import ContinuousWorld, PlanarArm
+from neuroprior.control import ContinuousWorld, PlanarArm, VectorPlanner, control
 
 MILLISECONDS = 50
 """That a picture is shown."""

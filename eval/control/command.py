@@ -31,8 +31,8 @@ from eval.control.run import (
 from eval.control.tasks import CONDITIONS, TASKS, TaskName, check_there
 from eval.worlds import runs
 from neuroprior._jobs import JobRun
-from neuroprior.plans import VectorPlans, read_vector_plans, write_vector_plans
-from neuroprior.report.document import publish, write_figures
+from neuroprior.behaviour.report.document import publish, write_figures
+from neuroprior.control import VectorPlans, read_vector_plans, write_vector_plans
 
 FEW = ("half_cheetah", "arm")
 """Tasks of the default, which takes about five minutes."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from eval.control.priors import CLONING, NETWORKS, NONE, SIMPLE, parted
 from eval.worlds import runs
-from neuroprior.analysis.statistics import ENOUGH_UNITS, paired_difference
+from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, paired_difference
 
 REFERENCE = 100
 """Candidates of the plain planner whose return is to be reached with fewer, or the nearest number that is tried."""

@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 
-from neuroprior.plans import VectorPlans
-from neuroprior.priors import (
+from neuroprior.control import (
     AutoregressivePrior,
     DiscretisedPrior,
     NoisePrior,
     StepSynergies,
     StoredWindows,
     VectorGRU,
+    VectorPlans,
     VectorPrior,
     VectorTransformer,
     WindowSynergies,

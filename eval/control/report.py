@@ -11,10 +11,10 @@ from eval.control.comparison import against_simple, differences, matches, over_b
 from eval.control.priors import NONE
 from eval.control.tasks import CONDITIONS, TASKS
 from eval.worlds import runs
-from neuroprior.analysis.statistics import ENOUGH_UNITS
-from neuroprior.report.document import Column, Document, table
-from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
-from neuroprior.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS
+from neuroprior.behaviour.report.document import Column, Document, table
+from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
 
 PLACE = ["task", "condition", "planner", "prior", "budget"]
 

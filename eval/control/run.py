@@ -11,10 +11,17 @@ from torch import Tensor
 
 from eval.control.priors import CLONING, NONE, fitted
 from eval.control.tasks import TASKS, Condition
-from neuroprior.planners import Control, ICEMPlanner, MPPIPlanner, ShootingPlanner, VectorPlanner, control
-from neuroprior.plans import VectorPlans
-from neuroprior.priors import VectorPrior
-from neuroprior.worlds.continuous import ContinuousWorld
+from neuroprior.control import (
+    ContinuousWorld,
+    Control,
+    ICEMPlanner,
+    MPPIPlanner,
+    ShootingPlanner,
+    VectorPlanner,
+    VectorPlans,
+    VectorPrior,
+    control,
+)
 
 PlannerName = Literal["icem", "mppi", "shooting"]
 PLANNERS: dict[str, type[ICEMPlanner] | type[MPPIPlanner] | type[ShootingPlanner]] = {

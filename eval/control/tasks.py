@@ -6,7 +6,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
-from neuroprior.worlds.continuous import ContinuousWorld, DoubleIntegrator, PlanarArm
+from neuroprior.control import ContinuousWorld, DoubleIntegrator, PlanarArm
 
 Condition = Literal["same", "masses", "goal", "validation"]
 CONDITIONS: tuple[Condition, ...] = ("same", "masses", "goal")
@@ -43,7 +43,7 @@ def _arm(condition: Condition) -> ContinuousWorld:
 
 
 def _mujoco(name: str, goal: Any, validation: Any, condition: Condition) -> ContinuousWorld:
-    from neuroprior.worlds.continuous import from_mujoco  # needs an extra, and takes time to import
+    from neuroprior.control import from_mujoco  # needs an extra, and takes time to import
 
     goals: Goals = {"goal": goal, "validation": validation}
     world: ContinuousWorld = from_mujoco(name, masses=MASSES[condition], goal=goals.get(condition))

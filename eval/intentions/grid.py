@@ -12,8 +12,8 @@ from torch import Tensor
 from eval.worlds.labyrinth import data_digest
 from neuroprior import MarkovPrior, Plans, Prior, TabularWorld
 from neuroprior._random import draw_seed
-from neuroprior.analysis import forecast, infer
-from neuroprior.analysis.calibration import reliability
+from neuroprior.behaviour.analysis.calibration import reliability
+from neuroprior.priors import forecast, infer
 from neuroprior.priors.counts import Chains
 from neuroprior.values import value_iteration
 from neuroprior.worlds import four_rooms, maze

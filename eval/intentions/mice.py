@@ -10,8 +10,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from eval.worlds.labyrinth import DATA, arrivals, arrives_within
 from neuroprior import MarkovPrior, Plans, read_plans
-from neuroprior.analysis import infer
-from neuroprior.priors import SwitchingPrior
+from neuroprior.priors import SwitchingPrior, infer
 from neuroprior.worlds import labyrinth
 
 BLOCKS = 10

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from eval.intentions.grid import FORECAST_AFTER, SWITCH_AT
 from eval.intentions.run import LABYRINTH
 from eval.worlds import runs
-from neuroprior.analysis.calibration import Reliability
-from neuroprior.analysis.statistics import mean_interval
-from neuroprior.report.document import Column, Document, table
-from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
-from neuroprior.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.analysis.calibration import Reliability
+from neuroprior.behaviour.analysis.statistics import mean_interval
+from neuroprior.behaviour.report.document import Column, Document, table
+from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
 
 KINDS = {
     "uniform": "#7d838c",

@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 
 from eval.live.run import FORESIGHT, ORACLE, PARTS, RANDOM
 from eval.worlds import runs
-from neuroprior.analysis.statistics import mean_intervals
-from neuroprior.report.document import Column, Document, table
-from neuroprior.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
-from neuroprior.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.analysis.statistics import mean_intervals
+from neuroprior.behaviour.report.document import Column, Document, table
+from neuroprior.behaviour.report.drawing import WIDTH, at_edges, band, drawn, legend, panels
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
 
 CONDITION = ["prior", "context", "learns", "warm_start"]
 NAMES = {"prior": "prior", "context": "context", "learns": "learns"}

@@ -25,8 +25,8 @@ from eval.worlds.runs import FORMER_NAMES, check_distinct, plus_minus, table_by
 from neuroprior import read_plans
 from neuroprior._files import write_json
 from neuroprior._jobs import Progress
-from neuroprior.report.document import Column, Document, results_of, show, table, write_figures, write_frames
-from neuroprior.report.page import Section, Table
+from neuroprior.behaviour.report.document import Column, Document, results_of, show, table, write_figures, write_frames
+from neuroprior.behaviour.report.page import Section, Table
 from neuroprior.worlds import labyrinth
 
 

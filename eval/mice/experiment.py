@@ -25,7 +25,7 @@ from neuroprior import (
     oracle,
 )
 from neuroprior._random import draw_seed
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
 
 ORDERS = range(9)
 DEPTH, SHOTS, SHOT_LENGTH = 6, 256, 16

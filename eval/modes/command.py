@@ -27,10 +27,10 @@ from eval.worlds import runs
 from eval.worlds.labyrinth import DATA, data_digest
 from neuroprior import read_plans
 from neuroprior._jobs import JobRun
-from neuroprior.analysis.modes import STABLE, mode_table
-from neuroprior.report.document import Column, Document, publish, table, write_figures
-from neuroprior.report.page import FigureBox, Section, Table
-from neuroprior.report.scores import load_arrays, save_arrays
+from neuroprior.behaviour.analysis.modes import STABLE, mode_table
+from neuroprior.behaviour.report.document import Column, Document, publish, table, write_figures
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.report.scores import load_arrays, save_arrays
 
 
 def modes(

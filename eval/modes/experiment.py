@@ -11,8 +11,8 @@ from torch import Tensor
 
 from eval.worlds.labyrinth import DATA, arrivals, arrives_within
 from neuroprior import Plans, read_plans
-from neuroprior.analysis.comparison import action_bits, score_bits
-from neuroprior.analysis.modes import STABLE, agreements, mode_plans
+from neuroprior.behaviour.analysis.comparison import action_bits, score_bits
+from neuroprior.behaviour.analysis.modes import STABLE, agreements, mode_plans
 from neuroprior.plans import folds
 from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import labyrinth

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 
 from neuroprior import MacroPrior, MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.planners import OptionPlanner
 from neuroprior.priors import SwitchingPrior
 

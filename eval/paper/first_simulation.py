@@ -17,7 +17,7 @@ from eval.paper.planners import (
     share_table,
 )
 from neuroprior import ExhaustivePlanner, MarkovPrior, Plans, gridworld, oracle
-from neuroprior.analysis.statistics import best_of
+from neuroprior.behaviour.analysis.statistics import best_of
 from neuroprior.planners import Decision
 from neuroprior.plans import all_plans
 from neuroprior.worlds import GridWorld

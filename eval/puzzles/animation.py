@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from eval.puzzles.contest import LETTERS
-from neuroprior.worlds import PuzzleWorld, SlidingTilesWorld
+from neuroprior.puzzles import PuzzleWorld, SlidingTilesWorld
 
 CELL = 32
 """Pixels of a cell."""

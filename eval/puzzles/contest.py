@@ -11,30 +11,25 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
-from neuroprior.planners import (
+from neuroprior.planners import FrontierPlanner, MCTSPlanner, Planner
+from neuroprior.priors import MarkovPrior, Prior, UniformPrior, load
+from neuroprior.puzzles import (
     AStarPlanner,
     BestFirstPlanner,
-    FrontierPlanner,
-    LevinPlanner,
-    MCTSPlanner,
-    Planner,
-    Search,
-    bootstrap,
-)
-from neuroprior.planners.bootstrap import fit_solutions, read_solutions
-from neuroprior.priors import (
     BoardNetwork,
+    LevinPlanner,
     LogLinearPrior,
-    MarkovPrior,
     PatternCounts,
     PatternNetwork,
-    Prior,
-    UniformPrior,
-    load,
+    PuzzleWorld,
+    Search,
+    bootstrap,
+    sliding_tiles,
+    sokoban,
 )
-from neuroprior.worlds import PuzzleWorld, sliding_tiles, sokoban
-from neuroprior.worlds.puzzles.puzzle import Observation
-from neuroprior.worlds.puzzles.sokoban import WALL
+from neuroprior.puzzles.bootstrap import fit_solutions, read_solutions
+from neuroprior.puzzles.worlds.puzzle import Observation
+from neuroprior.puzzles.worlds.sokoban import WALL
 
 BOOTSTRAP = "bootstrap"
 """The log-linear prior that found the solutions, from which all others learn."""

@@ -19,11 +19,11 @@ from eval.worlds.runs import Seed, plus_minus
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, Prior, TransformerPrior, fit
 from neuroprior._jobs import JobRun, Progress
 from neuroprior._random import draw_seed
-from neuroprior.analysis.comparison import Score, score
-from neuroprior.analysis.statistics import paired_difference
+from neuroprior.behaviour.analysis.comparison import Score, score
+from neuroprior.behaviour.analysis.statistics import paired_difference
+from neuroprior.behaviour.report.document import Column, Document, publish, table
+from neuroprior.behaviour.report.page import Section, Table
 from neuroprior.priors.ensembles.candidates import best_chain
-from neuroprior.report.document import Column, Document, publish, table
-from neuroprior.report.page import Section, Table
 
 LENGTH = 32
 CONTEXTS = 8

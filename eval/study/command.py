@@ -12,11 +12,10 @@ from scipy import stats
 
 from neuroprior import Plans
 from neuroprior._jobs import JobRun
-from neuroprior.analysis import compare_conditions, share_interval
-from neuroprior.report.document import Document, publish, table
-from neuroprior.report.page import Section, Table
-from neuroprior.testing import simulated_study
-from neuroprior.testing.study import LONGER, MOVED
+from neuroprior.behaviour import compare_conditions, share_interval, simulated_study
+from neuroprior.behaviour.report.document import Document, publish, table
+from neuroprior.behaviour.report.page import Section, Table
+from neuroprior.behaviour.study import LONGER, MOVED
 
 LEVEL = 0.05
 TOGETHER = 10
@@ -54,7 +53,7 @@ def study(
 ) -> None:
     """Simulated studies with known truth: how often each test of conditions finds an effect that is there, or is not.
 
-    Twelve animals, two sessions each: six of them treated, or each once; see `neuroprior.testing.simulated_study`.
+    Twelve animals, two sessions each: six of them treated, or each once; see `neuroprior.behaviour.simulated_study`.
 
     Args:
         studies: simulated studies without an effect, for each design.

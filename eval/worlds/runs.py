@@ -18,7 +18,7 @@ from jsonargparse.typing import extend_base_type, restricted_number_type
 
 from neuroprior._files import read_json
 from neuroprior._jobs import JobRun
-from neuroprior.analysis.statistics import (
+from neuroprior.behaviour.analysis.statistics import (
     holm,
     interquartile_gap,
     interquartile_mean,
@@ -26,8 +26,8 @@ from neuroprior.analysis.statistics import (
     paired_difference,
     probability_of_improvement,
 )
-from neuroprior.report.document import Column, Document, publish, table
-from neuroprior.report.page import Table
+from neuroprior.behaviour.report.document import Column, Document, publish, table
+from neuroprior.behaviour.report.page import Table
 
 MAKERS = ("gymnasium", "minigrid", "mujoco")
 """Packages of which another version may make other worlds."""

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from neuroprior._files import written_whole
-from neuroprior.testing import simulated_study
+from neuroprior.behaviour.study import simulated_study
 
 
 def example(file: str) -> None:

@@ -21,7 +21,9 @@ from lightning_utilities.core.rank_zero import rank_zero_only
 from rich.console import Console
 
 from neuroprior._files import write_whole
-from neuroprior.analysis import choose_modes
+from neuroprior.behaviour.analysis.modes import choose_modes
+from neuroprior.behaviour.report.document import printed, write_frames
+from neuroprior.behaviour.report.modes import choice_table
 from neuroprior.cli.fit_recipe import PlansData, PriorModel, recipe_path, recipes
 from neuroprior.cli.fit_report import report
 from neuroprior.cli.program import one_line
@@ -29,8 +31,6 @@ from neuroprior.plans import write_plans
 from neuroprior.priors import Prior, SwitchingPrior, load
 from neuroprior.priors.neural import NeuralPrior
 from neuroprior.priors.serialization import FILES
-from neuroprior.report.document import printed, write_frames
-from neuroprior.report.modes import choice_table
 from neuroprior.training import Settings, make_trainer, quiet, run_training
 from neuroprior.training.trainer import ProgressLines
 

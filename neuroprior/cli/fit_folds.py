@@ -10,14 +10,14 @@ import numpy as np
 import torch
 
 from neuroprior._jobs import JobRun
-from neuroprior.analysis.comparison import Score, action_bits, baselines, score_bits
+from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits
+from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT, Arrays
+from neuroprior.behaviour.report.scores import load_arrays, save_arrays
 from neuroprior.cli.fit_recipe import PlansData
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import divisible, fair_split, folds
 from neuroprior.plans.sequences import plans_digest
 from neuroprior.priors import Prior
-from neuroprior.report.fits import ACTIONS, CONTEXT, Arrays
-from neuroprior.report.scores import load_arrays, save_arrays
 
 TRAINED = "trained"
 """The recipe's prior among the models of a fold."""

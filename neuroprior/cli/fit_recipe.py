@@ -10,8 +10,10 @@ import torch
 import yaml
 
 from neuroprior.planners import Planner, collect
-from neuroprior.plans import Columns, Missing, PastDurations, Plans, read_plans
+from neuroprior.plans import Plans, read_plans
+from neuroprior.plans.columns import Columns, Missing
 from neuroprior.plans.folds import fair_split, longest_cut, num_units, ungrouped
+from neuroprior.plans.past_durations import PastDurations
 from neuroprior.priors import Prior
 from neuroprior.priors.fitting import make_prior
 from neuroprior.priors.prior import context_arguments

@@ -10,13 +10,13 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from neuroprior._files import versions, write_json
-from neuroprior.analysis.comparison import Score, baselines, never_taken, score, too_few, unit_name
+from neuroprior.behaviour.analysis.comparison import Score, baselines, never_taken, score, too_few, unit_name
+from neuroprior.behaviour.report.document import printed, records, table, write_figures, write_frames
 from neuroprior.cli.fit_folds import TRAINED, cross_validated
 from neuroprior.cli.fit_recipe import PlansData, PriorModel
 from neuroprior.priors import CombinedPrior, Prior, save
 from neuroprior.priors.fitting import name_of
 from neuroprior.priors.scoring import keep_learned
-from neuroprior.report.document import printed, records, table, write_figures, write_frames
 
 
 def report(

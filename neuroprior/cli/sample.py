@@ -8,8 +8,9 @@ import torch
 from jsonargparse.typing import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from neuroprior.behaviour.durations.semi_markov import SemiMarkovPrior
 from neuroprior.plans import Plans, write_plans
-from neuroprior.priors import Prior, SemiMarkovPrior, load
+from neuroprior.priors import Prior, load
 
 
 def sample(

@@ -8,13 +8,14 @@ from typing import Any
 import pandas as pd
 from rich.console import Console
 
-from neuroprior.analysis.comparison import action_bits, score_bits, too_few, unit_name
-from neuroprior.plans import Columns, Missing, Plans, read_plans
+from neuroprior.behaviour.analysis.comparison import action_bits, score_bits, too_few, unit_name
+from neuroprior.behaviour.report.document import printed, table, write_frames
+from neuroprior.plans import Plans, read_plans
+from neuroprior.plans.columns import Columns, Missing
 from neuroprior.plans.io import is_table
 from neuroprior.priors import load
 from neuroprior.priors.matching import learned_names, match_plans, numbered_note, taken_note, with_contexts_of
 from neuroprior.priors.scoring import learned_from, scores_by
-from neuroprior.report.document import printed, table, write_frames
 
 UNITS = ("plan", "group", "condition")
 """What has a table of its own, if the plans have it."""

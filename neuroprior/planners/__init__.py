@@ -1,16 +1,5 @@
 """Planners: they choose, for each start, a plan with a high score; executing, collecting and scoring plans."""
 
-from neuroprior.planners.best_first import AStarPlanner, BestFirstPlanner, LevinPlanner, Search
-from neuroprior.planners.bootstrap import Sweep, bootstrap
-from neuroprior.planners.continuous import (
-    Control,
-    ICEMPlanner,
-    MPPIPlanner,
-    ShootingPlanner,
-    VectorDecision,
-    VectorPlanner,
-    control,
-)
 from neuroprior.planners.cross_entropy import CrossEntropyPlanner
 from neuroprior.planners.distinct import DistinctPlanner
 from neuroprior.planners.exact import expected_score, oracle
@@ -28,9 +17,6 @@ from neuroprior.planners.sampling import SamplingPlanner
 from neuroprior.planners.tuning import Tuned, best_sampling, proposers, sampling_for, search_weights
 
 __all__ = [
-    "AStarPlanner",
-    "BestFirstPlanner",
-    "Control",
     "CrossEntropyPlanner",
     "Decision",
     "DistinctPlanner",
@@ -40,24 +26,14 @@ __all__ = [
     "FrontierPlanner",
     "HorizonPlanner",
     "HorizonRound",
-    "ICEMPlanner",
-    "LevinPlanner",
     "MCTSPlanner",
-    "MPPIPlanner",
     "OptionPlanner",
     "Planner",
     "PriorPlanner",
     "SamplingPlanner",
-    "Search",
-    "ShootingPlanner",
-    "Sweep",
-    "bootstrap",
     "Tuned",
-    "VectorDecision",
-    "VectorPlanner",
     "best_sampling",
     "collect",
-    "control",
     "execute",
     "expected_score",
     "extend_horizon",

@@ -1,5 +1,6 @@
 """Executed plans: the action sequences that were chosen before, from which a prior learns; reading, writing, folds."""
 
+from neuroprior.plans.columns import Columns, Missing
 from neuroprior.plans.folds import BLOCKS, FEWEST_UNITS, divisible, folds, in_parts
 from neuroprior.plans.io import (
     from_trajectories,
@@ -9,7 +10,6 @@ from neuroprior.plans.io import (
     write_minari,
     write_plans,
 )
-from neuroprior.plans.io.vectors import read_vector_plans, vector_plans_from_trajectories, write_vector_plans
 from neuroprior.plans.past_durations import PastDurations
 from neuroprior.plans.plans import (
     Plans,
@@ -20,17 +20,14 @@ from neuroprior.plans.plans import (
     has_patterns,
 )
 from neuroprior.plans.sequences import is_per_step
-from neuroprior.plans.tables import Columns, Missing
-from neuroprior.plans.vector_plans import VectorPlans
 
 __all__ = [
     "BLOCKS",
     "Columns",
-    "Missing",
     "FEWEST_UNITS",
+    "Missing",
     "PastDurations",
     "Plans",
-    "VectorPlans",
     "action_dtype",
     "all_plans",
     "check_context",
@@ -43,10 +40,7 @@ __all__ = [
     "is_per_step",
     "read_minari",
     "read_plans",
-    "read_vector_plans",
     "to_trajectories",
-    "vector_plans_from_trajectories",
     "write_minari",
     "write_plans",
-    "write_vector_plans",
 ]

@@ -1,9 +1,10 @@
 """What the readers of plans share: opening files, columns of numbers or names, padding."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 import torch
@@ -11,12 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neuroprior._checks import check_single_precision
+from neuroprior._registry import Registry
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.floating[Any]]
 Names = tuple[str, ...]
 Place = Callable[[int], str]
 """Where an entry stands: its position among all the entries to "FILE, line N"."""
+
+Missing = Literal["gap", "label", "error"]
+"""What rows without a label do in tables of events."""
 
 MOST_ENTRIES = 2**33
 """Entries of padded plans beyond which a file is refused."""
@@ -29,6 +34,9 @@ BLOCK = 2**20
 SHOWN = 8
 """Names in a note; more are left out."""
 
+READERS: Registry[Callable[..., dict[str, Any]]] = Registry()
+"""Readers of tables that a wing adds: of a frame of "events" to the fields of `Plans`."""
+
 MISSING_LABELS = frozenset(
     ("", "nan", "na", "n/a", "n.a.", "<na>", "null", "?", "-", "#n/a", "#value!", "#ref!", "#name?", "#div/0!", "#num!")
 )
@@ -38,6 +46,46 @@ NAMED = ("group", "condition")
 """Columns in which names may stand beside numbers, and numbers need not be whole, such as a dose: all are names
 then.
 """
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Which columns of a table of events hold what; where none is given, the column of that name, if there is one.
+
+    Attributes:
+        action: what was done: names, or whole numbers from 0.
+        plan: which rows belong together, such as the session; with a group, the same name in two groups is two plans.
+            Without it each group is one plan, and without a group the whole table is one.
+        context: what was known when the action was chosen: a column of names or whole numbers, or columns of features.
+        group: what is independent, such as the animal.
+        condition: what is to be compared, such as the treatment or the genotype; one for each plan.
+        start: when the action began: numbers, times of day or dates; the rows of a plan are put in this order.
+        stop: when it ended, as `start`.
+        duration: how long it took, in place of `stop`; where both are there, it counts.
+        event_type: START, STOP or POINT, where the start and the stop of an action are rows of their own, as in the
+            tabular export of BORIS; `start` is the time of each row then.
+
+    Example:
+        >>> Columns(action="behaviour", plan="session", group="animal").group
+        'animal'
+    """
+
+    action: str | None = None
+    plan: str | None = None
+    context: str | Sequence[str] | None = None
+    group: str | None = None
+    condition: str | None = None
+    start: str | None = None
+    stop: str | None = None
+    duration: str | None = None
+    event_type: str | None = None
+
+
+def fields_of_events(frame: Any, columns: Columns | Mapping[str, Any] | None = None, **options: Any) -> dict[str, Any]:
+    """Return what `Plans` are made of, by name, from a frame with one action a row; see `Plans.from_dataframe`."""
+    read = READERS.find("events")
+    assert read is not None
+    return read(frame, columns, **options)
 
 
 def is_missing(text: str) -> bool:

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_same_names, check_seed, check_sizes
-from neuroprior.plans.plans import Plans, check_are_plans
+from neuroprior.plans.plans import Plans
 from neuroprior.plans.sequences import Sequences, is_per_step
-from neuroprior.plans.vector_plans import VectorPlans
 
 FEWEST_UNITS = 2
 """Independent units that an interval needs; where there are fewer groups (or plans), a finer unit is taken."""
@@ -130,8 +129,8 @@ def folds(plans: Sequences, number: int, seed: int = 0) -> list[tuple[Tensor, Te
         >>> [(len(training), len(held_out)) for training, held_out in folds(plans, 3)]
         [(4, 2), (4, 2), (4, 2)]
     """
-    if not isinstance(plans, VectorPlans):
-        check_are_plans(plans)
+    if not isinstance(plans, Sequences):
+        raise ValueError(f"plans: Plans are expected, not {type(plans).__name__}")
     grouped = plans.group is not None and len(plans.group.unique()) >= FEWEST_UNITS
     unit = plans.group.unique(return_inverse=True)[1].cpu() if grouped and plans.group is not None else None
     unit = torch.arange(len(plans)) if unit is None else unit

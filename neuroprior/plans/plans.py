@@ -11,10 +11,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from neuroprior._checks import check_count, check_memory, check_range, check_sizes, is_integer
-from neuroprior.plans.columns import check_distinct
+from neuroprior.plans.columns import Columns, Missing, check_distinct, fields_of_events
 from neuroprior.plans.rows import check_readable, rows_of
 from neuroprior.plans.sequences import Sequences, check_index, is_per_step
-from neuroprior.plans.tables import Columns, Missing, fields_of
 
 MOST_BITS = 48
 """The most binary digits of the number of plans that `all_plans` lists, on any machine."""
@@ -227,7 +226,7 @@ class Plans(Sequences):
             ValueError: a column is not there, or an entry is wrong; the message names the row.
         """
         columns = Columns(action, plan, context, group, condition, start, stop, duration, event_type)
-        fields = fields_of(
+        fields = fields_of_events(
             frame,
             columns,
             missing=missing,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans
-from neuroprior.priors.fitting import NAMES, MakePrior, fit
+from neuroprior.priors.fitting import PRIORS, MakePrior, fit
 from neuroprior.priors.matching import match_plans
 from neuroprior.priors.prior import Prior
 
@@ -75,7 +75,7 @@ class PriorEstimator:
         Raises:
             ValueError: a setting that the prior does not have, or plans that it cannot learn from.
         """
-        make = NAMES.get(self.prior, self.prior) if isinstance(self.prior, str) else self.prior
+        make = PRIORS.find(self.prior) or self.prior if isinstance(self.prior, str) else self.prior
         taken = () if isinstance(make, str) else inspect.signature(make).parameters
         own = {name: value for name, value in self.settings.items() if name in taken}
         others = {name: value for name, value in self.settings.items() if name not in taken}

@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuroprior.plans import Plans, VectorPlans
+from neuroprior._registry import Registry
+from neuroprior.plans import Plans
+from neuroprior.plans.sequences import Sequences
 from neuroprior.priors.counts import ContextTreePrior, MarkovPrior
-from neuroprior.priors.durations import SemiMarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
 from neuroprior.priors.ensembles.candidates import Effort
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
@@ -35,7 +36,7 @@ def fit(
         plans: `Plans`, or integers `[N, L]` for plans without context, of as many actions as occur.
         prior: its class, such as `GRUPrior`; by default `CombinedPrior`, which combines priors of every kind. Or a
             function that makes it, such as `partial(GRUPrior, hidden_size=128)`, called with the number of actions and,
-            where it takes it, `num_contexts` or `context_size`; or one of the names in `NAMES`. A prior that cannot
+            where it takes it, `num_contexts` or `context_size`; or one of the names in `PRIORS`. A prior that cannot
             take the context of the plans ignores it.
         effort: how much the combined prior spends on networks: "fast", "standard" (default) or "full"; see
             `CombinedPrior`.
@@ -60,20 +61,18 @@ def fit(
             " its own fit(plans)"
         )
     given: object = plans
-    if isinstance(given, VectorPlans):
-        raise ValueError(
-            "plans: these are of vectors, which priors over vectors learn, such as"
-            " neuroprior.priors.VectorGRU(plans.action_low, plans.action_high).fit(plans)"
-        )
+    if isinstance(given, Sequences) and not isinstance(given, Plans):
+        raise ValueError(f"plans: Plans of numbered actions are expected, not {type(given).__name__}")
     if not isinstance(plans, Plans):
         actions = as_actions(plans)
         plans = Plans(actions, int(actions.max()) + 1 if actions.numel() else 1)
     if not plans.mask().any():
         raise ValueError(f"plans: at least one action to learn from is expected, and the {len(plans)} plans have none")
     if isinstance(prior, str):
-        if prior not in NAMES:
-            raise ValueError(f"prior: one of {', '.join(NAMES)} is expected, not {prior!r}")
-        prior = NAMES[prior]
+        kind = PRIORS.find(prior)
+        if kind is None:
+            raise ValueError(f"prior: one of {', '.join(PRIORS)} is expected, not {prior!r}")
+        prior = kind
     if not callable(prior):
         raise ValueError(f"prior: a class, a function or a name is expected, not {prior!r}")
     if effort is not None:
@@ -104,7 +103,7 @@ def _mixture(num_actions: int, num_contexts: int | None = None) -> MixturePrior:
     return MixturePrior(num_actions, [kind(num_actions, num_contexts=num_contexts) for kind in kinds])
 
 
-NAMES: dict[str, MakePrior] = {
+_CORE: dict[str, MakePrior] = {
     "combined": CombinedPrior,
     "uniform": UniformPrior,
     "markov": MarkovPrior,
@@ -113,12 +112,13 @@ NAMES: dict[str, MakePrior] = {
     "transformer": TransformerPrior,
     "stacked": StackedPrior,
     "mixture": _mixture,
-    "semi-markov": SemiMarkovPrior,
     "switching": SwitchingPrior,
 }
+
+PRIORS: Registry[MakePrior] = Registry(**_CORE)
 """Priors that `fit` knows by name."""
 
 
 def name_of(prior: Prior) -> str:
-    """The name of a prior in tables: that in `NAMES`, or of its class."""
-    return next((name for name, kind in NAMES.items() if kind is type(prior)), type(prior).__name__)
+    """The name of a prior in tables: that in `PRIORS`, or of its class."""
+    return next((name for name, kind in PRIORS.items() if kind is type(prior)), type(prior).__name__)

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import check_memory, check_range, check_same_names, check_sizes, is_integer, kind_of
-from neuroprior.plans import PastDurations, Plans, check_context, check_patterns, has_patterns, is_per_step
+from neuroprior.plans import Plans, check_context, check_patterns, has_patterns, is_per_step
+from neuroprior.plans.past_durations import PastDurations
 from neuroprior.priors.saved import SavedModule
 from neuroprior.sampling import ancestral as sampling
 from neuroprior.sampling.draws import after_end
@@ -452,17 +453,17 @@ def as_prior(given: Prior | Mapping[str, Any]) -> Prior:
     """A prior that is given, or described as in the `config` of a prior made of priors: `prior` (its class), `config`.
 
     Raises:
-        KeyError: the description lacks a key, or there is no such class.
-        ValueError: it describes another kind of module.
+        KeyError: the description lacks a key.
+        ValueError: it describes no prior that is known.
     """
     if isinstance(given, Prior):
         return given
     if not isinstance(given, Mapping):
         raise ValueError(f"a prior is expected, not {given!r}")
-    made = SavedModule.known[given["prior"]](**given["config"])
-    if not isinstance(made, Prior):
+    kind = SavedModule.known.find(given["prior"])
+    if kind is None or not issubclass(kind, Prior):
         raise ValueError(f"{given['prior']}: not a prior over numbered actions")
-    return made
+    return kind(**given["config"])
 
 
 def described(prior: Prior) -> dict[str, Any]:

@@ -8,11 +8,13 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from neuroprior._registry import Registry
+
 
 class SavedModule(nn.Module, ABC):
     """A module that `neuroprior.save` writes and `neuroprior.load` reads: a prior of actions or of vectors."""
 
-    known: ClassVar[dict[str, type["SavedModule"]]] = {}
+    known: ClassVar[Registry[type["SavedModule"]]] = Registry()
     """Every subclass by name; `load` finds a folder's class here."""
 
     tables: tuple[str, ...] = ()
@@ -26,7 +28,7 @@ class SavedModule(nn.Module, ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        SavedModule.known[cls.__name__] = cls
+        SavedModule.known.add(cls.__name__, cls)
 
     @property
     @abstractmethod
@@ -78,5 +80,7 @@ def _call(kind: type[SavedModule], config: Mapping[str, Any]) -> str:
 
 def _argument(value: Any) -> str:
     if isinstance(value, Mapping) and set(value) == {"prior", "config"}:
-        return _call(SavedModule.known[value["prior"]], value["config"])
+        kind = SavedModule.known.find(value["prior"])
+        assert kind is not None
+        return _call(kind, value["config"])
     return f"[{', '.join(map(_argument, value))}]" if isinstance(value, list) else repr(value)

@@ -3,8 +3,9 @@
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, TypeVar, overload
 
 import torch
 from safetensors import SafetensorError
@@ -12,10 +13,8 @@ from safetensors.torch import load as read_tensors
 from safetensors.torch import save as write_tensors
 
 from neuroprior._files import read_json
-from neuroprior.priors.durations.duration_model import DurationModel
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.saved import SavedModule
-from neuroprior.priors.vectors.vector_prior import VectorPrior
 
 FILES = ("model.safetensors", "config.json")
 
@@ -26,9 +25,7 @@ SPARE = 2**26
 """Numbers that a prior may hold beyond those of its file before these are read."""
 
 
-KINDS: dict[str, type] = {"actions": Prior, "vectors": VectorPrior, "durations": DurationModel}
-
-NOUNS = {"actions": "prior over actions", "vectors": "prior over vectors", "durations": "model of durations"}
+T = TypeVar("T", bound=SavedModule)
 
 
 def save(prior: SavedModule, folder: str | os.PathLike[str]) -> Path:
@@ -80,29 +77,16 @@ def written_state(prior: SavedModule) -> bytes:
 
 
 @overload
-def load(
-    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Literal["actions"] = "actions"
-) -> Prior: ...
+def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu") -> Prior: ...
 @overload
-def load(
-    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Literal["vectors"]
-) -> VectorPrior: ...
-@overload
-def load(
-    folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Literal["durations"]
-) -> DurationModel: ...
-def load(
-    folder: str | os.PathLike[str],
-    device: torch.device | str = "cpu",
-    *,
-    kind: Literal["actions", "vectors", "durations"] = "actions",
-) -> Prior | VectorPrior | DurationModel:
+def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Callable[..., T]) -> T: ...
+def load(folder: str | os.PathLike[str], device: torch.device | str = "cpu", *, kind: Any = Prior) -> SavedModule:
     """What `save` wrote to a folder.
 
     Args:
         folder: where.
         device: where the prior computes then.
-        kind: what it is a prior over: numbered "actions", or "vectors"; or "durations" for a `DurationModel`.
+        kind: the class that is expected, such as `VectorPrior` or `DurationModel`; a subclass of it will do.
 
     Raises:
         FileNotFoundError: the folder or one of its two files is not there.
@@ -118,13 +102,11 @@ def load(
         raise ValueError(f"folder: the name of a folder is expected, not {type(folder).__name__}")
     folder = Path(folder)
     config = _read_config(folder / "config.json")
-    if kind not in KINDS:
-        raise ValueError(f'kind: "actions", "vectors" or "durations" is expected, not {kind!r}')
-    saved = SavedModule.known[config["prior"]]
-    if not issubclass(saved, KINDS[kind]):
-        own = next((name for name in KINDS if issubclass(saved, KINDS[name])), None)
-        instead = "" if own is None else f'; in Python, load(folder, kind="{own}") reads it'
-        raise ValueError(f"{folder}: {config['prior']} is no {NOUNS[kind]}{instead}")
+    if not isinstance(kind, type):
+        raise ValueError(f"`kind` must be a class such as Prior, got {kind!r}")
+    if not issubclass(_class_of(config), kind):
+        name = config["prior"]
+        raise ValueError(f"{folder} must hold a {kind.__name__}, got {name}; load(folder, kind={name}) reads it")
     data = (folder / "model.safetensors").read_bytes()
     digest = hashlib.sha256(data).hexdigest()
     unfinished = folder / ".config.json.partial"
@@ -154,15 +136,21 @@ def load(
     if broken := [name for name, value in tensors.items() if value.is_floating_point() and bool(value.isnan().any())]:
         raise ValueError(f"{folder / 'model.safetensors'}: {broken[0]} has numbers that are NaN")
     try:
-        assert isinstance(prior, Prior | VectorPrior | DurationModel)
         return prior.to(device).eval()
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device: {str(device)!r} cannot be used here ({str(error).splitlines()[0][:200]})") from error
 
 
+def _class_of(config: dict[str, Any]) -> type[SavedModule]:
+    """The class that a configuration names, which `_read_config` has found to be known."""
+    kind = SavedModule.known.find(config["prior"])
+    assert kind is not None
+    return kind
+
+
 def _made(config: dict[str, Any]) -> SavedModule:
     """The prior that a configuration describes, before its tensors are loaded."""
-    prior = SavedModule.known[config["prior"]](**config["config"])
+    prior = _class_of(config)(**config["config"])
     prior.restore(config["learned"])
     return prior
 
@@ -187,7 +175,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     missing = [key for key in ("prior", "config", "learned", "sha256") if key not in config]
     if missing:
         raise ValueError(f"{path}: {missing[0]!r} is missing")
-    if not isinstance(config["prior"], str) or config["prior"] not in SavedModule.known:
+    if not isinstance(config["prior"], str) or SavedModule.known.find(config["prior"]) is None:
         raise ValueError(f"{path}: the prior {config['prior']!r} is not known; import the module that defines it first")
     for key in ("config", "learned"):
         if not isinstance(config[key], dict):

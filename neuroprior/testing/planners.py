@@ -2,34 +2,21 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import is_integer
 from neuroprior.planners import Decision, Planner, oracle
-from neuroprior.planners.continuous import VectorPlanner
 from neuroprior.priors import Prior, UniformPrior
 from neuroprior.testing.chi_square import chi_square
 from neuroprior.testing.rules import FALSE_ALARM, raises, require
-from neuroprior.testing.vector_planners import check_vector_planner
 from neuroprior.worlds import TabularWorld, World
 
 Make = Callable[[Prior, int, int], Planner]
 
 
-@overload
-def check_planner(
-    make: Callable[..., VectorPlanner], enough: int = 512, seed: int = 0, *, vectors: Literal[True]
-) -> None: ...
-
-
-@overload
-def check_planner(make: Make, enough: int = 512, seed: int = 0, *, vectors: Literal[False] = False) -> None: ...
-
-
-def check_planner(make: Callable[..., Any], enough: int = 512, seed: int = 0, *, vectors: bool = False) -> None:
+def check_planner(make: Make, enough: int = 512, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless a planner does what a planner must.
 
     In small random tables, where all or only some actions are legal: a decision has the right shapes, its plan is legal
@@ -38,21 +25,11 @@ def check_planner(make: Callable[..., Any], enough: int = 512, seed: int = 0, *,
     torch's global generator is not used; it plans for no starts at all; ties are broken uniformly at random (a
     chi-square test with a false-alarm probability of 1e-6); states that are not the world's raise ValueError.
 
-    Of a planner of vectors (`VectorPlanner`), from several starts and over several decisions: shapes; the plan is
-    between the bounds, even where noise of the prior goes beyond them, and has the score that it says when it is
-    executed (unless the planner `averages`), with many candidates a higher one than random plans have; its model steps
-    are those that it takes, `num_plans * length`; the same seed gives the same decision, and torch's global generator
-    is not used; equal starts get different random numbers, and no start's decision depends on the others; at
-    `prior_share` 0 the prior changes nothing; it plans for no starts at all; rewards that are NaN, and a prior with
-    other bounds than the world's, raise ValueError.
-
     Args:
         make: `make(prior, length, num_plans)` returns the planner; one that takes no prior, or no number of plans,
-            ignores it. All must have the same objective. Of vectors: `make(length, num_plans, prior=, prior_share=)`,
-            as of the classes themselves.
-        enough: a number of plans with which it must find the best of 16; not for vectors.
+            ignores it. All must have the same objective.
+        enough: a number of plans with which it must find the best of 16.
         seed: draws worlds, starts and decisions.
-        vectors: the planner is one of vectors.
 
     Raises:
         AssertionError: the planner breaks a rule.
@@ -60,9 +37,6 @@ def check_planner(make: Callable[..., Any], enough: int = 512, seed: int = 0, *,
     Example:
         >>> check_planner(SamplingPlanner)
     """
-    if vectors:
-        check_vector_planner(make, seed)
-        return
     for legal in (False, True):
         world = _random_table(2, legal, seed)
         state = world.reset(20, torch.Generator().manual_seed(seed))

@@ -1,21 +1,19 @@
 """The conformance suite of priors."""
 
 import tempfile
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from neuroprior.plans import Plans, all_plans, is_per_step
 from neuroprior.priors import Prior, load, save
-from neuroprior.priors.vectors import VectorPrior
 from neuroprior.sampling.ancestral import sample
 from neuroprior.testing.chi_square import chi_square
-from neuroprior.testing.rules import FALSE_ALARM, require
-from neuroprior.testing.vector_priors import check_vector_prior
+from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, require
 
 
-def check_prior(prior: Prior | VectorPrior, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
+def check_prior(prior: Any, length: int | None = None, num_plans: int = 20_000, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `prior` does what a prior must.
 
     With each kind of context that it takes: stepping equals `forward`, also past its window and after states were
@@ -24,8 +22,7 @@ def check_prior(prior: Prior | VectorPrior, length: int | None = None, num_plans
     same plans and torch's global generator is left alone; saving and loading, and moving to a GPU where there is one,
     change nothing.
 
-    A prior over vectors is checked in the same way: stepping against `action_log_probs`, and, with one or two
-    dimensions, that its densities integrate to one, the masses at the bounds included, and that samples fit them.
+    A prior over vectors is checked by `neuroprior.control.check_vector_prior`.
 
     Args:
         prior: the prior to check, trained or not; over numbered actions or over vectors.
@@ -39,8 +36,7 @@ def check_prior(prior: Prior | VectorPrior, length: int | None = None, num_plans
     Example:
         >>> check_prior(MarkovPrior(3, order=1).fit(torch.tensor([[0, 1, 2, 0, 1]])))
     """
-    if isinstance(prior, VectorPrior):
-        check_vector_prior(prior, length or 5, num_plans, seed)
+    if check_by_kind(PRIOR_CHECKS, prior, length, num_plans, seed):
         return
     found = f"the class {prior.__name__}" if isinstance(prior, type) else type(prior).__name__
     require(isinstance(prior, Prior), f"prior: a Prior, as `fit` has to return it, is expected, not {found}")

@@ -1,9 +1,19 @@
 """What the conformance suites share."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from neuroprior._registry import Registry
+
+Check = Callable[[Any, int | None, int, int], None]
+
+PRIOR_CHECKS: Registry[tuple[type, Check]] = Registry()
+WORLD_CHECKS: Registry[tuple[type, Check]] = Registry()
+"""Conformance suites of priors and worlds of other kinds that wings add: the class, and its suite. It takes the object,
+the length of plans (None: the suite's choice), a number of samples or of states, and a seed."""
 
 FALSE_ALARM = 1e-6
 """The probability with which correct code fails one of the tests of random draws."""
@@ -26,4 +36,15 @@ def raises(call: Callable[[], object]) -> bool:
         call()
     except ValueError:
         return True
+    return False
+
+
+def check_by_kind(
+    checks: Registry[tuple[type, Check]], value: object, length: int | None, number: int, seed: int
+) -> bool:
+    """Run the suite of the wing whose class `value` belongs to; return whether there is one."""
+    for _, (kind, check) in checks.items():
+        if isinstance(value, kind):
+            check(value, length, number, seed)
+            return True
     return False

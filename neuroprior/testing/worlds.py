@@ -3,23 +3,24 @@
 from collections.abc import Callable
 from functools import partial
 from numbers import Integral
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import is_integer
-from neuroprior.plans.vector_plans import VectorPlans
 from neuroprior.testing.chi_square import alike
-from neuroprior.testing.rules import FALSE_ALARM, raises, require, same
+from neuroprior.testing.rules import FALSE_ALARM, WORLD_CHECKS, check_by_kind, raises, require, same
 from neuroprior.worlds import TabularWorld, World
-from neuroprior.worlds.continuous import ContinuousWorld
+
+Simulator = Any
+"""A world, of numbered actions or of vectors."""
 
 TIMES = 200
 """Rollouts from each start, in a stochastic world."""
 
 
-def check_world(world: World | ContinuousWorld, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
+def check_world(world: Any, num_states: int = 50, length: int = 6, seed: int = 0) -> None:
     """Raise AssertionError, with a message that says how, unless `world` does what a world must.
 
     `reset`, `step`, `observe`, `legal_actions`, `terminated`, `solved` and `group` return what the interface says, for
@@ -30,8 +31,7 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     1e-6 together); those of a table use common random numbers for all plans of a start. Terminated states among those
     that random plans reach stay as they are, and give a reward of 0.
 
-    Of a `ContinuousWorld` also: its bounds are finite and in order, its names one a dimension; `rollout` refuses
-    vectors beyond the bounds, NaN in plans and NaN in states.
+    A `ContinuousWorld` is checked by `neuroprior.control.check_continuous_world`.
 
     Args:
         world: the world to check.
@@ -45,27 +45,53 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
     Example:
         >>> check_world(gridworld(5, 5, seed=0))
     """
-    kinds = World | ContinuousWorld
-    require(isinstance(world, kinds), f"a World or ContinuousWorld is expected, not {type(world).__name__}")
-    if isinstance(world, World):
-        number = getattr(world, "num_actions", None)
-        some = isinstance(number, Integral) and int(number) > 0
-        require(some, f"num_actions: an integer above 0 is expected, not {number!r}")
+    if check_by_kind(WORLD_CHECKS, world, length, num_states, seed):
+        return
+    require(isinstance(world, World), f"a World is expected, not {type(world).__name__}")
+    number = getattr(world, "num_actions", None)
+    some = isinstance(number, Integral) and int(number) > 0
+    require(some, f"num_actions: an integer above 0 is expected, not {number!r}")
     generator = torch.Generator().manual_seed(seed)
-    state = world.reset(num_states, torch.Generator().manual_seed(seed))
+    state = check_reset(world, num_states, seed)
+    plans, wrong_plans = _plans(world, state, length, generator)
+    _check_illegal(world, state, generator)
+    check_dynamics(world, state, plans, wrong_plans, _check_choices, generator, seed)
+
+
+def check_reset(world: Simulator, num_states: int, seed: int) -> Tensor:
+    """The starts `[N, ...]` of a world, which are right and depend on the seed alone."""
+    state: Tensor = world.reset(num_states, torch.Generator().manual_seed(seed))
     again = world.reset(num_states, torch.Generator().manual_seed(seed))
     require(isinstance(state, Tensor), f"reset must return a tensor, not {type(state).__name__}")
     require(len(state) == num_states, f"reset({num_states}) gave {len(state)} states")
     require(not state.isnan().any(), "reset: NaN in the states")
     require(state.equal(again), "reset: the same seed gave other states")
-    if isinstance(world, ContinuousWorld):
-        plans, wrong_plans = _vectors(world, state, length, generator)
-    else:
-        plans, wrong_plans = _numbers(world, state, length, generator)
-    if isinstance(world, World):
-        _check_illegal(world, state, generator)
+    return state
+
+
+def check_dynamics(
+    world: Simulator,
+    state: Tensor,
+    plans: Tensor,
+    wrong_plans: dict[str, Tensor],
+    check_queries: Callable[[Any, Tensor], None],
+    generator: torch.Generator,
+    seed: int,
+) -> None:
+    """Steps, rollouts and queries of a world, of numbered actions or of vectors.
+
+    Args:
+        world: the world.
+        state: starts `[N, ...]`.
+        plans: `[N, 3, L]`, or `[N, 3, L, D]` of vectors.
+        wrong_plans: plans that `rollout` must refuse, by what is wrong with them.
+        check_queries: checks what else the world answers about states `[M, ...]` that plans lead to.
+        generator: draws actions.
+        seed: of steps and rollouts.
+    """
+    num_states, length = len(state), plans.shape[2]
     _check_step(world, state, plans[:, 0, 0], seed)
-    _check_reached(world, state, plans, generator)
+    _check_reached(world, state, plans, check_queries, generator)
     by_steps, rewards, random = _step_through(world, state, plans, seed)
     rollout = world.rollout(state, plans, torch.Generator().manual_seed(seed))
     require(
@@ -101,7 +127,7 @@ def check_world(world: World | ContinuousWorld, num_states: int = 50, length: in
         require(same(kept[:, :, half - 1], shorter), "rollout: states on the way are not those of shorter plans")
 
 
-def _numbers(world: World, state: Tensor, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
+def _plans(world: World, state: Tensor, length: int, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor]]:
     """Random plans of numbers `[N, 3, L]`, and wrong ones."""
     actions = world.num_actions
     plans = torch.randint(actions, (len(state), 3, length), generator=generator).to(state.device)
@@ -112,38 +138,20 @@ def _numbers(world: World, state: Tensor, length: int, generator: torch.Generato
     }
 
 
-def _vectors(
-    world: ContinuousWorld, state: Tensor, length: int, generator: torch.Generator
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Random plans of vectors `[N, 3, L, D]`, and wrong ones; bounds and names are checked."""
-    low, high = world.action_low, world.action_high
-    try:
-        world.check_bounds()
-        world.check_state(state)
-        VectorPlans(torch.zeros(0, length, len(low)), low.cpu(), high.cpu(), action_names=world.action_names)
-    except ValueError as error:
-        raise AssertionError(str(error)) from error
-    plans = low + (high - low) * torch.rand(len(state), 3, length, len(low), generator=generator).to(low.device)
-    plans = plans.to(state.device)
-    return plans, {
-        "plans of integers": plans.long(),
-        "vectors above action_high": plans + (high - low),
-        "vectors below action_low": plans - (high - low),
-        "vectors of NaN": torch.full_like(plans, torch.nan),
-        "vectors of too few dimensions": plans[..., 1:],
-    }
-
-
-def _check_reached(world: World | ContinuousWorld, state: Tensor, plans: Tensor, generator: torch.Generator) -> None:
-    """In the states that plans lead to: queries; terminated ones stay, and give nothing. NaN in states is refused."""
-    if isinstance(world, ContinuousWorld) and state.is_floating_point():
-        wrong = torch.full_like(state, torch.nan)
-        require(raises(partial(world.rollout, wrong, plans)), "rollout must raise ValueError for states of NaN")
+def _check_reached(
+    world: Simulator,
+    state: Tensor,
+    plans: Tensor,
+    check_queries: Callable[[Any, Tensor], None],
+    generator: torch.Generator,
+) -> None:
+    """In the states that plans lead to: queries; terminated ones stay, and give nothing."""
     found = [state.repeat_interleave(plans.shape[1], 0)]
     for actions in plans.flatten(0, 1).unbind(1):
         found.append(world.step(found[-1], actions, generator)[0])
     reached = torch.cat(found)
     _check_queries(world, reached)
+    check_queries(world, reached)
     ends = reached[world.terminated(reached)]
     if len(ends):
         action = plans[:, 0, 0]
@@ -172,7 +180,7 @@ def _check_illegal(world: World, state: Tensor, generator: torch.Generator) -> N
             ) from error
 
 
-def _check_step(world: World | ContinuousWorld, state: Tensor, action: Tensor, seed: int) -> None:
+def _check_step(world: Simulator, state: Tensor, action: Tensor, seed: int) -> None:
     """`step`: shapes, dtypes, seeds, and no change to what it was given."""
     kept = state.clone(), action.clone()
     outcome: object = world.step(state, action, torch.Generator().manual_seed(seed))
@@ -192,8 +200,8 @@ def _check_step(world: World | ContinuousWorld, state: Tensor, action: Tensor, s
     require(same(reward, gained), "step: the same seed gave other rewards")
 
 
-def _check_queries(world: World | ContinuousWorld, state: Tensor) -> None:
-    """`observe`, `terminated` and `legal_actions`."""
+def _check_queries(world: Simulator, state: Tensor) -> None:
+    """`observe` and `terminated`."""
     observed = world.observe(state)
     require(isinstance(observed, Tensor), f"observe must return a tensor, not {type(observed).__name__}")
     fits = (is_integer(observed) and observed.dim() in (1, 2)) or (observed.is_floating_point() and observed.dim() == 2)
@@ -208,9 +216,10 @@ def _check_queries(world: World | ContinuousWorld, state: Tensor) -> None:
     require(isinstance(ended, Tensor), f"terminated must return a tensor, not {type(ended).__name__}")
     require(ended.dtype == torch.bool and ended.shape == state.shape[:1], f"terminated must be bool [{len(state)}]")
     _check_batch("terminated", world.terminated, state, ended)
-    if isinstance(world, ContinuousWorld):
-        require(observed.is_floating_point(), f"observe must give floating point features, not {observed.dtype}")
-        return
+
+
+def _check_choices(world: World, state: Tensor) -> None:
+    """`solved`, `legal_actions` and `group`."""
     solved = world.solved(state)
     require(solved.dtype == torch.bool and solved.shape == state.shape[:1], f"solved must be bool [{len(state)}]")
     _check_batch("solved", world.solved, state, solved)
@@ -234,9 +243,7 @@ def _check_batch(name: str, query: Callable[[Tensor], Tensor], state: Tensor, wh
         require(alone, f"{name}: what is found in a state depends on its batch")
 
 
-def _step_through(
-    world: World | ContinuousWorld, state: Tensor, plans: Tensor, seed: int
-) -> tuple[Tensor, Tensor, bool]:
+def _step_through(world: Simulator, state: Tensor, plans: Tensor, seed: int) -> tuple[Tensor, Tensor, bool]:
     """Final states `[B, P]` and rewards `[B, P, L]` of single steps, and whether their outcomes are random."""
     batch, num_plans, length = plans.shape[:3]
     finals, rewards = [], []
@@ -258,7 +265,7 @@ def _step_through(
     return torch.stack(finals, 1), torch.stack(rewards, 1), random
 
 
-def _check_distribution(world: World | ContinuousWorld, state: Tensor, plans: Tensor, seed: int) -> None:
+def _check_distribution(world: Simulator, state: Tensor, plans: Tensor, seed: int) -> None:
     """Rollouts in a stochastic world against steps, `TIMES` from each start `[N, ...]` by its plan."""
     generator = torch.Generator().manual_seed(seed)
     group = torch.arange(len(state)).repeat_interleave(TIMES)

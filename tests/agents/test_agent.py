@@ -24,7 +24,7 @@ from neuroprior import (
     save,
 )
 from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
-from neuroprior.planners import AStarPlanner
+from neuroprior.puzzles import AStarPlanner
 from neuroprior.worlds import ForagingWorld, patches
 from tests.support.sources import corridor, every_plan, refuses, seeded, stochastic_world
 

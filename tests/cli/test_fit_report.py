@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans
-from neuroprior.analysis.comparison import action_bits, baselines, score
+from neuroprior.behaviour.analysis.comparison import action_bits, baselines, score
 from neuroprior.cli import fit_recipe
 from neuroprior.cli.fit_folds import cross_validated
 from neuroprior.cli.fit_recipe import PlansData, PriorModel

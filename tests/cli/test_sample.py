@@ -5,8 +5,8 @@ import torch
 
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
+from neuroprior.behaviour import SemiMarkovPrior
 from neuroprior.plans import read_plans
-from neuroprior.priors import SemiMarkovPrior
 from tests.support.sources import seeded
 
 OPTIONS = ["--num-plans", "50", "--length", "4", "--temperature", "3", "--seed", "7"]

@@ -11,10 +11,10 @@ import torch
 
 from neuroprior import MarkovPrior, Plans, save
 from neuroprior.__main__ import main
+from neuroprior.behaviour.report.plan_report import report
 from neuroprior.cli import score as command
 from neuroprior.plans import read_plans, write_plans
 from neuroprior.priors.scoring import keep_learned
-from neuroprior.report import report
 from tests.support.sources import refuses, seeded
 
 

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from neuroprior.behaviour import study
 from neuroprior.cli.example import example
-from neuroprior.testing import study
 
 ROOT = Path(__file__).parents[2]
 SITE = sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts)

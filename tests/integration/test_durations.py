@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from neuroprior.__main__ import main
+from neuroprior.behaviour import SemiMarkovPrior
 from neuroprior.plans import Plans, read_plans, write_plans
-from neuroprior.priors import GRUPrior, MarkovPrior, SemiMarkovPrior, load, match_plans
+from neuroprior.priors import GRUPrior, MarkovPrior, load, match_plans
 from tests.support.sources import seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")

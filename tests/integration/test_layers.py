@@ -7,6 +7,8 @@ from pathlib import Path
 
 import networkx
 
+from neuroprior._registry import WINGS
+
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("neuroprior", "train", "eval")
 EXPERIMENTS = "eval/worlds"
@@ -95,6 +97,21 @@ def test_experiments_do_not_import_one_another() -> None:
         for first, second in graph().edges
         if experiment(second) is not None and experiment(first) != experiment(second) and first != "eval.__main__"
     ]
+    assert not across
+
+
+def test_the_core_imports_no_wing_and_no_wing_another() -> None:
+    def wing(module: str) -> str | None:
+        return next((name for name in WINGS if module == name or module.startswith(f"{name}.")), None)
+
+    users = ("neuroprior.cli", "neuroprior.__main__")
+    across = [
+        f"{first} imports {second}"
+        for first, second in graph().edges
+        if first.startswith("neuroprior.") and not first.startswith(users)
+        if wing(second) not in (None, wing(first))
+    ]
+    assert len(WINGS) == 3
     assert not across
 
 

@@ -8,8 +8,8 @@ import torch
 
 from neuroprior import Plans, load, write_plans
 from neuroprior.__main__ import main
+from neuroprior.behaviour.report.plan_report import report
 from neuroprior.priors import SwitchingPrior
-from neuroprior.report import report
 from tests.support.sources import seeded
 
 QUICK: dict = {"models": ["counts"], "sections": ["modes"], "folds": 2, "processes": 1}
@@ -18,7 +18,7 @@ QUICK: dict = {"models": ["counts"], "sections": ["modes"], "folds": 2, "process
 @pytest.fixture(autouse=True)
 def two_folds(monkeypatch):
     """The number of modes is chosen on two folds: to fit the modes on five takes longer than all else."""
-    monkeypatch.setattr("neuroprior.analysis.modes.FOLDS", 2)
+    monkeypatch.setattr("neuroprior.behaviour.analysis.modes.FOLDS", 2)
 
 
 @pytest.fixture

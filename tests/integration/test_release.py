@@ -94,7 +94,9 @@ def test_what_needs_no_library_imports_none() -> None:
 
 
 def test_the_top_level_has_its_names_and_rooms() -> None:
-    assert {*neuroprior.__all__, "plans", "priors", "worlds", "agents", "report"} <= set(dir(neuroprior))
+    assert {*neuroprior.__all__, "plans", "priors", "worlds", "agents", "behaviour", "control", "puzzles"} <= set(
+        dir(neuroprior)
+    )
     for name in dir(neuroprior):
         assert getattr(neuroprior, name) is not None
     assert neuroprior.priors.MarkovPrior is neuroprior.MarkovPrior

@@ -11,10 +11,10 @@ import torch
 
 from eval.__main__ import main
 from neuroprior import ContextTreePrior, GRUPrior, MarkovPrior, Plans, Prior, UniformPrior, load, save
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
+from neuroprior.behaviour.report.document import records, results_of
+from neuroprior.behaviour.report.plan_report import report
 from neuroprior.plans import read_plans, write_plans
-from neuroprior.report import report
-from neuroprior.report.document import records, results_of
 from tests.support.sources import seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")

@@ -120,7 +120,7 @@ def test_notebooks_show_results(site: Path) -> None:
     [
         ("reroot", "puzzles"),
         ("sokoban", "tutorials/sokoban"),
-        ("levinplann", "api/names/neuroprior.planners.LevinPlanner"),
+        ("levinplann", "api/names/neuroprior.puzzles.LevinPlanner"),
     ],
 )
 def test_search_finds_words(site: Path, word: str, page: str) -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neuroprior import CombinedPrior, GRUPrior, MarkovPrior, Plans, StackedPrior, TransformerPrior, load
-from neuroprior.analysis import Baseline
+from neuroprior.behaviour import Baseline
 from neuroprior.plans import read_plans, write_minari, write_plans
 from neuroprior.priors.scoring import learned_from
 from neuroprior.training import PriorModule, Settings

@@ -8,7 +8,7 @@ import torch
 
 import neuroprior.cli.fit_folds
 from neuroprior import GRUPrior, MarkovPrior, Plans, load
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.plans import write_plans
 from neuroprior.plans.folds import folds
 from tests.integration.test_train import recipe, some_plans

@@ -18,18 +18,15 @@ from neuroprior import (
 )
 from neuroprior.agents import Agent
 from neuroprior.planners import (
-    AStarPlanner,
     CrossEntropyPlanner,
     DistinctPlanner,
     FrontierPlanner,
-    LevinPlanner,
     MCTSPlanner,
     best_sampling,
-    bootstrap,
     extend_horizon,
     sampling_for,
 )
-from neuroprior.worlds import sliding_tiles
+from neuroprior.puzzles import AStarPlanner, LevinPlanner, bootstrap, sliding_tiles
 
 MAKERS = {
     "exhaustive": lambda **goal: ExhaustivePlanner(3, **goal),

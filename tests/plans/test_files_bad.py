@@ -10,13 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans import (
-    VectorPlans,
-    from_trajectories,
-    read_plans,
-    vector_plans_from_trajectories,
-    write_plans,
-)
+from neuroprior.control import VectorPlans, vector_plans_from_trajectories
+from neuroprior.plans import from_trajectories, read_plans, write_plans
 from tests.support.sources import refuses
 
 ONE = Plans(torch.tensor([[0, 1]]), 2)

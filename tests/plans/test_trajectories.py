@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import Plans
-from neuroprior.plans import VectorPlans, from_trajectories, read_minari, to_trajectories, write_minari
+from neuroprior.control import VectorPlans
+from neuroprior.plans import from_trajectories, read_minari, to_trajectories, write_minari
 from tests.support.sources import refuses
 
 ACTIONS = torch.tensor([[0, 2, 1], [1, 0, 0]])

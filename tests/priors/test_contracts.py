@@ -6,7 +6,8 @@ from functools import partial
 import pytest
 import torch
 
-from neuroprior import priors
+from neuroprior import behaviour, priors
+from neuroprior.behaviour import SemiMarkovPrior
 from neuroprior.plans import Plans
 from neuroprior.priors import (
     CombinedPrior,
@@ -16,13 +17,12 @@ from neuroprior.priors import (
     MarkovPrior,
     MixturePrior,
     Prior,
-    SemiMarkovPrior,
     StackedPrior,
     TransformerPrior,
     UniformPrior,
     fit,
 )
-from neuroprior.priors.fitting import NAMES
+from neuroprior.priors.fitting import PRIORS
 from neuroprior.training import Settings
 from tests.support.sources import refuses, seeded
 
@@ -72,7 +72,7 @@ def test_repr_makes_a_prior_of_the_same_configuration(name):
         if name != "uniform"
         else text == "UniformPrior(num_actions=3)"
     )
-    again = eval(text, vars(priors))
+    again = eval(text, vars(priors) | vars(behaviour))
     assert type(again) is type(prior)
     assert again.config == prior.config
     assert repr(again) == text
@@ -141,7 +141,7 @@ def test_actions_alone_are_plans_without_context(name):
         MarkovPrior(A, 1, num_contexts=C).log_prob(plans.actions)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", list(PRIORS))
 def test_fit_by_name(name, monkeypatch):
     # Chains of the first orders alone: most of the time of the combined prior is that of counting for all of them.
     monkeypatch.setattr("neuroprior.priors.ensembles.candidates.ORDERS", range(3))

@@ -305,7 +305,7 @@ def test_a_class_of_ones_own_is_found_by_name(tmp_path):
 
     save(OwnPrior(A), tmp_path)
     assert type(load(tmp_path)) is OwnPrior
-    del SavedModule.known["OwnPrior"]
+    del SavedModule.known._entries["OwnPrior"]
     refused(tmp_path, "OwnPrior", "import")
 
 

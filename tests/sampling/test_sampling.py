@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import GRUPrior, MarkovPrior, Plans, TabularWorld, TransformerPrior, UniformPrior, World, sample
-from neuroprior.priors import NoisePrior
+from neuroprior.control import NoisePrior
 from neuroprior.sampling import ancestral, draws, sample_in_world, stepping
 from neuroprior.sampling.draws import Draw
 from tests.support.sources import (

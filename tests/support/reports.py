@@ -9,9 +9,9 @@ import pytest
 
 from eval.__main__ import main
 from neuroprior import Plans
+from neuroprior.behaviour.report.document import results_of
+from neuroprior.behaviour.report.plan_report import report as report_on
 from neuroprior.plans import write_plans
-from neuroprior.report import report as report_on
-from neuroprior.report.document import results_of
 
 QUICK: dict[str, Any] = {"models": ["counts"], "max_steps": 3, "processes": 1}
 

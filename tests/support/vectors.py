@@ -2,8 +2,7 @@
 
 import torch
 
-from neuroprior.priors.vectors import GaussianForecast, VectorPrior
-from neuroprior.worlds.continuous import ContinuousWorld
+from neuroprior.control import ContinuousWorld, GaussianForecast, VectorPrior
 
 
 class Cart(ContinuousWorld):

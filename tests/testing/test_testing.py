@@ -23,10 +23,11 @@ from neuroprior import (
     from_gymnasium,
     gridworld,
 )
-from neuroprior.priors import BoardNetwork, LogLinearPrior, PatternCounts, PatternNetwork, SemiMarkovPrior
+from neuroprior.behaviour import SemiMarkovPrior
+from neuroprior.puzzles import BoardNetwork, LogLinearPrior, PatternCounts, PatternNetwork, sliding_tiles, sokoban
 from neuroprior.testing import check_prior, check_world
 from neuroprior.testing.chi_square import alike, chi_square
-from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze, sliding_tiles, sokoban
+from neuroprior.worlds import Rollout, cube, egocentric, four_rooms, maze
 from tests.support.sources import stochastic_world
 
 SOKOBAN = ["#######\n#@ $ .#\n#######", "######\n#.$  #\n# +$ #\n#    #\n######"]
@@ -545,5 +546,5 @@ def test_a_world_without_actions_and_what_is_no_world_are_refused() -> None:
     world.num_actions = 0
     with pytest.raises(AssertionError, match="num_actions: an integer above 0 is expected, not 0"):
         check_world(world)
-    with pytest.raises(AssertionError, match="a World or ContinuousWorld is expected, not int"):
+    with pytest.raises(AssertionError, match="a World is expected, not int"):
         check_world(3)  # type: ignore[arg-type]

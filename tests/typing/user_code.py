@@ -32,12 +32,11 @@ from neuroprior import (
     save,
     write_plans,
 )
-from neuroprior.analysis import mean_interval, order_selection
-from neuroprior.planners import Decision, Execution, ICEMPlanner, VectorDecision
-from neuroprior.plans import VectorPlans
-from neuroprior.priors import DurationModel, NoisePrior, VectorPrior
+from neuroprior.behaviour import DurationModel, mean_interval, order_selection
+from neuroprior.control import DoubleIntegrator, ICEMPlanner, NoisePrior, VectorDecision, VectorPlans, VectorPrior
+from neuroprior.planners import Decision, Execution
 from neuroprior.testing import check_planner, check_prior, check_world
-from neuroprior.worlds import DoubleIntegrator, GridWorld, Rollout
+from neuroprior.worlds import GridWorld, Rollout
 
 
 def behaviour(folder: Path) -> MarkovPrior:
@@ -135,8 +134,8 @@ def vectors(folder: Path) -> None:
     given = VectorPlans(torch.zeros(4, 6, 1).uniform_(-1, 1), -torch.ones(1), torch.ones(1))
     prior = NoisePrior([-1.0], [1.0], exponent=None).fit(given)
     assert_type(prior, NoisePrior)
-    assert_type(load(save(prior, folder / "noise"), kind="vectors"), VectorPrior)
-    assert_type(load(save(DurationModel(3), folder / "durations"), kind="durations"), DurationModel)
+    assert_type(load(save(prior, folder / "noise"), kind=VectorPrior), VectorPrior)
+    assert_type(load(save(DurationModel(3), folder / "durations"), kind=DurationModel), DurationModel)
     decision = ICEMPlanner(length=3, num_plans=4).plan(world, world.reset(2))
     assert_type(decision, VectorDecision)
 

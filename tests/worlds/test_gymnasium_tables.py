@@ -182,9 +182,7 @@ def test_what_cannot_occur_is_no_start():
 
 
 def test_gymnasium_is_imported_only_where_it_is_needed(monkeypatch):
-    code = (
-        "import sys, neuroprior.testing, neuroprior.worlds.continuous; print({'gymnasium', 'mujoco'} & {*sys.modules})"
-    )
+    code = "import sys, neuroprior.testing, neuroprior.control.worlds; print({'gymnasium', 'mujoco'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
     monkeypatch.setitem(sys.modules, "gymnasium", None)

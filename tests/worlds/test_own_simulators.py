@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from neuroprior.planners import ICEMPlanner, control
+from neuroprior.control import ContinuousWorld, ICEMPlanner, control, from_mujoco
 from neuroprior.testing import check_world
-from neuroprior.worlds import ContinuousWorld, from_mujoco
 
 
 class Push(ContinuousWorld):

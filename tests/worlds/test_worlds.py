@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from neuroprior import TabularWorld, World, gridworld
 from neuroprior._compiled import compiled
-from neuroprior.worlds import ContinuousWorld, Rollout
+from neuroprior.control import ContinuousWorld
+from neuroprior.worlds import Rollout
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
 
 UP, RIGHT, DOWN, LEFT = range(4)

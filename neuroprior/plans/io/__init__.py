@@ -5,14 +5,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neuroprior.plans.columns import check_names
+from neuroprior.plans.columns import Columns, Missing, check_names
 from neuroprior.plans.io.csv import read_csv, write_csv
 from neuroprior.plans.io.jsonl import read_jsonl, write_jsonl
 from neuroprior.plans.io.minari import read_minari, write_minari
 from neuroprior.plans.io.npz import read_npz, write_npz
 from neuroprior.plans.io.trajectories import from_trajectories, to_trajectories
 from neuroprior.plans.plans import Plans, check_are_plans, has_patterns
-from neuroprior.plans.tables import Columns, Missing
 
 __all__ = ["from_trajectories", "read_minari", "read_plans", "to_trajectories", "write_minari", "write_plans"]
 

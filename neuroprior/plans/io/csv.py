@@ -18,16 +18,17 @@ from neuroprior._files import written_whole
 from neuroprior.plans.columns import (
     LARGEST_FLOAT,
     Column,
+    Columns,
     Floats,
     Integers,
     Names,
+    fields_of_events,
     open_text,
 )
 from neuroprior.plans.io.assembly import assembled
 from neuroprior.plans.plans import Plans
 from neuroprior.plans.rows import check_readable, rows_of
 from neuroprior.plans.sequences import is_per_step
-from neuroprior.plans.tables import Columns, fields_of
 
 ROWS_AT_ONCE = 2**10
 """Rows that are parsed together; a few times faster than blocks that exceed the processor's cache."""
@@ -128,7 +129,7 @@ def _read_events(sheet: "_Sheet", **table: Any) -> Plans:
         # Where semicolons part the columns, commas are decimal: so spreadsheets write in much of Europe.
         decimal = "," if sheet.delimiter == ";" else "."
         place = lambda i: f"{sheet.path}, line {lines[i]}"  # noqa: E731
-        return Plans(**fields_of(frame, place=place, of=str(sheet.path), decimal=decimal, **table))
+        return Plans(**fields_of_events(frame, place=place, of=str(sheet.path), decimal=decimal, **table))
     except ValueError as error:
         named = str(sheet.path) in str(error)
         raise error if named else ValueError(f"{sheet.path}: {error}") from None
@@ -163,7 +164,7 @@ def _read_gaps(sheet: "_Sheet", action_columns: list[int], **table: Any) -> Plan
         if re.fullmatch(r"group|condition|context(_\d+)?", name)
     }
     frame = pd.DataFrame({"plan": row, "action": actions[taken]} | others)
-    fields = fields_of(frame, place=lambda i: f"{sheet.path}, line {lines[row[i]]}", of=str(sheet.path), **table)
+    fields = fields_of_events(frame, place=lambda i: f"{sheet.path}, line {lines[row[i]]}", of=str(sheet.path), **table)
     rows_of = fields.pop("plan_names", None)
     if "plan" in sheet.columns:
         called = cells[:, sheet.columns["plan"]]

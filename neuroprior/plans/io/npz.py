@@ -38,8 +38,8 @@ def read_npz(path: Path, num_actions: int | None, action_names: Names | None) ->
         raise ValueError(f"{path}: no array 'actions'; it has {', '.join(sorted([*arrays, *unused])) or 'none'}")
     if arrays["actions"].ndim == 3:
         raise ValueError(
-            f"{path}: actions {list(arrays['actions'].shape)} are vectors: in Python neuroprior.plans.read_vector_plans"
-            " reads them; programs take numbered actions"
+            f"{path}: actions {list(arrays['actions'].shape)} are vectors: in Python"
+            " neuroprior.control.read_vector_plans reads them; programs take numbered actions"
         )
     numbers: dict[str, Any] = {key: torch.from_numpy(native(arrays[key])) for key in NUMBERS if key in arrays}
     names: dict[str, Any] = {key: names_of(path, key, arrays[key]) for key in NAMES if key in arrays}

@@ -12,7 +12,7 @@ from neuroprior._checks import check_count, check_memory, check_seed, check_size
 from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import check_alike
-from neuroprior.priors import recordings
+from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.priors.neural.features import UNSCALED, Standardise
 from neuroprior.priors.prior import Prior
 from neuroprior.sampling.draws import Draw, check_possible

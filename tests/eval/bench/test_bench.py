@@ -24,9 +24,10 @@ from eval.bench.jobs import (
     source,
 )
 from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, UniformPrior, gridworld
-from neuroprior.planners import AStarPlanner
+from neuroprior.control import DoubleIntegrator
 from neuroprior.plans import all_plans
-from neuroprior.worlds import DoubleIntegrator, maze, sliding_tiles
+from neuroprior.puzzles import AStarPlanner, sliding_tiles
+from neuroprior.worlds import maze
 from tests.support.sources import FALSE_ALARM, p_value, refuses, seeded
 
 SMALL = 1e-3

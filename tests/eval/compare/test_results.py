@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from eval.compare.results import AGAINST, BEST, Results, best_difference, chosen, needed
-from neuroprior.analysis.statistics import (
+from neuroprior.behaviour.analysis.statistics import (
     holm,
     interquartile_gap,
     interquartile_mean,
@@ -18,7 +18,7 @@ from neuroprior.analysis.statistics import (
     paired_difference,
     probability_of_improvement,
 )
-from neuroprior.report.document import records
+from neuroprior.behaviour.report.document import records
 from tests.support.compare_runs import BUDGETS, TIMES, curve, entry, run, worlds
 
 ASKED = (16, 256, 4096)

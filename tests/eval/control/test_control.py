@@ -36,8 +36,7 @@ from eval.control.run import (
     tuning_run,
 )
 from eval.control.tasks import CONDITIONS, TASKS
-from neuroprior.plans import VectorPlans
-from neuroprior.worlds import PlanarArm
+from neuroprior.control import PlanarArm, VectorPlans
 from tests.support.sources import seeded
 
 pytestmark = pytest.mark.usefixtures("undrawn")

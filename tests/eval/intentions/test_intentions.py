@@ -16,8 +16,8 @@ from eval.intentions.mice import log_odds, regression, stretches
 from eval.intentions.report import compared
 from eval.worlds.labyrinth import DATA, arrives_within
 from neuroprior import read_plans
-from neuroprior.analysis import infer
 from neuroprior.plans import Plans
+from neuroprior.priors import infer
 from neuroprior.worlds import maze
 from tests.support.sources import seeded
 

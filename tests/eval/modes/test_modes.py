@@ -23,7 +23,7 @@ from eval.modes.experiment import (
 )
 from eval.worlds.labyrinth import DATA
 from neuroprior import Plans, read_plans
-from neuroprior.analysis import mode_plans
+from neuroprior.behaviour import mode_plans
 from neuroprior.plans import folds
 from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import labyrinth

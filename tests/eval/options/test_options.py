@@ -17,7 +17,7 @@ from eval.worlds.runs import Run
 from eval.worlds.starts import Starts
 from eval.worlds.suite import Task
 from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, TabularWorld, UniformPrior, collect, read_plans
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.planners import OptionPlanner
 from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import four_rooms

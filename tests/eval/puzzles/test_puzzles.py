@@ -9,7 +9,7 @@ import torch
 
 from eval.__main__ import main
 from eval.puzzles.contest import LETTERS
-from neuroprior.worlds import sliding_tiles, sokoban
+from neuroprior.puzzles import sliding_tiles, sokoban
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 

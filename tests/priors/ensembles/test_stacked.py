@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuroprior import MarkovPrior, Plans, StackedPrior, load, save
-from neuroprior.analysis.comparison import score
+from neuroprior.behaviour.analysis.comparison import score
 from neuroprior.priors.ensembles.stacked import LONG_AGO
 from neuroprior.testing import check_prior
 from tests.support.sources import seeded

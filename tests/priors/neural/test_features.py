@@ -8,8 +8,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from neuroprior import GRUPrior, Plans, TransformerPrior, load, save
-from neuroprior.plans import VectorPlans
-from neuroprior.priors import VectorGRU, VectorTransformer
+from neuroprior.control import VectorGRU, VectorPlans, VectorPrior, VectorTransformer
 from neuroprior.priors.neural.features import Standardise
 from tests.support.sources import seeded
 
@@ -164,7 +163,7 @@ def test_files_without_means_are_read_as_before(tmp_path):
     older = {"features.mean": "_mean", "features.std": "_std", "features.most": None}
     _edit(tmp_path / "vectors", lambda name: older.get(name, name))
     given = VectorPlans(torch.zeros(30, 12, 1), [-1.0], [1.0], context=plans.context)
-    assert load(tmp_path / "vectors", kind="vectors").log_prob(given).equal(vectors.log_prob(given))
+    assert load(tmp_path / "vectors", kind=VectorPrior).log_prob(given).equal(vectors.log_prob(given))
 
 
 def _edit(folder, renamed):

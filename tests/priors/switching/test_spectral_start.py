@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from neuroprior import Plans
-from neuroprior.analysis.modes import agreements
+from neuroprior.behaviour.analysis.modes import agreements
 from neuroprior.priors import SwitchingPrior
 from neuroprior.priors.switching.spectral_start import spectral_modes
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from neuroprior import score as score_table
-from neuroprior.analysis import (
+from neuroprior.behaviour import (
     action_bits,
     action_drift,
     baselines,
@@ -15,8 +15,6 @@ from neuroprior.analysis import (
     by_plan,
     by_position,
     choose_modes,
-    forecast,
-    infer,
     mode_frame,
     mode_plans,
     mode_table,
@@ -28,7 +26,7 @@ from neuroprior.analysis import (
     two_sample_tests,
     units,
 )
-from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior
+from neuroprior.priors import ContextTreePrior, MarkovPrior, SwitchingPrior, UniformPrior, forecast, infer
 from neuroprior.worlds import cube, gridworld
 from tests.support.pinned.data import behaviour, timed
 from tests.support.sources import seeded

@@ -6,22 +6,19 @@ from typing import Any
 import torch
 
 from neuroprior.agents import Agent, restore_agent, save_agent
+from neuroprior.control import DoubleIntegrator, ICEMPlanner, MPPIPlanner, ShootingPlanner, coloured_noise, control
 from neuroprior.planners import (
-    AStarPlanner,
     CrossEntropyPlanner,
     DistinctPlanner,
     ExhaustivePlanner,
     ForagingOracle,
     FrontierPlanner,
     HorizonPlanner,
-    LevinPlanner,
     MCTSPlanner,
     OptionPlanner,
     SamplingPlanner,
     best_sampling,
-    bootstrap,
     collect,
-    control,
     execute,
     expected_score,
     extend_horizon,
@@ -29,8 +26,8 @@ from neuroprior.planners import (
     sampling_for,
     search_weights,
 )
-from neuroprior.planners.continuous import ICEMPlanner, MPPIPlanner, ShootingPlanner, coloured_noise
-from neuroprior.priors import GRUPrior, LogLinearPrior, MarkovPrior, SwitchingPrior, UniformPrior
+from neuroprior.priors import GRUPrior, MarkovPrior, SwitchingPrior, UniformPrior
+from neuroprior.puzzles import AStarPlanner, LevinPlanner, LogLinearPrior, bootstrap, sliding_tiles, sokoban
 from neuroprior.sampling import (
     most_probable,
     sample,
@@ -38,17 +35,7 @@ from neuroprior.sampling import (
     sample_distinct_in_world,
     sample_in_world,
 )
-from neuroprior.worlds import (
-    DoubleIntegrator,
-    ForagingWorld,
-    cube,
-    four_rooms,
-    gridworld,
-    maze,
-    patches,
-    sliding_tiles,
-    sokoban,
-)
+from neuroprior.worlds import ForagingWorld, cube, four_rooms, gridworld, maze, patches
 from tests.support.pinned.data import behaviour
 from tests.support.sources import TablePrior, random_world, seeded, stochastic_world
 from tests.support.unchanged import case

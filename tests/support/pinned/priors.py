@@ -5,39 +5,36 @@ from typing import Any
 
 import torch
 
-from neuroprior.plans import Plans, VectorPlans
-from neuroprior.priors import (
+from neuroprior.behaviour import LAW_NAMES, DurationModel, SemiMarkovPrior
+from neuroprior.control import (
     AutoregressivePrior,
-    BoardNetwork,
-    CombinedPrior,
     DiscretisedPrior,
-    DurationModel,
+    NoisePrior,
+    StepSynergies,
+    StoredWindows,
+    VectorGRU,
+    VectorPlans,
+    VectorTransformer,
+    WindowSynergies,
+)
+from neuroprior.plans import Plans
+from neuroprior.priors import (
+    CombinedPrior,
     GRUPrior,
-    LogLinearPrior,
     MacroPrior,
     MarkovPrior,
     MixturePrior,
-    NoisePrior,
-    PatternCounts,
-    PatternNetwork,
     Prior,
-    SemiMarkovPrior,
     StackedPrior,
-    StepSynergies,
-    StoredWindows,
     SwitchingPrior,
     TransformerPrior,
-    VectorGRU,
-    VectorTransformer,
-    WindowSynergies,
     decode,
     fit,
     learn_macros,
 )
-from neuroprior.priors.durations import LAW_NAMES
-from neuroprior.priors.fitting import NAMES
+from neuroprior.priors.fitting import PRIORS
 from neuroprior.priors.macros import CRITERIA
-from neuroprior.priors.patterns import Steps
+from neuroprior.puzzles import BoardNetwork, LogLinearPrior, PatternCounts, PatternNetwork, Steps
 from tests.support.pinned.data import behaviour, timed
 from tests.support.sources import seeded
 from tests.support.unchanged import case
@@ -229,7 +226,7 @@ def patterns():
 @case(relative=2e-3)
 def fitted_by_name():
     plans, found = timed(16, 8), {}
-    for name in NAMES:
+    for name in PRIORS:
         quick = {} if name in ("uniform", "markov", "context-tree", "semi-markov", "switching") else QUICK
         if name not in ("combined", "mixture", "stacked"):
             prior = fit(plans, name, generator=seeded(0), **quick)

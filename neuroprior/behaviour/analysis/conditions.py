@@ -1,0 +1,455 @@
+"""Whether behaviour differs between conditions: in features of it, in bits, and for a classifier.
+
+Everything is tested by permuting what is independent (see `neuroprior.behaviour.analysis.permutation_design`).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import lcm, nan
+
+import numpy as np
+import torch
+from scipy.special import stdtrit
+from torch import Tensor
+
+from neuroprior._checks import check_sizes
+from neuroprior.behaviour.analysis.condition_chains import SMOOTHING, ConditionChains
+from neuroprior.behaviour.analysis.flat import FlatPlans, ranks
+from neuroprior.behaviour.analysis.permutation_design import PermutationDesign
+from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, Difference, holm, ratio_difference
+from neuroprior.plans import Plans
+from neuroprior.plans.plans import check_are_plans
+
+LEVEL = 0.05
+"""P-values below this are significant."""
+
+FEWEST_PERMUTATIONS = 999
+"""Permutations that are made whatever they cost."""
+
+ENOUGH_COUNTS = 100
+"""A feature is tested if it occurred so often, or once for each block on average."""
+
+MOST_FEATURES = {"actions": 1000, "transitions": 1000, "sequences": 100, "durations": 1000}
+"""Of each family the commonest are tested, so many at most."""
+
+LEAST_VARIANCE = 1e-6
+"""Of all variance: the least that counts as that within conditions, as units may agree at random."""
+
+TIE = 1e-8
+"""Statistics that differ by less than this, or by less than this share, are tied: rounding depends on sums' order."""
+
+NUMBERS_AT_ONCE = 2**20
+"""Statistics that are in memory at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionFamily:
+    """F features of behaviour of one kind, each with a number for each of B blocks, compared between C conditions.
+
+    Attributes:
+        name: "actions": the share of each action; "transitions": the probability of the second action after the first;
+            "sequences": the share of each sequence of three actions among all; "durations": the mean natural logarithm
+            of how long each action took.
+        features: int64 `[F, n]`: the actions of each.
+        values: float64 `[B, F]`: the number of each block; NaN where there is nothing to take it from.
+        means: float64 `[C, F]`: the mean over the units of each condition, with `low` and `high`, its 95 % interval.
+        low, high: float64 `[C, F]`.
+        difference: float64 `[3, F]`: the mean of the second of two conditions less that of the first, and the ends of
+            its 95 % interval; NaN for more than two conditions.
+        statistic: float64 `[F]`: between units Welch's t squared, or for more conditions Wald's standardised sum of
+            squares; within units the F of repeated measures (for two conditions the paired t squared).
+        p_values: float64 `[F]`: by permutation, of each feature alone.
+        corrected: float64 `[F]`: corrected for the F features: compared with the largest statistic of all in each
+            permutation (Westfall and Young 1993, single-step maxT).
+        p_value: that of the largest statistic: the test of the family.
+    """
+
+    name: str
+    features: Tensor
+    values: Tensor
+    means: Tensor
+    low: Tensor
+    high: Tensor
+    difference: Tensor
+    statistic: Tensor
+    p_values: Tensor
+    corrected: Tensor
+    p_value: float
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionPrediction:
+    """Whether knowing the condition helps to predict the actions of a held-out unit, and the actions its condition.
+
+    Attributes:
+        gain: bits per action that the chain which knows the condition takes less than the one which does not (see
+            `neuroprior.behaviour.analysis.condition_chains`), with its 95 % interval over units and its p-value by
+            permutation.
+        accuracy: the share of held-out blocks that have the highest likelihood under their own condition; the mean over
+            conditions. A tie counts one half.
+        expected: its mean over the permutations: less than 1 / C, as a unit that is held out is missing in its own
+            condition.
+        p_value: of the accuracy, by permutation; of equal accuracies that with the larger mean log odds is the better.
+        log_odds: float64 `[B, C]`: the held-out log2-likelihood of each block under each condition, less the mean of
+            those under the others.
+        sequences: int64 `[K, 2]`: the transitions that occurred; -1 for the beginning of a plan.
+        carried: float64 `[K]`: what each adds to the log odds of the right condition, bits per action in all; below 0
+            where it misleads.
+        speaks_for: int64 `[K]`: the rank of the condition under which it is most probable.
+    """
+
+    gain: Difference
+    accuracy: float
+    expected: float
+    p_value: float
+    log_odds: Tensor
+    sequences: Tensor
+    carried: Tensor
+    speaks_for: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionComparison:
+    """Whether behaviour differs between conditions.
+
+    Attributes:
+        design: the units and blocks, and what was permuted.
+        condition_names: C of them.
+        families: the features of each kind; none if nothing could be tested.
+        prediction: of actions from conditions and back; None if nothing could be tested.
+        tests: by name, the p-value of each family, "bits" and "classifier", and the same corrected for the number of
+            these tests (`neuroprior.behaviour.holm`).
+        p_value: of all tests together: Fisher's combination of their p-values, itself tested in the same permutations
+            (Pesarin and Salmaso 2010, nonparametric combination); NaN if nothing could be tested.
+        labellings: how many ways of giving blocks their conditions were compared, with the one observed.
+        exact: whether these were all.
+        smallest_p: the smallest p-value that is possible.
+        conclusive: whether there are enough units for a verdict.
+        verdict: one sentence or two.
+    """
+
+    design: PermutationDesign
+    condition_names: list[str]
+    families: list[ConditionFamily]
+    prediction: ConditionPrediction | None
+    tests: dict[str, tuple[float, float]]
+    p_value: float
+    labellings: int
+    exact: bool
+    smallest_p: float
+    conclusive: bool
+    verdict: str
+
+    def differs(self, name: str) -> bool:
+        """Whether the test of this name is significant, corrected; never where there are too few units."""
+        return self.conclusive and name in self.tests and self.tests[name][1] < LEVEL
+
+    def significant(self, family: ConditionFamily) -> Tensor:
+        """`[F]` bool: the features that differ, in a family that does."""
+        return (family.corrected < LEVEL) & self.differs(family.name)
+
+
+def compare_conditions(
+    plans: Plans,
+    permutations: int = 9_999,
+    generator: torch.Generator | None = None,
+    *,
+    max_work: int = 5 * 10**8,
+) -> ConditionComparison:
+    """Whether behaviour differs between the conditions of plans.
+
+    Units are groups (plans, where there are no groups). If each is under one condition, the conditions are permuted
+    among units; if units are under several, among the blocks of each unit. All labellings are compared where there
+    are no more than `permutations` + 1. So the tests hold however alike the plans of a unit are. The null hypothesis is
+    that units (blocks of a unit) under different conditions have the same distribution; statistics are studentised, so
+    that for many units differences in mean matter alone (Janssen 1997).
+
+    Each feature is one number for each block. As rare ones are noisy, a block's number is smoothed in tests, as if
+    `SMOOTHING` observations more were as in all units (in designs within units: in the whole unit), and weighted in
+    means by n / (n + `SMOOTHING`) for n observations. Neither depends on the conditions, nor does the choice of
+    features: the commonest that occurred at least `ENOUGH_COUNTS` times, or once for each block on average. Durations
+    of 0 and unknown ones do not count.
+
+    Args:
+        plans: with a `condition`. An end symbol is an action like others.
+        permutations: at most so many random ones.
+        generator: draws them.
+        max_work: numbers that they may compute, some ten seconds on one core; fewer permutations are made if need be,
+            but at least `FEWEST_PERMUTATIONS`.
+
+    Raises:
+        ValueError: the plans have no condition, or `permutations` or `max_work` is below 1.
+
+    Example:
+        >>> first, second = torch.tensor([[0, 1] * 10]).repeat(8, 1), torch.tensor([[0, 0, 1, 1] * 5]).repeat(8, 1)
+        >>> plans = Plans(torch.cat([first, second]), 2, group=torch.arange(16), condition=torch.arange(16) // 8)
+        >>> found = compare_conditions(plans, permutations=199, generator=torch.Generator().manual_seed(0))
+        >>> found.p_value < 0.05
+        True
+    """
+    check_are_plans(plans)
+    check_sizes(permutations=permutations, max_work=max_work)
+    design = PermutationDesign.of(plans)
+    names = [
+        plans.condition_names[c] if plans.condition_names else f"condition {c}" for c in design.conditions.tolist()
+    ]
+    if design.untestable:
+        verdict = " ".join(f"{text}." for text in (f"Not tested: {design.untestable}", design.odd) if text)
+        return ConditionComparison(design, names, [], None, {}, nan, 0, False, nan, False, verdict)
+    kept = (design.block >= 0).to(plans.actions.device)
+    plans, of_plan = plans[kept], design.block[design.block >= 0]
+    flat = _on_cpu(FlatPlans.of(plans))
+    block = of_plan[flat.plan]
+    found = [_Numbers(*family, design) for family in _counted(plans, flat, block, len(design.label))]
+    chains = ConditionChains.of(flat, block, design.unit)
+    num = len(names)
+    cost = num * (chains.cost + sum(numbers.smoothed.numel() for numbers in found) // 8)
+    drawn = min(permutations, max(max_work // max(cost, 1), FEWEST_PERMUTATIONS))
+    labellings = design.labellings(drawn, generator)
+    families, statistics = [], {}
+    for numbers in found:
+        family, statistics[numbers.name] = _tested(numbers, design, labellings)
+        families.append(family)
+    prediction, statistics["bits"], statistics["classifier"] = _predicted(
+        chains, design, labellings, block.bincount().double()
+    )
+    ranked = torch.stack([_shares_reaching(values) for values in statistics.values()])
+    p_values = ranked[:, 0].tolist()
+    tests = dict(zip(statistics, zip(p_values, holm(p_values).tolist(), strict=True), strict=True))
+    p_value = float(_shares_reaching(-ranked.log().sum(0))[0])
+    smallest = design.smallest_p(drawn)
+    conclusive = smallest < LEVEL and len(design.units) >= ENOUGH_UNITS
+    verdict = _verdict(design, names, tests, p_value, smallest, conclusive) + f" {design.odd}." * bool(design.odd)
+    exact = design.possible <= drawn + 1
+    return ConditionComparison(
+        design, names, families, prediction, tests, p_value, labellings.shape[1], exact, smallest, conclusive, verdict
+    )
+
+
+class _Numbers:
+    """The features of a family: `smoothed [B, F]` for tests, `values [B, F]` with `weights [B, F]` for means."""
+
+    def __init__(self, name: str, features: Tensor, above: Tensor, below: Tensor, design: PermutationDesign) -> None:
+        self.name, self.features = name, features
+        self.values = above / below  # 0 / 0 is NaN
+        self.weights = below / (below + SMOOTHING)
+        usual = (self.weights * self.values.nan_to_num()).sum(0) / self.weights.sum(0)
+        if design.kind == "within":
+            shape = len(design.units), len(design.conditions), -1
+            usual = (above.view(shape).sum(1) + SMOOTHING * usual) / (below.view(shape).sum(1) + SMOOTHING)
+            usual = usual[design.unit]
+        self.smoothed = (above + SMOOTHING * usual) / (below + SMOOTHING)
+
+
+def _on_cpu(flat: FlatPlans) -> FlatPlans:
+    return FlatPlans(flat.actions.cpu(), flat.plan.cpu(), flat.place.cpu(), flat.num_actions)
+
+
+def _counted(plans: Plans, flat: FlatPlans, block: Tensor, num: int) -> Iterator[tuple[str, Tensor, Tensor, Tensor]]:
+    """Name, features `[F, n]`, and the two sums `[B, F]` whose ratio is the number of a block, of each family."""
+    ones = torch.ones(len(block), dtype=torch.double)
+    for name, length in (("actions", 1), ("transitions", 2), ("sequences", 3)):
+        at = flat.starts(length)
+        features, _, counts = _sums(flat, at, length, block, num, name, ones)
+        if not len(features):
+            continue
+        below = counts.new_zeros(num, 1).index_add_(0, block[at], ones[at][:, None]).expand_as(counts)
+        if name == "transitions":
+            first, rank = flat.actions[at].unique(return_inverse=True)
+            rows = (block[at] * len(first) + rank).bincount(minlength=num * len(first)).view(num, -1).double()
+            below = rows[:, torch.searchsorted(first, features[:, 0].contiguous())]
+        yield name, features, counts, below
+    if plans.durations is not None:
+        times = plans.durations.flatten().cpu()[flat.place].double()
+        at = (times > 0).nonzero()[:, 0]
+        features, logs, counts = _sums(flat, at, 1, block, num, "durations", times.log())
+        if len(features):
+            yield "durations", features, logs, counts
+
+
+def _sums(
+    flat: FlatPlans, at: Tensor, length: int, block: Tensor, num: int, name: str, values: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Those of the sequences that begin `at` which are tested `[F, n]`; sums of `values`, and counts, in each block."""
+    rank = torch.zeros_like(at)
+    for step in range(length):
+        rank = ranks(rank * flat.num_actions + flat.actions[at + step])
+    total = rank.bincount()
+    common = total.argsort(descending=True, stable=True)[: MOST_FEATURES[name]]
+    chosen = common[total[common] >= min(num, ENOUGH_COUNTS)].sort().values
+    somewhere, place = torch.zeros_like(total), torch.full_like(total, -1)
+    somewhere[rank], place[chosen] = at, torch.arange(len(chosen))
+    features = flat.actions[somewhere[chosen][:, None] + torch.arange(length)]
+    taken = place[rank] >= 0
+    cell = block[at[taken]] * len(chosen) + place[rank[taken]]
+    counts = cell.bincount(minlength=num * len(chosen)).view(num, len(chosen)).double()
+    sums = cell.bincount(values[at[taken]], minlength=num * len(chosen)).view(num, len(chosen))
+    return features, sums, counts
+
+
+def _tested(numbers: _Numbers, design: PermutationDesign, labellings: Tensor) -> tuple[ConditionFamily, Tensor]:
+    """The family, and its largest statistic under each labelling `[P]`."""
+    size = max(NUMBERS_AT_ONCE // len(numbers.features), 1)
+    observed = _statistics(numbers.smoothed, design, labellings[:, :1])
+    greatest, reached = [], torch.zeros(len(observed), dtype=torch.double)
+    for part in labellings.split(size, 1):
+        statistics = _statistics(numbers.smoothed, design, part)
+        greatest.append(statistics.amax(0))
+        reached += (statistics >= _least(observed)).sum(1)
+    most = torch.cat(greatest)
+    above = len(most) - torch.searchsorted(most.sort().values, _least(observed[:, 0]))
+    means, low, high, difference = _estimates(numbers, design)
+    corrected = above.double() / len(most)
+    family = ConditionFamily(
+        numbers.name,
+        numbers.features,
+        numbers.values,
+        means,
+        low,
+        high,
+        difference,
+        observed[:, 0],
+        reached / len(most),
+        corrected,
+        float(corrected.min()),
+    )
+    return family, most
+
+
+def _least(statistic: Tensor) -> Tensor:
+    """What counts as at least this statistic."""
+    return statistic - TIE * (1 + statistic)
+
+
+def _statistics(values: Tensor, design: PermutationDesign, labellings: Tensor) -> Tensor:
+    """`[F, P]`: how unlike the conditions are, for `values [B, F]` under each of `labellings [B, P]`."""
+    num, within = len(design.conditions), design.kind == "within"
+    if within:
+        # What a unit has in common is no difference between conditions.
+        whole = values.view(len(design.units), num, -1)
+        values = (whole - whole.mean(1, keepdim=True)).view_as(values)
+    values = values - values.mean(0)
+    spread = values.square().mean(0).sqrt()
+    alike = spread <= 1e-12 * values.abs().amax(0).clamp(min=1)
+    values = (values / torch.where(alike, 1, spread)).masked_fill(alike, 0).T.contiguous()
+    squares, units = values.square(), len(design.units)
+    weights, means = [], []
+    for condition, size in enumerate(design.sizes):
+        taken = (labellings == condition).double()
+        mean = values @ taken / size
+        means.append(mean)
+        if not within:
+            variance = (squares @ taken / size - mean.square()).clamp(min=LEAST_VARIANCE) * size / (size - 1)
+            weights.append(size / variance)
+    if within:
+        between = units * sum(mean.square() for mean in means)
+        residual = (squares.sum(1, keepdim=True) - between).clamp(min=LEAST_VARIANCE * len(design.label))
+        return between / residual * (units - 1)
+    common = sum(w * mean for w, mean in zip(weights, means, strict=True)) / sum(weights)
+    parts = [w * (mean - common).square() for w, mean in zip(weights, means, strict=True)]
+    return torch.stack(parts).sum(0) / (num - 1)
+
+
+def _estimates(numbers: _Numbers, design: PermutationDesign) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The mean of each condition with its interval, each `[C, F]`, and the difference of two with its own `[3, F]`."""
+    values, weights = numbers.values.nan_to_num(), numbers.weights
+    each = [_mean(values[design.label == k], weights[design.label == k]) for k in range(len(design.conditions))]
+    mean, error, freedom = (torch.stack(parts) for parts in zip(*each, strict=True))
+    half = _half(error, freedom)
+    difference = torch.full((3, values.shape[1]), nan, dtype=torch.double)
+    if len(mean) == 2:
+        if design.kind == "within":
+            pair, sizes = values.view(-1, 2, values.shape[1]), weights.view(-1, 2, values.shape[1])
+            # n / (n + s) for half the harmonic mean, n, of the two numbers of observations.
+            both = 1 / (1 / sizes - 1).sum(1).add(1)
+            gap, gap_error, gap_freedom = _mean(pair[:, 1] - pair[:, 0], both)
+        else:
+            gap, gap_error = mean[1] - mean[0], error.square().sum(0).sqrt()
+            gap_freedom = error.square().sum(0).square() / (error**4 / freedom).sum(0)  # Welch and Satterthwaite
+        gap_half = _half(gap_error, gap_freedom)
+        difference = torch.stack([gap, gap - gap_half, gap + gap_half])
+    return mean, mean - half, mean + half, difference
+
+
+def _mean(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The weighted mean of `[U, F]` over units, its standard error (Cochran 1977, section 6.3), degrees of freedom."""
+    units, total = (weights > 0).sum(0).double(), weights.sum(0)
+    mean = (weights * values).sum(0) / total
+    spread = (weights * (values - mean)).square().sum(0)
+    freedom = torch.where(units > 1, units - 1, nan)
+    return mean, ((freedom + 1) / freedom * spread).sqrt() / total, freedom
+
+
+def _half(error: Tensor, freedom: Tensor) -> Tensor:
+    """Half the width of Student's interval; 0 without spread."""
+    student = torch.from_numpy(np.asarray(stdtrit(freedom.numpy(), 0.975)))
+    return torch.where(error == 0, 0, student * error)
+
+
+def _predicted(
+    chains: ConditionChains, design: PermutationDesign, labellings: Tensor, actions: Tensor
+) -> tuple[ConditionPrediction, Tensor, Tensor]:
+    """The prediction; the bits that knowing the condition saves, and the accuracy, under each labelling `[P]`."""
+    num, label = len(design.conditions), design.label
+    gains = chains.gains(labellings, num)  # [C, B, P]
+    right = gains.gather(0, labellings.long()[None])[0]
+    bits = right.sum(0)
+    others = gains.scatter(0, labellings.long()[None], -torch.inf).amax(0)
+    near = TIE * (1 + right.abs())
+    credit = (right > others + near).double() + ((right - others).abs() <= near) / 2
+    share = torch.zeros_like(bits)
+    for condition, size in enumerate(design.sizes):
+        share += (credit * (labellings == condition)).sum(0) / (num * size)
+    odds = (num * gains - gains.sum(0)) / (num - 1)
+    own = (num * right - gains.sum(0)) / (num - 1) / actions[:, None]
+    # Accuracies differ by no less than this: of equal ones the larger log odds are the better.
+    step = 1 / (2 * num * lcm(*design.sizes))
+    order = share + step * torch.tanh(own.mean(0)) / 2
+    units = len(design.units)
+    saved = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, right[:, 0])
+    sizes = torch.zeros(units, dtype=torch.double).index_add_(0, design.unit, actions)
+    mean, low, high, _ = ratio_difference(saved, sizes)
+    gain = Difference(mean, low, high, float(_shares_reaching(bits)[0]))
+    carried, speaks_for = chains.carried(label, num)
+    prediction = ConditionPrediction(
+        gain,
+        float(share[0]),
+        float(share.mean()),
+        float(_shares_reaching(order)[0]),
+        odds[:, :, 0].T,
+        chains.sequences,
+        carried / actions.sum(),
+        speaks_for,
+    )
+    return prediction, bits, order
+
+
+def _shares_reaching(statistics: Tensor) -> Tensor:
+    """`[P]`: for each labelling the share of all whose statistic is at least as large: its p-value."""
+    ordered, tie = statistics.sort().values, TIE * (statistics.abs() + 0.1)
+    return (len(ordered) - torch.searchsorted(ordered, statistics - tie)).double() / len(ordered)
+
+
+def _verdict(
+    design: PermutationDesign,
+    names: list[str],
+    tests: dict[str, tuple[float, float]],
+    p_value: float,
+    smallest: float,
+    conclusive: bool,
+) -> str:
+    sizes = " against ".join(map(str, design.sizes)) if design.kind == "between" else str(len(design.units))
+    units = f"{sizes} {design.item}" + " under every condition" * (design.kind == "within")
+    power = f"With {units} the smallest possible p is {smallest:.2g}"
+    if smallest >= LEVEL:
+        return f"{power}: no test can find a difference."
+    if not conclusive:
+        return f"{units[0].upper()}{units[1:]} are too few for a verdict."
+    between = f"between {names[0]} and {names[1]}" if len(names) == 2 else f"between the {len(names)} conditions"
+    if p_value >= LEVEL:
+        return f"No difference {between} was found (p = {p_value:.2g}). {power}."
+    where = [name for name, (_, corrected) in tests.items() if corrected < LEVEL]
+    found = f"Behaviour differs {between} (p = {p_value:.2g})"
+    if where:
+        return f"{found}, by the tests of {', '.join(where)} (corrected). {power}."
+    return f"{found}, but it cannot be said in what: no single test is significant when corrected. {power}."

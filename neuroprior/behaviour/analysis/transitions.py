@@ -1,0 +1,274 @@
+"""Which action follows which: first-order transitions, overall and in each group, and whether the groups differ."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from scipy import stats
+from torch import Tensor
+
+from neuroprior._checks import check_sizes
+from neuroprior._random import generator_on
+from neuroprior.behaviour.analysis.flat import FlatPlans
+from neuroprior.behaviour.analysis.statistics import holm
+from neuroprior.plans import Plans
+
+FEWEST_PERMUTATIONS = 99
+"""Permutations that are made whatever they cost."""
+
+FEWEST_DIVISIONS = 20
+"""Ways of dividing plans into groups below which no permutation could give a p-value of 0.05."""
+
+ROUNDING = 1e-12
+"""Statistics whose difference is below this share of their terms are tied, as rounding depends on the order of sums."""
+
+Test = Literal["permutation", "chi-square", "none"]
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """How often each action was followed by each other one, and whether groups differ in that.
+
+    Attributes:
+        counts: int64 `[A, A]`: how often each action (row) was followed by each action (column) within a plan.
+        group_counts: int64 `[G, A, A]`: the same in each group.
+        groups: int64 `[G]`: the numbers of the groups, ascending; a single 0 if plans have no groups.
+        statistic: the likelihood-ratio statistic of the hypothesis that groups do not differ (Anderson and Goodman
+            1957).
+        degrees_of_freedom: of its chi-square distribution.
+        p_value: of that statistic; NaN without a test.
+        cell_p_values: float64 `[G, A, A]`: for each group and transition, the p-value of the hypothesis that the
+            transition has the same probability in this group as in the others, corrected for the number of cells. NaN
+            where there is nothing to compare: the first action is never followed by another in this group, or in all
+            others; or it is never, or always, followed by the second.
+        test: the origin of the p-values: "permutation" of the groups of whole plans; "chi-square" if there are fewer
+            than `FEWEST_DIVISIONS` ways of dividing the plans into such groups; "none" if no two groups are comparable.
+        permutations: how many were made; 0 without any.
+    """
+
+    counts: Tensor
+    group_counts: Tensor
+    groups: Tensor
+    statistic: float
+    degrees_of_freedom: int
+    p_value: float
+    cell_p_values: Tensor
+    test: Test
+    permutations: int
+
+    def probs(self) -> Tensor:
+        """`[A, A]`, float64: the probability of each action (column) after each (row); NaN in rows without counts."""
+        return _row_probs(self.counts)
+
+    def group_probs(self) -> Tensor:
+        """`[G, A, A]`, float64: the same in each group."""
+        return _row_probs(self.group_counts)
+
+
+def transitions(
+    plans: Plans,
+    permutations: int = 999,
+    generator: torch.Generator | None = None,
+    *,
+    max_work: int = 10**9,
+    chunk_size: int = 2**21,
+) -> Transitions:
+    """The transitions between successive actions within plans, and a test of whether the groups differ in them.
+
+    The null distribution is that of the same statistics after the groups of the plans were permuted. Whole plans are
+    permuted, so that the test holds for any dependence of actions within a plan; the null hypothesis is that the plans
+    of all groups, lengths included, have the same distribution. A p-value is (1 + permutations that reach the
+    statistic) / (1 + permutations). A cell's statistic is the signed root of the likelihood ratio of its 2 x 2 table
+    (this group or the others; this transition or others from the same action): a standardised difference, whose scale
+    does not depend on the counts. It is compared to the largest of all cells in each permutation (Westfall and Young
+    1993: single-step maxT).
+
+    With too few plans for that, p-values are those of the chi-square distribution, which assumes a first-order Markov
+    chain (Anderson and Goodman 1957), and cells are corrected by Holm's procedure. That needs many actions in each
+    group; with few, or if the order is higher, it finds differences that do not exist.
+
+    Args:
+        plans: with a `group`; without, nothing is tested. An end symbol is an action like others.
+        permutations: at most so many; see `max_work`.
+        generator: draws the permutations.
+        max_work: numbers that the permutations may access, some ten seconds on one core; fewer are made if need be, but
+            at least `FEWEST_PERMUTATIONS`.
+        chunk_size: numbers that are in memory at a time.
+
+    Raises:
+        ValueError: `permutations`, `max_work` or `chunk_size` is below 1.
+
+    Example:
+        >>> transitions(Plans(torch.tensor([[0, 1, 0, 1, 1]]), 2)).counts.tolist()
+        [[0, 2], [1, 1]]
+    """
+    check_sizes(permutations=permutations, max_work=max_work, chunk_size=chunk_size)
+    flat, size = FlatPlans.of(plans), plans.num_actions
+    group = torch.zeros(len(plans), dtype=torch.long) if plans.group is None else plans.group.long()
+    groups, group = group.to(flat.actions.device).unique(return_inverse=True)
+    at = flat.starts(2)
+    cell, plan = flat.actions[at] * size + flat.actions[at + 1], flat.plan[at]
+    group_counts = (group[plan] * size**2 + cell).bincount(minlength=len(groups) * size**2).view(-1, size, size)
+    cells = torch.full((len(groups), size**2), float("nan"), dtype=torch.double, device=cell.device)
+    made, p_value = 0, float("nan")
+    table = _Table.of(group_counts)
+    test = _which_test(table, group[plan.unique()].bincount())
+    if test == "permutation":
+        taken = _PlanCounts.of(plan, cell, group, table)
+        made = min(permutations, max(max_work // _cost(table, taken), FEWEST_PERMUTATIONS))
+        p_value, found = _permutation_test(table, taken, made, chunk_size, generator_on(generator, cell.device))
+    elif test == "chi-square":
+        p_value, found = _chi_square_test(table)
+    if test != "none":
+        cells[table.present[:, None], table.cell] = found
+    statistic = float("nan") if test == "none" else float(table.overall(table.observed))
+    return Transitions(
+        group_counts.sum(0),
+        group_counts,
+        groups,
+        statistic,
+        table.degrees_of_freedom(),
+        p_value,
+        cells.view(-1, size, size),
+        test,
+        made,
+    )
+
+
+class _Table(NamedTuple):
+    """The counts `[G, C]` of the G groups that have transitions and the C transitions that occurred, and fixed sums.
+
+    Statistics take counts `[..., G, C]` with the same sums over groups.
+    """
+
+    present: Tensor  # int64 [G]: the groups
+    cell: Tensor  # int64 [C], ascending: from * A + to
+    row: Tensor  # int64 [C]: the rank of `from` among those that occurred
+    observed: Tensor  # float64 [G, C]
+    rows: int
+
+    @staticmethod
+    def of(group_counts: Tensor) -> "_Table":
+        cell = group_counts.sum(0).flatten().nonzero()[:, 0]
+        present = group_counts.sum((1, 2)).nonzero()[:, 0]
+        observed = group_counts.flatten(1)[present[:, None], cell].double()
+        start, row = cell.div(group_counts.shape[-1], rounding_mode="floor").unique(return_inverse=True)
+        return _Table(present, cell, row, observed, len(start))
+
+    def in_rows(self, values: Tensor) -> Tensor:
+        """`[..., R]`: the sums of `values [..., C]` over each row of the transition matrix."""
+        return values.new_zeros(*values.shape[:-1], self.rows).index_add_(-1, self.row, values)
+
+    def degrees_of_freedom(self) -> int:
+        groups, followers = (self.in_rows(self.observed) > 0).sum(0), self.row.bincount(minlength=self.rows)
+        return int(((groups - 1) * (followers - 1)).sum())
+
+    def comparable(self) -> Tensor:
+        """`[G, C]` bool: where neither the group, the others, the transition nor its alternatives are empty."""
+        ours, pooled = self.in_rows(self.observed)[:, self.row], self.observed.sum(0)
+        every = self.in_rows(pooled)[self.row]
+        return (ours > 0) & (ours < every) & (pooled < every)
+
+    def overall(self, counts: Tensor) -> Tensor:
+        """`[...]`: the likelihood-ratio statistic of homogeneity over groups, summed over rows."""
+        pooled = self.observed.sum(0)
+        fixed = _n_log_n(self.in_rows(pooled)).sum() - _n_log_n(pooled).sum()
+        return 2 * (_n_log_n(counts).sum((-2, -1)) - _n_log_n(self.in_rows(counts)).sum((-2, -1)) + fixed)
+
+    def cells(self, counts: Tensor) -> Tensor:
+        """`[..., G, C]`: the likelihood-ratio statistic of each 2 x 2 table: its standardised difference squared."""
+        pooled, in_rows = self.observed.sum(0), self.in_rows(counts)
+        every = self.in_rows(pooled)
+        ours = in_rows[..., self.row]
+        found = _n_log_n(counts) + _n_log_n(ours - counts) + _n_log_n(pooled - counts)
+        found += _n_log_n(every[self.row] - pooled - ours + counts)
+        found -= (_n_log_n(in_rows) + _n_log_n(every - in_rows))[..., self.row]
+        return 2 * (found + _n_log_n(every)[self.row] - _n_log_n(pooled) - _n_log_n(every[self.row] - pooled))
+
+    def tie(self) -> float:
+        return ROUNDING * float(_n_log_n(self.observed.sum()))
+
+
+class _PlanCounts(NamedTuple):
+    """The transitions of each of P plans that have any, as a sparse matrix, and the group of each plan."""
+
+    plan: Tensor  # int64 [Z]
+    column: Tensor  # int64 [Z]: of a `_Table`
+    times: Tensor  # float64 [Z]
+    label: Tensor  # int64 [P]: the row of the plan's group in a `_Table`
+
+    @staticmethod
+    def of(plan: Tensor, cell: Tensor, group: Tensor, table: _Table) -> "_PlanCounts":
+        column = torch.searchsorted(table.cell, cell)
+        which, rank = plan.unique_consecutive(return_inverse=True)
+        codes, times = (rank * len(table.cell) + column).unique(return_counts=True)
+        label = torch.searchsorted(table.present, group[which])
+        row = codes.div(len(table.cell), rounding_mode="floor")
+        return _PlanCounts(row, codes % len(table.cell), times.double(), label)
+
+    def regroup(self, labels: Tensor, table: _Table) -> Tensor:
+        """`[B, G, C]`: the counts under `labels [B, P]`."""
+        width = len(table.cell)
+        first = table.observed.numel() * torch.arange(len(labels), device=labels.device)[:, None]
+        index = (labels * width + first).index_select(1, self.plan).add_(self.column)
+        # Reshaping copies nothing where a single labelling of many plans is counted.
+        weights = self.times.expand(index.shape).reshape(-1)
+        counts = index.view(-1).bincount(weights, minlength=len(labels) * table.observed.numel())
+        return counts.view(-1, *table.observed.shape)
+
+
+def _which_test(table: _Table, plans: Tensor) -> Test:
+    """The test for groups of `plans [G]` plans each."""
+    if table.degrees_of_freedom() < 1:
+        return "none"
+    sizes = plans[plans > 0].double()
+    same_size = sizes.long().bincount().double()  # exchanging groups of one size gives no new division
+    divisions = torch.lgamma(sizes.sum() + 1) - torch.lgamma(sizes + 1).sum() - torch.lgamma(same_size + 1).sum()
+    return "permutation" if float(divisions) > math.log(FEWEST_DIVISIONS - 0.5) else "chi-square"
+
+
+def _cost(table: _Table, taken: _PlanCounts) -> int:
+    """Numbers that a permutation accesses; shuffling a plan and comparing a cell take several."""
+    return len(taken.times) + 6 * len(taken.label) + 8 * table.observed.numel()
+
+
+def _permutation_test(
+    table: _Table, taken: _PlanCounts, permutations: int, chunk_size: int, generator: torch.Generator
+) -> tuple[float, Tensor]:
+    """The p-value of the whole table, and those `[G, C]` of the cells."""
+    observed, tie = table.overall(table.observed), table.tie()
+    greatest, reached = [], 1
+    together = max(chunk_size // _cost(table, taken), 1)
+    num, device = len(taken.label), taken.label.device
+    for at in range(0, permutations, together):
+        part = range(at, min(at + together, permutations))
+        orders = [torch.randperm(num, generator=generator, device=device) for _ in part]
+        counts = taken.regroup(taken.label[torch.stack(orders)], table)
+        reached += int((table.overall(counts) >= observed - tie).sum())
+        greatest.append(table.cells(counts).amax((1, 2)))
+    ordered = torch.cat(greatest).sort().values
+    cells = table.cells(table.observed)
+    above = permutations - torch.searchsorted(ordered, cells - tie)
+    corrected = (1 + above).double() / (1 + permutations)
+    return reached / (1 + permutations), corrected.masked_fill(~table.comparable(), float("nan"))
+
+
+def _chi_square_test(table: _Table) -> tuple[float, Tensor]:
+    """The p-value of the whole table, and those `[G, C]` of the cells."""
+    p_value = float(stats.chi2.sf(float(table.overall(table.observed)), table.degrees_of_freedom()))
+    comparable = table.comparable()
+    cells = table.cells(table.observed)
+    found = torch.full_like(cells, float("nan"))
+    corrected = holm(stats.chi2.sf(cells[comparable].clamp(min=0).cpu().numpy(), 1))
+    found[comparable] = torch.from_numpy(corrected).to(found)
+    return p_value, found
+
+
+def _n_log_n(counts: Tensor) -> Tensor:
+    return torch.xlogy(counts, counts)
+
+
+def _row_probs(counts: Tensor) -> Tensor:
+    """0 / 0 is NaN: a row without counts has no probabilities."""
+    return counts.double() / counts.sum(-1, keepdim=True)

@@ -1,0 +1,242 @@
+"""The section on conditions: whether behaviour differs between them, in what, and which sequences give them away."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+import torch
+
+from neuroprior.behaviour.analysis.conditions import (
+    ConditionComparison,
+    ConditionFamily,
+    ConditionPrediction,
+    compare_conditions,
+)
+from neuroprior.behaviour.report import figures
+from neuroprior.behaviour.report.document import Column, table
+from neuroprior.behaviour.report.page import FigureBox, Section, Table
+from neuroprior.behaviour.report.part import LISTED, Part, action_names, group_names, p_text
+from neuroprior.behaviour.report.scores import Evaluation
+
+DRAWN = 8  # features in the figure
+
+FAMILIES = {"transitions": "{}", "durations": "duration of {}", "actions": "share of {}", "sequences": "{}"}
+"""How features of each family are called; families in the order in which they are listed.
+
+Where a transition changes, so do the shares of its actions, and of the sequences that hold it: these come last.
+"""
+
+TESTS = {
+    "actions": "shares of actions",
+    "transitions": "transition probabilities",
+    "sequences": "shares of sequences of three",
+    "durations": "durations of actions",
+    "bits": "bits saved by knowing the condition",
+    "classifier": "condition predicted from sequences",
+}
+
+
+def condition_section(found: Evaluation) -> Part | None:
+    """Whether behaviour differs between conditions; None where plans have none."""
+    if found.plans.condition is None:
+        return None
+    result = compare_conditions(found.plans, generator=torch.Generator().manual_seed(0))
+    names = ["condition_tests", "conditions", "condition_blocks", "condition_sequences"]
+    if result.prediction is None:
+        return Part(Section("Conditions", [result.verdict]), {name: pd.DataFrame() for name in names})
+    actions, units = action_names(found.plans), _unit_names(result, found)
+    tests, features = _tests(result), _features(result, actions)
+    blocks, sequences = _blocks(result, result.prediction, units), _sequences(result, result.prediction, actions)
+    frames = dict(zip(names, (tests, features, blocks, sequences), strict=True))
+    tables = [
+        _test_table(result, tests),
+        _feature_table(result, features),
+        _block_table(result, result.prediction, blocks),
+        _sequence_table(sequences),
+    ]
+    box = _figure_box(result, features, units)
+    return Part(Section("Conditions", _text(result), tables, [box]), frames)
+
+
+def _text(result: ConditionComparison) -> list[str]:
+    design, item = result.design, result.design.item
+    how = (
+        f"Each of the {item} is under one condition: conditions were permuted among {item}."
+        if design.kind == "between"
+        else f"Each of the {item} is under every condition: conditions were permuted within {item}."
+    )
+    left = len(design.left_out)
+    return [
+        result.verdict,
+        f"{how} Plans of one unit under one condition always stay together, so that it does not matter how alike they"
+        f" are. {'All' if result.exact else 'Random'} labellings that were compared, with the observed one:"
+        f" {result.labellings:,}." + f" {left} {item} that are not under every condition were left out." * (left > 0),
+        "Families of features are tested by their most different feature (Westfall and Young); the tests are corrected"
+        " for their number (Holm), and all of them are combined into one (p of the first sentence; Fisher's"
+        " combination in the same permutations). A star marks a feature that is significant, corrected for its family,"
+        " in a family that is. Rates of rare features are smoothed towards those of all.",
+    ]
+
+
+def _unit_names(result: ConditionComparison, found: Evaluation) -> list[str]:
+    if result.design.item == "plans":
+        names = found.plans.plan_names or ()
+        distinct = len(set(names)) == len(found.plans)
+        return [names[number] if distinct else f"plan {number}" for number in result.design.units.tolist()]
+    return group_names(found.plans, result.design.units)
+
+
+def _tests(result: ConditionComparison) -> pd.DataFrame:
+    sizes = {family.name: len(family.features) for family in result.families}
+    rows: list[tuple[object, ...]] = [("all", pd.NA, result.p_value, result.p_value)]
+    rows += [(name, sizes.get(name, 1), *p_values) for name, p_values in result.tests.items()]
+    frame = pd.DataFrame(rows, columns=["test", "features", "p_value", "corrected"])
+    return frame.astype({"features": "Int64"}).assign(smallest_p=result.smallest_p)
+
+
+def _test_table(result: ConditionComparison, tests: pd.DataFrame) -> Table:
+    columns: Mapping[str, Column] = {
+        "test": lambda row: TESTS.get(row.test, "all tests together"),
+        "features": "features:,",
+        "p": lambda row: f"{row.p_value:.2g}",
+        "p corrected": lambda row: "" if row.test == "all" else f"{row.corrected:.2g}" + "*" * result.differs(row.test),
+    }
+    prediction = result.prediction
+    assert prediction is not None
+    mean, low, high, _ = prediction.gain
+    caption = (
+        f"Smallest possible p: {result.smallest_p:.2g}; corrected for {len(result.tests)} tests:"
+        f" {min(len(result.tests) * result.smallest_p, 1):.2g}. *: p < 0.05, corrected. A Markov chain that knows the"
+        f" condition saves {mean:+.4f} bits per held-out action (95 % interval {low:+.4f} to {high:+.4f} over"
+        f" {result.design.item}; the test asks whether other labellings save as much, not whether this is above 0)."
+    )
+    return table(tests, columns, caption, "Do conditions differ?")
+
+
+def _features(result: ConditionComparison, actions: list[str]) -> pd.DataFrame:
+    """A row a feature, those that differ most first; durations as geometric means and ratios."""
+    parts = []
+    for family in result.families:
+        joint = " → " if family.name == "transitions" else " "
+        of_time = (lambda values: np.exp(values)) if family.name == "durations" else (lambda values: values)
+        part = pd.DataFrame({"family": family.name, "place": range(len(family.features))})
+        spelled = [joint.join(actions[action] for action in own) for own in family.features.tolist()]
+        part["feature"] = [FAMILIES[family.name].format(own) for own in spelled]
+        for name, *own in zip(result.condition_names, family.means, family.low, family.high, strict=True):
+            for what, values in zip(("mean", "low", "high"), own, strict=True):
+                part[f"{what}, {name}"] = of_time(values.numpy())
+        if len(result.condition_names) == 2:
+            for what, values in zip(("difference", "low", "high"), family.difference, strict=True):
+                part[what] = of_time(values.numpy())
+        part["p_value"], part["corrected"] = family.p_values.numpy(), family.corrected.numpy()
+        part["significant"], part["statistic"] = result.significant(family).numpy(), family.statistic.numpy()
+        parts.append(part)
+    frame = pd.concat(parts, ignore_index=True)
+    rank = frame["family"].map({name: place for place, name in enumerate(FAMILIES)})
+    keys = {"rank": rank.where(frame["significant"], len(FAMILIES)), "size": -frame["statistic"]}
+    frame = frame.assign(**keys).sort_values(["rank", "corrected", "p_value", "size"], kind="stable")
+    return frame.drop(columns=list(keys)).reset_index(drop=True)
+
+
+def _feature_table(result: ConditionComparison, features: pd.DataFrame) -> Table:
+    columns: dict[str, Column] = {"feature": "feature"}
+    for name in result.condition_names:
+        columns[f"mean,\n{name}"] = _cell_of(f"mean, {name}", ".3g")
+    if len(result.condition_names) == 2:
+        first, second = result.condition_names
+        columns[f"{second}\nagainst {first}"] = lambda row: (
+            f"{row.difference:{_sign(row)}.3g}" + " times" * (not _sign(row))
+        )
+        columns["95 % interval"] = lambda row: f"{row.low:{_sign(row)}.3g} to {row.high:{_sign(row)}.3g}"
+    columns["p"] = lambda row: p_text(row.corrected) + "*" * row.significant
+    shown = features[:LISTED]
+    caption = (
+        f"{len(shown)} of {len(features):,} features: *: significant; then those that differ most. Transitions are"
+        f" probabilities, sequences shares of all; means over {result.design.item}. Durations are geometric means and"
+        " ratios. p: corrected for the family; intervals are not."
+    )
+    return table(shown, columns, caption, "What differs")
+
+
+def _cell_of(name: str, form: str) -> Column:
+    """A column by its name, which may hold a colon."""
+    return lambda row: format(row[name], form)
+
+
+def _sign(row: pd.Series) -> str:
+    """Differences have a sign, ratios have none."""
+    return "" if row["family"] == "durations" else "+"
+
+
+def _blocks(result: ConditionComparison, prediction: ConditionPrediction, units: list[str]) -> pd.DataFrame:
+    """A row for each unit and condition: the condition that it was given, and the log odds of each."""
+    names, design = result.condition_names, result.design
+    odds = prediction.log_odds
+    frame = pd.DataFrame({design.item[:-1]: [units[unit] for unit in design.unit.tolist()]})
+    frame["condition"] = [names[label] for label in design.label.tolist()]
+    frame["classified"] = [names[label] for label in odds.argmax(1).tolist()]
+    return frame.assign(**{f"log odds, {name}": own.numpy() for name, own in zip(names, odds.T, strict=True)})
+
+
+def _block_table(result: ConditionComparison, prediction: ConditionPrediction, blocks: pd.DataFrame) -> Table:
+    """How many units of each condition were given which."""
+    names, item = result.condition_names, result.design.item
+    counts = pd.crosstab(blocks["condition"], blocks["classified"]).reindex(index=names, columns=names, fill_value=0)
+    columns: dict[str, Column] = {"condition": lambda row: str(row.name)}
+    columns |= {f"predicted\n{name}": _cell_of(name, "") for name in names}
+    caption = (
+        f"Held-out {item}, under the condition in which their sequences are most likely (Markov chains):"
+        f" {100 * prediction.accuracy:.0f} % are right on average over conditions, {100 * prediction.expected:.0f} % in"
+        f" permutations (p = {prediction.p_value:.2g}, not corrected)."
+    )
+    return table(counts, columns, caption, "Condition predicted from sequences")
+
+
+def _sequences(result: ConditionComparison, prediction: ConditionPrediction, actions: list[str]) -> pd.DataFrame:
+    """A row a transition, those first that bring most for the right condition."""
+    pairs = prediction.sequences.tolist()
+    frame = pd.DataFrame({"sequence": [f"{actions[a] if a >= 0 else '(beginning)'} → {actions[b]}" for a, b in pairs]})
+    frame["speaks_for"] = [result.condition_names[label] for label in prediction.speaks_for.tolist()]
+    frame["bits_per_1000"] = 1000 * prediction.carried.numpy()
+    return frame.sort_values("bits_per_1000", ascending=False, kind="stable").reset_index(drop=True)
+
+
+def _sequence_table(sequences: pd.DataFrame) -> Table:
+    columns = {"transition": "sequence", "speaks for": "speaks_for", "bits per\n1,000 actions": "bits_per_1000:+.2f"}
+    shown = sequences[:LISTED]
+    caption = (
+        f"The first {len(shown)} of {len(sequences)}. What each adds to the held-out log odds of the right condition;"
+        " below 0 it misleads."
+    )
+    return table(shown, columns, caption, "Transitions that predict the condition", "llr")
+
+
+def _figure_box(result: ConditionComparison, features: pd.DataFrame, units: list[str]) -> FigureBox:
+    """The features that differ most, with a dot for each unit."""
+    design, families = result.design, {family.name: family for family in result.families}
+    shown, means, values = features.drop_duplicates("feature")[:DRAWN], [], []
+    for row in shown.to_dict("records"):
+        own = _values(families[row["family"]], row["place"])
+        name = row["feature"] + "*" * row["significant"]
+        for unit, label, value in zip(design.unit.tolist(), design.label.tolist(), own, strict=True):
+            values.append((name, units[unit], result.condition_names[label], value))
+        for condition in result.condition_names:
+            means.append((name, condition, *(row[f"{what}, {condition}"] for what in ("mean", "low", "high"))))
+    figure = figures.condition_figure(
+        pd.DataFrame(means, columns=["feature", "condition", "mean", "low", "high"]),
+        pd.DataFrame(values, columns=["feature", "unit", "condition", "value"]),
+        paired=design.kind == "within",
+    )
+    lines = "; lines join those of one" if design.kind == "within" else ""
+    caption = (
+        f"The {len(shown)} features that differ most, each on an axis of its own. Dots: {design.item}{lines}. Bars:"
+        f" means with 95 % intervals over {design.item}. *: significant."
+    )
+    alt = "Features that differ most between conditions: " + "; ".join(shown["feature"][:5])
+    return FigureBox(figure, caption, alt, "conditions")
+
+
+def _values(family: ConditionFamily, place: int) -> list[float]:
+    values = family.values[:, place]
+    found: list[float] = (values.exp() if family.name == "durations" else values).tolist()
+    return found

@@ -1,0 +1,233 @@
+"""A document of results: tables and figures, printed in the terminal and written as CSV, JSON and one HTML page.
+
+Needs pandas, matplotlib, jinja2 and rich (`neuroprior[report]`).
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import rich.table
+from matplotlib.figure import Figure
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.text import Text
+
+from neuroprior._files import read_json, versions, write_json, written_whole
+from neuroprior.behaviour.report.page import Section, Table, write_page
+
+Column = str | Callable[[Any], str]
+
+RESULTS, PAGE = "results.json", "report.html"
+"""Files of a document, beside those of its frames."""
+
+
+@dataclass(frozen=True)
+class Document:
+    """Results with all that it takes to show them.
+
+    Each of `frames`, the tables of results, is written as `NAME.csv`, and as a list of rows in `results.json` under
+    `NAME`, or under what `keys` has for it.
+
+    Attributes:
+        title: of the page.
+        lead: the finding in one or two plain sentences.
+        sections: in order; their tables are printed too.
+        frames: tables of results, by name.
+        settings: how the results were made, by name.
+        command: the command line that makes them again.
+        results: further JSON values for `results.json`.
+        keys: the name in `results.json` of a frame, where it is another.
+        former_names: of columns, which files hold under both names.
+
+    Example:
+        >>> Document(
+        ...     "Chains", "Order 1 is best.", [Section("Scores", tables=[Table(["order", "bits"], [["1", "0.92"]])])]
+        ... ).title
+        'Chains'
+    """
+
+    title: str
+    lead: str
+    sections: Sequence[Section]
+    frames: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    command: str = ""
+    results: Mapping[str, Any] = field(default_factory=dict)
+    keys: Mapping[str, str] = field(default_factory=dict)
+    former_names: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """The frames that have rows, by name."""
+        return {name: frame for name, frame in self.frames.items() if len(frame)}
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """The figures by name."""
+        return {box.name: box.figure for section in self.sections for box in section.figures}
+
+    @property
+    def written(self) -> dict[str, pd.DataFrame]:
+        """The frames as files hold them, with their columns under former names, too."""
+        former = self.former_names
+        return {
+            name: frame.assign(**{former[column]: frame[column] for column in frame.columns if column in former})
+            for name, frame in self.frames.items()
+        }
+
+
+def publish(document: Document, folder: Path, console: Console | None = None) -> None:
+    """Print a document's tables and lead, and write its files; see `write_document`.
+
+    Args:
+        document: the document.
+        folder: where to write; made if it is not there.
+        console: where to print; None: standard output.
+
+    Raises:
+        ValueError: see `check_place`.
+        OSError: the files cannot be written.
+
+    Example:
+        >>> publish(Document("Chains", "Order 1 is best.", [Section("Scores")]), Path("runs/chains"))
+        Order 1 is best.
+        report: runs/chains/report.html
+    """
+    console = console or Console()
+    show(document, console)
+    write_document(document, folder)
+    console.print(f"report: {folder / 'report.html'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def show(document: Document, console: Console) -> None:
+    """Print a document's tables and lead."""
+    for section in document.sections:
+        for table in section.tables:
+            console.print(printed(table.title or section.title, table))
+    console.print(document.lead, highlight=False, markup=False)
+
+
+def check_place(folder: Path, frames: Iterable[str], keys: Mapping[str, str] = {}) -> None:
+    """Raise ValueError if a document with these frames would replace a file that no earlier one wrote to a folder.
+
+    Args:
+        folder: where it is to be written.
+        frames, keys: the names of its frames, and its keys, see `Document`.
+    """
+    earlier = _earlier(folder)
+    names = [] if earlier else [RESULTS, PAGE]
+    names += [f"{name}.csv" for name in frames if keys.get(name, name) not in earlier]
+    for path in (folder / name for name in names):
+        if path.exists():
+            raise ValueError(
+                f"out: {path} is there, and of no earlier report; give another folder, or move it away: finished jobs"
+                " are kept"
+            )
+
+
+def _earlier(folder: Path) -> dict[str, Any]:
+    """The results of an earlier document in a folder; empty if there is none."""
+    with suppress(OSError, ValueError):
+        content = read_json(folder / RESULTS)
+        return content if isinstance(content, dict) and {"settings", "versions"} <= content.keys() else {}
+    return {}
+
+
+def write_document(document: Document, folder: Path) -> None:
+    """Write `report.html`, `results.json` and a CSV file for each frame to a folder, which is made if it is not there.
+
+    CSV files of an earlier document there, whose frames this one does not have, are removed.
+
+    Raises:
+        ValueError: see `check_place`.
+        OSError: the files cannot be written.
+    """
+    check_place(folder, document.frames, document.keys)
+    folder.mkdir(parents=True, exist_ok=True)
+    names, content = {key: name for name, key in document.keys.items()}, _earlier(folder)
+    earlier = {names.get(key, key) for key, rows in content.items() if isinstance(rows, list)} - {*document.frames}
+    write_frames(folder, dict.fromkeys(earlier, pd.DataFrame()))
+    write_json(folder / RESULTS, results_of(document))  # before the tables: it says that they are its own
+    write_frames(folder, document.written)
+    shown = {**document.settings, **{f"version: {name}": number for name, number in versions().items()}}
+    write_page(folder / PAGE, document.title, document.lead, document.sections, shown, document.command)
+
+
+def results_of(document: Document) -> dict[str, Any]:
+    """What `results.json` holds: the rows of each frame, further results, settings and versions."""
+    rows = {document.keys.get(name, name): records(frame) for name, frame in document.written.items()}
+    return {**rows, **document.results, "settings": dict(document.settings), "versions": versions()}
+
+
+def write_frames(folder: Path, frames: Mapping[str, pd.DataFrame]) -> None:
+    """Write each frame as `NAME.csv`; an empty one removes the file of an earlier run."""
+    for name, frame in frames.items():
+        path = folder / f"{name}.csv"
+        if frame.empty:
+            path.unlink(missing_ok=True)
+            continue
+        with written_whole(path) as file:
+            frame.to_csv(file, index=False, lineterminator="\n")
+
+
+def write_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
+    """Write each figure as `NAME.png`."""
+    for name, figure in figures.items():
+        with written_whole(folder / f"{name}.png", "wb") as file:
+            figure.savefig(file, format="png", dpi=150, bbox_inches="tight", facecolor="white")
+
+
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a frame as JSON values; what is missing is None."""
+    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return [
+        {str(key): getattr(value, "item", lambda value=value: value)() for key, value in row.items()} for row in rows
+    ]
+
+
+def table(
+    frame: pd.DataFrame, columns: Mapping[str, Column], caption: str = "", title: str = "", align: str | None = None
+) -> Table:
+    """The text of a frame, as the terminal and the page show it.
+
+    Args:
+        frame: the results.
+        columns: what stands below each heading: the name of a column, perhaps with a format behind a colon
+            ("bits:.3f"; what is missing is left blank), or a function of the row.
+        caption: what the numbers are, and what their intervals are over.
+        title: above it; by default that of its section.
+        align: see `Table`.
+
+    Example:
+        >>> import pandas as pd
+        >>> table(
+        ...     pd.DataFrame({"prior": ["uniform"], "bits": [2.0]}), {"prior": "prior", "bits per action": "bits:.2f"}
+        ... ).rows
+        [['uniform', '2.00']]
+    """
+    rows = [[_cell(row, column) for column in columns.values()] for _, row in frame.iterrows()]
+    return Table(list(columns), rows, caption, align, title)
+
+
+def _cell(row: Any, column: Column) -> str:
+    if callable(column):
+        return column(row)
+    name, _, form = column.partition(":")
+    value = row[name]
+    return "" if pd.isna(value) else format(value, form)
+
+
+def printed(title: str, table: Table) -> rich.table.Table:
+    """A table for a terminal of 80 columns: names are folded where there is no room, numbers are not."""
+    made = rich.table.Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=escape(title))
+    for heading, side in zip(table.headings, table.align or "", strict=True):
+        made.add_column(heading, justify="left" if side == "l" else "right", no_wrap=side == "r", overflow="fold")
+    for row in table.rows:
+        made.add_row(*map(Text, row))  # names are no markup
+    made.caption = escape(table.caption)
+    return made

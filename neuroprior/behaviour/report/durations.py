@@ -1,0 +1,309 @@
+"""The section on durations: how long actions take, by which law, and whether that predicts the next action."""
+
+from collections.abc import Iterator
+from math import log
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from neuroprior.behaviour.analysis.comparison import Score, score_bits, unit_name
+from neuroprior.behaviour.analysis.statistics import ENOUGH_UNITS, ratio_difference
+from neuroprior.behaviour.durations.duration_model import DurationModel
+from neuroprior.behaviour.durations.laws import resolution
+from neuroprior.behaviour.report import figures
+from neuroprior.behaviour.report.document import Column, table
+from neuroprior.behaviour.report.fits import ACTIONS, DURATIONS
+from neuroprior.behaviour.report.page import FigureBox, Section
+from neuroprior.behaviour.report.part import LISTED, Part, action_names, p_text
+from neuroprior.behaviour.report.scores import Evaluation
+from neuroprior.plans import BLOCKS, FEWEST_UNITS, Plans, divisible, folds, in_parts
+from neuroprior.plans.folds import num_units
+from neuroprior.plans.plans import durations_of
+from neuroprior.priors import MarkovPrior
+from neuroprior.priors.counts.markov import blend
+
+FOLDS = 5
+
+CLASSES = 3
+"""Classes of the last duration: short, medium and long for its action."""
+
+PSEUDO_COUNTS = [2.0**k for k in range(21)]
+"""Weights of the chain without durations; the likeliest is taken."""
+
+MOST_ACTIONS = 500
+"""Kinds of actions up to which the next one is counted after each with each class of duration."""
+
+MOST_BINS = 30
+
+LEAST = 5e-4
+"""Gains below this are 0 in three digits, and not starred."""
+
+
+def duration_section(found: Evaluation) -> Part | None:
+    """How long actions take, and whether that predicts the next action; None where no plan has durations."""
+    plans = found.plans
+    if plans.durations is None or not bool((plans.durations[plans.mask()] > 0).any()):
+        return None
+    if len(plans) == 1:
+        plans = in_parts(plans, min(BLOCKS, int(plans.mask().sum())))
+    known = plans.mask() & ~durations_of(plans).isnan()
+    model = DurationModel(plans.num_actions).fit(found.plans)
+    gains = _held_out_gains(plans, known)
+    frame = _by_action(plans, known, model, gains)
+    laws = _laws(plans, known, model, gains)
+    dwell = dwell_times(plans, model)
+    following = _following(found, plans, known)
+    over = unit_name(plans, known)
+    few = f" Nothing is starred: there are fewer than {ENOUGH_UNITS} {over}."
+    star = f"*: above 0 by its 95 % interval over {over}."
+    of_all = f" The {LISTED} commonest of {len(frame)}." if len(frame) > LISTED else ""
+    columns: dict[str, Column] = {
+        "action": "action",
+        "known": "known:,",
+        "unkn.": "unknown:,",
+        "25 %": "quartile_1:.3g",
+        "median": "median:.3g",
+        "75 %": "quartile_3:.3g",
+        "mean": "mean:.3g",
+        "law": "law",
+        "gain": _gain,
+    }
+    caption = (
+        "Dwell times in the unit of the file. law: of durations above 0, chosen by held-out likelihood (of all: too few"
+        " for a law of its own). gain: of this"
+        f" over an exponential law, nats per held-out duration. {star}{of_all}"
+    )
+    tables = [table(frame[:LISTED], columns, caption, "Durations", "lrrrrrrlr")]
+    shown: dict[str, Column] = {"laws": "what", "nats per duration": _gain, "p": _p}
+    caption = (
+        "Over exponential laws of each action, and over the laws of the line above: durations may depend on the next"
+    )
+    caption += f" action, too, where that predicts them better. {star}"
+    tables.append(table(laws, shown, caption, "Laws of durations", "lrr"))
+    if len(following):
+        shown = {"model": "model", "without": "without:.4f", "with": "with:.4f", "gain": _gain, "p": _p}
+        caption = f"Bits per held-out action without and with the last duration known. {star}"
+        tables.append(table(following, shown, caption, "Whether durations predict the next action", "lrrrr"))
+    enough = bool(len(following)) and bool((following["units"] >= ENOUGH_UNITS).all())
+    text = [
+        "Exponential laws are those of a process without memory, in which a long stay says nothing of when it ends."
+        " Where another law predicts durations better, actions have typical lengths, or bursts and pauses.",
+        "Whether durations predict the next action: a chain of order 1 with back-off, and the same with how long the"
+        f" last action took, in {CLASSES} classes by its own action's terciles in the training plans. Where the gain is"
+        " above 0, durations carry information that a model of actions alone does not have.",
+    ]
+    text[-1] += "" if enough else few
+    figure = figures.dwell_figure(dwell)
+    caption = "Density of the logarithm of durations above 0 (bars), and of the law that was fitted (line)."
+    box = FigureBox(figure, caption, "Dwell times of the actions with their laws.", "dwell")
+    frames = {"durations": frame, "duration_laws": laws, "next_by_duration": following, "dwell": dwell}
+    return Part(Section("Durations", text, tables, [box]), frames)
+
+
+def _parts(plans: Plans, known: Tensor) -> Iterator[tuple[Plans, Tensor]]:
+    """The training plans, and the numbers of the held-out ones, of each fold whose training plans have durations."""
+    plans = divisible(plans)
+    number = num_units(plans)
+    for training, held_out in folds(plans, min(FOLDS, number)) if number >= FEWEST_UNITS else []:
+        if bool(((durations_of(plans) > 0) & known)[training].any()):
+            yield plans[training], held_out
+
+
+def _held_out_gains(plans: Plans, known: Tensor) -> dict[str, Tensor]:
+    """`[N, L]`, nats: what the law of each action gains over an exponential one, and laws of transitions over that.
+
+    NaN where there is no held-out duration above 0.
+    """
+    found = {what: torch.full(known.shape, torch.nan, dtype=torch.double) for what in ("law", "transition")}
+    above = known & (durations_of(plans) > 0)
+    for training, held_out in _parts(plans, known):
+        part, here = plans[held_out], above[held_out]
+        # Each action as a plan of its own has no next action: its law is that of the action.
+        alone = Plans(part.actions[here][:, None], plans.num_actions, durations=durations_of(part)[here][:, None])
+        model = DurationModel(plans.num_actions).fit(training)
+        plain = DurationModel(plans.num_actions, ["exponential"], transitions=False).fit(training)
+        own = model.log_prob(alone)[:, 0]
+        gains = {"law": own - plain.log_prob(alone)[:, 0], "transition": model.log_prob(part)[here] - own}
+        for what, gain in gains.items():
+            found[what][held_out] = found[what][held_out].masked_scatter(here, gain)
+    return found
+
+
+def _by_unit(values: Tensor, plans: Plans, mask: Tensor) -> dict[str, float]:
+    """The mean of `values [N, L]` where they are finite and in `mask`, with its interval over independent units."""
+    mask = mask & values.isfinite()
+    nothing = {"gain": np.nan, "low": np.nan, "high": np.nan, "p_value": np.nan, "units": 0}
+    if int(mask.sum()) < FEWEST_UNITS:
+        return nothing
+    score = score_bits("", "", values.nan_to_num(0, 0, 0), plans, mask)
+    gain, low, high, p_value = ratio_difference(score.bits, score.actions)
+    return {"gain": gain, "low": low, "high": high, "p_value": p_value, "units": len(score.bits)}
+
+
+def _by_action(plans: Plans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
+    """A row an action, the commonest first: its durations, their law, and what this gains over an exponential one."""
+    names, taken = action_names(plans), plans.mask()
+    laws = model.table()
+    times = pd.DataFrame({"action": plans.actions[known].tolist(), "time": durations_of(plans)[known].tolist()})
+    groups = times.groupby("action")["time"]
+    summary = groups.describe(percentiles=[0.25, 0.5, 0.75]).reindex(range(plans.num_actions))
+    number = plans.actions[taken].long().bincount(minlength=plans.num_actions)
+    rows = []
+    for action in number.argsort(descending=True, stable=True).tolist():
+        if not number[action]:
+            continue
+        own, law = summary.loc[action], laws[action]
+        count = 0 if np.isnan(own["count"]) else int(own["count"])
+        row = {"action": names[action], "known": count, "unknown": int(number[action]) - count, "zero": law.zero}
+        row |= {"quartile_1": own["25%"], "median": own["50%"], "quartile_3": own["75%"], "mean": own["mean"]}
+        row |= {"law": law.law if law.number else "of all"}
+        row |= {"parameters": ", ".join(f"{name} {value:.4g}" for name, value in law.parameters.items())}
+        rows.append(row | _by_unit(gains["law"], plans, known & (plans.actions == action)))
+    return pd.DataFrame(rows)
+
+
+def _laws(plans: Plans, known: Tensor, model: DurationModel, gains: dict[str, Tensor]) -> pd.DataFrame:
+    """What laws of actions gain over exponential ones, and laws of transitions over those of actions."""
+    number = len({row.action for row in model.table() if row.next_action is not None})
+    names = {
+        "law": "the law of each action",
+        "transition": f"and of each transition (in {number} of {plans.num_actions} actions)",
+    }
+    return pd.DataFrame([{"what": name} | _by_unit(gains[what], plans, known) for what, name in names.items()])
+
+
+def _following(found: Evaluation, plans: Plans, known: Tensor) -> pd.DataFrame:
+    """Bits per action with and without the last duration known: of a chain, and of networks that took them."""
+    rows = []
+    if plans.num_actions <= MOST_ACTIONS:
+        bits, mask = chain_bits(plans, known)
+        if int(mask.sum()) >= FEWEST_UNITS:
+            scores = [score_bits("", "", one, plans, mask) for one in bits]
+            rows.append({"model": "markov-1"} | _compared(*scores))
+    for model in found.models:
+        plain = next((one for one in found.models if (one.name, one.inputs) == (model.name, ACTIONS)), None)
+        if model.inputs == DURATIONS and plain is not None:
+            rows.append({"model": model.name} | _compared(plain.score, model.score))
+    return pd.DataFrame(rows)
+
+
+def _compared(without: Score, known: Score) -> dict[str, Any]:
+    gain, low, high, p_value = without.minus(known)
+    bits = {"without": without.bits_per_action().mean, "with": known.bits_per_action().mean}
+    return bits | {"gain": gain, "low": low, "high": high, "p_value": p_value, "units": len(known.bits)}
+
+
+def chain_bits(plans: Plans, known: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+    """The held-out bits of each action under a chain of order 1, and under one that knows the last duration.
+
+    The second counts the actions after each action with each class of its duration, and backs off to the first with
+    pseudo-counts (MacKay and Peto 1995), as many as make the training plans most probable.
+
+    Args:
+        plans: N of them, with durations.
+        known: `[N, L]` bool: where durations are known.
+
+    Returns:
+        Both `[N, L]`, float64; and where they have values: after a known duration, in folds that could be learned from.
+    """
+    without, knowing = (torch.zeros(known.shape, dtype=torch.double) for _ in range(2))
+    mask, size = torch.zeros_like(known), plans.num_actions
+    for training, held_out in _parts(plans, known):
+        chain = MarkovPrior(size, 1).fit(Plans(training.actions, size, training.lengths))
+        lower = chain.transition_matrix().double()[:, None].expand(size, CLASSES, size)
+        edges = _edges(training)
+        last, classes, after, _ = _pairs(training, edges)
+        counts = torch.zeros(size, CLASSES, size, dtype=torch.double)
+        counts.index_put_((last, classes, after), torch.ones(len(last), dtype=torch.double), accumulate=True)
+        weight = max(PSEUDO_COUNTS, key=lambda one: _evidence(counts, lower, one))
+        probs = blend(counts, lower, "dirichlet", weight, lower)
+        last, classes, after, here = _pairs(plans[held_out], edges)
+        for bits, likely in ((without, lower), (knowing, probs)):
+            own = -likely[last, classes, after].log() / log(2)
+            bits[held_out] = bits[held_out].masked_scatter(here, own)
+        mask[held_out] = here
+    return (without, knowing), mask
+
+
+def _edges(plans: Plans) -> Tensor:
+    """`[A, CLASSES - 1]`: the quantiles of the known durations of each action that divide it into classes."""
+    known = plans.mask() & ~durations_of(plans).isnan()
+    times = pd.DataFrame({"action": plans.actions[known].tolist(), "time": durations_of(plans)[known].tolist()})
+    shares = np.arange(1, CLASSES) / CLASSES
+    found = times.groupby("action")["time"].quantile(shares).unstack().reindex(range(plans.num_actions))
+    return torch.tensor(found.fillna(np.inf).to_numpy(np.float64))
+
+
+def _pairs(plans: Plans, edges: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of each action after a known duration: the last action, the class of its duration, the action; and where."""
+    times = durations_of(plans)[:, :-1]
+    here = plans.mask()[:, 1:] & ~times.isnan()
+    last, after = plans.actions[:, :-1][here].long(), plans.actions[:, 1:][here].long()
+    classes = (times[here].double()[:, None] > edges[last]).sum(1)
+    return last, classes, after, torch.nn.functional.pad(here, (1, 0))
+
+
+def _evidence(counts: Tensor, lower: Tensor, weight: float) -> float:
+    """The log-probability of counts `[..., A]` under a Dirichlet prior of `weight` pseudo-counts, spread as `lower`."""
+    total, some = counts.sum(-1), counts > 0
+    own = torch.lgamma(counts[some] + weight * lower[some]) - torch.lgamma(weight * lower[some])
+    return float((torch.lgamma(torch.tensor(weight).double()) - torch.lgamma(total + weight)).sum() + own.sum())
+
+
+def dwell_times(plans: Plans, model: DurationModel) -> pd.DataFrame:
+    """Histograms of durations above 0 with the fitted laws: the table that `dwell_figure` draws.
+
+    Args:
+        plans: with durations.
+        model: fitted to them.
+
+    Returns:
+        A row a bin, the commonest actions first: `action`, `number` of its known durations above 0, `zero` (the share
+        of durations of 0), `law`, `low` and `high` (the edges), `density` and `fitted`: shares by unit of the natural
+        logarithm, of the durations and of the law.
+    """
+    known = plans.mask() & (durations_of(plans) > 0)
+    times, actions = durations_of(plans)[known].double(), plans.actions[known].long()
+    step, rows, names, laws = resolution(times), [], action_names(plans), model.table()
+    count = actions.bincount(minlength=plans.num_actions)
+    for action in count.argsort(descending=True, stable=True).tolist():
+        if not count[action]:
+            continue
+        own = times[actions == action]
+        edges = torch.from_numpy(_bins(own.numpy(), step))
+        share = torch.histogram(own, edges)[0] / len(own)
+        width = edges.log().diff()
+        zero = laws[action].zero
+        fitted = model.cdf(action, edges).diff() / max(1 - zero, 1e-12)
+        law = laws[action].law if laws[action].number else f"{laws[action].law}, of all"
+        columns = {"low": edges[:-1], "high": edges[1:], "density": share / width, "fitted": fitted / width}
+        row = {"action": names[action], "number": len(own), "zero": zero, "law": law}
+        rows.append(pd.DataFrame({what: column.numpy() for what, column in columns.items()}).assign(**row))
+    frame = pd.concat(rows, ignore_index=True)
+    return frame[["action", "number", "zero", "law", "low", "high", "density", "fitted"]]
+
+
+def _bins(times: Any, step: float) -> Any:
+    """Edges on a logarithmic axis; of rounded times, between their values."""
+    low, high = times.min() / 1.02, times.max() * 1.02
+    edges = np.geomspace(low, high, min(MOST_BINS, 4 + int(2 * len(times) ** (1 / 3))))
+    if step:
+        edges = np.unique(np.maximum(np.floor(edges / step), 0) + 0.5) * step
+        edges = np.append(edges, edges[-1] + step) if edges[-1] < times.max() else edges
+        edges = np.append(edges[0] - step, edges) if edges[0] > times.min() else edges
+    return edges
+
+
+def _gain(row: Any) -> str:
+    """A gain with its interval; starred where it is above 0, if there are enough units."""
+    if pd.isna(row["gain"]):
+        return ""
+    star = "*" if row["units"] >= ENOUGH_UNITS and row["low"] >= LEAST else " "
+    return f"{row['gain']:+.3f}±{row['high'] - row['gain']:.3f}{star}"
+
+
+def _p(row: Any) -> str:
+    return "" if pd.isna(row["p_value"]) or row["units"] < ENOUGH_UNITS else p_text(row["p_value"])

@@ -1,0 +1,277 @@
+"""One job of a cross-validation: models are fitted without a fold and scored on it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from math import log
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuroprior._version import __version__
+from neuroprior.behaviour.analysis.calibration import Reliability, reliability
+from neuroprior.behaviour.analysis.comparison import Score, action_bits, baselines, score_bits, units
+from neuroprior.behaviour.analysis.lags import pieces
+from neuroprior.plans import Plans, is_per_step
+from neuroprior.plans.folds import FEWEST_UNITS, divisible, fair_split, folds, num_units
+from neuroprior.plans.past_durations import PastDurations
+from neuroprior.priors import CombinedPrior, GRUPrior, MarkovPrior, Prior, StackedPrior, TransformerPrior
+from neuroprior.priors.counts import TooLargeError
+from neuroprior.priors.ensembles import candidates
+from neuroprior.priors.ensembles.candidates import Effort, fitted_experts, number_tried
+from neuroprior.priors.ensembles.mixture import divided
+from neuroprior.priors.prior import construct, context_arguments
+from neuroprior.sampling.ancestral import sample, sample_in_world
+from neuroprior.worlds import TabularWorld
+
+Arrays = dict[str, np.ndarray[Any, Any]]
+
+ACTIONS, CONTEXT, DURATIONS = "actions", "actions and context", "actions and durations"
+"""The input of a model; durations are those of past actions."""
+
+WITH = {ACTIONS: "", CONTEXT: ", with context", DURATIONS: ", with durations"}
+"""The inputs in the order of tables, and what names of models say of them."""
+
+NETWORKS: dict[str, type[Prior]] = {"gru": GRUPrior, "transformer": TransformerPrior, "stacked": StackedPrior}
+"""Models that are trained."""
+
+COMBINED = "combined"
+"""The combined prior."""
+
+OF_FEATURES = (COMBINED, "transformer", "gru")
+"""Jobs whose models can take features, such as past durations."""
+
+KINDS = (COMBINED, "stacked", "transformer", "gru", "gru-lags", "lags", "counts")
+"""What one job fits; the slowest first."""
+
+LAGS = ("lags", "gru-lags")
+"""Jobs of the information by lag, by counts and by a GRU; of one fold only."""
+
+COUNTED = "markov"
+"""The count-based model of the information by lag; the other is the GRU."""
+
+VALIDATION = 0.1
+"""Share of the training plans on which the settings of count-based models are chosen."""
+
+MOST_PIECES, PIECES_A_STEP = 20_000, 128
+MOST_GENERATED = 1000
+"""Bounds of what is cut into pieces, read in a step, and sampled."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """All that decides the results of a cross-validation, beside the plans."""
+
+    folds: int  # how many; 1: learn from some plans and score on others
+    seed: int = 0  # draws the folds, and everything in training
+    skip: int = 0  # actions at the beginning of each plan that are left out of the score
+    max_steps: int | None = None  # gradient steps of neural priors; None: by the plans
+    effort: Effort = "standard"  # of the combined prior
+    reach: int = 16  # the most past actions whose information is measured
+    cut: bool = False  # whether the plans are consecutive parts of a single one
+    version: str = __version__  # of the library
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """How neural priors are trained."""
+        return {"max_steps": self.max_steps, "progress": False}
+
+    @property
+    def experts(self) -> set[str]:
+        """The models among the experts of the combined prior, which its job scores as well."""
+        return {name for name, kind in NETWORKS.items() if kind in candidates.NETWORKS[self.effort]}
+
+
+@dataclass(frozen=True)
+class Job:
+    """A fold, one of `KINDS`, and the input of its models: `ACTIONS`, `CONTEXT` or `DURATIONS`."""
+
+    fold: int
+    kind: str
+    inputs: str
+
+    def __str__(self) -> str:
+        return f"fold{self.fold}-{self.kind}{WITH[self.inputs].replace(', with ', '-')}"
+
+
+def counted(plans: Plans, skip: int, cut: bool = False) -> Tensor:
+    """`[N, L]` bool: all actions but the first `skip` of each plan; of parts of a single plan, but its first."""
+    mask = plans.mask()
+    if cut:
+        place = mask.flatten().cumsum(0).view(mask.shape)
+        return mask & (place > skip)
+    mask[:, :skip] = False
+    return mask
+
+
+def split(plans: Plans, test: Plans | None, design: Design, fold: int) -> tuple[Plans, Tensor]:
+    """The training plans of a fold, and the numbers of the plans that are scored."""
+    if test is not None:
+        return plans, torch.arange(len(test))
+    training, held_out = folds(plans, design.folds, design.seed)[fold]
+    return plans[training], held_out
+
+
+def fit_and_score(plans: Plans, test: Plans | None, design: Design, job: Job) -> Arrays:
+    """Fit the models of a job and score them on held-out plans, or on `test`.
+
+    Returns:
+        Arrays by the name of the model and what they are, such as "gru/bits". "how": its settings. "bits" `[n, L]`,
+        float32: those of each held-out action. "calibration": the sums of a `Reliability`. In the first fold,
+        "generated" `[g, L]`: plans sampled from it. Or, of `LAGS`, "bits" and "actions" `[J, U]`: those of the
+        same actions with 0, 1, ... J - 1 past ones known, by independent unit.
+    """
+    learned, index = split(plans, test, design, job.fold)
+    whole = plans if test is None else test
+    mask = counted(whole, design.skip, design.cut)
+    unit, scored = units(whole, mask)[index], whole[index]
+    if job.inputs != CONTEXT:
+        learned, scored = (some.without_context() for some in (learned, scored))
+    if job.inputs == DURATIONS:
+        past = PastDurations.of(learned)
+        learned, scored = past.added_to(learned), past.added_to(scored)
+    seed = design.seed * 1000 + job.fold
+    if job.kind in LAGS:
+        return _by_lag(job.kind, learned, scored, design, seed)
+    found: Arrays = {}
+    world = None if job.fold else _world(learned, context_arguments(learned, scored).get("num_contexts", 0))
+    for name, how, prior in _fitted(job.kind, learned, scored, design, seed):
+        arrays = {"how": np.array(how)} | score_arrays(prior, scored, mask[index], unit)
+        if job.fold == 0:
+            generated = _generated(prior, scored, world, seed)
+            arrays |= {} if generated is None else {"generated": generated.numpy()}
+        found |= {f"{name}/{what}": array for what, array in arrays.items()}
+    return found
+
+
+def score_arrays(prior: Prior, scored: Plans, mask: Tensor, unit: Tensor) -> Arrays:
+    """The bits of each action of plans, and the calibration over their units; see `fit_and_score`."""
+    bits = torch.zeros(scored.actions.shape)
+    total: Reliability | None = None
+    at = 0
+    with torch.no_grad():
+        for part, log_probs in prior.forecasts(scored):
+            rows = slice(at, at + len(part))
+            at += len(part)
+            taken = log_probs.gather(-1, part.actions.long()[..., None])[..., 0]
+            bits[rows] = -taken.masked_fill(~part.mask(), 0) / log(2)
+            counts = mask[rows]
+            if counts.any():
+                one = reliability(log_probs[counts], part.actions[counts].long(), unit[rows][counts])
+                total = one if total is None else total + one
+    return {"bits": bits.numpy()} | ({} if total is None else {"calibration": total.sums.numpy()})
+
+
+def _fitted(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Iterator[tuple[str, str, Prior]]:
+    """The name, the settings and the prior of each model of a kind."""
+    sizes = context_arguments(learned, scored)
+    learned = divisible(learned)
+    if "context_size" in sizes and kind in ("counts", "stacked"):
+        return  # features cannot be counted
+    generator = torch.Generator().manual_seed(seed)
+    if kind == "counts":
+        training, validation = fair_split(learned, VALIDATION, generator)
+        if int(validation.mask().sum()) < FEWEST_UNITS:
+            training, validation = learned.split(0.5, generator.manual_seed(seed))
+        for baseline in baselines(training, validation, sizes.get("num_contexts"), always_context=True):
+            if baseline.prior is not None:
+                # Chosen on the validation plans; then these are learned from as well.
+                yield baseline.model, baseline.how, baseline.prior.fit(learned)
+    elif kind == COMBINED:
+        training, validation = divided(learned, None, generator)
+        experts = list(fitted_experts(training, validation, sizes, design.effort, generator, design.training))
+        combined = construct(partial(CombinedPrior, experts=experts), learned.num_actions, sizes)
+        assert isinstance(combined, CombinedPrior)
+        combined.learn_weights(validation, number_tried(experts), training)
+        names = {type_: name for name, type_ in NETWORKS.items()}
+        for expert in [expert.recount(learned) for expert in experts]:
+            if type(expert) in names:
+                yield names[type(expert)], "", expert
+        yield kind, combined.summary(), combined
+    else:
+        prior: Any = construct(NETWORKS[kind], learned.num_actions, sizes | {"seed": seed})
+        yield kind, "", prior.fit(learned, generator=generator, **design.training)
+
+
+def _by_lag(kind: str, learned: Plans, scored: Plans, design: Design, seed: int) -> Arrays:
+    """The bits of the last actions of short pieces, with 0, 1, 2 and more of the actions before them known."""
+    # At most half of what the median plan has, so that pieces stand anywhere in plans.
+    halves = (int(plans.mask().sum(1).double().median()) // 2 for plans in (learned, scored))
+    reach = min(design.reach, *halves)
+    if reach < 1:
+        return {}
+    sizes = context_arguments(learned, scored)
+    generator = torch.Generator().manual_seed(seed)
+    late = scored.steps(0 if design.cut else max(design.skip - reach, 0))
+    if int(late.mask().sum(1).max()) <= reach:
+        return {}
+    held_out = pieces(late, reach + 1, MOST_PIECES, generator)
+    short = pieces(learned, reach + 1, MOST_PIECES * 5, generator)
+    if held_out.group is None or num_units(held_out) < FEWEST_UNITS:
+        return {}
+    if kind == "gru-lags":
+        name, neural = "gru", GRUPrior(learned.num_actions, seed=seed, **sizes)
+        neural.fit(divisible(short), generator=generator, batch_size=PIECES_A_STEP, **design.training)
+        scores = [_of_last(neural, held_out, known) for known in range(reach + 1)]
+    elif "context_size" in sizes:
+        return {}  # features cannot be counted
+    else:
+        name, scores = COUNTED, _chains(learned, held_out, reach, sizes.get("num_contexts"))
+    return {f"{name}/{what}": np.stack([getattr(score, what) for score in scores]) for what in ("bits", "actions")}
+
+
+def _chains(learned: Plans, held_out: Plans, reach: int, num_contexts: int | None) -> list[Score]:
+    """The bits of the last action of pieces under a chain of order j, for each j.
+
+    Each order is a prior of its own: in one of a high order the shorter histories only serve to back off to.
+    """
+    scores = []
+    for order in range(reach + 1):
+        chain = MarkovPrior(learned.num_actions, order, initial="lower", num_contexts=num_contexts)
+        try:
+            chain.fit(learned)
+        except TooLargeError:
+            break
+        scores.append(_of_last(chain, held_out, order))
+    return scores
+
+
+def _of_last(prior: Prior, held_out: Plans, known: int) -> Score:
+    """The bits of the last action of each piece, with so many before it known: the same actions whatever is known."""
+    length = held_out.max_length
+    bits = action_bits(prior, replace(held_out.steps(length - known - 1), lengths=None))
+    return score_bits("", "", bits[:, -1:], replace(held_out.steps(length - 1), lengths=None))
+
+
+def _world(learned: Plans, num_contexts: int) -> TabularWorld | None:
+    """How the context of a step follows from the one before and the action there, where these alone decide it."""
+    context, actions = learned.context, learned.num_actions
+    if context is None or context.is_floating_point() or not is_per_step(context):
+        return None
+    goes_on = learned.mask()[:, 1:]
+    pair = (context.long() * actions + learned.actions.long())[:, :-1][goes_on]
+    after = context[:, 1:][goes_on].long()
+    table = torch.arange(num_contexts).repeat_interleave(actions)
+    table[pair] = after
+    if not bool((table[pair] == after).all()) or len(pair) == 0:
+        return None
+    legal_actions = torch.zeros(num_contexts * actions, dtype=torch.bool)
+    legal_actions[pair] = True
+    legal_actions = legal_actions.view(num_contexts, actions)
+    legal_actions[~legal_actions.any(1)] = True
+    return TabularWorld(table.view(num_contexts, actions), torch.zeros(1, num_contexts), legal_actions)
+
+
+def _generated(prior: Prior, scored: Plans, world: TabularWorld | None, seed: int) -> Tensor | None:
+    """A plan sampled in the place of each of the first held-out plans, as long; None where contexts are unknown."""
+    like, generator = scored[:MOST_GENERATED], torch.Generator().manual_seed(seed)
+    if not prior.takes_context:
+        return sample(prior, len(like), like.max_length, generator=generator)
+    assert like.context is not None
+    if not is_per_step(like.context):
+        return sample(prior, len(like), like.max_length, like.context, generator=generator)
+    if world is None or like.max_length == 0:
+        return None
+    return sample_in_world(prior, world, like.context[:, 0].long(), 1, like.max_length, generator=generator)[0][:, 0]

@@ -1,0 +1,36 @@
+"""A section of a report on plans with its tables, and what sections share: names, texts of p-values, limits."""
+
+from typing import NamedTuple
+
+import pandas as pd
+from torch import Tensor
+
+from neuroprior.behaviour.report.page import Section
+from neuroprior.plans import Plans
+
+LISTED = 12
+"""Rows that are shown of a table; its file has all."""
+
+SIGNIFICANT = 0.05
+
+
+class Part(NamedTuple):
+    """A section, and its tables of results by name."""
+
+    section: Section
+    frames: dict[str, pd.DataFrame]
+
+
+def action_names(plans: Plans) -> list[str]:
+    """Names of the actions; their numbers where they have none."""
+    return list(plans.action_names or map(str, range(plans.num_actions)))
+
+
+def group_names(plans: Plans, groups: Tensor) -> list[str]:
+    """Names of these groups; their numbers where they have none."""
+    return [plans.group_names[g] if plans.group_names else f"group {g}" for g in groups.tolist()]
+
+
+def p_text(value: float) -> str:
+    """A p-value in a table."""
+    return f"{value:.1g}" if value else "<1e-300"

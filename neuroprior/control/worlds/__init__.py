@@ -1,0 +1,1 @@
+"""Worlds whose actions are vectors."""

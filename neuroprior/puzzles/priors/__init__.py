@@ -1,0 +1,1 @@
+"""Priors over the patterns of a board."""

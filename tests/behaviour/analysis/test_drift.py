@@ -1,0 +1,301 @@
+"""Drift by hand, where it was planted with a known size, and where there is none; short plans and a single long one."""
+
+import math
+from itertools import permutations
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from neuroprior import Plans
+from neuroprior.behaviour.analysis.drift import action_drift, by_group, by_plan, by_position
+from neuroprior.behaviour.analysis.statistics import holm, mean_interval, paired_difference, ratio_difference
+from neuroprior.plans.folds import BLOCKS
+from tests.support.sources import FALSE_ALARM, refuses, seeded
+
+
+def plans_of(num: int, length: int, **more) -> Plans:
+    return Plans(torch.zeros(num, length).long(), 2, **more)
+
+
+def noise(num: int, length: int, seed: int) -> torch.Tensor:
+    return torch.randn(num, length, generator=seeded(seed), dtype=torch.double)
+
+
+def few(rejections: float, sets: int, rate: float) -> bool:
+    """Whether so many of `sets` null data sets may be rejected at a true level of `rate`."""
+    return rejections <= stats.binom.isf(FALSE_ALARM, sets, rate)
+
+
+def test_a_line_is_found():
+    """Bits that rise by 3 over a plan, exactly: the slope is 3, and each tenth has the mean of its place."""
+    place = (torch.arange(40) + 0.5) / 40
+    plans = plans_of(12, 40)
+    found = by_position(plans, (3 * place + 1).expand(12, 40), plans.mask())
+    assert found.trend.mean == pytest.approx(3)
+    assert found.trend.p_value == 2.0**-11  # by signs: there is no spread
+    assert [part.mean for part in found.parts] == pytest.approx([1.15 + 0.3 * k for k in range(10)])
+    assert found.actions.tolist() == [48] * 10
+
+
+def test_slopes_of_plans_of_equal_lengths_are_students():
+    plans, bits = plans_of(9, 20), noise(9, 20, 0)
+    place = ((torch.arange(20) + 0.5) / 20).numpy()
+    slopes = [stats.linregress(place, row).slope for row in bits.numpy()]
+    found = by_position(plans, bits, plans.mask(), 4)
+    assert found.trend[:3] == pytest.approx(tuple(mean_interval(slopes)))
+    assert found.trend.p_value == pytest.approx(float(stats.ttest_1samp(slopes, 0).pvalue))
+    for k, part in enumerate(found.parts):
+        assert part == pytest.approx(tuple(mean_interval(bits[:, 5 * k : 5 * k + 5].mean(1))))
+
+
+def test_parts_of_plans_of_unlike_length():
+    """Places are those of the actions in their own plan; groups are the units; what is masked does not count."""
+    lengths = torch.tensor([4, 2, 1, 4])
+    plans = plans_of(4, 4, lengths=lengths, group=torch.tensor([0, 0, 1, 1]))
+    mask = plans.mask()
+    mask[0, 3] = False
+    bits = torch.arange(16.0).view(4, 4)
+    found = by_position(plans, bits, mask, 2)
+    # Second halves: action 2 of plan 0, 1 of plan 1; the only one of plan 2; 2 and 3 of plan 3.
+    assert found.actions.tolist() == [2 + 1 + 2, 2 + 1 + 2]
+    assert found.parts[0] == pytest.approx(ratio_difference([0 + 1 + 4, 12 + 13], [3, 2])[:3])
+    assert found.parts[1] == pytest.approx(ratio_difference([2 + 5, 8 + 14 + 15], [2, 3])[:3])
+    slopes, sizes = [], []
+    for places in ([[0.125, 0.375, 0.625], [0.25, 0.75]], [[0.5], [0.125, 0.375, 0.625, 0.875]]):
+        off = [np.array(row) - np.mean(row) for row in places]
+        slopes.append(sum(float(row @ np.arange(len(row))) for row in off))
+        sizes.append(sum(float(row @ row) for row in off))
+    assert found.trend == pytest.approx(ratio_difference(slopes, sizes))
+
+
+def test_short_plans_are_in_some_parts():
+    plans = plans_of(3, 2)
+    found = by_position(plans, torch.ones(3, 2), plans.mask(), 5)
+    assert found.actions.tolist() == [0, 3, 0, 3, 0]
+    assert math.isnan(found.parts[0].mean)
+    assert found.parts[1] == (1, 1, 1)
+    assert found.trend == (0, 0, 0, 1)
+    plans = plans_of(2, 4, lengths=torch.tensor([4, 1]))
+    found = by_position(plans, torch.ones(2, 4), plans.mask(), 4)
+    assert found.parts[0].mean == 1
+    assert math.isnan(found.parts[0].low)
+
+
+def test_no_trends_within_plans_of_independent_actions():
+    """200 sets each: of groups with levels of their own, of plans of unequal lengths, and of a single plan."""
+    rejections = np.zeros(3)
+    for seed in range(200):
+        group = torch.arange(24) // 3
+        level = noise(8, 1, seed)[group]
+        grouped, ragged = plans_of(24, 12, group=group), plans_of(20, 12, lengths=torch.arange(20) % 11 + 2)
+        single = plans_of(1, 400)
+        cases = [(grouped, noise(24, 12, seed) + level), (ragged, noise(20, 12, seed)), (single, noise(1, 400, seed))]
+        rejections += [by_position(p, bits, p.mask(), 1).trend.p_value <= 0.05 for p, bits in cases]
+    assert few(rejections[0], 200, 0.06)
+    assert few(rejections[1], 200, 0.07)
+    assert few(rejections[2], 200, 0.07)
+
+
+def test_trends_of_a_single_plan():
+    """In the plan, and over its parts."""
+    plans = plans_of(1, 2000)
+    bits = noise(1, 2000, 0) + torch.linspace(0, 1, 2000)
+    within = by_position(plans, bits, plans.mask())
+    assert within.trend.low <= 1 <= within.trend.high
+    assert within.trend.p_value < 1e-6
+    over = by_plan(plans, bits, plans.mask())
+    assert over.item == "parts"
+    assert over.bits.tolist() == pytest.approx(bits.view(BLOCKS, 50).mean(1).tolist())
+    want = stats.spearmanr(np.arange(BLOCKS), over.bits.numpy())
+    assert over.trend.mean == pytest.approx(float(want.statistic))
+    assert over.trend.p_value == pytest.approx(float(want.pvalue))
+    assert list(over.correlations) == [0]
+    whole = by_group(plans, bits, plans.mask())
+    assert whole.p_value is None
+    assert whole.groups[0] == pytest.approx(tuple(mean_interval(over.bits)))
+
+
+def test_plans_in_order_within_their_groups():
+    group = torch.tensor([7, 2, 7, 2, 2, 7, 5, 7])
+    plans = plans_of(8, 3, group=group, lengths=torch.tensor([3, 3, 1, 2, 3, 3, 3, 0]))
+    bits = torch.tensor([5.0, 1, 4, 2, 3, 1, 9, 0])[:, None].expand(8, 3)
+    found = by_plan(plans, bits, plans.mask())
+    assert found.item == "plans"
+    assert found.index.tolist() == [0, 2, 5, 1, 3, 4, 6]
+    assert found.group.tolist() == [7, 7, 7, 2, 2, 2, 5]
+    assert found.bits.tolist() == [5, 4, 1, 1, 2, 3, 9]
+    assert found.actions.tolist() == [3, 1, 3, 3, 2, 3, 3]
+    assert list(found.correlations) == [7, 2]
+    # Two of the six orders of three plans are as extreme.
+    assert found.correlations[7] == pytest.approx((-1, -1, 1, 1 / 3))
+    assert found.correlations[2] == pytest.approx((1, -1, 1, 1 / 3))
+    assert found.trend.mean == pytest.approx(0)
+
+
+@pytest.mark.parametrize("values", [[1.0, 3, 2, 5], [1.0, 2, 2, 0, 7], [3.0, 3, 3, 3], [1.0, 2, 2, 3, 5, 4, 7]])
+def test_rank_correlation_of_few_plans_is_exact(values):
+    plans = plans_of(len(values), 1)
+    found = by_plan(plans, torch.tensor(values)[:, None], plans.mask()).trend
+    if len(set(values)) == 1:
+        assert found == (0, -1, 1, 1)
+        return
+    rho = float(stats.spearmanr(range(len(values)), values).statistic)
+    orders, ranks = np.array(list(permutations(range(len(values))))), stats.rankdata(values)
+    every = (orders - orders.mean()) @ (ranks - ranks.mean())
+    every /= len(values) * orders[0].std() * ranks.std()
+    assert found.mean == pytest.approx(rho)
+    assert found.p_value == pytest.approx(np.mean(np.abs(every) >= abs(rho) - 1e-9))
+    half = stats.norm.ppf(0.975) * np.sqrt(1.06 / (len(values) - 3))  # Fieller, Hartley and Pearson 1957
+    assert (found.low, found.high) == pytest.approx(tuple(np.tanh(np.arctanh(rho) + np.array([-half, half]))))
+
+
+def test_plans_that_are_all_the_same_have_no_trend():
+    plans = plans_of(8, 2)
+    assert by_plan(plans, torch.ones(8, 2), plans.mask()).trend == (0, -1, 1, 1)
+
+
+def test_groups_of_which_all_go_the_same_way():
+    """Three groups of three plans, all in order: three equal signs, which occur at random one time in four."""
+    plans = plans_of(9, 1, group=torch.arange(9) // 3)
+    found = by_plan(plans, torch.arange(9.0)[:, None], plans.mask()).trend
+    assert found == (1, -1, 1, 0.25)
+
+
+def test_trends_over_plans():
+    """Planted in 8 groups, and 200 sets of 6 groups and of one without any."""
+    group, order = torch.arange(80) % 8, torch.arange(80) // 8
+    plans = plans_of(80, 5, group=group)
+    found = by_plan(plans, noise(80, 5, 0) + 3 * noise(8, 1, 1)[group] + 0.2 * order[:, None], plans.mask())
+    assert found.trend.p_value < 1e-3
+    assert 0.4 < found.trend.mean < 1
+    rejections = np.zeros(2)
+    for seed in range(200):
+        several, one = plans_of(36, 2, group=torch.arange(36) % 6), plans_of(15, 2)
+        rejections += [by_plan(p, noise(len(p), 2, seed), p.mask()).trend.p_value <= 0.05 for p in (several, one)]
+    assert few(rejections[0], 200, 0.06)
+    assert few(rejections[1], 200, 0.06)
+
+
+def test_groups_by_hand():
+    """Costs 1, 2, 3 against 4, 5, 6: Kruskal and Wallis's H is 27 / 7."""
+    costs, lengths = torch.tensor([1.0, 4, 2, 5, 3, 6, 9]), torch.tensor([2, 1, 2, 2, 1, 2, 2])
+    plans = plans_of(7, 2, group=torch.tensor([3, 1, 3, 1, 3, 1, 2]), lengths=lengths)
+    found = by_group(plans, costs[:, None].expand(7, 2), plans.mask())
+    assert list(found.groups) == [1, 2, 3]
+    assert found.groups[3] == pytest.approx(ratio_difference([2, 4, 3], [2, 2, 1])[:3])
+    assert found.groups[2].mean == 9
+    assert math.isnan(found.groups[2].low)
+    assert found.p_value == pytest.approx(float(stats.chi2.sf(27 / 7, 1)))
+
+
+def test_groups_that_do_not_differ():
+    plans, same = plans_of(6, 2, group=torch.arange(6) // 2), torch.ones(6, 2)
+    assert by_group(plans, same, plans.mask()).p_value == 1
+    alone = plans_of(6, 2, group=torch.arange(6))
+    assert by_group(alone, same, alone.mask()).p_value is None
+    none = by_group(plans_of(6, 2), noise(6, 2, 0), torch.ones(6, 2).bool())
+    assert none.p_value is None
+    assert none.groups[0] == pytest.approx(tuple(mean_interval(noise(6, 2, 0).mean(1))))
+    rejections = 0
+    for seed in range(200):
+        plans = plans_of(30, 3, group=torch.arange(30) % 5)
+        rejections += by_group(plans, noise(30, 3, seed), plans.mask()).p_value <= 0.05
+    assert few(rejections, 200, 0.05)
+    plans = plans_of(60, 3, group=torch.arange(60) % 2)
+    assert by_group(plans, noise(60, 3, 0) + 2 * plans.group[:, None], plans.mask()).p_value < 1e-6
+
+
+def test_actions_by_hand():
+    """Halves of plans of 4, 5 (without the central one), 2 and 1 (none) actions."""
+    actions = torch.tensor([[0, 1, 2, 2, 0], [0, 0, 1, 2, 0], [1, 0, 0, 0, 0], [2, 0, 0, 0, 0]])
+    found = action_drift(Plans(actions, 4, torch.tensor([4, 5, 2, 1])))
+    assert [one.action for one in found] == [0, 1, 2, 3]
+    assert [one.first for one in found] == pytest.approx([3 / 5, 2 / 5, 0, 0])
+    assert [one.second for one in found] == pytest.approx([2 / 5, 0, 3 / 5, 0])
+    for one, change in zip(found, ([-1, -1, 1], [-1, 0, -1], [2, 1, 0], [0, 0, 0]), strict=True):
+        assert one.change == pytest.approx(ratio_difference(change, [2, 2, 1]))
+    assert [one.corrected for one in found] == pytest.approx(holm([one.change.p_value for one in found]).tolist())
+
+
+def test_actions_of_groups_and_of_a_single_plan():
+    actions = torch.randint(3, (12, 6), generator=seeded(0))
+    grouped = action_drift(Plans(actions, 3, group=torch.arange(12) % 4))
+    single = action_drift(Plans(torch.randint(3, (1, 401), generator=seeded(1)), 3))
+    row = torch.randint(3, (1, 401), generator=seeded(1))[0]
+    for k in range(3):
+        first, second = ((part == k).double().mean(1) for part in (actions[:, :3], actions[:, 3:]))
+        want = paired_difference(*(part.view(3, 4).mean(0) for part in (second, first)))
+        assert grouped[k].change == pytest.approx(tuple(want))
+        halves = [(half == k).double().view(20, 10).mean(1) for half in (row[201:], row[:200])]
+        assert single[k].change == pytest.approx(tuple(paired_difference(*halves)))
+
+
+def test_actions_that_drift_and_that_do_not():
+    """A share of 0.5 that falls to 0.3 in the second halves; 200 sets where nothing changes, and 100 single plans."""
+    late = torch.arange(40) >= 20
+    actions = (torch.rand(200, 40, generator=seeded(0)) >= torch.where(late, 0.3, 0.5)).long()
+    found = action_drift(Plans(actions, 3))
+    assert found[0].change.low <= -0.2 <= found[0].change.high
+    assert found[0].corrected < 1e-6
+    assert found[2].change == (0, 0, 0, 1)
+    wrong = np.zeros(2)
+    for seed in range(200):
+        generator = seeded(seed)
+        several = Plans(torch.randint(4, (30, 10), generator=generator), 4)
+        single = Plans(torch.randint(4, (1, 600), generator=generator), 4)
+        wrong += [min(one.corrected for one in action_drift(p)) <= 0.05 for p in (several, single)]
+    assert few(wrong[0], 200, 0.05)
+    assert few(wrong[1], 200, 0.05)
+
+
+def test_bad_input():
+    plans, bits = plans_of(3, 4, lengths=torch.tensor([4, 2, 3])), torch.ones(3, 4)
+    mask = plans.mask()
+    for call in (by_position, by_plan, by_group):
+        with refuses("bits", "[3, 4]"):
+            call(plans, bits[:2], mask)
+        with refuses("mask", "[3, 4]"):
+            call(plans, bits, mask[0])
+        with refuses("mask", "bool"):
+            call(plans, bits, mask.long())
+        with refuses("mask[1, 2]", "ended"):
+            call(plans, bits, torch.ones(3, 4).bool())
+        with refuses("bits[2, 1]", "nan"):
+            call(plans, bits.clone().index_put_((torch.tensor(2), torch.tensor(1)), torch.tensor(math.nan)), mask)
+        with refuses("mask", "two actions"):
+            call(plans, bits, mask & (torch.arange(12).view(3, 4) == 1))
+    with refuses("no plan has two actions"):
+        by_position(plans, bits, mask & (torch.arange(4) == 0))
+    with refuses("parts"):
+        by_position(plans, bits, mask, 0)
+    for wrong in (plans_of(3, 1), plans_of(1, 3), plans_of(0, 3)):
+        with refuses("plans", "at least"):
+            action_drift(wrong)
+
+
+def test_plans_that_are_equal_but_for_rounding_do_not_differ():
+    """All actions have log2(3) bits: their means over plans differ in the last digit, by the length of the plan."""
+    lengths = torch.arange(5, 29)
+    plans = Plans(torch.zeros(24, 28, dtype=torch.long), 3, lengths=lengths, group=torch.arange(24) // 8)
+    bits = torch.full((24, 28), math.log2(3), dtype=torch.double)
+    means = (bits * plans.mask()).sum(1) / lengths
+    assert len(means.unique()) > 1
+    assert by_group(plans, bits, plans.mask()).p_value == 1
+    found = by_plan(plans, bits, plans.mask())
+    assert [one[0::3] for one in found.correlations.values()] == [(0, 1)] * 3
+
+
+def test_small_bits_are_ranked_too():
+    """A thousandth of them as well as all: what is compared are digits of the largest."""
+    bits = torch.arange(1.0, 9).double()[:, None].expand(-1, 4)
+    plans = Plans(torch.zeros(8, 4, dtype=torch.long), 2)
+    found = [by_plan(plans, bits * scale, plans.mask()).correlations[0] for scale in (1, 1e-3, 1e-12)]
+    assert [one.mean for one in found] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("analysis", [by_position, by_plan, by_group, lambda plans, *_: action_drift(plans)])
+def test_plans_are_expected(analysis):
+    with refuses("plans: Plans are expected"):
+        analysis(torch.zeros(4, 3), torch.zeros(4, 3), torch.ones(4, 3, dtype=torch.bool))

@@ -1,0 +1,227 @@
+"""Transitions and the tests of their differences against brute force, scipy, enumeration and null data."""
+
+import itertools
+from collections import Counter
+
+import pytest
+import torch
+from scipy import stats
+
+from neuroprior import Plans
+from neuroprior.behaviour import transitions
+from neuroprior.behaviour.analysis.statistics import holm
+from neuroprior.behaviour.analysis.transitions import FEWEST_DIVISIONS, FEWEST_PERMUTATIONS
+from tests.support.chains import markov_plans, markov_probs, null_sets
+from tests.support.sources import FALSE_ALARM, refuses, seeded
+
+
+def unequal() -> Plans:
+    """Plans of 0 to 7 of 4 actions, one of which never occurs, in the groups -2, 5 and 9."""
+    group = torch.tensor([5, 9, 5, -2] * 5)
+    lengths = torch.randint(8, (20,), generator=seeded(1))
+    return Plans(torch.randint(3, (20, 7), generator=seeded(0)), 4, lengths, group=group)
+
+
+def test_counts_are_those_of_brute_force():
+    plans = unequal()
+    found = transitions(plans, 9, seeded(0))
+    assert found.groups.tolist() == [-2, 5, 9]
+    each = Counter()
+    for row, length, group in zip(plans.actions.tolist(), plans.lengths.tolist(), plans.group.tolist(), strict=True):
+        each.update((group, *pair) for pair in itertools.pairwise(row[:length]))
+    for g, a, b in itertools.product(range(3), range(4), range(4)):
+        assert found.group_counts[g, a, b] == each[found.groups[g].item(), a, b]
+    assert found.counts.equal(found.group_counts.sum(0))
+    assert found.counts.dtype == torch.int64
+
+
+def test_probs():
+    found = transitions(Plans(torch.tensor([[0, 1, 0, 1, 0, 0]]), 3))
+    want = [[1 / 3, 2 / 3, 0], [1, 0, 0]]
+    assert found.probs()[:2].flatten().tolist() == pytest.approx([p for row in want for p in row])
+    assert found.probs()[2].isnan().all()
+    torch.testing.assert_close(found.group_probs()[0], found.probs(), equal_nan=True)
+
+
+def test_the_statistics_are_scipys():
+    """Of all: the sum over rows of the G of the table of groups against followers; of cells: G of each 2 x 2 table."""
+    plans = Plans(torch.randint(3, (4, 60), generator=seeded(0)), 3, group=torch.arange(4))
+    found = transitions(plans)
+    assert found.test == "chi-square"
+    tables = [found.group_counts[:, a].numpy() for a in range(3)]
+    each = [stats.chi2_contingency(table, correction=False, lambda_="log-likelihood") for table in tables]
+    assert found.statistic == pytest.approx(sum(one.statistic for one in each))
+    assert found.degrees_of_freedom == sum(one.dof for one in each) == 18
+    assert found.p_value == pytest.approx(stats.chi2.sf(found.statistic, 18))
+    p_values = []
+    for g, a, b in itertools.product(range(4), range(3), range(3)):
+        table = tables[a]
+        ours, others = table[g], table.sum(0) - table[g]
+        cell = [[ours[b], ours.sum() - ours[b]], [others[b], others.sum() - others[b]]]
+        p_values.append(stats.chi2_contingency(cell, correction=False, lambda_="log-likelihood").pvalue)
+    assert found.cell_p_values.flatten().tolist() == pytest.approx(holm(p_values).tolist())
+    assert found.permutations == 0
+
+
+def statistics(plans: Plans) -> tuple[float, float]:
+    """The statistics of all and of the strongest cell, by scipy."""
+    counts = transitions(Plans(plans.actions, plans.num_actions, group=plans.group), 1, seeded(0)).group_counts
+    whole, cells = 0.0, [0.0]
+    for table in counts.transpose(0, 1).numpy():
+        table = table[table.sum(1) > 0][:, table.sum(0) > 0]
+        if min(table.shape, default=0) < 2:
+            continue
+        whole += stats.chi2_contingency(table, correction=False, lambda_="log-likelihood").statistic
+        for g, b in itertools.product(range(table.shape[0]), range(table.shape[1])):
+            ours, others = table[g], table.sum(0) - table[g]
+            cell = [[ours[b], ours.sum() - ours[b]], [others[b], others.sum() - others[b]]]
+            cells.append(stats.chi2_contingency(cell, correction=False, lambda_="log-likelihood").statistic)
+    return whole, max(cells)
+
+
+def test_permutations_come_near_to_all_divisions():
+    """Three of seven plans in one group: all 35 divisions against 4,000 drawn ones (5 standard errors)."""
+    actions = markov_plans(markov_probs(2, 1, 0), 7, 9, 5).actions
+    divisions = []
+    for chosen in itertools.combinations(range(7), 3):
+        group = torch.zeros(7).long().index_fill(0, torch.tensor(chosen), 1)
+        divisions.append(statistics(Plans(actions, 2, group=group)))
+    observed = statistics(Plans(actions, 2, group=torch.tensor([1, 1, 1, 0, 0, 0, 0])))
+    found = transitions(Plans(actions, 2, group=torch.tensor([1, 1, 1, 0, 0, 0, 0])), 4000, seeded(1))
+    assert found.test == "permutation"
+    assert found.permutations == 4000
+    reached = [sum(one[i] >= observed[i] - 1e-9 for one in divisions) / 35 for i in (0, 1)]
+    assert 0.05 < reached[0] < 0.95
+    assert 0.05 < reached[1] < 0.95
+    assert found.p_value == pytest.approx(reached[0], abs=5 * 0.5 / 4000**0.5)
+    assert float(found.cell_p_values.min()) == pytest.approx(reached[1], abs=5 * 0.5 / 4000**0.5)
+
+
+def test_ties_count():
+    """Plans that are all equal: every permutation has the same statistic, and every p-value is 1."""
+    plans = Plans(torch.tensor([0, 0, 1, 1, 0]).expand(12, 5), 2, group=torch.arange(12) % 2)
+    found = transitions(plans, 50, seeded(0))
+    assert found.p_value == 1
+    assert (found.cell_p_values == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("plans_of_groups", "test"),
+    [
+        ([5], "none"),
+        ([0, 4, 0], "none"),
+        ([1] * 30, "chi-square"),
+        ([2, 2], "chi-square"),  # 3 divisions
+        ([3, 3], "chi-square"),  # 10
+        ([18, 1], "chi-square"),  # 19
+        ([19, 1], "permutation"),  # 20
+        ([3, 4], "permutation"),  # 35
+        ([2, 2, 2], "chi-square"),  # 15
+    ],
+)
+def test_which_test(plans_of_groups, test):
+    """Plans of a single action, three in each group, count for nothing."""
+    group = torch.arange(len(plans_of_groups)).repeat_interleave(torch.tensor(plans_of_groups))
+    lengths = torch.cat([torch.full_like(group, 20), torch.ones(3 * len(group.unique()), dtype=torch.long)])
+    group = torch.cat([group, group.unique().repeat(3)])
+    actions = torch.randint(2, (len(group), 20), generator=seeded(0))
+    found = transitions(Plans(actions, 2, lengths, group=group), 19, seeded(0))
+    assert found.test == test
+    assert found.permutations == (19 if test == "permutation" else 0)
+    assert (found.p_value != found.p_value) == (test == "none")
+    assert FEWEST_DIVISIONS == 20
+
+
+def test_without_anything_to_compare():
+    for plans in (
+        Plans(torch.zeros(0, 5).long(), 2),
+        Plans(torch.zeros(3, 1).long(), 2, group=torch.arange(3)),
+        Plans(torch.zeros(30, 5).long(), 2, group=torch.arange(30) % 2),
+        Plans(torch.randint(2, (9, 5), generator=seeded(0)), 2),
+    ):
+        found = transitions(plans)
+        assert found.test == "none"
+        assert found.p_value != found.p_value
+        assert found.statistic != found.statistic
+        assert found.cell_p_values.isnan().all()
+        assert found.cell_p_values.shape == found.group_counts.shape
+
+
+def test_cells_without_anything_to_compare_are_nan():
+    """After action 2 only group 1 goes on, after 1 there is always 0, nobody takes action 3, and group 2 is empty."""
+    actions = torch.tensor([[0, 0, 1, 0, 0, 1, 0]] * 6 + [[1, 0, 2, 2, 1, 0, 0]] * 6)
+    lengths = torch.tensor([7] * 12 + [1])
+    group = torch.tensor([0] * 6 + [1] * 6 + [2])
+    plans = Plans(torch.cat([actions, actions[:1]]), 4, lengths, group=group)
+    known = ~transitions(plans, 99, seeded(0)).cell_p_values.isnan()
+    want = torch.zeros(3, 4, 4, dtype=torch.bool)
+    want[:2, 0, :3] = True  # 0 is followed by 0, 1 and 2
+    assert known.equal(want)
+
+
+def null_plans(seed: int, groups: int, num: int, length: int) -> Plans:
+    """A source of dissimilar plans: each follows one of two chains."""
+    both = [markov_plans(markov_probs(3, 1, 2 * seed + i), num, length, 7 * seed + i) for i in (0, 1)]
+    which = torch.rand(num, 1, generator=seeded(seed)) < 0.5
+    actions = torch.where(which, both[0].actions, both[1].actions)
+    return Plans(
+        actions, 3, torch.randint(length + 1, (num,), generator=seeded(seed)), group=torch.arange(num) % groups
+    )
+
+
+def test_false_positives_of_permutations():
+    """200 null data sets whose actions depend on each other within a plan: p <= 0.05 in no more than 5 %."""
+    found = [transitions(null_plans(seed, 3, 18, 20), 99, seeded(seed)) for seed in range(200)]
+    assert {one.test for one in found} == {"permutation"}
+    most = stats.binom.isf(FALSE_ALARM, 200, 0.05)
+    assert sum(one.p_value <= 0.05 for one in found) <= most
+    assert sum(bool((one.cell_p_values <= 0.05).any()) for one in found) <= most
+    assert stats.kstest([one.p_value for one in found], "uniform").pvalue > FALSE_ALARM
+    # The chi-square distribution does not hold for them, so the test above can fail.
+    assert sum(stats.chi2.sf(one.statistic, one.degrees_of_freedom) <= 0.05 for one in found) > most
+
+
+def test_false_positives_of_chi_square():
+    """200 null data sets of one chain each, with as many groups as plans."""
+    found = [transitions(Plans(plans.actions, 3, group=torch.arange(4))) for plans in null_sets(3, 1, 200, 4, 200)]
+    assert {one.test for one in found} == {"chi-square"}
+    most = stats.binom.isf(FALSE_ALARM, 200, 0.06)  # approximate, so let be 0.06
+    assert sum(one.p_value <= 0.05 for one in found) <= most
+    assert sum(bool((one.cell_p_values <= 0.05).any()) for one in found) <= most
+
+
+def test_a_group_of_its_own_is_found():
+    """Group 2 goes from 0 to 1 more often; the rows of other actions do not differ."""
+    probs = markov_probs(4, 1, 0)
+    other = probs.clone()
+    other[0] = torch.tensor([0.1, 0.7, 0.1, 0.1])
+    parts = [markov_plans(p, 12, 60, seed).actions for seed, p in enumerate((probs, probs, other))]
+    plans = Plans(torch.cat(parts), 4, group=torch.arange(3).repeat_interleave(12))
+    found = transitions(plans, 999, seeded(0))
+    assert found.p_value == 1 / 1000
+    assert found.cell_p_values[2, 0, 1] == 1 / 1000
+    assert (found.cell_p_values[:, 1:] > 0.05).all()
+
+
+def test_the_same_seed_gives_the_same_result():
+    plans = null_plans(0, 3, 18, 20)
+    first, second = (transitions(plans, 99, seeded(5)) for _ in range(2))
+    assert first.p_value == second.p_value
+    assert first.cell_p_values.equal(second.cell_p_values)
+
+
+def test_work_is_bounded():
+    plans = null_plans(0, 3, 18, 20)
+    full = transitions(plans, 300, seeded(0))
+    assert full.permutations == 300
+    # How many are made together changes nothing.
+    alone = transitions(plans, 300, seeded(0), chunk_size=1)
+    assert alone.p_value == full.p_value
+    assert alone.cell_p_values.equal(full.cell_p_values)
+    assert transitions(plans, 300, seeded(0), max_work=1).permutations == FEWEST_PERMUTATIONS
+    assert transitions(plans, 20, seeded(0), max_work=1).permutations == 20
+
+
+def test_bad_input():
+    with refuses("permutations", "0"):
+        transitions(unequal(), 0)

@@ -1,0 +1,201 @@
+"""The section on conditions: its tables say what the comparison found, and its figure shows it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from neuroprior import Plans
+from neuroprior.behaviour import compare_conditions
+from neuroprior.behaviour.report.conditions import DRAWN, condition_section
+from neuroprior.behaviour.report.figures import condition_figure
+from neuroprior.behaviour.report.part import LISTED, Part
+from neuroprior.behaviour.report.plan_report import report
+from neuroprior.behaviour.report.scores import evaluate_saved
+from neuroprior.priors import UniformPrior
+from tests.support.reports import QUICK
+from tests.support.sources import refuses, seeded
+from tests.support.studies import between, study, within
+
+NAMES = ["eat", "groom", "rear"]
+
+
+def section_of(plans: Plans) -> Part | None:
+    return condition_section(evaluate_saved({"uniform": UniformPrior(plans.num_actions)}, plans, 0))
+
+
+def changed(conditions, length: int = 80, **more: object) -> Plans:
+    """Action 0 takes four times as long in condition 1, and is rarely followed by itself."""
+
+    def change(probs: torch.Tensor, condition: torch.Tensor) -> None:
+        probs[condition == 1, 0] = torch.tensor([0.05, 0.65, 0.3])
+
+    plans = study(0, conditions, length, 3, habit=0.2, change=change, slower={0: 4.0})
+    return replace(plans, action_names=NAMES, **more)
+
+
+@pytest.mark.parametrize(
+    "conditions",
+    [between(12), within(8), between(12, 4, 3), within(6, 6, 3)],
+    ids=["between", "within", "three", "three within"],
+)
+def test_the_tables_hold_what_was_found(conditions):
+    plans = changed(conditions)
+    section, frames = section_of(plans)
+    found = compare_conditions(plans, generator=seeded(0))
+    assert section.text[0] == found.verdict
+    tests = frames["condition_tests"].set_index("test")
+    assert tests["p_value"]["all"] == found.p_value
+    assert {name: tuple(tests.loc[name, ["p_value", "corrected"]]) for name in found.tests} == found.tests
+    features = frames["conditions"]
+    assert len(features) == sum(len(family.features) for family in found.families)
+    assert features["significant"].sum() == sum(int(found.significant(family).sum()) for family in found.families)
+    assert features["significant"].is_monotonic_decreasing
+    family = next(family for family in found.families if family.name == "durations")
+    row = features.set_index("feature").loc["duration of eat"]
+    assert row["significant"]
+    assert row["mean, drug 1"] == pytest.approx(float(family.means[1, 0].exp()))
+    if len(found.condition_names) == 2:
+        assert row["difference"] == pytest.approx(row["mean, drug 1"] / row["mean, drug 0"], rel=0.05)
+        assert row["low"] < 4 < row["high"]
+    chosen = features.set_index("feature").loc["eat → eat"]
+    assert chosen["mean, drug 1"] == pytest.approx(0.05, abs=0.02)
+    blocks = frames["condition_blocks"]
+    right = (blocks["condition"] == blocks["classified"]).groupby(blocks["condition"]).mean().mean()
+    assert right == pytest.approx(found.prediction.accuracy)
+    carried = frames["condition_sequences"]
+    assert carried["bits_per_1000"].sum() == pytest.approx(1000 * float(found.prediction.carried.sum()))
+    assert carried.set_index("sequence")["speaks_for"]["eat → groom"] == "drug 1"
+
+
+def test_stars_and_limits_of_the_printed_tables():
+    section, frames = section_of(changed(between(12)))
+    tests, features, predicted, carried = section.tables
+    assert tests.rows[0][0] == "all tests together"
+    assert all(row[-1].endswith("*") == (float(row[-1].strip("*")) < 0.05) for row in tests.rows[1:])
+    assert "Smallest possible p: 0.0022; corrected for 6 tests: 0.013." in tests.caption
+    assert len(features.rows) == LISTED < len(frames["conditions"])
+    starred = [row[0] for row in features.rows if row[-1].endswith("*")]
+    assert starred == frames["conditions"]["feature"][frames["conditions"]["significant"]].tolist()[:LISTED]
+    assert [row[0] for row in predicted.rows] == ["drug 0", "drug 1"]
+    assert [sum(map(int, row[1:])) for row in predicted.rows] == [6, 6]
+    assert len(carried.rows) == min(LISTED, len(frames["condition_sequences"]))
+
+
+def test_units_are_counted_by_their_condition_and_by_the_one_predicted():
+    """Short plans without an effect, so that not as many of one condition are taken for the other as the reverse."""
+    section, frames = section_of(study(0, between(9, 1), 12, 3, habit=0.2))
+    blocks = frames["condition_blocks"]
+    pairs = [*zip(blocks["condition"], blocks["classified"], strict=True)]
+    printed = section.tables[2]
+    names = ["drug 0", "drug 1"]
+    assert printed.headings == ["condition", *(f"predicted\n{name}" for name in names)]
+    assert printed.rows == [[own, *(str(pairs.count((own, other))) for other in names)] for own in names]
+    assert pairs.count(("drug 0", "drug 1")) != pairs.count(("drug 1", "drug 0"))
+
+
+def test_a_report_has_the_section(tmp_path):
+    made = report(changed(between(12)), folds=2, out=tmp_path, sections=["file", "conditions"], **QUICK)
+    assert made.lead.endswith(compare_conditions(changed(between(12)), generator=seeded(0)).verdict)
+    names = ["condition_tests", "conditions", "condition_blocks", "condition_sequences"]
+    assert {*names} <= {*made.tables}
+    assert all((tmp_path / f"{name}.csv").exists() for name in names)
+    assert "conditions" in made.figures
+    assert any("the smallest possible p is 0.0022" in text for text in made.sections[-1].text)
+
+
+def test_without_conditions_there_is_no_section_and_with_one_it_says_why():
+    plans = changed(between(6))
+    assert section_of(replace(plans, condition=None, condition_names=None)) is None
+    part = section_of(replace(plans, condition=torch.zeros(len(plans), dtype=torch.long)))
+    assert part.section.text == ["Not tested: all plans are under one condition."]
+    assert all(frame.empty for frame in part.frames.values())
+
+
+def test_plans_without_groups_or_names_that_are_those_of_columns():
+    names = ["p", "condition: feature"]
+    plans = replace(changed(between(12, 1), condition_names=names), group=None)
+    section, frames = section_of(plans)
+    assert frames["condition_blocks"]["plan"].tolist() == [f"plan {number}" for number in range(12)]
+    assert section.tables[1].headings == [
+        "feature",
+        *(f"mean,\n{name}" for name in names),
+        *("condition: feature\nagainst p", "95 % interval", "p"),
+    ]
+    assert [row[0] for row in section.tables[2].rows] == names
+
+
+def figure_tables(num: int, units: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+    names = [f"c{k}" for k in range(num)]
+    means = [(f, name, 0.5 + k, 0.4 + k, 0.6 + k) for f in ("a", "b") for k, name in enumerate(names)]
+    values = [
+        (f, u, name, 0.5 + k + 0.01 * u) for f in ("a", "b") for u in range(units) for k, name in enumerate(names)
+    ]
+    return (
+        pd.DataFrame(means, columns=["feature", "condition", "mean", "low", "high"]),
+        pd.DataFrame(values, columns=["feature", "unit", "condition", "value"]),
+    )
+
+
+@pytest.mark.parametrize("num", [2, 3])
+def test_the_figure_has_a_dot_for_each_unit_and_joins_those_of_one(num):
+    means, values = figure_tables(num, 5)
+    for paired in (False, True):
+        cells = condition_figure(means, values, paired).axes
+        assert [axes.get_title(loc="left") for axes in cells] == ["a", "b"]
+        for axes in cells:
+            dots = [line for line in axes.lines if line.get_marker() == "o"]
+            assert [len(line.get_xdata()) for line in dots] == [5] * num
+            assert np.concatenate([line.get_xdata() for line in dots]) == pytest.approx(
+                values[values["feature"] == "a"].sort_values(["condition", "unit"])["value"].tolist()
+            )
+            joined = [line for line in axes.lines if line.get_marker() == "None" and len(line.get_xdata()) == num]
+            own = [line for line in joined if len({*line.get_ydata()}) == num]
+            assert len(own) == 5 * paired
+            assert [label.get_text() for label in axes.get_yticklabels()] == [f"c{k}" for k in range(num)]
+
+
+def test_the_figure_shows_the_features_that_differ_most():
+    """With the values of units, those of durations as geometric means, and the means of the table."""
+    plans = changed(within(8))
+    section, frames = section_of(plans)
+    cells, features = section.figures[0].figure.axes, frames["conditions"][:DRAWN]
+    assert [axes.get_title(loc="left").rstrip("*") for axes in cells] == features["feature"].tolist()
+    found = compare_conditions(plans, generator=seeded(0))
+    families = {family.name: family for family in found.families}
+    spelled = {"durations": "duration of {}", "actions": "share of {}"}
+    for axes, (_, row) in zip(cells, features.iterrows(), strict=True):
+        family, joint = families[row["family"]], " → " if row["family"] == "transitions" else " "
+        names = [spelled.get(family.name, "{}").format(joint.join(NAMES[a] for a in own)) for own in family.features]
+        values = family.values[:, names.index(row["feature"])]
+        values = values.exp() if family.name == "durations" else values
+        dots = [line.get_xdata() for line in axes.lines if line.get_marker() == "o"]
+        bars = [line.get_xdata()[0] for line in axes.lines if line.get_marker() == "|"]
+        for k, name in enumerate(found.condition_names):
+            assert sorted(dots[k]) == pytest.approx(sorted(values[found.design.label == k].tolist()))
+            assert bars[k] == row[f"mean, {name}"]
+    assert "durations" in set(features["family"])
+    with refuses("means"):
+        condition_figure(*(frame[:0] for frame in figure_tables(2, 3)))
+
+
+@pytest.mark.parametrize("conditions", [between(12), within(8)], ids=["between", "within"])
+def test_features_that_differ_most_come_first(conditions):
+    """Significant ones by family, then all by their p-values, and among equals by how unlike they are."""
+    features = section_of(changed(conditions, 40))[1]["conditions"]
+    families = ["transitions", "durations", "actions", "sequences"]
+    rank = [families.index(row.family) if row.significant else len(families) for row in features.itertuples()]
+    keys = [*zip(rank, features["corrected"], features["p_value"], -features["statistic"], strict=True)]
+    assert keys == sorted(keys)
+    assert len({key[:3] for key in keys}) < len(keys)
+
+
+def test_units_that_cannot_be_compared_are_counted():
+    """Of eight animals under both conditions one has lost the sessions under the second."""
+    plans = changed(within(8))
+    lost = (plans.group == 3) & (plans.condition == 1)
+    text = " ".join(section_of(plans[~lost])[0].text)
+    assert "1 groups that are not under every condition were left out" in text
+    assert "left out" not in " ".join(section_of(plans)[0].text)

@@ -1,0 +1,204 @@
+"""Figures of the report against tables made by hand: everything that is drawn stands where the table says."""
+
+import pandas as pd
+import pytest
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+
+from neuroprior import Plans
+from neuroprior.behaviour.report.drawing import KINDS, MARKOV, SPARE, colors, lines
+from neuroprior.behaviour.report.figures import (
+    STRIPS,
+    calibration_figure,
+    condition_figure,
+    drift_figure,
+    dwell_figure,
+    ethogram_figure,
+    lag_figure,
+    motif_figure,
+    order_figure,
+    score_figure,
+)
+
+
+def title(axes: Axes) -> str:
+    return axes.get_title(loc="left")
+
+
+def test_dwell_times():
+    """The commonest action first; bars between the edges of their bins, the law at their middles."""
+    bins = [(1.0, 4.0, 0.5, 0.4), (4.0, 9.0, 0.2, 0.3)]
+    actions = [("rare", 3, 0.0, "gamma"), ("usual", 50, 0.25, "weibull"), ("some", 10, 0.0, "exponential")]
+    columns = ["action", "number", "zero", "law", "low", "high", "density", "fitted"]
+    figure = dwell_figure(pd.DataFrame([(*one, *each) for one in actions for each in bins], columns=columns))
+    assert [title(axes) for axes in figure.axes] == ["usual\nweibull, 25 % at 0", "some\nexponential", "rare\ngamma"]
+    for axes in figure.axes:
+        bars = [(bar.get_x(), bar.get_width(), bar.get_height()) for bar in axes.patches]
+        assert bars == [(1.0, 3.0, 0.5), (4.0, 5.0, 0.2)]
+        (law,) = axes.lines
+        assert law.get_xydata().tolist() == [[2.0, 0.4], [6.0, 0.3]]
+        assert (axes.get_xscale(), axes.get_xlim()) == ("log", (1.0, 9.0))
+
+
+def test_calibration():
+    """A panel a model; a dot at forecast and share, its area by the number, and the interval upright through it."""
+    bins = [("gru", "actions", 0.1, 0.2, 0.05, 0.3, 100), ("gru", "actions", 0.8, 0.7, 0.6, 0.9, 25)]
+    bins.append(("gru", "actions and context", 0.5, 0.4, 0.3, 0.6, 7))
+    columns = ["model", "context", "forecast", "taken", "low", "high", "number"]
+    figure = calibration_figure(pd.DataFrame(bins, columns=columns))
+    assert [title(axes) for axes in figure.axes] == ["gru", "gru, with context"]
+    bars, dots = figure.axes[0].collections
+    assert [segment.tolist() for segment in bars.get_segments()] == [
+        [[0.1, 0.05], [0.1, 0.3]],
+        [[0.8, 0.6], [0.8, 0.9]],
+    ]
+    assert dots.get_offsets().tolist() == [[0.1, 0.2], [0.8, 0.7]]
+    assert dots.get_sizes().tolist() == pytest.approx([8 + 70, 8 + 35])
+    assert figure.axes[1].collections[1].get_offsets().tolist() == [[0.5, 0.4]]
+    assert figure.axes[0].lines[0].get_xydata().tolist() == [[0, 0], [1, 1]]
+    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("forecast probability", "share taken")
+
+
+@pytest.mark.parametrize("paired", [False, True])
+def test_conditions_in_an_order_of_their_own(paired):
+    """From the top down as in the means, not by name; dots, bars of means and lines between dots of one unit."""
+    conditions, units = ["z", "a", "m"], ["u", "v"]
+    means = [("f", one, k + 0.5, k + 0.25, k + 0.75) for k, one in enumerate(conditions)]
+    values = [("f", unit, one, 10.0 * k + u) for u, unit in enumerate(units) for k, one in enumerate(conditions)]
+    (axes,) = condition_figure(
+        pd.DataFrame(means, columns=["feature", "condition", "mean", "low", "high"]),
+        pd.DataFrame(values, columns=["feature", "unit", "condition", "value"]),
+        paired,
+    ).axes
+    assert [(label.get_text(), label.get_position()[1]) for label in axes.get_yticklabels()] == [
+        ("z", 0),
+        ("a", -1),
+        ("m", -2),
+    ]
+    joined, rest = axes.lines[: 2 * paired], axes.lines[2 * paired :]
+    assert [line.get_xydata().tolist() for line in joined] == [
+        [[u, 0], [10 + u, -1], [20 + u, -2]] for u in range(2 * paired)
+    ]
+    assert len(rest) == 9
+    for k in range(3):
+        dots, bar, mean = rest[3 * k : 3 * k + 3]
+        assert dots.get_xydata().tolist() == [[10 * k, -k], [10 * k + 1, -k]]
+        assert bar.get_xydata().tolist() == [[k + 0.25, -k - 0.32], [k + 0.75, -k - 0.32]]
+        assert mean.get_xydata().tolist() == [[k + 0.5, -k - 0.32]]
+        assert {line.get_color() for line in (dots, bar, mean)} == {dots.get_color()}
+
+
+def test_motifs_have_their_counts():
+    """From the top down: name, ratio, interval and count of each row stand at one height."""
+    rows = [("a b", 4.0, 2.0, 5.0, 1234), ("b a", 0.5, 0.3, 0.8, 7), ("c c", 1.5, 1.2, 1.9, 56)]
+    axes = motif_figure(pd.DataFrame(rows, columns=["sequence", "ratio", "low", "high", "count"])).axes[0]
+    heights = dict(zip((label.get_text() for label in axes.get_yticklabels()), axes.get_yticks(), strict=True))
+    assert list(heights) == ["c c", "b a", "a b"]
+    assert sorted(heights.values()) == list(heights.values())
+    dots = {line.get_ydata()[0]: line.get_xdata()[0] for line in axes.lines if line.get_marker() == "o"}
+    spans = {line.get_ydata()[0]: list(line.get_xdata()) for line in axes.lines[1:] if line.get_marker() == "None"}
+    counts = {text.get_position()[1]: text.get_text() for text in axes.texts if text.get_text() != "count"}
+    for name, ratio, low, high, count in rows:
+        at = heights[name]
+        assert (dots[at], spans[at], counts[at]) == (ratio, [low, high], f"{count:,}")
+
+
+def test_orders_that_are_left_out():
+    """A chain that was too large has no row: what is drawn, and ringed, stands at the order, not at the row."""
+    orders = pd.DataFrame({"order": [1, 2, 4], "context": "actions", "bic_bits": [2.0, 1.8, 1.5]})
+    orders["aic_bits"] = [1.9, 1.6, 1.7]
+    held_out = [("markov-4", 1.4, 1.3, 1.5), ("uniform", 3.0, 3.0, 3.0), ("markov-2", 1.7, 1.6, 1.8)]
+    scores = pd.DataFrame(held_out, columns=["model", "bits_per_action", "low", "high"]).assign(context="actions")
+    axes = order_figure(orders, scores).axes[0]
+    curves = {line.get_label(): line for line in axes.lines if line.get_markersize() != 13}
+    assert {name: line.get_xydata().tolist() for name, line in curves.items()} == {
+        "BIC": [[1, 2.0], [2, 1.8], [4, 1.5]],
+        "AIC": [[1, 1.9], [2, 1.6], [4, 1.7]],
+        "held out, actions": [[2, 1.7], [4, 1.4]],
+    }
+    rings = [line for line in axes.lines if line.get_markersize() == 13]
+    assert [line.get_xydata().tolist() for line in rings] == [[[4, 1.5]], [[2, 1.6]], [[4, 1.4]]]
+    assert [line.get_markeredgecolor() for line in rings] == [line.get_color() for line in curves.values()]
+    assert curves["held out, actions"].get_color() == next(iter(lines(["held out, actions"])))[0]
+    ends = axes.collections[-1].get_paths()[0].vertices
+    assert {tuple(end) for end in ends.tolist()} == {(2, 1.6), (2, 1.8), (4, 1.3), (4, 1.5)}
+    assert not [
+        line for line in order_figure(orders, scores, ringed=False).axes[0].lines if line.get_markersize() == 13
+    ]
+
+
+@pytest.mark.parametrize(
+    ("make", "frames", "words"),
+    [
+        (score_figure, ["model context low high"], "scores: .*; bits_per_action missing"),
+        (lag_figure, ["model lag bits low high critical_value"], "lags: .*; what, context missing"),
+        (
+            order_figure,
+            ["order", "model context bits_per_action low high"],
+            "orders: .*; context, bic_bits, aic_bits m",
+        ),
+        (order_figure, ["order context bic_bits aic_bits", "model"], "scores: .*; context, bits_per_action"),
+        (dwell_figure, ["action"], "dwell: .*; number, zero"),
+        (calibration_figure, ["model context"], "calibration: .*; forecast"),
+        (condition_figure, ["feature", "feature"], "means: .*; condition"),
+        (condition_figure, ["feature condition mean low high", "feature"], "values: .*; unit, condition, value m"),
+        (motif_figure, ["sequence"], "motifs: .*; ratio, low, high, count missing"),
+        (drift_figure, ["what name", "index bits"], "drift: .*; bits, low, high missing"),
+        (drift_figure, ["what name bits low high", "index"], "plans: .*; bits missing"),
+    ],
+)
+def test_tables_without_a_column_are_refused(make, frames, words):
+    with pytest.raises(ValueError, match=words):
+        make(*(pd.DataFrame([dict.fromkeys(columns.split(), 1)]) for columns in frames))
+
+
+def test_drift_stands_at_the_middles_of_parts_and_at_the_numbers_of_plans():
+    places = [("place", f"part {n}", bits, bits - 0.1, bits + 0.1) for n, bits in enumerate((2.0, 1.5, 1.2, 1.0), 1)]
+    groups = [
+        ("group", name, bits, bits - 0.2, bits + 0.3) for name, bits in (("low", 1.0), ("high", 2.0), ("mid", 1.5))
+    ]
+    drift = pd.DataFrame(places + groups, columns=["what", "name", "bits", "low", "high"])
+    many = pd.DataFrame({"index": range(1, 2502), "bits": [2.0 - n / 2500 for n in range(2501)]})
+    within, between, below = drift_figure(drift, many).axes
+    assert within.lines[0].get_xydata().tolist() == [[12.5, 2.0], [37.5, 1.5], [62.5, 1.2], [87.5, 1.0]]
+    dots, means = between.lines
+    assert len(dots.get_xdata()) == 1000
+    assert (dots.get_xdata()[0], dots.get_xdata()[-1]) == (1, 2501)  # from the first to the last
+    assert (dots.get_ydata() == 2.0 - (dots.get_xdata() - 1) / 2500).all()
+    assert title(between) == "from plan to plan (1,000 of 2,501 drawn)"
+    assert len(means.get_xdata()) == 20
+    assert means.get_ydata().tolist() == pytest.approx((2.0 - (means.get_xdata() - 1) / 2500).tolist())
+    assert [label.get_text() for label in below.get_yticklabels()] == ["low", "mid", "high"]  # from below
+    bars = [line.get_xdata().tolist() for line in below.lines if len(line.get_xdata()) == 2]
+    assert bars == [pytest.approx([bits - 0.2, bits + 0.3]) for bits in (1.0, 1.5, 2.0)]
+
+
+def test_intervals_end_where_the_axis_does():
+    """Of sequences an interval may be wide: the axis is by the ratios."""
+    rows = [("a b c", 2.0, 0.01, 400.0, 9), ("c b a", 0.5, 0.3, 0.6, 8)]
+    (axes,) = motif_figure(pd.DataFrame(rows, columns=["sequence", "ratio", "low", "high", "count"])).axes
+    bars = [[*line.get_xdata()] for line in axes.lines if len(line.get_xdata()) == 2][1:]  # the first is at 1
+    below, above = sorted(bars, key=lambda bar: bar[1])
+    assert below == pytest.approx([2**-1.25, 0.6])
+    assert above == pytest.approx([2**-1.25, 2**1.25])
+
+
+def test_plans_stand_in_their_own_order_and_not_by_name():
+    """One action a plan, so that each row has one colour; parts of a plan are in one row."""
+    actions = torch.tensor([[0, 0], [1, 1], [2, 2], [1, 1]])
+    plans = Plans(actions, 3, plan_names=("c", "a", "b", "a"), group=torch.zeros(4, dtype=torch.long))
+    for some, want in (([0, 1, 2], [0, 1, 2]), ([1, 2, 0], [1, 2, 0]), ([0, 1, 3, 2], [0, 1, 2])):
+        (axes,) = ethogram_figure(plans[torch.tensor(some)]).axes
+        column = axes.images[0].get_array()[:, 0]
+        shown = [tuple(color[:3]) for color in column if color[3] == 1]
+        assert [*dict.fromkeys(shown)] == [to_rgb(STRIPS[action]) for action in want]
+
+
+def test_models_have_the_colours_of_their_orders():
+    assert [*colors(["markov-0", "markov-1", "markov", "Markov-2, with context", "markov-40"])] == [
+        *(MARKOV[k] for k in (0, 1, 1, 2)),
+        MARKOV[-1],
+    ]
+    others = [*colors(["mine", "gru", "yours", "uniform"])]
+    assert others == [SPARE[0], KINDS["gru"], SPARE[1], KINDS["uniform"]]

@@ -1,0 +1,210 @@
+"""What the report makes of its arguments: which plans are learned from, scored and described, and in how many folds."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import matplotlib.figure
+import pytest
+import torch
+
+from neuroprior import Plans, write_plans
+from neuroprior.behaviour.report.document import Document
+from neuroprior.behaviour.report.page import FigureBox, Section, write_page
+from neuroprior.behaviour.report.plan_report import report
+from neuroprior.priors import MarkovPrior, UniformPrior, save
+from neuroprior.priors.scoring import keep_learned
+from tests.support.chains import markov_plans, markov_probs
+from tests.support.reports import QUICK
+from tests.support.sources import refuses, seeded
+
+SCORES: dict[str, Any] = QUICK | {"sections": ["scores"]}
+
+
+def chain(num: int = 12, length: int = 8, seed: int = 1, **more: Any) -> Plans:
+    return markov_plans(markov_probs(3, 1, 0, 1.5), num, length, seed, **more)
+
+
+def bits(document: Document, model: str, inputs: str = "actions") -> float:
+    rows = document.frames["plans"]
+    (found,) = rows["bits_per_action"][(rows["model"] == model) & (rows["context"] == inputs)]
+    return float(found)
+
+
+@pytest.mark.parametrize(
+    ("group", "folds"),
+    [
+        pytest.param(None, 5, marks=pytest.mark.slow),
+        (torch.arange(12) % 3, 3),
+        (torch.zeros(12, dtype=torch.long), 5),
+        (torch.arange(12) % 6, 5),
+    ],
+)
+def test_as_many_folds_as_there_are_units_but_five_at_most(group, folds):
+    made = report(chain(group=group), **SCORES)
+    assert made.settings["folds"] == folds
+    assert not made.settings["cut"]
+
+
+@pytest.mark.parametrize("num", [1, 12])
+def test_test_plans_are_scored_and_nothing_is_held_out_of_the_others(num):
+    """One test plan alone is cut; a chain of order 0 is that of all plans to learn from."""
+    learned, other = chain(), chain(num, 60, seed=7)
+    made = report(learned, test=other, **SCORES)
+    costs = [
+        -float(MarkovPrior(3, 0, s, backoff=b).fit(learned).log_prob(other).sum()) / math.log(2) / other.actions.numel()
+        for b, s in (("kneser-ney", 1), ("kneser-ney", 0.5), ("witten-bell", 1), ("dirichlet", 1), ("dirichlet", 8))
+    ]
+    assert min(costs) - 1e-3 <= bits(made, "markov-0") <= max(costs) + 1e-3
+    assert made.settings["folds"] == 1
+    assert made.settings["cut"] == (num == 1)
+    assert ("1 plan is too few for a verdict" in made.lead) == (num == 1)
+    assert made.results["unit"] == ("parts of the plan" if num == 1 else "plans")
+
+
+def test_contexts_of_plans_and_of_test_plans_are_numbered_together():
+    """With gaps between them; the test plans have one, between the others, that those to learn from have not."""
+    learned = chain(context=torch.arange(12) % 2 * 7 + 3)
+    other = chain(8, seed=5, context=torch.arange(8) % 2 * 2 + 3)
+    made = report(learned, test=other, **SCORES)
+    same = report(
+        replace(learned, context=torch.arange(12) % 2 * 2, context_names=("a", "b", "c")),
+        test=replace(other, context=torch.arange(8) % 2, context_names=("a", "b", "c")),
+        **SCORES,
+    )
+    for model in ("markov-0", "markov-1"):
+        assert bits(made, model, "actions and context") == bits(same, model, "actions and context")
+
+
+def test_what_has_no_actions_is_left_out_and_counted():
+    plans = chain(length=4)
+    empty = replace(plans, lengths=torch.tensor([0, 4, 4, 0, 4, 0, 4, 4, 4, 4, 4, 4]))
+    others = replace(plans[empty.mask().any(1)], lengths=None)
+    made, whole = (report(some, folds=2, **SCORES) for some in (empty, others))
+    assert made.settings["plans without actions, left out"] == 3
+    assert "plans without actions, left out" not in whole.settings
+    assert made.frames["plans"]["bits_per_action"].tolist() == whole.frames["plans"]["bits_per_action"].tolist()
+
+
+def test_a_single_plan_is_cut_for_scores_and_described_whole():
+    """What does not count is at the beginning of the plan, not of each part."""
+    plans = chain(1, 300)
+    made = report(plans, skip=10, folds=2, **QUICK | {"sections": ["file", "scores"]})
+    assert made.results["file"]["plans"] == 1
+    assert made.results["file"]["longest"] == 300
+    assert made.settings["cut"]
+    rows = [row[-1] for row in made.sections[0].tables[1].rows]
+    assert rows == ["1"] * 3
+    assert bits(made, "uniform") == pytest.approx(math.log2(3), abs=1e-5)
+
+
+@pytest.fixture
+def asked(monkeypatch) -> dict[str, Any]:
+    """The kinds of models that a report asks for, after which it is interrupted, and its design."""
+    from neuroprior.behaviour.report import plan_report
+
+    found: dict[str, Any] = {}
+
+    def stop(design, kinds, inputs):
+        found.update(design=design, kinds=", ".join(kinds))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(plan_report, "jobs", stop)
+    return found
+
+
+@pytest.mark.parametrize(("models", "kinds"), [(["counts"], "counts, lags"), (["gru"], "gru, lags, gru-lags")])
+def test_information_by_lag_is_that_of_counts_and_of_networks_where_there_are_any(models, kinds, asked):
+    with pytest.raises(KeyboardInterrupt):
+        report(chain(), models=models, max_steps=3, processes=1)
+    assert asked["kinds"] == kinds
+
+
+@pytest.mark.parametrize(
+    ("more", "kinds"),
+    [
+        ({}, "counts, gru, transformer, stacked, combined"),
+        ({"effort": "full"}, "counts, gru, transformer, stacked, combined"),
+        ({"effort": "fast"}, "counts, gru, combined"),
+        ({"effort": "fast", "models": ["stacked", "combined"]}, "stacked, combined"),
+    ],
+)
+def test_effort_decides_which_models_are_fitted_where_none_are_given(more, kinds, asked):
+    with pytest.raises(KeyboardInterrupt):
+        report(chain(), sections=["scores"], **more)
+    assert asked["kinds"] == kinds
+    assert asked["design"].effort == more.get("effort", "standard")
+
+
+@pytest.mark.parametrize("more", [{"models": ["gru"]}, {"priors": {"even": UniformPrior(3)}}])
+def test_effort_without_a_combined_prior_to_fit_is_said(more):
+    with refuses("effort"):
+        report(chain(), effort="full", **more)
+
+
+@pytest.mark.parametrize("effort", ["quick", ["fast"]])
+def test_an_unknown_effort_is_said(effort):
+    with refuses("effort", "one of fast, standard, full", f"not {effort!r}"):
+        report(chain(), effort=effort)
+
+
+@pytest.mark.parametrize("skip", [0, 3])
+def test_saved_priors_are_scored_on_the_actions_that_count_and_known_plans_are_marked(skip, tmp_path):
+    """Two priors: the one has learned from four of the twelve plans, the other from none of them."""
+    plans, others = (Plans(torch.randint(3, (num, 24), generator=seeded(num)), 3) for num in (12, 9))
+    for name, some in (("one", torch.cat([plans.actions[:4], others.actions])), ("two", others.actions)):
+        save(MarkovPrior(3, 1).fit(some), tmp_path / name)
+        keep_learned(tmp_path / name, Plans(some, 3))
+    folders = [str(tmp_path / name) for name in ("one", "two")]
+    made = report(plans, priors=folders, skip=skip, sections=["scores"])
+    assert made.settings["training data"] == {folders[0]: 4}
+    assert f"{folders[0]} has learned from 4 of the 12 plans" in made.lead
+    marked = [row[0].endswith("(training data)") for row in made.sections[0].tables[0].rows]
+    assert marked == [True, False]
+    prior = MarkovPrior(3, 1).fit(others.actions)
+    expected = -prior.action_log_probs(plans)[:, skip:].mean() / math.log(2)
+    assert made.frames["plans"]["bits_per_action"][1] == pytest.approx(float(expected), abs=1e-5)
+
+
+def test_options_of_files_reach_the_reader(tmp_path):
+    """Rows that follow a pause end the plan, labels that are the same are merged, and a missing one counts."""
+    rows = ["session,behaviour,begin,end"]
+    for plan in range(8):
+        acts = torch.randint(3, (12,), generator=seeded(plan)).tolist()
+        for t, action in enumerate(acts):
+            at = t + (100 if t >= 6 else 0)
+            rows.append(f"s{plan},{'' if (plan, t) == (0, 2) else 'abc'[action]},{at},{at + 1}")
+    (tmp_path / "plans.csv").write_text("\n".join(rows) + "\n")
+    columns = {"plan": "session", "action": "behaviour", "start": "begin", "stop": "end"}
+    only: dict[str, Any] = {"columns": columns, "priors": {"none": UniformPrior(3)}, "sections": ["file"]}
+    facts = {}
+    for how in ({}, {"max_gap": 5}, {"merge_repeats": True}):
+        facts[str(how)] = report(tmp_path / "plans.csv", **only, **how).results["file"]
+    plain, gap, merged = facts.values()
+    assert (plain["plans"], gap["plans"]) == (9, 17)
+    assert merged["actions"] < plain["actions"] == gap["actions"] == 95
+    labelled = report(tmp_path / "plans.csv", **only | {"priors": {"none": UniformPrior(4)}}, missing="label")
+    assert labelled.results["file"]["actions"] == 96
+    assert labelled.results["file"]["kinds of actions"] == 4
+
+
+def test_figures_of_all_sections_have_ids_of_their_own(tmp_path):
+    def box() -> FigureBox:
+        figure = matplotlib.figure.Figure(figsize=(2, 2))
+        figure.subplots().plot([0, 1], [1, 0], "o")
+        return FigureBox(figure, "caption", "alt")
+
+    sections = [Section("One", figures=[box(), box()]), Section("Two", figures=[box()])]
+    write_page(tmp_path / "page.html", "Title", "Lead", sections, {})
+    text = (tmp_path / "page.html").read_text()
+    ids = [part.split('"')[0] for part in text.split(' id="')[1:]]
+    assert len(ids) > 20
+    assert len(set(ids)) == len(ids)
+
+
+def test_plans_in_memory_are_those_of_their_file(tmp_path):
+    plans = chain(context=torch.arange(12) % 2, group=torch.arange(12) % 4)
+    write_plans(plans, tmp_path / "plans.npz")
+    one, two = (report(given, folds=2, **SCORES) for given in (plans, tmp_path / "plans.npz"))
+    assert one.frames["plans"].equals(two.frames["plans"])
+    assert (one.title, two.title) == ("Plans", "Plans in plans.npz")

@@ -1,0 +1,311 @@
+"""The numbers of each section of a report, worked out anew from plans that are unlike in all that matters.
+
+Plans of unlike lengths, in groups that are not sorted, with a context and durations; models are made by hand.
+"""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from neuroprior import Plans
+from neuroprior.behaviour import (
+    by_group,
+    by_plan,
+    by_position,
+    motifs,
+    mutual_information,
+    order_selection,
+    two_sample_tests,
+)
+from neuroprior.behaviour.report.conditions import condition_section
+from neuroprior.behaviour.report.fits import ACTIONS, CONTEXT
+from neuroprior.behaviour.report.scores import Evaluation, evaluate_saved
+from neuroprior.behaviour.report.sections import (
+    action_frame,
+    calibration_section,
+    drift_section,
+    file_section,
+    lag_section,
+    likeness_section,
+    motif_section,
+    order_section,
+    score_section,
+    transition_section,
+)
+from neuroprior.priors import MarkovPrior, UniformPrior
+from tests.support.chains import markov_plans, markov_probs
+from tests.support.sources import seeded
+
+LENGTHS = torch.tensor([20, 5, 5, 6, 5, 5, 20, 4, 5, 5, 20, 5])
+GROUP = torch.tensor([4, 1, 4, 0, 1, 0, 2, 2, 3, 3, 1, 4])
+NAMES = ("walk", "rest", "dig")
+
+
+@pytest.fixture(scope="module")
+def plans() -> Plans:
+    """Twelve plans in five groups; what comes next depends on the context of the plan."""
+    parts = [markov_plans(markov_probs(3, 1, seed, 2), 12, 20, seed + 5).actions for seed in (0, 1)]
+    context = torch.tensor([0, 1, 1, 0, 1, 0, 1, 0, 0, 1, 1, 0])
+    actions = torch.where(context[:, None] == 0, parts[0], parts[1])
+    durations = torch.rand(12, 20, generator=seeded(3)) ** 3 * 10
+    named = {"action_names": NAMES, "group_names": ("ada", "ben", "cleo", "dora", "eve")}
+    return Plans(actions, 3, LENGTHS, context=context, group=GROUP, durations=durations, **named)
+
+
+@pytest.fixture(scope="module")
+def found(plans) -> Evaluation:
+    """Chains that learned from these plans, with and without the context; the best takes it."""
+    plain = plans.without_context()
+    chains = {f"markov-{k}": MarkovPrior(3, k).fit(plain) for k in (0, 1)}
+    more = {name: MarkovPrior(3, k, num_contexts=2).fit(plans) for name, k in (("one", 2), ("two", 1))}
+    return evaluate_saved({"uniform": UniformPrior(3), **chains, **more}, plans, 1)
+
+
+def cells(part, number: int = 0) -> list[list[str]]:
+    return [[cell.strip() for cell in row] for row in part.section.tables[number].rows]
+
+
+def flat(plans: Plans) -> list[list[int]]:
+    return [row[:length] for row, length in zip(plans.actions.tolist(), plans.lengths.tolist(), strict=True)]
+
+
+def test_what_is_in_the_file(plans, found):
+    part, rows = file_section(found), []
+    taken, times = plans.actions[plans.mask()], plans.durations[plans.mask()].double()
+    counts = taken.bincount()
+    for action in counts.argsort(descending=True).tolist():
+        held = sum(action in row for row in flat(plans))
+        share, middle = 100 * counts[action] / len(taken), np.median(times[taken == action].numpy())
+        assert abs(middle - float(times[taken == action].mean())) > 0.1
+        rows.append([NAMES[action], str(int(counts[action])), f"{share:.1f}", str(held), f"{middle:.3g}"])
+    assert cells(part, 1) == rows
+    assert cells(part) == [["12", "105", "4", "20", "3", "5", "2 contexts, once a plan"]]
+    assert action_frame(plans)["median_duration"].tolist() == pytest.approx([float(row[4]) for row in rows], rel=5e-3)
+
+
+@pytest.mark.parametrize("section", [file_section, transition_section, condition_section])
+def test_all_plans_are_described_whichever_were_scored_and_sampled(section, plans, found):
+    described = replace(plans, condition=GROUP % 2)
+    parts = []
+    for scored, sampled in ((plans, plans), (plans[:4], plans[5:7])):
+        some = replace(found, plans=described, scored=scored, mask=scored.mask(), sampled=sampled)
+        parts.append(section(some))
+    first, second = parts
+    assert [table.rows for table in first.section.tables] == [table.rows for table in second.section.tables]
+    assert first.section.tables
+    assert first.frames.keys() == second.frames.keys()
+    for name, frame in first.frames.items():
+        pd.testing.assert_frame_equal(frame, second.frames[name])
+
+
+@pytest.mark.parametrize(
+    ("context", "words"),
+    [
+        (None, "none"),
+        (torch.tensor([[0, 4], [1, 1]]), "5 contexts, at each step"),
+        (torch.zeros(2, 3), "features, once a plan"),
+        (torch.zeros(2, 2, 3), "features, at each step"),
+    ],
+)
+def test_what_the_context_is(context, words):
+    plans = Plans(torch.tensor([[0, 1], [2, 1]]), 3, context=context, condition=torch.tensor([0, 1]))
+    assert cells(file_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, 0)))[0][5:] == ["0", words, "2"]
+
+
+def test_scores_with_their_intervals(found):
+    """Bits are those of the actions that count, by group; the reference is the first prior."""
+    rows = found.table()
+    want = []
+    for row in rows.itertuples():
+        name = {ACTIONS: "actions", CONTEXT: "actions, context"}[row.context]
+        bits = f"{row.bits_per_action:.4f}±{row.high - row.bits_per_action:.4f}"
+        more = f"{row.more:+.4f}±{row.more_high - row.more:.4f}"
+        want.append([row.model, name, f"{row.nats_per_action:.4f}", bits, f"{row.perplexity:.3f}", more])
+    assert cells(score_section(found)) == want
+    assert rows["more"].tolist() == pytest.approx((rows["bits_per_action"] - math.log2(3)).tolist(), abs=1e-6)
+    assert (rows["more_low"] <= rows["more"]).all()
+    assert (rows["more"] <= rows["more_high"]).all()
+
+
+@pytest.mark.parametrize("skip", [0, 2])
+def test_mutual_information_is_that_after_what_does_not_count(plans, skip):
+    part = lag_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, skip))
+    frame = part.frames["lags"]
+    want = pd.DataFrame(mutual_information(plans, 20, skip, seeded(0)))
+    for name in ("bits", "low", "high", "critical_value", "lag"):
+        assert frame[name].tolist() == want[name].tolist()
+    assert lag_section(evaluate_saved({"uniform": UniformPrior(3)}, plans[LENGTHS > 5], 3)) is not None
+
+
+def test_where_no_pair_of_actions_counts_there_is_no_section():
+    plans = markov_plans(markov_probs(3, 1, 0), 8, 6, 1)
+    assert lag_section(evaluate_saved({"uniform": UniformPrior(3)}, replace(plans, group=None), 5)) is not None
+    evaluation = replace(evaluate_saved({"uniform": UniformPrior(3)}, plans, 0), settings={"skip": 6})
+    assert lag_section(evaluation) is None
+
+
+def test_orders_are_those_of_half_the_median_plan_with_and_without_the_context(plans, found):
+    """The criteria are halved, in bits an action: at order 0 that is the entropy and half a parameter's price."""
+    frame = order_section(found).frames["orders"]
+    for inputs, contexts in ((ACTIONS, None), (CONTEXT, 2)):
+        own = frame[frame["context"] == inputs]
+        want = pd.DataFrame(order_selection(plans, 2, contexts))  # the median plan has five actions, the mean nearly 9
+        assert own["order"].tolist() == [0, 1, 2]
+        for name in want:
+            assert own[name].tolist() == want[name].tolist()
+        for price, name in ((math.log2(want["num_actions_scored"][0]) / 2, "bic_bits"), (1 / math.log(2), "aic_bits")):
+            bits = -want["log_likelihood"] / math.log(2) + want["num_parameters"] * price
+            assert own[name].tolist() == pytest.approx((bits / want["num_actions_scored"]).tolist())
+
+
+def test_calibration_is_that_of_the_models_with_the_best_input(found):
+    part = calibration_section(found)
+    frame = part.frames["calibration"]
+    assert found.best.inputs == CONTEXT
+    assert [*dict.fromkeys(zip(frame["model"], frame["context"], strict=True))] == [("one", CONTEXT), ("two", CONTEXT)]
+    assert frame.groupby("model")["number"].sum().tolist() == [3 * int(found.mask.sum())] * 2
+    for (name, error), (_, own) in zip(cells(part), frame.groupby("model"), strict=True):
+        gaps = (own["forecast"] - own["taken"]).abs() * own["number"]
+        assert name == f"{own['model'].iloc[0]}, with context"
+        assert float(error) == pytest.approx(100 * gaps.sum() / own["number"].sum(), abs=0.01)
+
+
+def test_transitions_are_counted_in_each_group(plans, found):
+    """Pairs of all groups and of each, by hand; a probability is of those that follow the same action."""
+    counts: dict[tuple[str, str, str], int] = {}
+    for row, number in zip(flat(plans), GROUP.tolist(), strict=True):
+        for a, b in pairwise(row):
+            for name in ("all", plans.group_names[number]):
+                counts[name, NAMES[a], NAMES[b]] = counts.get((name, NAMES[a], NAMES[b]), 0) + 1
+    frame = transition_section(found).frames["transitions"]
+    keys = [*zip(frame["group"], frame["from"], frame["to"], strict=True)]
+    assert dict(zip(keys, frame["count"], strict=True)) == counts
+    assert len(keys) == len(counts)
+    for (name, a, b), prob in zip(keys, frame["probability"], strict=True):
+        whole = sum(n for key, n in counts.items() if key[:2] == (name, a))
+        assert prob == pytest.approx(counts[name, a, b] / whole)
+
+
+@pytest.fixture(scope="module")
+def worded() -> Plans:
+    """Words with long runs, among noise."""
+    words = torch.tensor([[0, 0, 0, 1, 1, 2], [3, 3, 1, 1, 1, 0], [2, 2, 3, 0, 0, 3]])
+    plans = words[torch.randint(3, (34, 4), generator=seeded(0))].flatten(1)
+    wild = torch.rand(plans.shape, generator=seeded(1)) < 0.25
+    actions = torch.where(wild, torch.randint(4, plans.shape, generator=seeded(2)), plans)
+    return Plans(actions, 4, action_names=list("abcd"), group=torch.arange(34) % 6)
+
+
+def test_sequences_with_repeats_kept_and_merged(worded):
+    part = motif_section(evaluate_saved({"uniform": UniformPrior(4)}, worded, 0))
+    frame = part.frames["motifs"]
+    for repeats, merged in (("kept", False), ("merged", True)):
+        every = motifs(worded, top=12, collapse_repeats=merged)
+        want = [one for one in every if one.corrected < 0.05]
+        assert len([one for one in every if one.p_value < 0.05]) > len(want) > 0
+        own = frame[frame["repeats"] == repeats]
+        assert own["sequence"].tolist() == [" ".join("abcd"[a] for a in one.actions) for one in want]
+        for name in ("count", "expected", "ratio", "low", "high", "p_value", "corrected"):
+            assert own[name].tolist() == [getattr(one, name) for one in want]
+        first = [own["sequence"].iloc[0], f"{own['count'].iloc[0]:,}", f"{own['expected'].iloc[0]:,.1f}"]
+        assert cells(part, merged)[0][:3] == first
+
+
+def generating(plans: Plans, found: Evaluation) -> Evaluation:
+    """The two models with a context have made up plans for eight of the plans; `two` is the better."""
+    sampled = plans[[11, 8, 6, 5, 4, 3, 1, 0]]
+    made = {"one": torch.zeros(8, 20, dtype=torch.long), "two": sampled.actions.roll(1, 0), "markov-1": sampled.actions}
+    models = [replace(model, generated=made.get(model.name)) for model in found.models]
+    return replace(found, models=models, sampled=sampled)
+
+
+@pytest.mark.parametrize("grouped", [True, False])
+def test_generated_plans_are_compared_with_those_in_whose_place_they_stand(plans, found, grouped):
+    """As long as these; the best model first; no test where plans of a group are alike."""
+    if not grouped:
+        plans = replace(plans, group=None, group_names=None)
+        found = replace(found, plans=plans, scored=plans)
+    evaluation = generating(plans, found)
+    part = likeness_section(evaluation)
+    frame, real = part.frames["likeness"], evaluation.sampled
+    order = sorted((m for m in evaluation.models if m.generated is not None), key=lambda model: model.cost)
+    assert frame["model"].unique().tolist() == [model.name for model in order]
+    for model in order:
+        alike = [Plans(some, 3, real.lengths) for some in (real.actions, model.generated)]
+        tests = two_sample_tests(*alike, generator=seeded(0))
+        own = frame[frame["model"] == model.name]
+        assert own["statistic"].tolist() == [one.statistic for one in tests]
+        for name in ("distance", "null_distance"):
+            assert own[name].tolist() == [getattr(one, name) for one in tests]
+        for name in ("p_value", "corrected"):
+            assert own[name].dropna().tolist() == ([] if grouped else [getattr(one, name) for one in tests])
+        (row,) = (row for row in cells(part) if row[0] == model.name)
+        stars = ["*" * (not grouped and one.corrected < 0.05) for one in tests]
+        assert row[2:] == [f"{one.distance:.3f}{star}" for one, star in zip(tests, stars, strict=True)]
+    best = two_sample_tests(
+        *[Plans(x, 3, real.lengths) for x in (real.actions, order[0].generated)], generator=seeded(0)
+    )
+    figures = {box.name: box for box in part.section.figures}
+    assert order[0].label in figures["raster"].caption
+    lengths = [one for one in best if one.statistic in ("run lengths", "return times")]
+    for axes, one in zip(figures["distributions"].figure.axes, lengths, strict=True):
+        drawn = {line.get_label(): line.get_ydata().tolist() for line in axes.lines}
+        assert drawn == {
+            name: values[values > 0].tolist() for name, values in (("real", one.real), ("generated", one.generated))
+        }
+
+
+def test_drift_within_plans_between_them_and_between_groups(plans, found):
+    part, best = drift_section(found), found.best
+    given = plans, best.bits, found.mask
+    frame = part.frames["drift"]
+    places, groups = (frame[frame["what"] == what] for what in ("place", "group"))
+    want = by_position(*given).parts
+    assert places[["bits", "low", "high"]].to_numpy() == pytest.approx(np.array(want), nan_ok=True)
+    assert places["name"].tolist() == [f"part {n} of 10" for n in range(1, 11)]
+    by_name = by_group(*given).groups
+    assert groups["name"].tolist() == [plans.group_names[number] for number in by_name]
+    assert groups[["bits", "low", "high"]].to_numpy() == pytest.approx(np.array([*by_name.values()]), nan_ok=True)
+    own = by_plan(*given)
+    (box,) = part.section.figures
+    (cloud,) = (axes for axes in box.figure.axes if "plan to plan" in axes.get_title(loc="left"))
+    group = own.group.tolist()
+    index = [group[: at + 1].count(number) for at, number in enumerate(group)]
+    assert cloud.lines[0].get_xdata().tolist() == index
+    assert cloud.lines[0].get_ydata().tolist() == own.bits.tolist()
+    assert max(index) == 3
+
+
+@pytest.mark.parametrize(("length", "words"), [(20, "first 5 actions of each plan"), (8, "too short to leave out")])
+def test_the_beginnings_of_plans_are_no_drift(length, words):
+    """Actions repeat at probability .9 throughout; only the first, which nothing stands before, costs more."""
+    repeats = torch.rand(200, length, generator=seeded(0)) < 0.9
+    repeats[:, 0] = torch.rand(200, generator=seeded(1)) < 0.5
+    plans = Plans((~repeats).long().cumsum(1) % 2, 2)
+    part = drift_section(evaluate_saved({"chain": MarkovPrior(2, 1).fit(plans)}, plans, 0))
+    change = part.frames["drift_tests"].set_index("test").loc["change over a plan, bits"]
+    assert (change["low"] < 0 < change["high"]) == (length == 20)
+    assert any(words in line for line in part.section.text)
+
+
+def test_the_action_that_changes_most_clearly_comes_first():
+    """By the corrected p-value: a small change of a rare action may be clearer than a large one of a common action."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for _ in range(30):
+        first = [*rng.choice(3, 10, p=[0.5, 0.5, 0])]
+        often = rng.choice([0.2, 0.8]) if rng.random() < 0.9 else 0.5
+        second = [*rng.choice(3, 9, p=[often, 1 - often, 0]), 2]
+        rows.append(first + second)
+    actions = torch.tensor(np.array(rows))
+    actions[:12, 15:19] = 0
+    plans = Plans(actions, 3, action_names=NAMES)
+    part = drift_section(evaluate_saved({"uniform": UniformPrior(3)}, plans, 0))
+    frame = part.frames["action_drift"].set_index("action")
+    assert cells(part, len(part.section.tables) - 1)[0][0] == "dig"
+    assert frame["change"].abs().idxmax() != "dig"

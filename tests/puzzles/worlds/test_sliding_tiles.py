@@ -1,0 +1,189 @@
+"""Sliding tiles: rules, parity, patterns and files, against enumeration and plain Python."""
+
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neuroprior import FrontierPlanner, SamplingPlanner, UniformPrior
+from neuroprior.puzzles import SlidingTilesWorld, read_tiles, sliding_tiles
+
+PUZZLES = Path(__file__).parents[3] / "eval/data/sliding_tiles/test.txt.xz"
+
+
+def distances(world: SlidingTilesWorld) -> dict[tuple[int, ...], int]:
+    """The distance of each board from the goal, breadth first; the moves are written anew here."""
+    height, width = world.goal.shape
+    front, found, depth = [tuple(world.goal.flatten().tolist())], {}, 0
+    while front:
+        found.update((board, depth) for board in front)
+        after = set()
+        for board in front:
+            y, x = divmod(board.index(0), width)
+            for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                if 0 <= y + dy < height and 0 <= x + dx < width:
+                    tiles = list(board)
+                    other = (y + dy) * width + x + dx
+                    tiles[y * width + x], tiles[other] = tiles[other], 0
+                    after.add(tuple(tiles))
+        front, depth = [board for board in after if board not in found], depth + 1
+    return found
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 3), (3, 2), (1, 4), (5, 1)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_boards_from_which_the_goal_can_be_reached_are_known(shape: tuple[int, int], turned: bool) -> None:
+    cells = shape[0] * shape[1]
+    goal = torch.arange(cells).flip(0).view(shape) if turned else None
+    found = distances(sliding_tiles(shape=shape, goal=goal))
+    for board in permutations(range(cells)):
+        if board not in found:  # the others are given together
+            with pytest.raises(ValueError, match=r"boards\[0\]: the goal cannot be reached"):
+                sliding_tiles(torch.tensor([board]), shape=shape, goal=goal)
+    world = sliding_tiles(torch.tensor(sorted(found)), shape=shape, goal=goal)
+    bound = world.lower_bound(world.boards).tolist()  # type: ignore[arg-type]
+    assert all(low <= found[board] for low, board in zip(bound, sorted(found), strict=True))
+    assert world.lower_bound(world.goal[None]).tolist() == [0]
+
+
+def test_the_first_board_without_solution_is_named() -> None:
+    boards = torch.arange(9).repeat(3, 1)
+    boards[1, 1], boards[1, 2] = 2, 1
+    with pytest.raises(ValueError, match=r"boards\[1\]: the goal cannot be reached"):
+        sliding_tiles(boards, shape=(3, 3))
+
+
+def test_steps_move_the_blank() -> None:
+    world = sliding_tiles(torch.tensor([[[3, 1, 2], [0, 4, 5]]]))
+    state = world.reset(4)
+    assert world.legal_actions(state)[0].tolist() == [True, False, False, True]
+    after, reward = world.step(state, torch.arange(4))
+    assert after.tolist() == [
+        [[0, 1, 2], [3, 4, 5]],
+        [[3, 1, 2], [0, 4, 5]],
+        [[3, 1, 2], [0, 4, 5]],
+        [[3, 1, 2], [4, 0, 5]],
+    ]
+    assert reward.tolist() == [1, 0, 0, 0]
+    assert world.solved(after).tolist() == world.terminated(after).tolist() == [True, False, False, False]
+    again, reward = world.step(after[:1], torch.tensor([1]))
+    assert again.equal(after[:1])
+    assert reward.tolist() == [0]
+    assert world.lower_bound(after).tolist() == [0, 1, 1, 2]
+
+
+def test_observations() -> None:
+    board = torch.tensor([[[1, 0], [2, 3]]])
+    goal = torch.tensor([[1, 2], [3, 0]])
+    world = sliding_tiles(board, goal=torch.tensor([[1, 3], [2, 0]]))
+    state = world.reset(1)
+    # Kinds: 1 + 3 (rows to go + 1) + columns to go + 1; 0 lies outside. Tile 3 must go up, the blank down.
+    assert world.kinds(state).tolist() == [[[5, 8], [5, 2]]]
+    single = sliding_tiles(
+        board, goal=torch.tensor([[1, 3], [2, 0]]), windows=[(0, -1, 1, 2), (-1, 0, 1, 1), (1, 0, 1, 1)]
+    )
+    assert single.observe(state).tolist() == [[5 * 10 + 8, 100 + 0, 110 + 2]]
+    assert world.observe(state).dtype == torch.int32
+    planes = sliding_tiles(shape=(2, 2), goal=goal, observation="board", scramble=0)
+    assert planes.observe(planes.reset(1)).view(4, 4).argmax(1).tolist() == [3, 0, 1, 2]
+
+
+def test_scrambles_can_be_solved_and_repeated() -> None:
+    world = sliding_tiles(shape=(3, 4), scramble=31)
+    first, again = (world.reset(50, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert first.equal(again)
+    assert len(first.unique(dim=0)) > 25
+    sliding_tiles(first)  # all can be solved
+    assert (world.lower_bound(first) <= 31).all()
+
+
+def test_published_puzzles_are_read() -> None:
+    world = sliding_tiles(PUZZLES)
+    assert world.boards is not None
+    assert world.boards.shape == (1000, 5, 5)
+    assert world.boards[0, 0].tolist() == [20, 23, 0, 3, 1]
+
+
+@given(st.lists(st.permutations(range(6)), min_size=1, max_size=5), st.sampled_from([" ", "  ", "\t"]))
+def test_what_is_written_is_read_again(boards: list[list[int]], between: str) -> None:
+    text = "".join(between.join(map(str, board)) + " \n" for board in boards)
+    assert read_tiles(text, shape=(2, 3)).reshape(-1, 6).tolist() == boards
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "there is no puzzle"),
+        ("0 1 2 3\n\n0 1 2 2\n", "line 3: each of 0 to 3 once is expected, not '0 1 2 2'"),
+        ("0 1 2 3\n0 1 2\n", "line 2: each of 0 to 3 once"),
+        ("0 1 2 x\n", "line 1: each of 0 to 3 once"),
+        ("0 1 2\n", r"line 1: 3 numbers are no square board; give shape"),
+    ],
+)
+def test_wrong_files_are_refused_in_one_line(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "puzzles.txt"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message) as error:
+        sliding_tiles(path)
+    assert str(path) in str(error.value)
+
+
+def test_wrong_arguments_are_refused() -> None:
+    for arguments, message in (
+        ({}, "boards, shape or goal"),
+        ({"boards": torch.zeros(2, 4)}, r"\[n, H \* W\] with shape"),
+        ({"boards": torch.zeros(2, 2, 2)}, "integers"),
+        ({"boards": torch.zeros(2, 2, 2, dtype=torch.long)}, r"boards\[0\]: each of 0 to 3 once"),
+        ({"shape": (2, 2), "goal": torch.arange(4)}, "goal: shape"),
+        ({"shape": (1, 1)}, "2 to 256 cells"),
+        ({"shape": 3}, "shape: height and width, integers"),
+        ({"shape": (3.0, 3)}, "shape: height and width, integers"),
+        ({"boards": ["1 0 2 3"]}, "boards: a file or boards"),
+        ({"boards": "0 1 2 3\n", "shape": (10**5, 10**5)}, "at most 256 cells"),
+        ({"boards": "0 1 2 3\n", "shape": (-2, -2)}, "shape: height and width"),
+        ({"boards": [[*range(1, 16), 0]], "shape": (4, 4)}, r"cannot be reached.*without goal="),
+        ({"shape": (2, 2), "observation": "picture"}, "observation"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sliding_tiles(**arguments)  # type: ignore[arg-type]
+
+
+def test_planners_solve_an_easy_board() -> None:
+    world = sliding_tiles(torch.tensor([[[1, 2, 0], [3, 4, 5]]]))
+    state = world.reset(3)
+    # The one plan of two actions is among 16; 500 samples miss it with p < 1e-13.
+    for planner in (
+        FrontierPlanner(UniformPrior(4), 2, 16, objective="return"),
+        SamplingPlanner(UniformPrior(4), 2, 500, objective="return"),
+    ):
+        decision = planner.plan(world, state, torch.Generator().manual_seed(0))
+        assert world.solved(decision.final_state).all()
+        assert decision.plan.tolist() == [[2, 2]] * 3
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (6, 6), (7, 7), (2, 30), (15, 15)])
+def test_boards_of_all_sizes_have_patterns(shape: tuple[int, int]) -> None:
+    world = sliding_tiles(shape=shape, scramble=10)
+    state = world.reset(4, torch.Generator().manual_seed(0))
+    codes = world.observe(state)
+    assert codes.dtype == torch.int32
+    assert int(codes.min()) >= 0
+    assert int(codes.max()) < world.windows.num_codes < 2**31
+    large = max(height * width for _, _, height, width in world.windows.windows)
+    assert large == (4 if shape in ((2, 2), (6, 6)) else 2)
+    single = [window for window in world.windows.windows if window[2:] == (1, 1)]
+    assert len(single) == (2 * shape[0] - 1) * (2 * shape[1] - 1)
+
+
+def test_a_shape_may_be_a_list() -> None:
+    boards = torch.arange(6).view(1, 6)
+    assert sliding_tiles(boards, shape=[2, 3]).goal.equal(sliding_tiles(boards, shape=(2, 3)).goal)  # type: ignore[arg-type]
+
+
+def test_no_boards_are_a_batch() -> None:
+    for observation in ("patterns", "board"):
+        world = sliding_tiles(shape=(2, 2), observation=observation)  # type: ignore[arg-type]
+        assert len(world.observe(world.reset(0))) == len(world.lower_bound(world.reset(0))) == 0
