@@ -75,7 +75,6 @@ ROOMS = {
     "neuroprior.priors.switching": "Priors with hidden modes",
     "neuroprior.sampling": "Sampling",
     "neuroprior.worlds": "Worlds",
-    "neuroprior.values": "Values",
     "neuroprior.planners": "Planners",
     "neuroprior.agents": "Agents",
     "neuroprior": "The top level",

@@ -82,7 +82,7 @@ __all__ = [
 _ROOMS = ("plans", "worlds", "sampling", "priors", "priors.scoring", "planners")
 """Where the names above are: those that import the fewest others first."""
 
-_OTHER_ROOMS = ("agents", "behaviour", "control", "puzzles", "testing", "training", "values")
+_OTHER_ROOMS = ("agents", "behaviour", "control", "puzzles", "testing", "training")
 
 if not TYPE_CHECKING:
 

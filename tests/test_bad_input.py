@@ -31,7 +31,6 @@ from neuroprior.control import ICEMPlanner, PlanarArm, control
 from neuroprior.planners import expected_score
 from neuroprior.plans import folds
 from neuroprior.priors import CombinedPrior, learn_macros
-from neuroprior.values import q_learning
 from neuroprior.worlds import cube
 from tests.support.sources import refuses, seeded
 
@@ -81,8 +80,6 @@ def test_exact_solutions_need_a_table():
     world = cube()
     with refuses("world", "TabularWorld", "PocketCube"):
         oracle(world, world.reset(2, seeded(0)), 3)
-    with refuses("world", "TabularWorld", "PocketCube"):
-        q_learning(world, 0)
     with refuses("world", "TabularWorld", "PocketCube"):
         expected_score(world, world.reset(2, seeded(0)), torch.zeros(2, 1, 3, dtype=torch.long))
 

@@ -41,13 +41,11 @@ from neuroprior.behaviour import (
 )
 from neuroprior.behaviour.report.plan_report import report
 from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPlanner, VectorGRU, VectorPlans
-from neuroprior.planners import CrossEntropyPlanner, ForagingOracle, HorizonPlanner, expected_score
+from neuroprior.planners import expected_score, value_iteration
 from neuroprior.plans import all_plans, folds, in_parts
-from neuroprior.priors import CombinedPrior, StackedPrior, SwitchingNetwork, SwitchingPrior
+from neuroprior.priors import CombinedPrior, StackedPrior, SwitchingPrior
 from neuroprior.puzzles import AStarPlanner, PatternCounts
-from neuroprior.sampling import most_probable, sample_distinct
 from neuroprior.training import Settings
-from neuroprior.values import can_reach, q_learning, tile_approximation, value_iteration
 from neuroprior.worlds import four_rooms, maze
 from tests.support.sources import refuses, seeded
 
@@ -63,10 +61,8 @@ NONE_OF_THEM = [nan, True, "1"]
 POSITIVE = {
     "smoothing": [partial(MarkovPrior, 3, 1), partial(PatternCounts, 3, 2)],
     "alpha": [partial(ContextTreePrior, 3)],
-    "strength": [partial(CrossEntropyPlanner, UNIFORM, 3, 4)],
     "temperature": [
         partial(UNIFORM.sample, 2, 2),
-        partial(most_probable, UNIFORM, 2, 2),
         partial(SamplingPlanner, UNIFORM, 2, 2),
         partial(MPPIPlanner, 2, 2),
     ],
@@ -87,12 +83,9 @@ SHARES = {
         partial(GRUPrior, 3),
         partial(TransformerPrior, 3),
         partial(StackedPrior, 3),
-        partial(SwitchingNetwork, 3),
         partial(VectorGRU, *ENDS),
     ],
     "uniform_share": [partial(SamplingPlanner, UNIFORM, 3, 4)],
-    "elites": [partial(CrossEntropyPlanner, UNIFORM, 3, 4)],
-    "pilot": [partial(HorizonPlanner, UNIFORM, 3, 4)],
     "keep_elites": [partial(ICEMPlanner, 3, 20)],
     "momentum": [partial(ICEMPlanner, 3, 20)],
     "prior_share": [partial(ShootingPlanner, 3, 4, prior=NoisePrior(*ENDS))],
@@ -105,10 +98,8 @@ SHARES = {
     "discount": [
         partial(SamplingPlanner, UNIFORM, 3, 4, objective="return"),
         partial(ShootingPlanner, 3, 4),
-        partial(ForagingOracle, 3),
         partial(oracle, WORLD, STATE, 3, objective="return"),
         partial(expected_score, WORLD, STATE, torch.zeros(2, 1, 2).long(), objective="return"),
-        partial(q_learning, WORLD, 1, steps=2),
         partial(value_iteration, WORLD),
     ],
 }
@@ -128,10 +119,8 @@ ORDERS = {
     "skip": [partial(mutual_information, PLANS, 2)],
     "first": [PLANS.steps, VECTORS.steps],
     "stop": [partial(VECTORS.steps, 1)],
-    "length": [partial(all_plans, 2), partial(can_reach, WORLD, STATE, 1)],
+    "length": [partial(all_plans, 2)],
     "sweeps": [partial(value_iteration, WORLD)],
-    "num_tilings": [partial(tile_approximation, torch.rand(1, 4), torch.arange(4)[:, None], 2.0)],
-    "steps": [partial(q_learning, WORLD, 1)],
 }
 SIZES = {
     "num_contexts": [
@@ -144,13 +133,11 @@ SIZES = {
     ],
     "num_plans": [
         lambda num_plans: UNIFORM.sample(num_plans, 2),
-        lambda num_plans: sample_distinct(UNIFORM, num_plans, 2),
         lambda num_plans: SemiMarkovPrior(3).sample_plans(num_plans, 2),
         lambda num_plans: NoisePrior(*ENDS).sample(num_plans, 2),
         lambda num_plans: collect(ExhaustivePlanner(2), WORLD, num_plans),
     ],
     "length": [partial(UNIFORM.sample, 2), lambda length: NoisePrior(*ENDS).sample(2, length)],
-    "num_sets": [partial(sample_distinct, UNIFORM, 2, 2)],
     "num_steps": [partial(execute, ExhaustivePlanner(2), WORLD, STATE)],
 }
 

@@ -45,11 +45,11 @@ from neuroprior.control import (
     WindowSynergies,
     control,
 )
-from neuroprior.planners import CrossEntropyPlanner, DistinctPlanner, FrontierPlanner, HorizonPlanner, oracle
+from neuroprior.planners import FrontierPlanner, oracle
 from neuroprior.priors import CombinedPrior, MixturePrior, StackedPrior, SwitchingPrior
 from neuroprior.priors.neural import cuda_graphs as recordings
 from neuroprior.puzzles import AStarPlanner, LevinPlanner, sliding_tiles, sokoban
-from neuroprior.sampling import most_probable, sample_distinct, sample_in_world
+from neuroprior.sampling import sample_in_world
 from neuroprior.testing import check_prior, check_world
 from neuroprior.worlds import cube, maze
 from tests.support.sources import seeded
@@ -96,8 +96,6 @@ def test_plans_of_a_prior(name: str) -> None:
         drawn = prior.sample(3000, 7, method=method, generator=seeded(2))
         assert drawn.device.type == DEVICE.type
         assert drawn.equal(prior.sample(3000, 7, method=method, generator=seeded(2)))
-    assert sample_distinct(prior, 20, 5, generator=seeded(3)).plans.shape == (1, 20, 5)
-    assert most_probable(prior, 20, 5)[0].device.type == DEVICE.type
 
 
 NETWORKS: dict[str, Callable[[], Any]] = {
@@ -215,10 +213,7 @@ def test_a_world_conforms(name: str) -> None:
 
 PLANNERS: dict[str, Callable[[Prior], Planner]] = {
     "sampling": lambda prior: SamplingPlanner(prior, 6, 64),
-    "cross-entropy": lambda prior: CrossEntropyPlanner(prior, 6, 64),
-    "distinct": lambda prior: DistinctPlanner(prior, 6, 64),
     "frontier": lambda prior: FrontierPlanner(prior, 6, 64),
-    "horizon": lambda prior: HorizonPlanner(prior, 6, 64),
     "trees": lambda prior: MCTSPlanner(prior, 6, 64),
     "exhaustive": lambda prior: ExhaustivePlanner(4),
 }

@@ -14,7 +14,7 @@ from neuroprior import (
     gridworld,
 )
 from neuroprior._checks import physical_memory
-from neuroprior.sampling import sample_distinct, sample_in_world
+from neuroprior.sampling import sample_in_world
 from neuroprior.worlds import cube
 from tests.support.sources import refuses
 
@@ -29,7 +29,6 @@ PRIOR = UniformPrior(4)
             ["num_plans and length: 1000000000 and 1000000 ", "1,000,262,1"],
         ),
         (lambda: PRIOR.sample(1, 10**15), ["num_plans and length", "5,000,000,000,000,000 bytes"]),
-        (lambda: sample_distinct(PRIOR, 10**12, 10**6), ["num_plans and length"]),
         (lambda: sample_in_world(PRIOR, gridworld(3, 3), torch.zeros(1, dtype=torch.long), 10**12, 9), ["num_plans"]),
         (lambda: SamplingPlanner(PRIOR, 10**7, 10**9), ["length and num_plans"]),
         (lambda: collect(SamplingPlanner(PRIOR, 2, 3), gridworld(3, 3), 10**13), ["num_plans: 10000000000000 "]),

@@ -60,7 +60,7 @@ def compare(
         beside: folders (--out) of finished comparisons in the same worlds, with the same seeds and settings, whose
             other priors are put into the tables too. They should be of the same version of the code, which is not
             checked; that random plans reach the same is.
-        planners: some of sampling, distinct, frontier, mcts, cross-entropy, halving and replanning (these two in
+        planners: some of sampling, frontier, mcts, halving and replanning (these two in
             stochastic worlds): they are compared, not priors, at as many model steps, with uniform plans, a chain of
             order 3 and the networks of --kinds, after the horizon curriculum.
         context: contexts of priors: none (the plan so far alone), initial (the first observation too) or per-step; by

@@ -7,12 +7,13 @@ from typing import Any
 
 from jsonargparse.typing import PositiveInt
 
+from eval.compare.horizon import HorizonPlanner
 from eval.compare.planners import ORDERS, planned, planner_document
 from eval.compare.run import Contest, Settings
 from eval.worlds import runs
 from eval.worlds.starts import starts_of
 from eval.worlds.suite import TASKS, WorldName
-from neuroprior.planners import HorizonPlanner, Planner, SamplingPlanner
+from neuroprior.planners import Planner, SamplingPlanner
 
 WORLDS = ("grid", "four_rooms", "egocentric", "goal_maze", "taxi", "frozen_lake")
 

@@ -18,15 +18,7 @@ from eval.worlds.starts import Starts, worth
 from eval.worlds.suite import TASKS
 from neuroprior.behaviour.report.document import Document
 from neuroprior.behaviour.report.page import FigureBox, Section, Table
-from neuroprior.planners import (
-    CrossEntropyPlanner,
-    DistinctPlanner,
-    FrontierPlanner,
-    MCTSPlanner,
-    Planner,
-    SamplingPlanner,
-    execute,
-)
+from neuroprior.planners import FrontierPlanner, MCTSPlanner, Planner, SamplingPlanner, execute
 from neuroprior.planners.tuning import TEMPERATURES
 from neuroprior.worlds import World
 
@@ -35,10 +27,8 @@ ORDERS = (3,)
 
 PLANNERS: dict[str, Callable[..., Planner]] = {
     "sampling": SamplingPlanner,
-    "distinct": DistinctPlanner,
     "frontier": FrontierPlanner,
     "mcts": MCTSPlanner,
-    "cross-entropy": CrossEntropyPlanner,
     "halving": partial(SamplingPlanner, halving=True),
     "replanning": partial(SamplingPlanner, halving=True),
 }
@@ -46,7 +36,7 @@ PLANNERS: dict[str, Callable[..., Planner]] = {
 
 PlannerName: TypeAlias = Literal[tuple(PLANNERS)]  # type: ignore[valid-type]
 
-STOCHASTIC, ONLY_STOCHASTIC = {"sampling", "cross-entropy", "halving", "replanning"}, {"halving", "replanning"}
+STOCHASTIC, ONLY_STOCHASTIC = {"sampling", "halving", "replanning"}, {"halving", "replanning"}
 """Planners for stochastic worlds, and those that plan like another one in deterministic worlds."""
 
 TRAJECTORIES = 8

@@ -13,9 +13,9 @@ from eval.worlds.labyrinth import data_digest
 from neuroprior import MarkovPrior, Plans, Prior, TabularWorld
 from neuroprior._random import draw_seed
 from neuroprior.behaviour.analysis.calibration import reliability
+from neuroprior.planners import value_iteration
 from neuroprior.priors import forecast, infer
 from neuroprior.priors.counts import Chains
-from neuroprior.values import value_iteration
 from neuroprior.worlds import four_rooms, maze
 from neuroprior.worlds.grid import GridWorld
 

@@ -8,8 +8,8 @@ from jsonargparse.typing import PositiveInt, restricted_number_type
 
 from eval.live.report import live_document
 from eval.live.run import LEARN_EVERY, PARTS, REPLAN_EVERY, LiveSettings, run_live
+from eval.live.worlds import FORAGING_WORLDS, ForagingWorldName
 from eval.worlds import runs
-from eval.worlds.foraging import FORAGING_WORLDS, ForagingWorldName
 from neuroprior.behaviour.report.document import write_figures
 
 Kind: TypeAlias = Literal[tuple(LEARN_EVERY)]  # type: ignore[valid-type]

@@ -7,13 +7,15 @@ from typing import Any, NamedTuple
 
 import torch
 
-from eval.worlds.foraging import FORAGING_WORLDS
+from eval.live.foraging import ForagingWorld, patches
+from eval.live.oracle import ForagingOracle
+from eval.live.worlds import FORAGING_WORLDS
 from eval.worlds.runs import Run
 from neuroprior._random import draw_seed
 from neuroprior.agents.agent import Agent
-from neuroprior.planners import ForagingOracle, Planner, SamplingPlanner
+from neuroprior.planners import Planner, SamplingPlanner
 from neuroprior.priors import GRUPrior, MarkovPrior, Prior, UniformPrior
-from neuroprior.worlds import ForagingWorld, TabularWorld, patches
+from neuroprior.worlds import TabularWorld
 
 ORDERS = {"none": 3, "per-step": 2}
 """Orders of the Markov priors, by their context."""

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import torch
 
+from eval.options.planner import OptionPlanner
 from neuroprior import MacroPrior, MarkovPrior, Plans, Prior, SamplingPlanner, UniformPrior
 from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.planners import OptionPlanner
 from neuroprior.priors import SwitchingPrior
 
 ORDERS = range(8)

@@ -18,8 +18,9 @@ from eval.paper.planners import (
     paired_table,
     share_table,
 )
+from eval.paper.values import can_reach, q_learning
 from neuroprior import ExhaustivePlanner, Planner, Plans, Prior
-from neuroprior.values import can_reach, q_learning, value_iteration
+from neuroprior.planners import value_iteration
 from neuroprior.worlds import GridWorld
 
 PAPER_REACHED = {"deterministic": 0.2422, "random": 0.3952, "markov-1": 0.4961, "markov-2": 0.4733}

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from eval.paper.planners import Finished, PaperSettings, make_planners, over_groups
 from eval.paper.second_simulation import ceiling, empty_world, learned_values, objective, pursue, random_starts
+from eval.paper.values import network_approximation, tile_approximation
 from neuroprior import Prior
-from neuroprior.values import network_approximation, tile_approximation, value_iteration
+from neuroprior.planners import value_iteration
 
 STARTS = 600
 """Starts for each level, at the most."""

@@ -35,7 +35,7 @@ class Agent:
         prior: the prior that learns, usually the planner's. It also continues the rest of the last plan.
         state: `[B, ...]`: the states of the agents; None: one agent in a state that `world.reset` draws.
         replan_every: actions that are executed before replanning.
-        change: applied to the states after each step, such as `ForagingWorld.regrow`; planners do not foresee it.
+        change: applied to the states after each step; planners do not foresee it.
         warm_start: the rest of the last plan, continued by the prior, is one of the candidates. Without effect for
             best-first searches, whose plans end by themselves.
         num_rollouts: of this candidate and of the planner's best one in a stochastic world, where they are compared.

@@ -1,12 +1,14 @@
-"""Exact scores in tables, by dynamic programming: of the best plan (`oracle`), of given plans (`expected_score`)."""
+"""Exact solutions in tables: the best plan (`oracle`), scores of plans (`expected_score`), state values."""
 
+import itertools
+import math
 from collections.abc import Callable
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from neuroprior._checks import check_range, check_sizes
+from neuroprior._checks import check_count, check_range, check_sizes, is_number
 from neuroprior.planners.planner import check_objective, value_of
 from neuroprior.worlds.tabular import TabularWorld, check_tabular
 from neuroprior.worlds.world import check_plans
@@ -182,3 +184,81 @@ def _check_lengths(lengths: Tensor, shape: torch.Size) -> None:
     if (lengths < 1).any():
         where = (lengths < 1).nonzero()[0].tolist()
         raise ValueError(f"lengths{where}: at least one action must be executed, not 0")
+
+
+@torch.no_grad()
+def value_iteration(
+    world: TabularWorld,
+    *,
+    discount: float = 0.9,
+    goal: int | None = None,
+    sweeps: int | None = None,
+    tolerance: float = 1e-9,
+) -> Tensor:
+    """Returns optimal state values, exact or after some sweeps.
+
+    With a goal, the reward is 1 for reaching it and 0 otherwise, whatever rewards the world has. A cell at distance d
+    then has the value discount ** (d - 1), and the goal itself 1 / discount: a planner that maximises the value of the
+    final cell must prefer the goal to the cells beside it.
+
+    Args:
+        world: gives the transitions, the legal actions and, without a goal, the rewards of its W reward maps.
+        discount: the factor for a reward one step later: at least 0 (with a goal: above 0) and below 1.
+        goal: the goal's cell, for the values of reaching it; None: the world's own rewards, for ever.
+        sweeps: stop after so many synchronous sweeps from values of 0: with a goal, cells farther from it than that
+            then still have the value 0. None: until convergence.
+        tolerance: converged is when no value changes by more than this; values are then within
+            tolerance * discount / (1 - discount) of the true ones. With a goal in a deterministic world, when no value
+            changes at all.
+
+    Returns:
+        `[W, S]` float64; with a goal `[1, S]`.
+
+    Raises:
+        ValueError: an argument is out of range, or the reward of a legal action is infinite.
+
+    Example:
+        >>> world = TabularWorld(torch.tensor([[0, 1], [1, 1]]), torch.tensor([0.0, 1.0]))
+        >>> value_iteration(world, discount=0.5).round(decimals=2).tolist()
+        [[2.0, 2.0]]
+    """
+    if sweeps is not None:
+        check_count("sweeps", sweeps, 0)
+    if not (is_number(tolerance) and tolerance > 0):
+        raise ValueError(f"`tolerance` must be above 0, got {tolerance!r}.")
+    if not (is_number(discount) and 0 <= discount < 1) or (goal is not None and discount == 0):
+        raise ValueError(f"`discount` must be at least 0 (with a goal: above 0) and below 1, got {discount!r}.")
+    if goal is not None:
+        goal, tolerance = check_goal(world, goal), tolerance if world.stochastic else 0.0
+    rewards = _action_rewards(world, goal is not None)
+    values = rewards.new_zeros(rewards.shape[0], world.num_states)
+    if goal is not None:
+        values[:, goal] = 1 / discount
+    most = math.inf
+    for _ in itertools.count() if sweeps is None else range(sweeps):
+        before, values = values, (rewards + discount * world.mean_after(values)).amax(-1)
+        if goal is not None:
+            values[:, goal] = 1 / discount
+        # Each sweep shrinks the largest change at least by the discount; rounding must not hide that.
+        most = min(float((values - before).abs().max()), most * discount)
+        if sweeps is None and not most > tolerance:
+            break
+    return values
+
+
+def _action_rewards(world: TabularWorld, none: bool) -> Tensor:
+    """The reward of each action in each cell, `[W, S, A]` float64, or 0 `[1, S, A]`; -inf where it is not legal."""
+    shape = 1, world.num_states, world.num_actions
+    rewards = (world.reward.new_zeros(shape) if none else world.mean_reward()).double()
+    legal = world.legal_actions(torch.arange(world.num_states, device=world.device))
+    for where in (rewards.isinf() & legal).nonzero().tolist()[:1]:
+        raise ValueError(f"world: the reward of [map, cell, action] {where} is infinite; values need finite ones")
+    return rewards.masked_fill(~legal, -torch.inf)
+
+
+def check_goal(world: TabularWorld, goal: int) -> int:
+    """Returns `goal`, a cell of the world; ValueError where it is none, or the world is no table."""
+    check_tabular(world)
+    if goal not in range(world.num_states):
+        raise ValueError(f"`goal` must be a cell from 0 to {world.num_states - 1}, got {goal!r}.")
+    return int(goal)

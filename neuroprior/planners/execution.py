@@ -13,7 +13,7 @@ from neuroprior.plans import Plans, is_per_step
 from neuroprior.worlds.world import World, check_is_world
 
 Change = Callable[[Tensor, torch.Generator | None], Tensor]
-"""A change of states `[B, ...]` that is not caused by the agents' own steps, such as `ForagingWorld.regrow`."""
+"""A change of states `[B, ...]` that is not caused by the agents' own steps."""
 
 
 class Execution(NamedTuple):

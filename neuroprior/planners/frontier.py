@@ -10,7 +10,6 @@ from neuroprior._hashing import row_hashes
 from neuroprior._random import gumbel
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, as_floats, join_decisions, random_best
 from neuroprior.plans import action_dtype
-from neuroprior.sampling.distinct import child_log_probs, parents
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import World
 
@@ -113,11 +112,11 @@ class FrontierPlanner(PriorPlanner):
     ) -> tuple["_Front", Tensor, Tensor]:
         """Try `width` continuations; also the row of the plan that each extends, and its action: `[B * width]`."""
         logits = legal_logits(world, front.state, logits)
-        log_prob = child_log_probs(front.log_prob.view(-1, 1), logits, self.temperature)
+        log_prob = _child_log_probs(front.log_prob.view(-1, 1), logits, self.temperature)
         log_prob = log_prob.view(len(front.log_prob), front.log_prob.shape[1] * world.num_actions)
         height = gumbel(log_prob, generator) if self.noise else log_prob
         index = height.topk(width).indices
-        row, action = parents(index, front.log_prob.shape[1], world.num_actions)
+        row, action = _parents(index, front.log_prob.shape[1], world.num_actions)
         state, reward = world.step(front.state.index_select(0, row), action, generator)
         return front.extend(row, action, log_prob.gather(1, index), state, reward), row, action
 
@@ -178,3 +177,22 @@ class _Front(NamedTuple):
         total = torch.zeros_like(prob).scatter_add_(1, group, rest).log() + top
         log_prob = torch.where(new, total.gather(1, group), -torch.inf)
         return self._replace(log_prob=torch.empty_like(log_prob).scatter_(1, order, log_prob))
+
+
+def _child_log_probs(log_prob: Tensor, logits: Tensor, temperature: float) -> Tensor:
+    """The log-probabilities `[M, A]` of plans of `log_prob [M, 1]` after one more action, by its `logits [M, A]`."""
+    if (logits.isnan() & (log_prob > -torch.inf)).any():
+        raise ValueError("prior: its logits are NaN")
+    child = log_prob + (logits.double() / temperature).log_softmax(-1)
+    # After an impossible prefix a prior may give NaN.
+    return torch.where(log_prob > -torch.inf, child, -torch.inf)
+
+
+def _parents(index: Tensor, beams: int, actions: int) -> tuple[Tensor, Tensor]:
+    """The parents of children that were picked by `index [B, K]` from B rows of `beams * actions` children.
+
+    Returns:
+        The rows `[B * K]` of the parents among all B * `beams`, and the actions `[B * K]` that lead to the children.
+    """
+    first = torch.arange(len(index), device=index.device)[:, None] * beams
+    return (first + index.div(actions, rounding_mode="floor")).flatten(), (index % actions).flatten()

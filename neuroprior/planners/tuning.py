@@ -1,7 +1,7 @@
 """What helps a planner that samples: who proposes, at which temperature, with how many uniform plans, and hard plans.
 
 The likeliest plans are not the best candidates: those are likely and different. `best_sampling` chooses by what is
-found in a world, `sampling_for` without one, and `search_weights` says which plans to learn from.
+found in a world, and `search_weights` says which plans to learn from.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +17,7 @@ from neuroprior._random import generator_on
 from neuroprior.planners.planner import Objective
 from neuroprior.planners.rollouts import mean_scores
 from neuroprior.planners.sampling import SamplingPlanner, uniform_plans
-from neuroprior.plans import Plans
-from neuroprior.plans.plans import check_are_plans
 from neuroprior.priors.ensembles.mixture import MixturePrior
-from neuroprior.priors.prior import Prior, check_is_prior
 from neuroprior.priors.uniform import UniformPrior
 from neuroprior.sampling.draws import check_temperature
 from neuroprior.sampling.stepping import Steppable, check_in_world
@@ -192,65 +189,6 @@ def choices(score: Tensor, drawn: int, num_plans: int, share: float, keys: Tenso
 
 
 @torch.no_grad()
-def sampling_for(
-    prior: Prior,
-    plans: Plans,
-    num_plans: int,
-    temperatures: Sequence[float] = TEMPERATURES,
-    uniform_shares: Sequence[float] = UNIFORM_SHARES,
-) -> tuple[float, float]:
-    """The temperature and the share of uniform plans to sample with, where there are plans but no world to try.
-
-    With both, a plan of L actions is drawn with probability q = (1 - share) p + share / A^L, where p is the prior's at
-    the temperature. One of P candidates is that plan with probability 1 - (1 - q)^P, whose mean over held-out plans is
-    highest: where plans have groups the mean of the group in which it is lowest, so that least is lost in the worst
-    case; of equals, the mean over all plans.
-
-    Args:
-        prior: fitted to other plans.
-        plans: held-out plans, at least one. The probability is that of whole plans: cut them to the length to be
-            planned.
-        num_plans: P.
-        temperatures, uniform_shares: what is tried; of settings that are equal in both, the first.
-
-    Returns:
-        The temperature and the share.
-
-    Raises:
-        ValueError: an argument is out of range, there is nothing to try, or plans that the prior does not know.
-
-    Example:
-        >>> plans = Plans(torch.tensor([[0, 1, 2, 0, 1, 2]]).repeat(20, 1), 3)
-        >>> sampling_for(MarkovPrior(3, 1).fit(plans), plans, num_plans=16)
-        (1.0, 0.0)
-    """
-    temperatures, uniform_shares = as_tried(temperatures, uniform_shares)
-    check_sizes(num_plans=num_plans)
-    check_is_prior(prior)
-    check_are_plans(plans)
-    if len(plans) == 0:
-        raise ValueError("plans: at least one is expected; from none, no setting is better than another")
-    parts: dict[float, list[Tensor]] = {heat: [] for heat in temperatures}
-    for part, log_probs in prior.forecasts(plans):
-        action, beyond = part.actions.long()[..., None], ~part.mask()
-        for heat, found in parts.items():
-            taken = (log_probs.double() / heat).log_softmax(-1).gather(-1, action)[..., 0]
-            found.append(taken.masked_fill(beyond, 0).sum(1).cpu())
-    at = {heat: torch.cat(found) for heat, found in parts.items()}
-    even = -plans.mask().sum(1).double().cpu() * log(plans.num_actions)
-    group = torch.zeros(len(plans), dtype=torch.long) if plans.group is None else plans.group.cpu()
-    members = group.unique(return_inverse=True)[1]
-
-    def worth(setting: tuple[float, float]) -> tuple[float, float]:
-        heat, share = setting
-        ways = [at[heat] + (log(1 - share) if share < 1 else -inf), even + (log(share) if share else -inf)]
-        found = log_inclusion(torch.logaddexp(*ways), num_plans)
-        groups = [_log_mean(found[members == number]) for number in range(int(members.max()) + 1)]
-        return round(min(groups), DIGITS), round(_log_mean(found), DIGITS)
-
-    return max(product(temperatures, uniform_shares), key=worth)
-
-
 def search_weights(log_prob: Tensor, num_plans: int) -> Tensor:
     """How much each plan should count for a prior of which one of P samples is to be that plan.
 
@@ -288,11 +226,6 @@ def log_inclusion(log_prob: Tensor, num_plans: int) -> Tensor:
     log_prob = log_prob.double().clamp(max=0)
     never = torch.special.xlog1py(torch.tensor(float(num_plans)), -log_prob.exp())
     return torch.where(log_prob < SMALLEST, log(num_plans) + log_prob, (-torch.expm1(never)).log())
-
-
-def _log_mean(values: Tensor) -> float:
-    """The logarithm of the mean of what has these logarithms."""
-    return float(values.logsumexp(0)) - log(len(values))
 
 
 def as_tried(temperatures: Sequence[float], uniform_shares: Sequence[float]) -> tuple[list[float], list[float]]:

@@ -2,7 +2,6 @@
 
 from neuroprior.priors.counts import ContextTreePrior, Leaf, MarkovPrior
 from neuroprior.priors.ensembles import CombinedPrior, MixturePrior, StackedPrior
-from neuroprior.priors.estimator import PriorEstimator
 from neuroprior.priors.fitting import fit
 from neuroprior.priors.intentions import Posterior, forecast, infer
 from neuroprior.priors.macros import Macro, MacroPrior, learn_macros
@@ -10,7 +9,7 @@ from neuroprior.priors.matching import decode, match_plans
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.serialization import load, save
-from neuroprior.priors.switching import ModePosterior, SwitchingNetwork, SwitchingPrior
+from neuroprior.priors.switching import ModePosterior, SwitchingPrior
 from neuroprior.priors.uniform import UniformPrior
 
 __all__ = [
@@ -27,9 +26,7 @@ __all__ = [
     "MixturePrior",
     "ModePosterior",
     "Prior",
-    "PriorEstimator",
     "StackedPrior",
-    "SwitchingNetwork",
     "SwitchingPrior",
     "TransformerPrior",
     "UniformPrior",

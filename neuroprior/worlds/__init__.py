@@ -1,8 +1,7 @@
-"""Worlds: batched simulators in which planners try plans; grids, mazes, puzzles, foraging, Gymnasium environments."""
+"""Worlds: batched simulators in which planners try plans; grids, mazes, cube, Gymnasium environments."""
 
 from neuroprior.worlds.cube import PocketCube, cube
 from neuroprior.worlds.episodes import EpisodicWorld
-from neuroprior.worlds.foraging import ForagingWorld, patches
 from neuroprior.worlds.grid import GridWorld, egocentric, goal_direction, gridworld, local_view
 from neuroprior.worlds.gymnasium import SteppedWorld, from_gymnasium
 from neuroprior.worlds.labyrinth import labyrinth
@@ -12,7 +11,6 @@ from neuroprior.worlds.world import Rollout, World
 
 __all__ = [
     "EpisodicWorld",
-    "ForagingWorld",
     "GridWorld",
     "PocketCube",
     "Rollout",
@@ -28,5 +26,4 @@ __all__ = [
     "labyrinth",
     "local_view",
     "maze",
-    "patches",
 ]

@@ -7,6 +7,7 @@ from functools import cache
 import pytest
 import torch
 
+from eval.live.foraging import ForagingWorld, patches
 from neuroprior import (
     CombinedPrior,
     ExhaustivePlanner,
@@ -25,7 +26,6 @@ from neuroprior import (
 )
 from neuroprior.agents import Agent, checkpoints, restore_agent, save_agent
 from neuroprior.puzzles import AStarPlanner
-from neuroprior.worlds import ForagingWorld, patches
 from tests.support.sources import corridor, every_plan, refuses, seeded, stochastic_world
 
 TRAINING = {"max_steps": 4, "progress": False}

@@ -80,7 +80,6 @@ WITHOUT_EXAMPLE = {
         *(
             "Decision",
             "Difference",
-            "Distinct",
             "DurationLaw",
             "Execution",
             "GaussianForecast",

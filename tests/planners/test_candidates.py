@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neuroprior import FrontierPlanner, MarkovPrior, MCTSPlanner, TabularWorld
-from neuroprior.planners import CrossEntropyPlanner, DistinctPlanner, HorizonPlanner, SamplingPlanner
+from neuroprior.planners import SamplingPlanner
 from tests.support.sources import FALSE_ALARM, p_value, seeded
 
 SHARES = torch.tensor([0.6, 0.4])
@@ -38,11 +38,6 @@ def tried(planner, starts: int) -> torch.Tensor:
     return torch.tensor(world.first)
 
 
-def test_the_horizon_planner_draws_at_its_temperature():
-    sharp = SHARES**4 / (SHARES**4).sum()
-    assert p_value(tried(HorizonPlanner(chain(), 1, 4000, pilot=1.0, temperature=0.25), 1), sharp) > FALSE_ALARM
-
-
 def test_without_noise_the_frontier_planner_takes_the_most_probable():
     assert tried(FrontierPlanner(chain(), 1, 1, noise=False), 100).unique().tolist() == [0]
     assert p_value(tried(FrontierPlanner(chain(), 1, 1), 4000), SHARES) > FALSE_ALARM
@@ -59,15 +54,8 @@ def test_without_exploration_tree_search_does_not_heed_the_prior():
     assert p_value(tried(MCTSPlanner(chain(), 1, 1, exploration=0.0), 4000), torch.ones(2)) > FALSE_ALARM
 
 
-@pytest.mark.parametrize(("num_plans", "length", "steps"), [(5, 4, 2 + 4 + 5 + 5), (1, 3, 3), (100, 2, 2 + 4)])
-def test_distinct_plans_share_the_steps_of_their_beginnings(num_plans, length, steps):
-    world = Recorded()
-    decision = DistinctPlanner(chain(), length, num_plans).plan(world, torch.zeros(7, dtype=torch.long), seeded(0))
-    assert decision.model_steps == world.steps / 7 == steps
-
-
 @pytest.mark.parametrize("temperature", [0.25, 1.0, 4.0])
-@pytest.mark.parametrize("kind", [SamplingPlanner, DistinctPlanner, FrontierPlanner, CrossEntropyPlanner])
+@pytest.mark.parametrize("kind", [SamplingPlanner, FrontierPlanner])
 def test_candidates_are_drawn_at_the_planners_temperature(kind, temperature):
     """Of two actions, and of the plans of two that begin with them."""
     sharp = SHARES ** (1 / temperature) / (SHARES ** (1 / temperature)).sum()

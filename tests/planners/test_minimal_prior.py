@@ -4,15 +4,7 @@ import pytest
 import torch
 
 from neuroprior import FrontierPlanner, MarkovPrior, MCTSPlanner, SamplingPlanner, UniformPrior
-from neuroprior.planners import CrossEntropyPlanner, DistinctPlanner, HorizonPlanner
-from neuroprior.sampling import (
-    Steppable,
-    most_probable,
-    sample,
-    sample_distinct,
-    sample_distinct_in_world,
-    sample_in_world,
-)
+from neuroprior.sampling import Steppable, sample, sample_in_world
 from neuroprior.testing import check_planner
 from tests.support.sources import random_world, refuses, seeded, stochastic_world
 
@@ -56,31 +48,23 @@ def test_sampling(method):
     assert same(*plans)
 
 
-def test_distinct_and_most_probable():
-    assert same(*(sample_distinct(prior, 9, 4, num_sets=3, generator=seeded(1)) for prior in (CHAIN, FITTED)))
-    assert same(*(most_probable(prior, 9, 4) for prior in (CHAIN, FITTED)))
-
-
 @pytest.mark.parametrize("kind", WORLDS)
 def test_sampling_in_a_world(kind):
     world = WORLDS[kind]
     state = world.reset(20, seeded(0))
     found = [sample_in_world(prior, world, state, 30, 4, generator=seeded(1)) for prior in (CHAIN, FITTED)]
     assert same(*found)
-    if not world.stochastic:
-        found = [sample_distinct_in_world(prior, world, state, 5, 3, generator=seeded(1)) for prior in (CHAIN, FITTED)]
-        assert same(*found)
 
 
 @pytest.mark.parametrize("kind", WORLDS)
 @pytest.mark.parametrize(
     "kind_of_planner",
-    [SamplingPlanner, CrossEntropyPlanner, HorizonPlanner, FrontierPlanner, DistinctPlanner, MCTSPlanner],
+    [SamplingPlanner, FrontierPlanner, MCTSPlanner],
 )
 def test_planning(kind_of_planner, kind):
     world = WORLDS[kind]
     state = world.reset(20, seeded(0))
-    if world.stochastic and kind_of_planner in (FrontierPlanner, DistinctPlanner, MCTSPlanner):
+    if world.stochastic and kind_of_planner in (FrontierPlanner, MCTSPlanner):
         with refuses("deterministic"):
             kind_of_planner(CHAIN, 4, 12).plan(world, state)
         return

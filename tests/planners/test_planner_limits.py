@@ -17,24 +17,14 @@ from neuroprior import (
     oracle,
 )
 from neuroprior.agents import Agent
-from neuroprior.planners import (
-    CrossEntropyPlanner,
-    DistinctPlanner,
-    FrontierPlanner,
-    MCTSPlanner,
-    best_sampling,
-    extend_horizon,
-    sampling_for,
-)
+from neuroprior.planners import FrontierPlanner, MCTSPlanner, best_sampling, extend_horizon
 from neuroprior.puzzles import AStarPlanner, LevinPlanner, bootstrap, sliding_tiles
 
 MAKERS = {
     "exhaustive": lambda **goal: ExhaustivePlanner(3, **goal),
     "sampling": lambda **goal: SamplingPlanner(UniformPrior(3), 3, 64, **goal),
-    "distinct": lambda **goal: DistinctPlanner(UniformPrior(3), 3, 27, **goal),
     "frontier": lambda **goal: FrontierPlanner(UniformPrior(3), 3, 27, **goal),
     "mcts": lambda **goal: MCTSPlanner(UniformPrior(3), 3, 40, **goal),
-    "cross-entropy": lambda **goal: CrossEntropyPlanner(UniformPrior(3), 3, 64, **goal),
 }
 PLANNERS = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 
@@ -209,8 +199,6 @@ def learn(world=PUZZLE, prior=CHAIN, **settings):
         (lambda: collect(None, GRID, 3), "planner: a Planner is expected"),
         (lambda: collect(ExhaustivePlanner(2), None, 3), "world: a World"),
         (lambda: best_sampling(CHAIN, GRID, STARTS, 3, 4, temperatures=1.5), "temperatures: a list of numbers"),
-        (lambda: sampling_for(CHAIN, SHORT, 4, uniform_shares=0.1), "uniform_shares: a list of numbers"),
-        (lambda: sampling_for(CHAIN, SHORT.actions, 4), "plans: Plans are expected"),
         (
             lambda: list(extend_horizon(CHAIN, SHORT, GRID, ["3"], num_starts=4, num_plans=4)),
             "lengths: integers of at least 1 .*'3'",
@@ -224,7 +212,6 @@ def learn(world=PUZZLE, prior=CHAIN, **settings):
             "plans: Plans are expected",
         ),
         (lambda: list(extend_horizon(None, SHORT, GRID, [3], num_starts=4)), "prior: a Prior is expected"),
-        (lambda: sampling_for(None, SHORT, 4), "prior: a Prior is expected, not NoneType"),
         (lambda: execute(ExhaustivePlanner(2), GRID, STARTS, 3, change=3), "change: a function of states"),
         (lambda: learn(generator=0), "generator: a torch.Generator"),
         (lambda: learn(teacher=SamplingPlanner(CHAIN, 3, 4)), "teacher: a BestFirstPlanner"),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neuroprior import CombinedPrior, MarkovPrior, MixturePrior, Plans, SamplingPlanner, TabularWorld, UniformPrior
-from neuroprior.planners import best_sampling, proposers, sampling_for, search_weights
+from neuroprior.planners import best_sampling, proposers, search_weights
 from neuroprior.planners.tuning import choices, log_inclusion
 from neuroprior.testing import check_planner
 from neuroprior.worlds import gridworld
@@ -218,68 +218,6 @@ def chance(prior: MarkovPrior, plan: list[int], heat: float, share: float, numbe
     return 1 - (1 - (1 - share) * prob - share / prior.num_actions ** len(plan)) ** number
 
 
-@pytest.mark.parametrize("number", [1, 8, 64])
-def test_sampling_for_is_the_best_by_enumeration(number):
-    prior = MarkovPrior(3, 1).fit(torch.tensor([[0, 1, 2], [0, 1, 1], [0, 0, 1]] * 10))
-    tried = list(product((0.5, 1.0, 1.5, 2.0, 4.0), (0.0, 0.1, 0.3, 0.9)))
-    for plans in ([[0, 1, 2]], [[2, 2, 0]], [[0, 1, 2], [2, 2, 0], [1, 0, 0]], [[0, 1, 2]] * 3 + [[2, 0, 2]]):
-        worth = {
-            setting: sum(chance(prior, plan, *setting, number) for plan in plans) / len(plans) for setting in tried
-        }
-        found = sampling_for(
-            prior, Plans(torch.tensor(plans), 3), number, (0.5, 1.0, 1.5, 2.0, 4.0), (0.0, 0.1, 0.3, 0.9)
-        )
-        assert worth[found] == pytest.approx(max(worth.values()), rel=1e-6)
-        assert found == max(tried, key=lambda setting: worth[setting])
-
-
-def test_the_worst_group_counts():
-    """Nine plans are what the prior says, one of another group is not: for their mean no uniform plans, for it some."""
-    plans = torch.tensor([[0] * 4] * 9 + [[1, 0, 1, 1]])
-    group = torch.tensor([3] * 9 + [7])
-    how = 1, (1.0,), (0.0, 0.3)
-    assert sampling_for(sure_of(0), Plans(plans, 2), *how) == (1.0, 0.0)
-    assert sampling_for(sure_of(0), Plans(plans, 2, group=group), *how) == (1.0, 0.3)
-
-
-def test_of_equal_settings_the_first():
-    even = Plans(torch.tensor([[0, 1], [1, 1]]), 2)
-    assert sampling_for(UniformPrior(2), even, 4, (2.0, 1.0), (0.5, 0.0)) == (2.0, 0.5)
-
-
-def test_the_mean_breaks_ties():
-    """The worst plan, 0 0, has a probability of 1/4 at any temperature; 1 1 has 1/2, and less when it is hot."""
-    training = torch.tensor([[0, 0], [0, 1], [1, 1], [1, 1]] * 10)
-    prior = MarkovPrior(2, 1, smoothing=1e-9, backoff="dirichlet").fit(training)
-    plans = Plans(torch.tensor([[0, 0], [1, 1]]), 2, group=torch.tensor([0, 1]))
-    assert sampling_for(prior, plans[:1], 4, (8.0, 1.0), (0.0,)) == (8.0, 0.0)
-    assert sampling_for(prior, plans, 4, (8.0, 1.0), (0.0,)) == (1.0, 0.0)
-
-
-def test_tiny_probabilities_are_told_apart():
-    """Plans of 2,000 actions: their probability is 0 in float64, and its logarithm is not."""
-    plans = Plans(torch.ones(3, 2000, dtype=torch.long), 2)
-    assert sampling_for(sure_of(0), plans, 16, (1.0, 2.0, 8.0), (0.0,)) == (8.0, 0.0)
-    assert sampling_for(sure_of(0), plans, 16, (1.0,), (0.0, 0.3)) == (1.0, 0.3)
-    small = torch.tensor([-50.0, -599.0, -601.0, -5000.0], dtype=torch.float64)
-    assert torch.allclose(log_inclusion(small, 64), small + log(64), rtol=1e-12)
-
-
-def test_plans_of_several_lengths():
-    plans = Plans(torch.tensor([[0, 1, 0], [1, 0, 0]]), 2, lengths=torch.tensor([3, 1]))
-    prior, number = sure_of(0), 4
-    worth = {
-        share: chance(prior, [0, 1, 0], 1.0, share, number) + chance(prior, [1], 1.0, share, number)
-        for share in (0.0, 0.2, 0.6)
-    }
-    assert sampling_for(prior, plans, number, (1.0,), tuple(worth))[1] == max(worth, key=lambda share: worth[share])
-    # Of one action half of all uniform plans are right, of three an eighth: only together with the former a share pays.
-    plans = Plans(torch.tensor([[0, 0, 0], [1, 0, 0]]), 2, lengths=torch.tensor([3, 1]))
-    worth = {share: chance(prior, [0, 0, 0], 1.0, share, 2) + chance(prior, [1], 1.0, share, 2) for share in (0.0, 0.4)}
-    assert worth[0.4] > worth[0.0] + 0.2
-    assert sampling_for(prior, plans, 2, (1.0,), (0.0, 0.4)) == (1.0, 0.4)
-
-
 @pytest.mark.parametrize("number", [1, 2, 64, 4096])
 def test_weights_are_the_gradient(number):
     """Of -log(1 - (1 - p) ** P), with respect to log p."""
@@ -296,36 +234,22 @@ def test_weights_at_the_ends():
 
 
 def test_nothing_to_try():
-    world, plans, prior = bandit(), Plans(torch.zeros(2, 1, dtype=torch.long), 2), UniformPrior(2)
+    world, prior = bandit(), UniformPrior(2)
     state = torch.zeros(2, dtype=torch.long)
     with refuses("prior: it has 3 actions, and the world 4"):
         best_sampling(UniformPrior(3), gridworld(4, 4), torch.arange(16), 4, 8)
     with refuses("temperatures: at least one"):
         best_sampling(prior, world, state, 1, 4, temperatures=())
-    with refuses("uniform_shares: at least one"):
-        sampling_for(prior, plans, 4, uniform_shares=())
-    with refuses("uniform_share: a number from 0 to 1"):
-        sampling_for(prior, plans, 4, uniform_shares=(2,))
     with refuses("temperature: a positive"):
         best_sampling(prior, world, state, 1, 4, temperatures=(0,))
     with refuses("state: at least one start"):
         best_sampling(prior, world, state[:0], 1, 4)
-    with refuses("plans: at least one"):
-        sampling_for(prior, plans[:0], 4)
-    with refuses("num_plans"):
-        sampling_for(prior, plans, 0)
     with refuses("at most 0"):
         search_weights(torch.tensor([0.1]), 4)
     with refuses("at most 0"):
         search_weights(torch.tensor([float("nan")]), 4)
 
 
-def test_what_is_beyond_the_ends_of_plans_counts_nothing():
-    """What pads them would be far likelier at a higher temperature, or under uniform plans."""
-    for sure in (0, 1):
-        own = torch.tensor([[sure, sure], [sure, sure], [sure, 1 - sure]])
-        padded = torch.nn.functional.pad(own, (0, 6), value=1 - sure)
-        for shares in ((0.0,), (0.0, 0.3)):
-            found = sampling_for(sure_of(sure), Plans(padded, 2, torch.tensor([2, 2, 2])), 1, uniform_shares=shares)
-            assert found == sampling_for(sure_of(sure), Plans(own, 2), 1, uniform_shares=shares)
-            assert found != sampling_for(sure_of(sure), Plans(padded, 2), 1, uniform_shares=shares)
+def test_tiny_probabilities_keep_their_logarithms():
+    small = torch.tensor([-50.0, -599.0, -601.0, -5000.0], dtype=torch.float64)
+    assert torch.allclose(log_inclusion(small, 64), small + log(64), rtol=1e-12)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from neuroprior import ExhaustivePlanner, FrontierPlanner, MCTSPlanner, Planner, SamplingPlanner, TabularWorld
-from neuroprior.planners import CrossEntropyPlanner, Decision, DistinctPlanner, HorizonPlanner
+from neuroprior.planners import Decision
 from neuroprior.testing import check_planner
 from tests.support.sources import TablePrior, refuses, seeded
 
@@ -16,13 +16,8 @@ HOW = {
 }
 PLANNERS = {
     "sampling": SamplingPlanner,
-    "distinct": DistinctPlanner,
     "frontier": FrontierPlanner,
-    "cross-entropy": lambda prior, length, number, **how: CrossEntropyPlanner(
-        prior, length, number, rounds=min(3, number), **how
-    ),
     "mcts": MCTSPlanner,
-    "horizon": lambda prior, length, number, any_prefix=True, **how: HorizonPlanner(prior, length, number, **how),
     "exhaustive": lambda prior, length, number, **how: ExhaustivePlanner(length, **how),
 }
 
@@ -33,7 +28,7 @@ def test_planners_conform(make, how):
     check_planner(lambda prior, length, number: make(prior, length, number, **how))
 
 
-@pytest.mark.parametrize("make", [MCTSPlanner, DistinctPlanner])
+@pytest.mark.parametrize("make", [MCTSPlanner])
 def test_priors_that_hold_all_that_exists_impossible_are_named(make):
     """Where action 0 alone exists, a prior that never takes it."""
     world = TabularWorld(torch.zeros(1, 2, dtype=torch.long), torch.ones(1), torch.tensor([[True, False]]))

@@ -7,9 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from eval.paper.values import can_reach, q_learning
 from neuroprior import TabularWorld
+from neuroprior.planners import value_iteration
 from neuroprior.testing import check_world
-from neuroprior.values import can_reach, q_learning, value_iteration
 from neuroprior.worlds.outcomes import Outcomes
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded, stochastic_world, trajectories
 

@@ -1,7 +1,6 @@
 """The experts of a combined prior: which are tried on plans of a kind, and what is spent on them."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from math import inf
 from typing import Any, Literal
 
@@ -14,17 +13,16 @@ from neuroprior.priors.counts import BACKOFFS_TRIED, Chains, ContextTreePrior, M
 from neuroprior.priors.ensembles.stacked import StackedPrior
 from neuroprior.priors.neural import GRUPrior, TransformerPrior
 from neuroprior.priors.prior import Prior, construct
-from neuroprior.priors.switching.switching_network import SwitchingNetwork
 from neuroprior.priors.uniform import UniformPrior
 
 Effort = Literal["fast", "standard", "full"]
 """What is spent: "fast" trains a GRU beside what counts, "standard" a stacked prior as well, "full" a
-transformer and a switching network of four modes as well."""
+transformer as well."""
 
 NETWORKS: dict[Effort, tuple[Callable[..., Prior], ...]] = {
     "fast": (GRUPrior,),
     "standard": (GRUPrior, StackedPrior),
-    "full": (GRUPrior, StackedPrior, TransformerPrior, partial(SwitchingNetwork, num_modes=4)),
+    "full": (GRUPrior, StackedPrior, TransformerPrior),
 }
 """The experts that are trained, in this order."""
 

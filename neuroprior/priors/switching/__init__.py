@@ -1,6 +1,5 @@
 """Priors with hidden modes that persist and switch."""
 
-from neuroprior.priors.switching.switching_network import SwitchingNetwork
 from neuroprior.priors.switching.switching_prior import ModePosterior, SwitchingPrior
 
-__all__ = ["ModePosterior", "SwitchingNetwork", "SwitchingPrior"]
+__all__ = ["ModePosterior", "SwitchingPrior"]

@@ -63,7 +63,7 @@ def test_the_networks_among_experts_are_fitted_once(effort, apart, monkeypatch):
     assert {job.kind for job in todo} == {COMBINED, "counts"} | apart
     found = fit_and_score(plans, None, design, Job(0, COMBINED, ACTIONS))
     assert {name.removesuffix("/bits") for name in found if name.endswith("/bits")} == {COMBINED} | networks - apart
-    assert len(trained) == {"fast": 1, "standard": 2, "full": 4}[effort]
+    assert len(trained) == {"fast": 1, "standard": 2, "full": 3}[effort]
 
 
 def test_the_reach_of_lags_is_half_of_the_shorter_plans():

@@ -9,6 +9,7 @@ import torch
 
 from eval.__main__ import main
 from eval.options import run as run_module
+from eval.options.planner import OptionPlanner
 from eval.options.priors import entrants, pairs
 from eval.options.report import compared_pairs
 from eval.options.run import OptionSettings, index_of, numbered, observed, scores_reached
@@ -18,7 +19,6 @@ from eval.worlds.starts import Starts
 from eval.worlds.suite import Task
 from neuroprior import ExhaustivePlanner, Plans, SamplingPlanner, TabularWorld, UniformPrior, collect, read_plans
 from neuroprior.behaviour.analysis.comparison import score
-from neuroprior.planners import OptionPlanner
 from neuroprior.priors import SwitchingPrior
 from neuroprior.worlds import four_rooms
 from tests.support.sources import seeded

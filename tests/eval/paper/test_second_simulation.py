@@ -8,10 +8,11 @@ import torch
 from eval.paper.planners import PaperSettings
 from eval.paper.second_simulation import ceiling, empty_world, objective, pursue, random_starts
 from eval.paper.value_quality import families, quality
+from eval.paper.values import can_reach
 from neuroprior import ExhaustivePlanner, SamplingPlanner, TabularWorld, UniformPrior, collect, oracle
+from neuroprior.planners import value_iteration
 from neuroprior.testing import FALSE_ALARM
 from neuroprior.testing.chi_square import chi_square
-from neuroprior.values import can_reach, value_iteration
 
 
 def settings(**changes: object) -> PaperSettings:

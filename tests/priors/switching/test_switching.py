@@ -9,7 +9,7 @@ import torch
 from scipy.stats import nbinom
 
 from neuroprior import Plans, load, save
-from neuroprior.priors import SwitchingNetwork, SwitchingPrior
+from neuroprior.priors import SwitchingPrior
 from neuroprior.testing import check_prior
 from tests.support.sources import refuses, seeded
 
@@ -346,24 +346,6 @@ def test_it_is_a_prior(phases, contexts):
     check_prior(SwitchingPrior(3, 2, 2, contexts, phases=phases, max_iterations=10).fit(plans, generator=seeded(0)))
 
 
-@pytest.mark.parametrize("contexts", [None, 3])
-def test_the_network_is_a_prior(contexts):
-    plans = some_plans(contexts=contexts)
-    prior = SwitchingNetwork(3, 2, hidden_size=8, num_contexts=contexts)
-    check_prior(prior.fit(plans, generator=seeded(0), progress=False, max_steps=5))
-
-
-@pytest.mark.slow
-def test_the_network_learns_modes_that_persist():
-    actions = switching_source(120, 40)[0]
-    held_out = switching_source(60, 40, seed=5)[0]
-    settings = {"generator": seeded(0), "progress": False, "max_steps": 150, "learning_rate": 1e-2}
-    prior = SwitchingNetwork(3, 2, hidden_size=8).fit(actions, **settings)
-    chain = SwitchingPrior(3, 2).fit(actions, generator=seeded(0))
-    loss = [-float(p.log_prob(held_out).detach().mean()) / 40 for p in (prior, chain)]
-    assert loss[0] < loss[1] + 0.02
-
-
 def test_the_same_seed_gives_the_same_modes(tmp_path):
     plans = some_plans(contexts=3)
     one, two = (SwitchingPrior(3, 2, num_contexts=3).fit(plans, generator=seeded(7)) for _ in range(2))
@@ -407,5 +389,3 @@ def test_wrong_plans_are_refused():
         SwitchingPrior(3, 2, num_contexts=2).fit(some_plans())
     with refuses("actions"):
         prior.posterior(some_plans(actions=4))
-    with refuses("num_modes"):
-        SwitchingNetwork(3, 0)

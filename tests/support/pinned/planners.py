@@ -8,34 +8,21 @@ import torch
 from neuroprior.agents import Agent, restore_agent, save_agent
 from neuroprior.control import DoubleIntegrator, ICEMPlanner, MPPIPlanner, ShootingPlanner, coloured_noise, control
 from neuroprior.planners import (
-    CrossEntropyPlanner,
-    DistinctPlanner,
     ExhaustivePlanner,
-    ForagingOracle,
     FrontierPlanner,
-    HorizonPlanner,
     MCTSPlanner,
-    OptionPlanner,
     SamplingPlanner,
     best_sampling,
     collect,
-    execute,
     expected_score,
     extend_horizon,
     oracle,
-    sampling_for,
     search_weights,
 )
-from neuroprior.priors import GRUPrior, MarkovPrior, SwitchingPrior, UniformPrior
+from neuroprior.priors import GRUPrior, MarkovPrior, UniformPrior
 from neuroprior.puzzles import AStarPlanner, LevinPlanner, LogLinearPrior, bootstrap, sliding_tiles, sokoban
-from neuroprior.sampling import (
-    most_probable,
-    sample,
-    sample_distinct,
-    sample_distinct_in_world,
-    sample_in_world,
-)
-from neuroprior.worlds import ForagingWorld, cube, four_rooms, gridworld, maze, patches
+from neuroprior.sampling import sample, sample_in_world
+from neuroprior.worlds import cube, four_rooms, gridworld, maze
 from tests.support.pinned.data import behaviour
 from tests.support.sources import TablePrior, random_world, seeded, stochastic_world
 from tests.support.unchanged import case
@@ -51,51 +38,11 @@ def chain(num_actions: int = 3, **more: Any) -> MarkovPrior:
 MAKERS = {
     "sampling": lambda prior, **how: SamplingPlanner(prior, 4, 12, temperature=1.3, uniform_share=0.25, **how),
     "halving": lambda prior, **how: SamplingPlanner(prior, 4, 12, num_rollouts=6, halving=True, **how),
-    "distinct": lambda prior, **how: DistinctPlanner(prior, 4, 12, **how),
     "exhaustive": lambda prior, **how: ExhaustivePlanner(3, num_rollouts=2, **how),
     "frontier": lambda prior, **how: FrontierPlanner(prior, 4, 12, **how),
-    "cross-entropy": lambda prior, **how: CrossEntropyPlanner(prior, 4, 24, rounds=3, elites=0.25, order=1, **how),
     "mcts": lambda prior, **how: MCTSPlanner(prior, 4, 16, compile=False, **how),
-    "horizon": lambda prior, **how: HorizonPlanner(prior, 4, 24, pilot=0.5, rounds=2, **how),
 }
 ONLY_SURE = ("distinct", "frontier", "mcts", "horizon")
-
-
-@case
-def decisions():
-    """Of every planner: in tables with maps and illegal actions, for each goal, and in a stochastic one."""
-    found: dict[str, Any] = {}
-    sure, unsure = random_world(3, legal=True, states=12), stochastic_world(2)
-    goals: dict[str, dict[str, Any]] = {
-        "terminal": {},
-        "return": {"objective": "return", "discount": 0.8},
-        "prefix": {"any_prefix": True},
-        "value": {"objective": "return", "discount": 0.9, "value": lambda state: (state % 5).double()},
-    }
-    for name, make in MAKERS.items():
-        for goal, how in goals.items():
-            if name == "halving" or (name == "exhaustive" and goal == "value"):
-                continue
-            state = sure.reset(6, seeded(0))
-            found[f"{name}, {goal}"] = make(chain(), **how).plan(sure, state, seeded(1))
-        try:
-            found[f"{name}, stochastic"] = make(chain(), **goals["return"]).plan(
-                unsure, unsure.reset(5, seeded(0)), seeded(1)
-            )
-        except ValueError as error:
-            found[f"{name}, stochastic"] = str(error)
-    state = sure.reset(6, seeded(0))
-    found["best"] = [oracle(sure, state, 4, **how) for how in goals.values()]
-    plans = torch.randint(3, (5, 2, 3), generator=seeded(0))
-    state = unsure.reset(5, seeded(0))
-    found["expected"] = expected_score(unsure, state, plans, objective="return", discount=0.9)
-    world = gridworld(4, 4, "torus")
-    foraging = ForagingWorld(world, patches(world, 2, 1, seeded(0)), 5, 3)
-    found["foraging"] = ForagingOracle(4, 0.9).plan(foraging, foraging.reset(5, seeded(0)), seeded(1))
-    found["executed"] = execute(
-        MAKERS["sampling"](chain(4)), foraging, foraging.reset(4, seeded(0)), 5, 2, seeded(1), foraging.regrow
-    )
-    return found
 
 
 @case(slow=True)
@@ -118,89 +65,6 @@ def searches():
     found["cube"] = MCTSPlanner(UniformPrior(table.num_actions), 3, 20).plan(
         table, table.reset(4, seeded(0)), seeded(1)
     )
-    return found
-
-
-@case
-def curricula():
-    """The horizon curriculum, problems that are solved again and again, and how candidates are best drawn."""
-    found: dict[str, Any] = {}
-    world = maze(7, 7, num_layouts=2, num_worlds=2)
-    plans = collect(ExhaustivePlanner(3), world, 30, generator=seeded(0))
-    found["collected"] = [plans.actions, plans.group]
-    better = collect(
-        ExhaustivePlanner(2),
-        world,
-        context="step",
-        state=world.reset(12, seeded(1)),
-        min_score=0.6,
-        generator=seeded(0),
-    )
-    found["with a least score"] = [better.actions, better.context, better.group]
-    prior = MarkovPrior(4, 2)
-    rounds = extend_horizon(
-        prior, plans, world, (5, 7), num_starts=20, num_plans=16, temperatures=(1.0, 2.0),
-        uniform_shares=(0.0, 0.2), min_score=0.3, generator=seeded(2),
-    )  # fmt: skip
-    found["rounds"] = [[one.length, one.plans.actions] for one in rounds]
-    found["learned"] = prior.transition_matrix()
-    tuned = best_sampling(prior, world, world.reset(20, seeded(3)), 6, 16, generator=seeded(4))
-    found["tuned"] = [tuned.temperature, tuned.uniform_share, {str(key): one for key, one in tuned.scores.items()}]
-    found["sampling for"] = sampling_for(prior, collect(ExhaustivePlanner(3), world, 10, generator=seeded(5)), 64)
-    found["weights"] = search_weights(torch.tensor([-1.0, -3.0, -9.0]), 8)
-    tiles = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=8).reset(20, seeded(3)))
-    learner = LogLinearPrior(4, len(tiles.windows.windows))
-    found["bootstrap"] = [
-        sweep._replace(search_seconds=0, fit_seconds=0)
-        for sweep in bootstrap(
-            tiles, learner, tiles.boards, max_nodes=60, sweeps=2, first=15, generator=seeded(0), epochs=1
-        )
-    ]
-    found["weights of patterns"] = learner.weights.double()
-    return found
-
-
-@case
-def options():
-    plans = behaviour(40)
-    prior = SwitchingPrior(3, 2, max_iterations=5, restarts=1).fit(plans, generator=seeded(0))
-    world, found = random_world(3, states=12), {}
-    for name, how in {
-        "kept": {"terminations": False},
-        "mixed": {"uniform_share": 0.5},
-        "plain": {"any_prefix": True},
-    }.items():
-        planner = OptionPlanner(prior, 4, 9, **how)
-        state = world.reset(5, seeded(0))
-        found[name] = [planner.plan(world, state, seeded(1)), planner.candidates(world, state, seeded(2))[0]]
-    return found
-
-
-@case(relative=2e-3)
-def agents():
-    world, found = gridworld(5, 5, "torus"), {}
-    foraging = ForagingWorld(world, patches(world, 2, 1, seeded(0)), 12, 3)
-    for name, make, more in (
-        ("counts", lambda: MarkovPrior(4, 2), {}),
-        ("network", lambda: GRUPrior(4, 8, window=4, seed=1), {"training": {"max_steps": 3, "progress": False}}),
-        ("cold", lambda: MarkovPrior(4, 1), {"warm_start": False, "retention": 0.5, "min_score": 0.5}),
-    ):
-
-        def agent(generator=0, make=make, more=more):
-            prior = make()
-            planner = SamplingPlanner(prior, 6, 8, objective="return", discount=0.9)
-            return Agent(
-                foraging, planner, prior, foraging.reset(4, seeded(7)), replan_every=2, change=foraging.regrow,
-                learn_every=12, plan_length=6, generator=seeded(generator), **more,
-            )  # fmt: skip
-
-        one = agent()
-        done = one.run(24)
-        with TemporaryDirectory() as folder:
-            save_agent(one, folder)
-            again = restore_agent(agent(1), folder)
-        found[name] = [done.actions, done.rewards, done.model_steps, one.time, again.time, again.run(4).actions]
-        found[name] += [one.replay.plans.actions, one.prior.log_prob(behaviour(4, 6, 4).actions)]
     return found
 
 
@@ -235,16 +99,106 @@ def samples():
             found[f"{name} {temperature}"] = {
                 "tree": sample(one, 200, 4, generator=seeded(0), method="tree", **how),
                 "ancestral": sample(one, 40, 4, generator=seeded(0), method="ancestral", batch_size=16, **how),
-                "distinct": sample_distinct(one, 9, 4, generator=seeded(0), **how),
-                "sets": sample_distinct(one, 4, 3, num_sets=3, generator=seeded(0), **how),
-                "most probable": most_probable(one, 7, 4, **how),
                 "in a world": sample_in_world(one, world, world.reset(3, seeded(0)), 5, 4, generator=seeded(1), **how),
-                "distinct in it": sample_distinct_in_world(
-                    one, world, world.reset(3, seeded(0)), 5, 4, generator=seeded(1), **how
-                ),
             }
     rooms = four_rooms(9, 9)
     network = GRUPrior(4, 8, num_contexts=rooms.num_states, seed=2)
     network.context_per = "step"
     found["network"] = sample_in_world(network, rooms, rooms.reset(3, seeded(0)), 5, 4, generator=seeded(1))[0]
+    return found
+
+
+@case
+def decisions():
+    """Of every planner: in tables with maps and illegal actions, for each goal, and in a stochastic one."""
+    found: dict[str, Any] = {}
+    sure, unsure = random_world(3, legal=True, states=12), stochastic_world(2)
+    goals: dict[str, dict[str, Any]] = {
+        "terminal": {},
+        "return": {"objective": "return", "discount": 0.8},
+        "prefix": {"any_prefix": True},
+        "value": {"objective": "return", "discount": 0.9, "value": lambda state: (state % 5).double()},
+    }
+    for name, make in MAKERS.items():
+        for goal, how in goals.items():
+            if name == "halving" or (name == "exhaustive" and goal == "value"):
+                continue
+            state = sure.reset(6, seeded(0))
+            found[f"{name}, {goal}"] = make(chain(), **how).plan(sure, state, seeded(1))
+        try:
+            found[f"{name}, stochastic"] = make(chain(), **goals["return"]).plan(
+                unsure, unsure.reset(5, seeded(0)), seeded(1)
+            )
+        except ValueError as error:
+            found[f"{name}, stochastic"] = str(error)
+    state = sure.reset(6, seeded(0))
+    found["best"] = [oracle(sure, state, 4, **how) for how in goals.values()]
+    plans = torch.randint(3, (5, 2, 3), generator=seeded(0))
+    state = unsure.reset(5, seeded(0))
+    found["expected"] = expected_score(unsure, state, plans, objective="return", discount=0.9)
+    return found
+
+
+@case
+def curricula():
+    """The horizon curriculum, problems that are solved again and again, and how candidates are best drawn."""
+    found: dict[str, Any] = {}
+    world = maze(7, 7, num_layouts=2, num_worlds=2)
+    plans = collect(ExhaustivePlanner(3), world, 30, generator=seeded(0))
+    found["collected"] = [plans.actions, plans.group]
+    better = collect(
+        ExhaustivePlanner(2),
+        world,
+        context="step",
+        state=world.reset(12, seeded(1)),
+        min_score=0.6,
+        generator=seeded(0),
+    )
+    found["with a least score"] = [better.actions, better.context, better.group]
+    prior = MarkovPrior(4, 2)
+    rounds = extend_horizon(
+        prior, plans, world, (5, 7), num_starts=20, num_plans=16, temperatures=(1.0, 2.0),
+        uniform_shares=(0.0, 0.2), min_score=0.3, generator=seeded(2),
+    )  # fmt: skip
+    found["rounds"] = [[one.length, one.plans.actions] for one in rounds]
+    found["learned"] = prior.transition_matrix()
+    tuned = best_sampling(prior, world, world.reset(20, seeded(3)), 6, 16, generator=seeded(4))
+    found["tuned"] = [tuned.temperature, tuned.uniform_share, {str(key): one for key, one in tuned.scores.items()}]
+    found["weights"] = search_weights(torch.tensor([-1.0, -3.0, -9.0]), 8)
+    tiles = sliding_tiles(sliding_tiles(shape=(3, 3), scramble=8).reset(20, seeded(3)))
+    learner = LogLinearPrior(4, len(tiles.windows.windows))
+    found["bootstrap"] = [
+        sweep._replace(search_seconds=0, fit_seconds=0)
+        for sweep in bootstrap(
+            tiles, learner, tiles.boards, max_nodes=60, sweeps=2, first=15, generator=seeded(0), epochs=1
+        )
+    ]
+    found["weights of patterns"] = learner.weights.double()
+    return found
+
+
+@case(relative=2e-3)
+def agents():
+    world, found = gridworld(5, 5, "torus"), {}
+    for name, make, more in (
+        ("counts", lambda: MarkovPrior(4, 2), {}),
+        ("network", lambda: GRUPrior(4, 8, window=4, seed=1), {"training": {"max_steps": 3, "progress": False}}),
+        ("cold", lambda: MarkovPrior(4, 1), {"warm_start": False, "retention": 0.5, "min_score": 0.5}),
+    ):
+
+        def agent(generator=0, make=make, more=more):
+            prior = make()
+            planner = SamplingPlanner(prior, 6, 8, objective="return", discount=0.9)
+            return Agent(
+                world, planner, prior, world.reset(4, seeded(7)), replan_every=2,
+                learn_every=12, plan_length=6, generator=seeded(generator), **more,
+            )  # fmt: skip
+
+        one = agent()
+        done = one.run(24)
+        with TemporaryDirectory() as folder:
+            save_agent(one, folder)
+            again = restore_agent(agent(1), folder)
+        found[name] = [done.actions, done.rewards, done.model_steps, one.time, again.time, again.run(4).actions]
+        found[name] += [one.replay.plans.actions, one.prior.log_prob(behaviour(4, 6, 4).actions)]
     return found

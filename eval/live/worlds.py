@@ -14,7 +14,7 @@ class ForagingTask:
     Attributes:
         about: what it is.
         table: makes the table of a seed.
-        radius: of a patch of food, in actions, see `neuroprior.worlds.patches`.
+        radius: of a patch of food, in actions, see `eval.live.foraging.patches`.
     """
 
     about: str

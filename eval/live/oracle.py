@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
+from eval.live.foraging import ForagingWorld
 from neuroprior._checks import check_sizes
 from neuroprior._random import generator_on
 from neuroprior.planners.planner import Decision, Planner, join_decisions, random_best
 from neuroprior.plans import action_dtype
-from neuroprior.worlds.foraging import ForagingWorld
 from neuroprior.worlds.world import World
 
 MOST_ITEMS = 12

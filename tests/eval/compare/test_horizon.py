@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from eval.__main__ import main
+from eval.compare.horizon import HorizonPlanner, _Found
 from neuroprior import MarkovPrior, SamplingPlanner, TabularWorld, UniformPrior, gridworld
-from neuroprior.planners import HorizonPlanner
-from neuroprior.planners.horizon import _Found
 from neuroprior.testing import check_planner
 from neuroprior.worlds import labyrinth
 from tests.support.reports import FROM_ELSEWHERE

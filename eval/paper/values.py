@@ -1,4 +1,4 @@
-"""State values to plan by, right or wrong: Q-learning, value iteration, approximations over coordinates, exact reach.
+"""State values to plan by, right or wrong: Q-learning, approximations over coordinates, exact reach.
 
 The ways in which a planner's values can be wrong (Hyvärinen, second simulation), and what gives them:
 
@@ -21,7 +21,8 @@ from torch import Tensor
 
 from neuroprior._checks import check_count, check_sizes, is_number
 from neuroprior._random import generator_on
-from neuroprior.worlds.tabular import TabularWorld, check_tabular
+from neuroprior.planners.exact import check_goal
+from neuroprior.worlds.tabular import TabularWorld
 
 
 @torch.no_grad()
@@ -68,7 +69,7 @@ def q_learning(
         >>> q_learning(world, goal=24, steps=1000, generator=torch.Generator().manual_seed(0)).shape
         torch.Size([1, 25, 4])
     """
-    goal = _check_goal(world, goal)
+    goal = check_goal(world, goal)
     _require(world.num_states > 1, "world", "a cell that is not the goal", "the goal alone")
     check_sizes(num_agents=num_agents)
     check_count("steps", steps, 0)
@@ -115,71 +116,6 @@ def _other_cells(goal: int, num_states: int, number: int, generator: torch.Gener
     return cell + (cell >= goal)
 
 
-@torch.no_grad()
-def value_iteration(
-    world: TabularWorld,
-    *,
-    discount: float = 0.9,
-    goal: int | None = None,
-    sweeps: int | None = None,
-    tolerance: float = 1e-9,
-) -> Tensor:
-    """Optimal state values, exact or after some sweeps.
-
-    Args:
-        world: gives the transitions, the legal actions and, without a goal, the rewards of its W reward maps.
-        discount: the factor for a reward one step later: at least 0 (with a goal: above 0) and below 1.
-        goal: the goal's cell, for the values of reaching it (see the module); None: the world's own rewards, for ever.
-        sweeps: stop after so many synchronous sweeps from values of 0: with a goal, cells farther from it than that
-            then still have the value 0. None: until convergence.
-        tolerance: converged is when no value changes by more than this; values are then within
-            tolerance * discount / (1 - discount) of the true ones. With a goal in a deterministic world, when no value
-            changes at all.
-
-    Returns:
-        `[W, S]` float64; with a goal `[1, S]`.
-
-    Raises:
-        ValueError: an argument is out of range, or the reward of a legal action is infinite.
-
-    Example:
-        >>> world = TabularWorld(torch.tensor([[0, 1], [1, 1]]), torch.tensor([0.0, 1.0]))
-        >>> value_iteration(world, discount=0.5).round(decimals=2).tolist()
-        [[2.0, 2.0]]
-    """
-    if sweeps is not None:
-        check_count("sweeps", sweeps, 0)
-    _require(is_number(tolerance) and tolerance > 0, "tolerance", "a positive number", tolerance)
-    _require(is_number(discount) and 0 <= discount < 1, "discount", "a number of at least 0 and below 1", discount)
-    if goal is not None:
-        _require(discount > 0, "discount", "with a goal, a number above 0", discount)
-        goal, tolerance = _check_goal(world, goal), tolerance if world.stochastic else 0.0
-    rewards = _action_rewards(world, goal is not None)
-    values = rewards.new_zeros(rewards.shape[0], world.num_states)
-    if goal is not None:
-        values[:, goal] = 1 / discount
-    most = math.inf
-    for _ in itertools.count() if sweeps is None else range(sweeps):
-        before, values = values, (rewards + discount * world.mean_after(values)).amax(-1)
-        if goal is not None:
-            values[:, goal] = 1 / discount
-        # Each sweep shrinks the largest change at least by the discount; rounding must not hide that.
-        most = min(float((values - before).abs().max()), most * discount)
-        if sweeps is None and not most > tolerance:
-            break
-    return values
-
-
-def _action_rewards(world: TabularWorld, none: bool) -> Tensor:
-    """The reward of each action in each cell, `[W, S, A]` float64, or 0 `[1, S, A]`; -inf where it is not legal."""
-    shape = 1, world.num_states, world.num_actions
-    rewards = (world.reward.new_zeros(shape) if none else world.mean_reward()).double()
-    legal = world.legal_actions(torch.arange(world.num_states, device=world.device))
-    for where in (rewards.isinf() & legal).nonzero().tolist()[:1]:
-        raise ValueError(f"world: the reward of [map, cell, action] {where} is infinite; values need finite ones")
-    return rewards.masked_fill(~legal, -torch.inf)
-
-
 def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, within: bool = False) -> Tensor:
     """Which starts can reach the goal at all: the upper bound for all planners, by dynamic programming in the table.
 
@@ -202,7 +138,7 @@ def can_reach(world: TabularWorld, state: Tensor, goal: int, length: int, *, wit
         [False, True]
     """
     world.check_state(state)
-    goal = _check_goal(world, goal)
+    goal = check_goal(world, goal)
     _require(not world.stochastic, "world", "a deterministic one", "a stochastic one")
     check_count("length", length, 0)
     cells = torch.arange(world.num_states, device=world.device)
@@ -316,12 +252,6 @@ def _standardised(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _require(holds: bool, name: str, wanted: str, given: object) -> None:
     if not holds:
         raise ValueError(f"{name}: {wanted} is expected, not {given!r}")
-
-
-def _check_goal(world: TabularWorld, goal: int) -> int:
-    check_tabular(world)
-    _require(goal in range(world.num_states), "goal", f"a cell from 0 to {world.num_states - 1}", goal)
-    return int(goal)
 
 
 def _check_fit(values: Tensor, coordinates: Tensor) -> None:

@@ -3,11 +3,12 @@
 import pytest
 import torch
 
+from eval.live.foraging import ForagingWorld, patches
+from eval.live.oracle import ForagingOracle
 from neuroprior import ExhaustivePlanner, FrontierPlanner, MarkovPrior, SamplingPlanner, UniformPrior, gridworld
-from neuroprior.planners import ForagingOracle, HorizonPlanner
 from neuroprior.sampling import sample_in_world
 from neuroprior.testing import check_world
-from neuroprior.worlds import ForagingWorld, egocentric, labyrinth, maze, patches
+from neuroprior.worlds import egocentric, labyrinth, maze
 from tests.support.sources import (
     FALSE_ALARM,
     corridor,
@@ -157,7 +158,7 @@ def test_many_starts_are_planned_for_in_parts():
 def test_no_starts_are_no_trouble():
     world = forage(gridworld(4, 4))
     none = world.reset(3, seeded(0))[:0]
-    for planner in (ForagingOracle(5), FrontierPlanner(UniformPrior(4), 5, 8), HorizonPlanner(UniformPrior(4), 5, 8)):
+    for planner in (ForagingOracle(5), FrontierPlanner(UniformPrior(4), 5, 8)):
         assert planner.plan(world, none, seeded(0)).plan.shape == (0, 5)
 
 

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from neuroprior.values import network_approximation, q_learning, value_iteration
+from eval.paper.values import network_approximation, q_learning
+from neuroprior.planners import value_iteration
 from neuroprior.worlds import TabularWorld, gridworld
 from tests.support.sources import corridor, seeded
 
@@ -120,9 +121,9 @@ def test_progress_is_reported():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"goal": 9}, "goal: a cell from 0 to 8 is expected, not 9"),
-        ({"goal": -1}, "goal: a cell"),
-        ({"goal": 1.5}, "goal: a cell from 0 to 8 is expected, not 1.5"),
+        ({"goal": 9}, "`goal` must be a cell from 0 to 8, got 9"),
+        ({"goal": -1}, "`goal` must be a cell"),
+        ({"goal": 1.5}, "`goal` must be a cell from 0 to 8, got 1.5"),
         ({"num_agents": 0}, "num_agents: an integer of at least 1 is expected, not 0"),
         ({"steps": -1}, "steps: "),
         ({"step_size": 0}, "step_size: "),

@@ -5,8 +5,8 @@ import itertools
 import pytest
 import torch
 
+from eval.options.planner import OptionPlanner
 from neuroprior import SamplingPlanner, TabularWorld, UniformPrior
-from neuroprior.planners import OptionPlanner
 from neuroprior.priors import SwitchingPrior
 from neuroprior.testing import check_planner
 from tests.support.sources import FALSE_ALARM, every_plan, p_value, plan_number, refuses, seeded

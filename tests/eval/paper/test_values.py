@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from neuroprior.values import can_reach, value_iteration
+from eval.paper.values import can_reach
+from neuroprior.planners import value_iteration
 from neuroprior.worlds import TabularWorld, gridworld
 from tests.support.sources import CORRIDOR, corridor, distances, every_plan, seeded
 
@@ -143,13 +144,13 @@ def test_can_reach_depends_on_legal_actions_and_the_cell_of_a_state():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"discount": 1.0}, "discount: "),
-        ({"discount": -0.1}, "discount: "),
-        ({"discount": float("nan")}, "discount: "),
-        ({"discount": 0.0, "goal": 1}, "discount: with a goal, a number above 0 is expected, not 0.0"),
-        ({"goal": 9}, "goal: "),
+        ({"discount": 1.0}, "`discount` must be"),
+        ({"discount": -0.1}, "`discount` must be"),
+        ({"discount": float("nan")}, "`discount` must be"),
+        ({"discount": 0.0, "goal": 1}, "`discount` must be at least 0"),
+        ({"goal": 9}, "`goal` must be"),
         ({"sweeps": -1}, "sweeps: "),
-        ({"tolerance": 0.0}, "tolerance: "),
+        ({"tolerance": 0.0}, "`tolerance` must be"),
     ],
 )
 def test_bad_iteration_is_refused(arguments, message):
@@ -170,7 +171,7 @@ def test_infinite_rewards_are_refused_where_they_count():
         (torch.tensor([9]), 4, 2, "state"),
         (torch.tensor([0.5]), 4, 2, "state"),
         (torch.tensor(3), 4, 2, "state"),
-        (torch.tensor([1]), 9, 2, "goal"),
+        (torch.tensor([1]), 9, 2, "`goal`"),
         (torch.tensor([1]), 4, -1, "length"),
     ],
 )

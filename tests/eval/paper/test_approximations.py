@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from neuroprior.values import network_approximation, tile_approximation, value_iteration
+from eval.paper.values import network_approximation, tile_approximation
+from neuroprior.planners import value_iteration
 from neuroprior.worlds import gridworld
 from tests.support.sources import seeded
 
