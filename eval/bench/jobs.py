@@ -339,7 +339,7 @@ def evaluate(scale: float) -> Job:
         lambda device: partial(world.to(device).rollout, state.to(device), plans.to(device)),
         (
             Peer("plain torch indexing", lambda: partial(peers.torch_rollout, *given), 5),
-            Peer("numba, parallel", partial(peers.numba_rollout, *given), 1, needs="numba"),
+            Peer("numba, parallel", partial(peers.numba_rollout, *given), 1),
         ),
     )
 
@@ -456,7 +456,6 @@ def search_tiles(scale: float) -> Job:
         f"A*, {most:,} expansions of each of 100 24-puzzles",
         lambda device: partial(AStarPlanner(world.lower_bound, max_nodes=most).search, world, boards),
         (Peer("plain Python, heapq", partial(peers.python_a_star, few, 5, most), 20, len(few) / len(boards)),),
-        "numba",
     )
 
 
@@ -517,13 +516,13 @@ def trees(policy: str, starts: int, scale: float) -> Job:
 
     peer = Peer("mctx", mctx, 1.5 if policy == "GRU-64" else 3, needs="mctx")
     about = f"tree search of 64 x 8 steps, {policy}, from {starts:,} start" + "s" * (starts > 1)
-    return Job(about, lambda device: decision, (peer,), "numba")
+    return Job(about, lambda device: decision, (peer,))
 
 
 @torch.no_grad()
 def simulations(planner: MCTSPlanner, world: TabularWorld, state: Tensor) -> int:
     """How many plans the planner simulates from each start, on average."""
-    from neuroprior.planners.compiled_mcts import search_all  # needs numba
+    from neuroprior.planners.compiled_mcts import search_all
 
     done = search_all(planner, world, state, torch.Generator().manual_seed(0))[3]
     return round(float(done.sum(1).double().mean()))

@@ -16,7 +16,7 @@ from neuroprior._threads import one_thread
 from neuroprior.planners.planner import PriorPlanner
 from neuroprior.plans import action_dtype
 from neuroprior.priors.counts.history_prior import HistoryPrior
-from neuroprior.priors.neural.compiled_gru import BLOCK, Network, on_one_thread
+from neuroprior.priors.neural.compiled_gru import BLOCK, Network, advance, on_one_thread
 from neuroprior.priors.neural.gru import GRUPrior
 from neuroprior.priors.prior import Prior
 from neuroprior.priors.uniform import UniformPrior
@@ -195,19 +195,6 @@ def back_up(nodes: Nodes, rows: Array, path: Array, plan: Array, score: Array) -
                 finished &= nodes.closed[b, node, a]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _exp(x: Any) -> Any:
-    """e to the power of a float32, to 1e-7 of it; of arithmetic alone, so that loops over it are vectorised."""
-    x = min(max(x, np.float32(-87)), np.float32(87))
-    # x = n log 2 + r: n is rounded by adding what leaves no digits behind the point, log 2 is split in two.
-    n = (x * np.float32(1.4426950408889634) + np.float32(12582912)) - np.float32(12582912)
-    r = (x - n * np.float32(0.693359375)) + n * np.float32(2.1219444005469057e-4)
-    series = np.float32(1 / 5040)
-    for factor in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
-        series = series * r + np.float32(factor)
-    return series * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
 def _evaluate(
     policy: Policy,
@@ -231,9 +218,9 @@ def _evaluate(
         observed: `[K]`: the states whose contexts the prior is given.
         code, hidden: `[K]` and `[K, layers * H]`: its state, which is overwritten.
         weights, probs: `[K, A]`: get its predictions: cumulative unnormalised probabilities, and probabilities.
-        work: room for `BLOCK` rows of one layer's states, products, gates and logits.
+        work: room for `BLOCK` rows of all layers' states, products, gates and logits.
     """
-    (layers, size, _), actions, one = policy.network.recurrent.shape, weights.shape[1], np.float32(1)
+    (layers, size, _), actions = policy.network.recurrent.shape, weights.shape[1]
     if size == 0:
         for k in which:
             code[k] = policy.after[code[k], plans[k, t]]
@@ -241,9 +228,8 @@ def _evaluate(
             for a in range(actions):
                 weights[k, a], probs[k, a] = policy.weights[row, a], policy.probs[row, a]
         return
-    # Gates of its own: what numba compiled of a file is kept until this file changes, not those that it calls.
     # Single numbers are indexed, not rows: numba counts references to each row, which takes as long as all else here.
-    block, product, gates, logits = work
+    states, product, gates, logits = work
     action, past, beyond = policy.network.action, policy.network.past, policy.network.beyond
     for begin in range(0, len(which), BLOCK):
         number = min(BLOCK, len(which) - begin)
@@ -263,33 +249,17 @@ def _evaluate(
                 now = policy.context[observed[k]]
                 for j in range(3 * size):
                     gates[i, j] += policy.by_context[now, j]
-        for layer in range(layers):
-            first = layer * size
-            if layer > 0:
-                np.dot(block[:number], policy.network.above[layer - 1], gates[:number])
-                for i in range(number):
-                    for j in range(3 * size):
-                        gates[i, j] += policy.network.above_bias[layer - 1, j]
-            for i in range(number):
-                k = which[begin + i]
+            for layer in range(layers):
                 for j in range(size):
-                    block[i, j] = hidden[k, first + j]
-            np.dot(block[:number], policy.network.recurrent[layer], product[:number])
-            for i in range(number):
-                k = which[begin + i]
-                for j in range(2 * size):
-                    gates[i, j] = one / (one + _exp(-(gates[i, j] + product[i, j])))
-                for j in range(size):
-                    own = product[i, 2 * size + j] + policy.network.bias[layer, j]
-                    new = gates[i, 2 * size + j] + gates[i, j] * own
-                    new = one - np.float32(2) / (_exp(new + new) + one)  # tanh
-                    hidden[k, first + j] = block[i, j] = new + gates[i, size + j] * (block[i, j] - new)
-        np.dot(block[:number], policy.network.head, logits[:number])
+                    states[layer, i, j] = hidden[k, layer * size + j]
+        advance(policy.network, number, states, gates, product, logits)
         for i in range(number):
             k = which[begin + i]
+            for layer in range(layers):
+                for j in range(size):
+                    hidden[k, layer * size + j] = states[layer, i, j]
             top, total = np.float32(-np.inf), 0.0
             for a in range(actions):
-                logits[i, a] += policy.network.head_bias[a]
                 top = max(top, logits[i, a])
             for a in range(actions):
                 probs[k, a] = np.exp((logits[i, a] - top) / policy.temperature)
@@ -319,7 +289,7 @@ class Room(NamedTuple):
         code, hidden: `[K]` and `[K, layers * H]`: the prior's state.
         weights, probs: `[K, A]`: its predictions, see `_evaluate`.
         which: int64 `[K]`: the plans that are stepped.
-        block: float32: `BLOCK` rows of one layer's states, products, gates and logits.
+        block: float32: `BLOCK` rows of all layers' states, products, gates and logits.
     """
 
     alive: Array
@@ -636,7 +606,10 @@ def _room(number: int, layers: int, size: int, actions: int) -> Room:
         np.empty(number, np.bool_), np.empty(number), np.empty(number, np.int64), np.empty(number, np.int64),
         np.empty(number, np.int64), np.empty((number, layers * size), np.float32),
         np.empty((number, actions), np.float32), np.empty((number, actions)), np.empty(number, np.int64),
-        tuple(np.empty((rows, width), np.float32) for width in (size, 3 * size, 3 * size, actions)),
+        (
+            np.empty((layers, rows, size), np.float32), np.empty((rows, 3 * size), np.float32),
+            np.empty((rows, 3 * size), np.float32), np.empty((rows, actions), np.float32),
+        ),
     )  # fmt: skip
 
 
@@ -651,7 +624,7 @@ def can_search(planner: PriorPlanner, world: World, state: Tensor) -> bool:
     if not isinstance(world, TabularWorld) or getattr(world.step, "__func__", None) is not TabularWorld.step:
         return False
     known = world.all_legal and world.outcomes is None and planner.value is None
-    known = known and world.reward.dtype in (torch.float32, torch.float64)
+    known = known and world.reward.dtype in (torch.float32, torch.float64) and state.device.type == "cpu"
     if not known or len(state) == 0 or not _knows(prior) or Stepper(prior).device != state.device:
         return False
     rows = len(prior.next_node) * (prior.num_contexts or 1) if isinstance(prior, HistoryPrior) else 0

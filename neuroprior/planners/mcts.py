@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from neuroprior._checks import is_number
-from neuroprior._compiled import compiled
-from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions, random_best
+from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
 from neuroprior.sampling.draws import Draw
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
+from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
 
 PER_ACTION = 64
@@ -31,15 +31,15 @@ class MCTSPlanner(PriorPlanner):
     prior only from its new node on; actions after which everything has been tried are closed. With a large enough
     budget it finds the optimum.
 
+    The trees are on the CPU. One compiled loop makes the whole search in a deterministic `TabularWorld` where all
+    actions are legal, without `value`, if the prior is uniform, counts histories or is a GRU.
+
     Args:
         prior: the policy.
         length: number of actions in a plan, at least 1.
         num_plans: P, at least 1: simulations end when the next one would exceed P times `length` simulator steps.
         exploration: c >= 0.
         temperature: divides the prior's logits.
-        compile: search by compiled loops where numba is installed, on the CPU: the whole search in a deterministic
-            `TabularWorld` where all actions are legal, without `value`, with a prior that is uniform, counts histories
-            or is a GRU; otherwise selection and backup alone. They find the same, but for rounding.
         **goal: objective, discount, value, any_prefix: see `Planner`. With `any_prefix` the score of a simulation is
             that of its best prefix.
 
@@ -60,25 +60,25 @@ class MCTSPlanner(PriorPlanner):
         *,
         exploration: float = 1.25,
         temperature: float = 1.0,
-        compile: bool = True,
         **goal: Unpack[Objective],
     ) -> None:
         super().__init__(prior, length, num_plans, temperature=temperature, **goal)
         if not is_number(exploration) or not 0 <= exploration < float("inf"):
             raise ValueError(f"exploration: a finite number of at least 0 is expected, not {exploration!r}")
-        self.exploration, self.compile = exploration, compile
+        self.exploration = exploration
 
     def plan(self, world: World, state: Tensor, generator: torch.Generator | None = None) -> Decision:
         if world.stochastic:
             raise ValueError("world: a deterministic one is expected: a node of the tree is one state")
         generator = self._check(world, state, generator)
-        able = self.compile and state.device.type == "cpu"
-        module = compiled("neuroprior.planners.compiled_mcts") if able else None
+        from neuroprior.planners import compiled_mcts
+
+        whole = compiled_mcts.can_search(self, world, state)
         numbers = world.num_actions  # that each node has
-        if module is None or not module.can_search(self, world, state):
+        if not whole:
             numbers = max(numbers, self._state_size(world, state) // PER_ACTION)
         chunks = self.chunks(state, self.num_plans * self.length * numbers)
-        return join_decisions((self._plan(module, world, some, generator) for some in chunks), len(state))
+        return join_decisions((self._plan(whole, world, some, generator) for some in chunks), len(state))
 
     @torch.no_grad()
     def _state_size(self, world: World, state: Tensor) -> int:
@@ -91,12 +91,14 @@ class MCTSPlanner(PriorPlanner):
         return before.numel() + max(after.numel() - before.numel(), 0) * (self.length - 1)
 
     @torch.no_grad()
-    def _plan(self, module: Any, world: World, state: Tensor, generator: torch.Generator) -> Decision:
-        if module is not None and module.can_search(self, world, state):
-            *found, steps = module.search_all(self, world, state, generator)
+    def _plan(self, whole: bool, world: World, state: Tensor, generator: torch.Generator) -> Decision:
+        from neuroprior.planners.compiled_mcts import search_all
+
+        if whole and isinstance(world, TabularWorld):
+            *found, steps = search_all(self, world, state, generator)
         else:
             with self._threads_for(len(state)):
-                *found, steps = _Trees(self, module, world, state, generator).search()
+                *found, steps = _Trees(self, world, state, generator).search()
         plans, rewards, states, done = found
         rollout = Rollout(states[:, :, -1], rewards, states if self.any_prefix else None)
         score, ends = self.score_rollout(rollout)
@@ -105,6 +107,8 @@ class MCTSPlanner(PriorPlanner):
 
 class _Trees:
     """The trees of B starts, and the simulations in them, in any world and with any prior.
+
+    States and rewards are where the world computes, everything else is on the CPU.
 
     Attributes:
         child: `[B, M, A]`: the node that an action leads to; 0: none yet (the root, node 0, is no child).
@@ -121,27 +125,24 @@ class _Trees:
         low, high: `[B]`: the lowest and the highest finite score.
     """
 
-    def __init__(
-        self, planner: MCTSPlanner, module: Any, world: World, state: Tensor, generator: torch.Generator
-    ) -> None:
+    def __init__(self, planner: MCTSPlanner, world: World, state: Tensor, generator: torch.Generator) -> None:
         self.planner, self.world, self.generator = planner, world, generator
         batch, actions = len(state), world.num_actions
         self.draw = Draw(actions, planner.temperature, generator)
         self.stepper = Stepper(planner.prior, in_place=False)
         self.logits, hidden = self.stepper.start_in(world, state)
-        # The loop draws as many numbers as are needed at most: of one type, so that it can give back what is left.
-        self.module: Any = module if self.logits.dtype == torch.float32 else None
-        self.child = torch.zeros(batch, 1, actions, dtype=torch.long, device=state.device)
+        self.device = state.device
+        self.child = torch.zeros(batch, 1, actions, dtype=torch.long)
         self.visits, self.closed = self.child.int(), self.child.bool()
         self.total, self.probs = self.child.double(), self.child.double()
-        self.reward, self.state = torch.zeros(batch, 1, device=state.device), state[:, None]
-        self.size = torch.ones(batch, dtype=torch.long, device=state.device)
+        self.reward, self.state = torch.zeros(batch, 1, device=self.device), state[:, None]
+        self.size = torch.ones(batch, dtype=torch.long)
         self.steps = planner.num_plans * planner.length
         self.left, self.over = torch.full_like(self.size, self.steps), torch.zeros_like(self.size, dtype=torch.bool)
         self.low, self.high = (self.total.new_full((batch,), sign * torch.inf) for sign in (1, -1))
         self.kept, self.used = [hidden[:0]] * planner.length, [0] * planner.length
-        self.place = torch.zeros(batch, 1, dtype=torch.long, device=state.device)
-        every = torch.arange(batch, device=state.device)
+        self.place = torch.zeros(batch, 1, dtype=torch.long)
+        every = torch.arange(batch)
         self._keep(every, torch.zeros_like(every), 0, self._legal(state, self.logits), hidden)
 
     def search(self) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
@@ -164,8 +165,10 @@ class _Trees:
 
     def simulate(self, rows: Tensor) -> tuple[Tensor, ...]:
         """One more plan from the starts `rows [K]`; for all B: plan, rewards, states, whether there is a plan."""
+        from neuroprior.planners.compiled_mcts import back_up
+
         self._make_room()
-        path, plan, depth, uniform = (self._descend if self.module is None else self._descend_compiled)(rows)
+        path, plan, depth, uniform = self._descend(rows)
         # A plan that the budget does not allow to the end is not begun.
         alive = self.left[rows] >= self.planner.length - depth
         self.over[rows[~alive]] = True
@@ -175,8 +178,10 @@ class _Trees:
         score, _ = self.planner.score_rollout(
             Rollout(states[:, -1], rewards, states if self.planner.any_prefix else None)
         )
-        self._back_up(rows, path, plan, (score if score.dim() == 1 else score.amax(1)).double())
-        found = (plan.to(self.draw.dtype), rewards, kept, torch.ones_like(rows, dtype=torch.bool))
+        score = (score if score.dim() == 1 else score.amax(1)).double().cpu()
+        back_up(self._nodes(), *(x.numpy() for x in (rows, path, plan, score)))
+        rows = rows.to(self.device)
+        found = (plan.to(self.device, self.draw.dtype), rewards, kept, torch.ones_like(rows, dtype=torch.bool))
         batch = len(self.size)
         # Where there is no plan, states are those of the starts: values are asked for all.
         empty = [part.new_zeros(batch, *part.shape[1:]) for part in found]
@@ -190,48 +195,25 @@ class _Trees:
             The nodes on the way, `[K, L]` (-1 beyond), the actions up to that one `[K, L]`, how many come before it
             `[K]`, and uniform numbers `[K, L]` to draw the rest of the plan with.
         """
-        length = self.planner.length
-        node, depth = torch.zeros_like(rows), torch.full_like(rows, -1)
-        path, plan = (rows.new_full((len(rows), length), fill) for fill in (-1, 0))
-        uniform = []
-        for t in range(length):
-            uniform.append(self.draw.uniform((len(rows),), self.logits))
-            inside = (depth < 0).nonzero()[:, 0]
-            if len(inside) == 0:
-                continue
-            own, at = rows[inside], node[inside]
-            action = self._select(own, at)
-            path[inside, t], plan[inside, t] = at, action
-            node[inside] = child = self.child[own, at, action]
-            depth[inside[child == 0]] = t
-        return path, plan, depth, torch.stack(uniform, 1)
+        from neuroprior.planners.compiled_mcts import descend
 
-    def _descend_compiled(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `_descend`."""
         length, actions = self.planner.length, self.world.num_actions
         path, plan, depth = (rows.new_zeros(shape) for shape in ((len(rows), length),) * 2 + ((len(rows),),))
         first = rows.new_zeros(length)
-        before = self.generator.get_state()
-        draws = torch.rand(plan.numel() * (1 + actions), generator=self.generator)
-        given = [x.numpy() for x in (draws, path, plan, depth, first)]
-        used = self.module.descend(self._nodes(), rows.numpy(), self.planner.exploration, *given)
+        # As many numbers are drawn as are needed at most, and what is left is given back.
+        before, device = self.generator.get_state(), self.generator.device
+        draws = torch.rand(plan.numel() * (1 + actions), generator=self.generator, device=device)
+        given = [x.numpy() for x in (draws.cpu(), path, plan, depth, first)]
+        used = descend(self._nodes(), rows.numpy(), self.planner.exploration, *given)
         self.generator.set_state(before)
-        torch.rand(used, generator=self.generator)
-        return path, plan, depth, draws[first + torch.arange(len(rows))[:, None]]
+        torch.rand(used, generator=self.generator, device=device)
+        return path, plan, depth, draws[(first + torch.arange(len(rows))[:, None]).to(device)]
 
     def _nodes(self) -> Any:
         """The trees for compiled loops."""
-        return self.module.Nodes(*(getattr(self, name).numpy() for name in self.module.Nodes._fields))
+        from neuroprior.planners.compiled_mcts import Nodes
 
-    def _select(self, rows: Tensor, node: Tensor) -> Tensor:
-        """The actions that PUCT takes at nodes `[K]`."""
-        probs, visits, total = self.probs[rows, node], self.visits[rows, node].double(), self.total[rows, node]
-        low, span = self.low[rows, None], (self.high - self.low)[rows, None]
-        tries = visits.sum(1, keepdim=True)
-        mean = torch.where(visits > 0, total / visits, total.cumsum(1)[:, -1:] / tries)
-        value = torch.where((tries > 0) & (span > 0), (mean - low) / span, 0.5)
-        bonus = self.planner.exploration * probs * tries.clamp(min=1).sqrt() / (1 + visits)
-        return random_best(value + bonus, self.generator, ~self.closed[rows, node])
+        return Nodes(*(getattr(self, name).numpy() for name in Nodes._fields))
 
     def _follow(
         self, rows: Tensor, path: Tensor, plan: Tensor, depth: Tensor, uniform: Tensor
@@ -241,32 +223,35 @@ class _Trees:
         Returns:
             The reward of each step, `[K, L]`, and the state after it, `[K, L, ...]`.
         """
-        length = plan.shape[1]
-        inside = path[:, 1:].clamp(min=0)
-        rewards = torch.nn.functional.pad(self.reward[rows[:, None], inside], (0, 1))
-        states = self.state[rows[:, None], torch.nn.functional.pad(inside, (0, 1))]
-        going, now = rows[:0], self.state[:0, 0]
+        length, device = plan.shape[1], self.device
+        inside, starts = path[:, 1:].clamp(min=0).to(device), rows.to(device)
+        rewards = torch.nn.functional.pad(self.reward[starts[:, None], inside], (0, 1))
+        states = self.state[starts[:, None], torch.nn.functional.pad(inside, (0, 1))]
+        uniform, going, now = uniform.to(self.logits), rows[:0], self.state[:0, 0]
         logits = hidden = self.logits[:0]
         for t in range(int(depth.min()) if len(rows) else length, length):
             # All of these plans have t actions behind them, so that the states of the prior have one shape.
             fresh = (depth == t).nonzero()[:, 0]
             own, node = rows[fresh], path[fresh, t]
             if len(going):
-                plan[going, t] = self.draw.actions(logits, uniform[going, t])
+                plan[going, t] = self.draw.actions(logits, uniform[going.to(device), t]).cpu()
             if len(fresh):
-                kept = self.kept[t][self.place[own, node]]
+                kept = self.kept[t][self.place[own, node].to(device)]
                 hidden = torch.cat([hidden, kept]) if len(going) else kept
-            now, going = torch.cat([now, self.state[own, node]]), torch.cat([going, fresh])
-            now, gained = self.world.step(now, plan[going, t], self.generator)
+            now = torch.cat([now, self.state[own.to(device), node.to(device)]])
+            going = torch.cat([going, fresh])
+            action, place = plan[going, t].to(device), going.to(device)
+            now, gained = self.world.step(now, action, self.generator)
             self.reward, rewards = self.reward.to(gained.dtype), rewards.to(gained.dtype)
-            rewards[going, t], states[going, t] = gained, now
+            rewards[place, t], states[place, t] = gained, now
             self.left[rows[going]] -= 1
             new, old = self.size[own], len(going) - len(fresh)
             self.child[own, node, plan[fresh, t]] = new
-            self.state[own, new], self.reward[own, new] = now[old:], gained[old:]
+            at = own.to(device), new.to(device)
+            self.state[at], self.reward[at] = now[old:], gained[old:]
             self.size[own] += 1
             if t + 1 < length:
-                logits, hidden = self.stepper.step_in(self.world, plan[going, t], hidden, now)
+                logits, hidden = self.stepper.step_in(self.world, action, hidden, now)
                 logits = self._legal(now, logits)
                 self._keep(own, new, t + 1, logits[old:], hidden[old:])
         return rewards, states
@@ -284,9 +269,10 @@ class _Trees:
         """Keep what the prior predicts at new nodes `[K]`, and its states."""
         if len(rows) == 0:
             return
-        self.probs[rows, node] = (logits.double() / self.planner.temperature).softmax(-1)
+        self.probs[rows, node] = (logits.double() / self.planner.temperature).softmax(-1).cpu()
         if not self.world.all_legal:
-            self.closed[rows, node] = ~self.world.legal_actions(self.state[rows, node])
+            state = self.state[rows.to(self.device), node.to(self.device)]
+            self.closed[rows, node] = ~self.world.legal_actions(state).cpu()
         first, last = self.used[depth], self.used[depth] + len(rows)
         if last > len(self.kept[depth]):
             room = hidden.new_empty(2 * last, *hidden.shape[1:])
@@ -294,28 +280,8 @@ class _Trees:
                 room[:first] = self.kept[depth][:first]
             self.kept[depth] = room
         self.kept[depth][first:last] = hidden
-        self.place[rows, node] = torch.arange(first, last, device=rows.device)
+        self.place[rows, node] = torch.arange(first, last)
         self.used[depth] = last
-
-    def _back_up(self, rows: Tensor, path: Tensor, plan: Tensor, score: Tensor) -> None:
-        """Count plans `[K, L]` and their scores at the nodes of their `path [K, L]` (-1: outside of the tree)."""
-        if self.module is not None:
-            self.module.back_up(self._nodes(), *(x.numpy() for x in (rows, path, plan, score)))
-            return
-        finite = score.isfinite()
-        self.low[rows[finite]] = torch.minimum(self.low[rows[finite]], score[finite])
-        self.high[rows[finite]] = torch.maximum(self.high[rows[finite]], score[finite])
-        # An infinite score counts as the lowest, or highest, finite one so far.
-        extreme = torch.where(score > 0, self.high[rows], self.low[rows])
-        score = torch.where(finite, score, extreme.nan_to_num(0, 0, 0))
-        finished = torch.ones_like(rows, dtype=torch.bool)
-        for t in reversed(range(plan.shape[1])):
-            inside = path[:, t] >= 0
-            at = rows[inside], path[inside, t], plan[inside, t]
-            self.visits[at] += 1
-            self.total[at] += score[inside]
-            self.closed[at] |= finished[inside]
-            finished = torch.zeros_like(finished).masked_scatter(inside, self.closed[at[:2]].all(1))
 
     def _make_room(self) -> None:
         """Double the number of nodes where one more might not fit."""

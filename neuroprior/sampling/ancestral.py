@@ -48,8 +48,7 @@ def sample(
     prefixes of each length ("tree"), which gives the same distribution as drawing each plan by itself ("ancestral").
     "auto" splits as long as there are far fewer prefixes than plans, and draws plan by plan from there on; plans that
     still begin alike are stepped once. On a GPU, up to 32,768 plans are stepped each by itself, which is faster. Many
-    plans of a small chain are drawn by a compiled loop, where numba is installed; with the same seed they are other
-    ones than without.
+    plans of a small chain are drawn from alias tables of several actions.
 
     Args:
         prior: any prior.

@@ -1,13 +1,11 @@
 """Worlds that are tables: a transition table and any number of reward maps over it, all evaluated in one call."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuroprior._checks import check_count, check_range, is_integer
-from neuroprior._compiled import compiled
 from neuroprior._memory import new_empty
 from neuroprior._random import generator_on
 from neuroprior.worlds.outcomes import Outcomes
@@ -39,8 +37,8 @@ class TabularWorld(World):
         next_state, reward: as given, `reward` always with a dimension for the maps.
         legal_table: `[S, A]` bool, or None where all actions are legal.
         outcomes: draws the outcomes; None for a deterministic world.
-        compile_from: rollouts of at least so many steps go through a compiled loop, where numba is installed: loading
-            it, and compiling the loop the first time, is worth it only for many.
+        compile_from: rollouts of at least so many steps go through a compiled loop, which gives the same: loading it is
+            worth it only for many.
         num_layouts: number of layouts, see `layout`; 1 unless a subclass has more.
 
     Raises:
@@ -158,7 +156,9 @@ class TabularWorld(World):
         actions = self.num_actions
         table, flat_reward = self.next_state.int().view(-1), self.reward.view(-1)
         cell = self.cell(state)
-        if (compiled := self._compiled(plans)) is not None:
+        if self._is_compiled(plans):
+            from neuroprior.worlds import compiled
+
             return Rollout(*compiled.rollout(table, self.reward, cell, state - cell, plans, keep_states))
         offset = (state - cell).int()[:, None]
         cell = cell.int()[:, None].expand(batch, num_plans)
@@ -188,11 +188,10 @@ class TabularWorld(World):
         generator = generator_on(generator, self.device)
         return torch.rand(length, batch, generator=generator, device=self.device, dtype=torch.float32)
 
-    def _compiled(self, plans: Tensor) -> Any:
-        """The module with the compiled loop, where it can roll out `plans [B, P, L]` and is worth it; else None."""
+    def _is_compiled(self, plans: Tensor) -> bool:
+        """Returns whether the compiled loop can roll out `plans [B, P, L]`, and these are many."""
         able = self.outcomes is None and self.reward.dtype in (torch.float32, torch.float64)
-        able = able and plans.device.type == "cpu"
-        return compiled("neuroprior.worlds.compiled") if able and plans.numel() >= self.compile_from else None
+        return able and plans.device.type == "cpu" and plans.numel() >= self.compile_from
 
     def _reward_index(self, offset: Tensor, taken: Tensor, outcome: Tensor, after: Tensor) -> Tensor:
         """The indices of the rewards of steps to the cells `after`; `offset` is the reward map * S."""

@@ -1,4 +1,4 @@
-"""Tree search by compiled loops, by torch alone, and by a search that evaluates the prior anew: the same decisions."""
+"""Tree search in one compiled loop, step by step, and by a search that evaluates the prior anew: the same decisions."""
 
 import math
 
@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, MarkovPrior, MCTSPlanner, TabularWorld, TransformerPrior, UniformPrior
+from neuroprior.planners import compiled_mcts
 from tests.support.sources import random_world, seeded
 
 LENGTH, ACTIONS = 4, 3
@@ -47,6 +48,12 @@ PRIORS = {
     "gru of two layers, in windows": lambda: wide(GRUPrior(ACTIONS, 8, num_layers=2, window=2)),
     "transformer": lambda: wide(TransformerPrior(ACTIONS, 8, num_heads=2, lags=2)),
 }
+
+
+def search_by(whole: bool, monkeypatch) -> None:
+    """Search step by step, unless `whole`: then in one loop where it knows the world, the prior and the goal."""
+    if not whole:
+        monkeypatch.setattr(compiled_mcts, "can_search", lambda *given: False)
 
 
 def reference(prior, world: TabularWorld, start: int, steps: int, generator, exploration: float = 1.25) -> float:
@@ -101,12 +108,13 @@ def reference(prior, world: TabularWorld, start: int, steps: int, generator, exp
     return best
 
 
-@pytest.mark.parametrize("compile", [False, True])
+@pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("name", PRIORS)
-def test_it_finds_what_a_plain_search_does_that_evaluates_the_prior_anew(name, compile):
+def test_it_finds_what_a_plain_search_does_that_evaluates_the_prior_anew(name, whole, monkeypatch):
     """From one start, with the same draws: the same score, and as many draws are left."""
+    search_by(whole, monkeypatch)
     prior, world = PRIORS[name]().eval(), exact_world(1)
-    planner = MCTSPlanner(prior, LENGTH, 5, objective="return", compile=compile)
+    planner = MCTSPlanner(prior, LENGTH, 5, objective="return")
     for seed in range(3):
         with torch.no_grad():
             want = reference(prior, world, seed, 5 * LENGTH, seeded(seed))
@@ -116,9 +124,8 @@ def test_it_finds_what_a_plain_search_does_that_evaluates_the_prior_anew(name, c
 
 @pytest.mark.parametrize("legal", [False, True])
 @pytest.mark.parametrize("name", PRIORS)
-def test_compiled_and_plain_searches_decide_alike(name, legal):
-    """Also where only selection and backup are compiled: with values, or actions that are not legal."""
-    pytest.importorskip("numba")
+def test_both_searches_decide_alike(name, legal, monkeypatch):
+    """Also where the one loop does not know the world or the goal: with values, or actions that are not legal."""
     prior, world = PRIORS[name](), exact_world(2, "WSA", legal)
     state = world.reset(9, seeded(0))
     goals = [
@@ -128,20 +135,22 @@ def test_compiled_and_plain_searches_decide_alike(name, legal):
     ]
     for seed, goal in enumerate(goals):
         found, drawn = [], []
-        for compile in (False, True):
+        for whole in (True, False):
+            if not whole:
+                search_by(whole, monkeypatch)
             generator = seeded(seed)
-            planner = MCTSPlanner(prior, LENGTH, 6, temperature=0.5, compile=compile, **goal)
+            planner = MCTSPlanner(prior, LENGTH, 6, temperature=0.5, **goal)
             found.append(planner.plan(world, state, generator))
             drawn.append(float(torch.rand(1, generator=generator)))
         for plain, compiled in zip(*found, strict=True):
             assert plain == compiled if not isinstance(plain, torch.Tensor) else torch.equal(plain, compiled)
+        monkeypatch.undo()
         assert drawn[0] == drawn[1]
 
 
 @pytest.mark.parametrize("takes", [{}, {"num_contexts": random_world(0).num_states}], ids=["blind", "seeing"])
 def test_threads_that_share_many_starts_decide_as_one_thread_does(takes):
     """Some starts are finished before others: what the others draw depends on how many are left."""
-    pytest.importorskip("numba")
     prior, world = wide(GRUPrior(ACTIONS, 64, lags=2, **takes)), exact_world(5)
     state = world.reset(1000, seeded(0))
     planner = MCTSPlanner(prior, LENGTH, 6, objective="return")
@@ -158,15 +167,14 @@ def test_threads_that_share_many_starts_decide_as_one_thread_does(takes):
             assert torch.equal(torch.as_tensor(one), torch.as_tensor(same))
 
 
-@pytest.mark.parametrize("compile", [False, True])
-def test_scores_that_are_infinite_count_as_the_extremes(compile):
+def test_scores_that_are_infinite_count_as_the_extremes(monkeypatch):
     world = exact_world(3)
     reward = world.reward.masked_fill(torch.rand(world.reward.shape, generator=seeded(1)) < 0.4, -torch.inf)
     world = TabularWorld(world.next_state, reward)
-    planner = MCTSPlanner(UniformPrior(ACTIONS), 3, 8, compile=compile)
-    other = MCTSPlanner(UniformPrior(ACTIONS), 3, 8, compile=False)
     state = world.reset(20, seeded(0))
-    assert torch.equal(planner.plan(world, state, seeded(0)).plan, other.plan(world, state, seeded(0)).plan)
+    found = MCTSPlanner(UniformPrior(ACTIONS), 3, 8).plan(world, state, seeded(0))
+    search_by(False, monkeypatch)
+    assert torch.equal(MCTSPlanner(UniformPrior(ACTIONS), 3, 8).plan(world, state, seeded(0)).plan, found.plan)
 
 
 class Counted(MarkovPrior):
@@ -188,10 +196,11 @@ def test_the_prior_is_evaluated_once_for_each_step_of_the_world():
     assert sum(prior.log) - sizing < decision.model_steps
 
 
-@pytest.mark.parametrize("compile", [False, True])
-def test_refuses_a_prior_of_nans(compile):
+@pytest.mark.parametrize("whole", [False, True])
+def test_refuses_a_prior_of_nans(whole, monkeypatch):
+    search_by(whole, monkeypatch)
     prior = GRUPrior(ACTIONS, 8, lags=1)
     with torch.no_grad():
         prior.head.bias[1] = torch.nan
     with pytest.raises(ValueError, match="prior"):
-        MCTSPlanner(prior, LENGTH, 5, compile=compile).plan(exact_world(0), torch.tensor([0]), seeded(0))
+        MCTSPlanner(prior, LENGTH, 5).plan(exact_world(0), torch.tensor([0]), seeded(0))

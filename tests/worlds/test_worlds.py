@@ -1,15 +1,11 @@
 """Worlds: transitions by hand, fast rollouts against stepping, reward maps, legal actions, and what is refused."""
 
-import sys
-from types import ModuleType
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuroprior import TabularWorld, World, gridworld
-from neuroprior._compiled import compiled
 from neuroprior.control import ContinuousWorld
 from neuroprior.worlds import Rollout
 from tests.support.sources import FALSE_ALARM, p_value, random_world, refuses, seeded
@@ -115,8 +111,6 @@ def test_step_by_hand(kind):
 @pytest.mark.parametrize("size", [(4, 5, 6), (1, 1, 1), (4, 5, 0), (4, 0, 3), (0, 3, 2)])
 @pytest.mark.parametrize("by", ["tensors", "loop"])
 def test_rollout_is_stepping(kind, layout, size, by):
-    if by == "loop":
-        pytest.importorskip("numba")
     world = random_world(1, kind)
     world.compile_from = 0 if by == "loop" else 2**60
     batch, num_plans, length = size
@@ -144,7 +138,6 @@ def test_rollout_is_stepping(kind, layout, size, by):
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 7])  # seven share the seven plans of each start
 def test_each_thread_follows_plans_of_its_own(monkeypatch, threads):
-    pytest.importorskip("numba")
     world = random_world(1, "WS")
     state, plans = world.reset(3, seeded(0)), torch.randint(3, (3, 7, 4), generator=seeded(1))
     want = world.rollout(state, plans)
@@ -156,7 +149,6 @@ def test_each_thread_follows_plans_of_its_own(monkeypatch, threads):
 
 
 def test_the_loop_is_for_what_it_can_do(monkeypatch):
-    pytest.importorskip("numba")
     from neuroprior.worlds import compiled
 
     compiled_sizes, rollout = [], compiled.rollout
@@ -173,23 +165,6 @@ def test_the_loop_is_for_what_it_can_do(monkeypatch):
         world.compile_from = 0
         assert world.rollout(state, few).rewards.dtype == reward.dtype
         assert len(compiled_sizes) == times
-
-
-@pytest.mark.parametrize("error", [ImportError, KeyError])
-def test_a_numba_that_does_not_work_is_left_alone(monkeypatch, error):
-    class Wrong(ModuleType):
-        def __getattr__(self, name):
-            raise error(name)
-
-    monkeypatch.setitem(sys.modules, "numba", Wrong("numba"))
-    monkeypatch.delitem(sys.modules, "neuroprior.worlds.compiled", raising=False)
-    compiled.cache_clear()
-    world = random_world(1, "WS")
-    world.compile_from = 0
-    try:
-        assert world.rollout(world.reset(2, seeded(0)), torch.zeros(2, 3, 4).long()).rewards.shape == (2, 3, 4)
-    finally:
-        compiled.cache_clear()
 
 
 def test_rollout_takes_stored_actions():

@@ -7,16 +7,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from neuroprior._compiled import compiled
 from neuroprior._random import draw_seed
 from neuroprior._threads import share
 from neuroprior.plans import Plans, action_dtype, is_per_step
 from neuroprior.priors.counts.histories import MAX_TABLE_BYTES, Counts, Tree, count_histories
 from neuroprior.priors.prior import Prior
 
-COMPILE_FROM: int | None = 2**20
-"""Actions of plans from which a compiled loop draws them, where numba is installed; None: never. Its call is worth less
-by far, but the first one in a process loads numba, which takes about a second.
+COMPILE_FROM = 2**20
+"""Actions of plans from which they are drawn from alias tables, by a compiled loop: the first call in a process loads
+numba, which takes about a second.
 """
 
 LARGEST, RUNS = 2**17, 256
@@ -78,12 +77,13 @@ class HistoryPrior(Prior):
         """Many plans from few states, drawn by a compiled loop; see `neuroprior.sampling.Steppable`."""
         actions, contexts, total = self.num_actions, self.num_contexts or 1, int(counts.sum())
         states, drawn = len(self.next_node) * contexts, total * length
-        worth = COMPILE_FROM is not None and drawn >= COMPILE_FROM and 8 * states * actions <= drawn
+        worth = drawn >= COMPILE_FROM and 8 * states * actions <= drawn
         able = type(self).step is HistoryPrior.step and self.device.type == "cpu" and self.end is None
         fits = states * actions <= LARGEST
-        fast = compiled("neuroprior.priors.counts.compiled_draws") if worth and able and fits else None
-        if fast is None:
+        if not (worth and able and fits):
             return None
+        from neuroprior.priors.counts import compiled_draws
+
         every, dtype, run = torch.arange(states), action_dtype(actions), 1
         room = min(LARGEST, max(drawn // 4, states * actions)) // states
         while actions ** (2 * run) <= min(RUNS, room) and 2 * run <= 8 // dtype.itemsize and run < length:
@@ -97,14 +97,14 @@ class HistoryPrior(Prior):
         for _ in range(run - 1):
             probs, after = (probs[..., None] * single[after]).flatten(1), follow[after].flatten(1)
         runs = torch.cartesian_prod(*[torch.arange(actions)] * run).view(-1, run).to(dtype).numpy()
-        tables = fast.tables(probs.numpy(), after.numpy(), runs)
+        tables = compiled_draws.tables(probs.numpy(), after.numpy(), runs)
         plans = np.empty((total, -(-length // run)), tables.actions.dtype)
         ends, start, seed = counts.cumsum(0).numpy(), state.numpy(), draw_seed(generator)
 
         def part(first: int) -> None:
-            fast.draw(tables, start, ends, seed, first, plans[first : first + fast.PLANS])
+            compiled_draws.draw(tables, start, ends, seed, first, plans[first : first + compiled_draws.PLANS])
 
-        share(part, range(0, total, fast.PLANS))
+        share(part, range(0, total, compiled_draws.PLANS))
         return torch.from_numpy(plans.view(runs.dtype))[:, :length].contiguous()
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:

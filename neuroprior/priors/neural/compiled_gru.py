@@ -1,5 +1,5 @@
-"""A recurrent network by compiled loops: its gates, for `gru_step` and `gru_sequence`, whole steps of many plans, and
-plans that are drawn from it to their ends; importing this loads numba."""
+"""The cell of a gated recurrent network on a CPU, in float32, and the loops around it: single steps, sequences with
+gradients, and plans that are drawn to their ends. Importing this loads numba; elsewhere torch's own cell is used."""
 
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ def on_one_thread(width: int, num_actions: int) -> bool:
     return BLOCK * width * max(3 * width, num_actions) <= ALONE
 
 
-def gates(
+def step(
     given: Tensor,
     rows: Tensor,
     hidden: Tensor,
@@ -30,17 +30,22 @@ def gates(
     bias: Tensor | None = None,
     after: Tensor | None = None,
 ) -> Tensor:
-    """As `neuroprior.priors.neural.gru.gates`, of float32 on the CPU; columns of `before` must be contiguous.
+    """Returns the new hidden states `[N, width]` of one layer.
 
-    `bias [3 * width]` is added to `hidden`, which is left as it is. The new hidden states are written to
-    `after [N, width]`, where it is given.
+    Args:
+        given: `[M, 3 * width]`: what distinct inputs add to the reset gate, the update gate and the new state.
+        rows: int32 `[N]`: which of the inputs each row reads.
+        hidden: `[N, 3 * width]`: what the hidden states add, of which the reset gate lets a share into the new state.
+        before: `[N, width]`: the hidden states, with contiguous columns.
+        bias: `[3 * width]`: added to `hidden`, which is left as it is; None for nothing.
+        after: `[N, width]`: gets the new hidden states; None: they get memory of their own.
     """
     after = before.new_empty(before.shape) if after is None else after
     bias = hidden.new_zeros(hidden.shape[1]) if bias is None else bias
     # rows of the hidden states may have other numbers behind them
     span = max((len(before) - 1) * before.stride(0) + before.shape[1], 0)
     flat = before.as_strided((span,), (1,)).numpy()
-    _gates(given.numpy(), rows.numpy(), hidden.numpy(), bias.numpy(), flat, before.stride(0), after.numpy())
+    _step(given.numpy(), rows.numpy(), hidden.numpy(), bias.numpy(), flat, before.stride(0), after.numpy())
     return after
 
 
@@ -70,17 +75,31 @@ def sigmoid(x: Any) -> Any:
     return half * tanh(half * x) + half
 
 
+@njit(fastmath=True)
+def cell(reset: Any, update: Any, new: Any, own: Any, last: Any) -> Any:
+    """Returns the gates, the candidate and the new state of one hidden unit (Cho et al. 2014).
+
+    Args:
+        reset, update: what inputs and hidden states add to the two gates.
+        new: what inputs add to the candidate.
+        own: what hidden states add to it, of which the reset gate lets a share through.
+        last: the state before.
+    """
+    reset, update = sigmoid(reset), sigmoid(update)
+    new = tanh(new + reset * own)
+    return reset, update, new, new + update * (last - new)
+
+
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def _gates(given: Array, rows: Array, hidden: Array, bias: Array, before: Array, stride: int, after: Array) -> None:
+def _step(given: Array, rows: Array, hidden: Array, bias: Array, before: Array, stride: int, after: Array) -> None:
     """`before` is flat, of rows at this `stride`."""
     width = after.shape[1]
     for n in range(len(after)):
         mine, own, last, new = given[rows[n]], hidden[n], before[n * stride : n * stride + width], after[n]
         for k in range(width):
-            reset = sigmoid(mine[k] + own[k] + bias[k])
-            update = sigmoid(mine[width + k] + own[width + k] + bias[width + k])
-            fresh = tanh(mine[2 * width + k] + reset * (own[2 * width + k] + bias[2 * width + k]))
-            new[k] = fresh + update * (last[k] - fresh)
+            reset = mine[k] + own[k] + bias[k]
+            update = mine[width + k] + own[width + k] + bias[width + k]
+            new[k] = cell(reset, update, mine[2 * width + k], own[2 * width + k] + bias[2 * width + k], last[k])[3]
 
 
 class Network(NamedTuple):
@@ -115,7 +134,7 @@ def advance(network: Network, number: int, states: Array, gates: Array, product:
         network: the network.
         number: of plans, the first rows of the arrays.
         states: `[K, BLOCK, H]`: the hidden states, which are overwritten.
-        gates: `[BLOCK, 3 H]`: what the inputs add to the gates of the first layer; overwritten.
+        gates: `[BLOCK, 3 H]`: what the inputs add to the gates of the first layer; overwritten where there are more.
         product: `[BLOCK, 3 H]`: room.
         logits: `[BLOCK, A]`: gets the logits of the next action.
     """
@@ -129,11 +148,10 @@ def advance(network: Network, number: int, states: Array, gates: Array, product:
                     gates[i, j] += network.above_bias[layer - 1, j]
         np.dot(states[layer][:number], network.recurrent[layer], product[:number])
         for i in range(number):
-            for j in range(2 * size):
-                gates[i, j] = sigmoid(gates[i, j] + product[i, j])
             for j in range(size):
-                new = tanh(gates[i, 2 * size + j] + gates[i, j] * (product[i, 2 * size + j] + network.bias[layer, j]))
-                states[layer, i, j] = new + gates[i, size + j] * (states[layer, i, j] - new)
+                reset, update = gates[i, j] + product[i, j], gates[i, size + j] + product[i, size + j]
+                own = product[i, 2 * size + j] + network.bias[layer, j]
+                states[layer, i, j] = cell(reset, update, gates[i, 2 * size + j], own, states[layer, i, j])[3]
     np.dot(states[layers - 1][:number], network.head, logits[:number])
     for i in range(number):
         for a in range(actions):
@@ -242,12 +260,10 @@ def _forward(given: Array, hidden: Array, states: Array, opened: Array, t: int) 
     width = states.shape[2]
     for n in range(states.shape[1]):
         mine, own, gate, last, new = given[t, n], hidden[t, n], opened[t, n], states[t, n], states[t + 1, n]
-        for k in range(2 * width):
-            gate[k] = sigmoid(mine[k] + own[k])
         for k in range(width):
-            fresh = tanh(mine[2 * width + k] + gate[k] * own[2 * width + k])
-            gate[2 * width + k] = fresh
-            new[k] = fresh + gate[width + k] * (last[k] - fresh)
+            reset, update = mine[k] + own[k], mine[width + k] + own[width + k]
+            reset, update, fresh, after = cell(reset, update, mine[2 * width + k], own[2 * width + k], last[k])
+            gate[k], gate[width + k], gate[2 * width + k], new[k] = reset, update, fresh, after
 
 
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")

@@ -1,6 +1,5 @@
 """The GRU prior: a recurrent network over the actions so far."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -8,12 +7,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neuroprior._checks import check_memory, check_sizes
-from neuroprior._compiled import compiled
 from neuroprior._threads import one_thread, share
 from neuroprior.priors.neural.neural import Embedding, NeuralPrior
 
-COMPILE_FROM: int | None = 4096
-"""Numbers in the hidden states from which a compiled loop is worth its call, where numba is installed; None: never."""
+DRAW_FROM = 4096
+"""Numbers in the hidden states of plans from which they are drawn to their ends by one compiled loop."""
 
 ROWS, WORTH_THREADS = 2048, 8
 """Rows of hidden states whose products stay in a processor's cache, and so many times these from which threads share
@@ -112,7 +110,7 @@ class GRUPrior(NeuralPrior):
         return self.head(out), torch.cat([inputs.index_select(0, row), layers.transpose(0, 1).flatten(1)], 1)
 
     def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
-        """As that of `NeuralPrior`; on a CPU by a compiled loop, where there is one that is worth its call.
+        """As that of `NeuralPrior`; on a CPU by one compiled loop, where plans are many.
 
         The state is `[N, D + K H + lags - 1]`, of K layers.
         """
@@ -121,17 +119,25 @@ class GRUPrior(NeuralPrior):
         size, (steps, number), kinds = self.hidden_size, uniform.shape, self.num_actions
         # Tables of what each of the last actions adds have to be worth their making.
         worth = 4 * self.lags * kinds <= number * steps and 3 * size * self.lags * kinds <= LARGEST
-        worth = worth and COMPILE_FROM is not None and number * size >= COMPILE_FROM
-        able = worth and state.dtype == uniform.dtype == torch.float32 and self._may_step(state[:, None])
-        fast = compiled("neuroprior.priors.neural.compiled_gru") if able and self.is_plain else None
-        if fast is None or not fast.on_one_thread(size, kinds):
+        able = (
+            worth
+            and number * size >= DRAW_FROM
+            and state.dtype == uniform.dtype == torch.float32
+            and self._may_step(state[:, None])
+        )
+        if not (able and self.is_plain):
+            return None
+        from neuroprior.priors.neural import compiled_gru
+
+        if not compiled_gru.on_one_thread(size, kinds):
             return None
         last, hidden, recent = state.split([self.input_size, self.num_layers * size, self.lags - 1], 1)
         given = self.context_gates(last) if self.takes_context else state.new_empty(0, 3 * size)
         line = torch.cat([recent.long(), action[:, None], action.new_empty(number, steps)], 1)
         hidden = hidden.unflatten(1, (self.num_layers, size))
-        arrays = (x.detach().contiguous().numpy() for x in (given, hidden, line, uniform))
-        fast.draw_to_the_end(fast.Network(*self.arrays()), *arrays, float(temperature))
+        arrays: Any = (x.detach().contiguous().numpy() for x in (given, hidden, line, uniform))
+        draw: Any = compiled_gru.draw_to_the_end
+        draw(compiled_gru.Network(*self.arrays()), *arrays, float(temperature))
         return line[:, self.lags :]
 
     @property
@@ -184,7 +190,7 @@ class GRUPrior(NeuralPrior):
 
 
 def gru_sequence(gru: nn.GRU, inputs: Tensor, layers: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """The output of `nn.GRU`, which is slow for small batches, by compiled loops where they are worth it.
+    """Returns the output of `nn.GRU`; of float32 on a CPU by compiled loops, which are faster.
 
     Args:
         gru: the network, `batch_first`, with weights of one width.
@@ -195,26 +201,26 @@ def gru_sequence(gru: nn.GRU, inputs: Tensor, layers: Tensor | None = None) -> t
         The output `[N, T, width]`, and the new `layers`.
     """
     plain = inputs.dtype == torch.float32 and not torch.is_autocast_enabled(inputs.device.type)
-    able = plain and COMPILE_FROM is not None and inputs.numel() >= COMPILE_FROM and inputs.device.type == "cpu"
-    fast = compiled("neuroprior.priors.neural.compiled_gru") if able else None
     if layers is not None and inputs.shape[1] == 1 and plain and not torch.is_grad_enabled():
         out, layers = gru_step(gru, inputs[:, 0], layers)
         return out[:, None], layers
-    if fast is None:
+    if not plain or inputs.device.type != "cpu" or inputs.numel() == 0:
         out, layers = gru(inputs, None if layers is None else layers.contiguous())
         return out, layers
+    from neuroprior.priors.neural.compiled_gru import Sequence
+
     after, below = [], inputs.transpose(0, 1)
     for layer, (w_in, w_hidden, b_in, b_hidden) in enumerate(gru.all_weights):
         if layer > 0:
             below = functional.dropout(below, gru.dropout, gru.training)
         first = below.new_zeros(below.shape[1], w_hidden.shape[1]) if layers is None else layers[layer]
-        below = fast.Sequence.apply(functional.linear(below, w_in, b_in), first, w_hidden, b_hidden)
+        below = Sequence.apply(functional.linear(below, w_in, b_in), first, w_hidden, b_hidden)
         after.append(below[-1])
     return below.transpose(0, 1), torch.stack(after)
 
 
 def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """The output of `nn.GRU`, which is made for long sequences, for a single input, in half the time; no gradients.
+    """Returns the output of `nn.GRU`, which is made for long sequences, for a single input; without gradients.
 
     Args:
         gru: the network, with weights of one width.
@@ -226,7 +232,7 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
         The output `[N, width]`, and the new `layers`.
     """
     after = []
-    if layers.device.type != "cpu":
+    if layers.device.type != "cpu" or layers.dtype != torch.float32:
         below = below if rows is None else below.index_select(0, rows)
         for before, weights in zip(layers, gru.all_weights, strict=True):
             below = torch.gru_cell(below, before.contiguous(), *weights)
@@ -236,45 +242,25 @@ def gru_step(gru: nn.GRU, below: Tensor, layers: Tensor, rows: Tensor | None = N
         w_in, w_hidden, b_in, b_hidden = gru.all_weights[layer]
         if layer > 0 or rows is None:
             rows = torch.arange(len(before), dtype=torch.int32)
-        given = functional.linear(below, w_in, b_in)
-        able = COMPILE_FROM is not None and before.numel() >= COMPILE_FROM and before.dtype == torch.float32
-        fast = compiled("neuroprior.priors.neural.compiled_gru") if able and before.stride(1) == 1 else None
-        if fast is None:
-            below = gates(given, rows, functional.linear(before, w_hidden, b_hidden), before)
-        else:
-            below = _in_parts(fast.gates, given, rows, before, w_hidden, b_hidden)
+        below = _step_in_parts(functional.linear(below, w_in, b_in), rows, before, w_hidden, b_hidden)
         after.append(below)
     return below, after[0][None] if len(after) == 1 else torch.stack(after)
 
 
-def _in_parts(
-    compiled_gates: Callable[..., Tensor], given: Tensor, rows: Tensor, before: Tensor, weight: Tensor, bias: Tensor
-) -> Tensor:
+def _step_in_parts(given: Tensor, rows: Tensor, before: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """The new hidden states of one layer, where products of `ROWS` rows stay in the cache; threads share many."""
+    from neuroprior.priors.neural.compiled_gru import step
+
+    before = before if before.stride(1) == 1 else before.contiguous()
     if len(before) <= ROWS:
-        return compiled_gates(given, rows, before @ weight.T, before, bias)
+        return step(given, rows, before @ weight.T, before, bias)
     after = before.new_empty(before.shape)
 
     def part(begin: int) -> None:
         some = slice(begin, begin + ROWS)
-        compiled_gates(given, rows[some], before[some] @ weight.T, before[some], bias, after[some])
+        step(given, rows[some], before[some] @ weight.T, before[some], bias, after[some])
 
     begins = range(0, len(before), ROWS)
     with one_thread(len(begins) < WORTH_THREADS):
         share(part, begins)
     return after
-
-
-def gates(given: Tensor, rows: Tensor, hidden: Tensor, before: Tensor) -> Tensor:
-    """The new hidden states `[N, width]` of one layer (Cho et al. 2014).
-
-    Args:
-        given: `[M, 3 * width]`: what distinct inputs add to the reset gate, the update gate and the new state.
-        rows: integers `[N]`: which of the inputs each row reads.
-        hidden: `[N, 3 * width]`: what the hidden states add, of which the reset gate lets a share into the new state.
-        before: `[N, width]`: the hidden states.
-    """
-    size, given = before.shape[1], given.index_select(0, rows)
-    opened = hidden[:, : 2 * size].add_(given[:, : 2 * size]).sigmoid_()
-    new = given[:, 2 * size :].addcmul_(opened[:, :size], hidden[:, 2 * size :]).tanh_()
-    return torch.lerp(new, before, opened[:, size:])

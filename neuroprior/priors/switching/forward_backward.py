@@ -9,11 +9,9 @@ the identity; and `likelihood [N, L, K]` is that of each action in each mode, no
 sequence likelihoods are 1 and steps the identity.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 TINY = 1e-300
@@ -48,7 +46,8 @@ def predict(initial: Tensor, steps: Tensor, likelihood: Tensor) -> tuple[Tensor,
     given = [values.detach().double().cpu().contiguous() for values in (initial, steps, likelihood)]
     predicted, filtered = torch.empty_like(given[2]), torch.empty_like(given[2])
     totals = given[2].new_empty(given[2].shape[:2])
-    filter_modes(*_arrays(*given), TINY, *_arrays(predicted, filtered, totals))
+    run: Any = filter_modes
+    run(*_arrays(*given), TINY, *_arrays(predicted, filtered, totals))
     return predicted.to(likelihood), filtered.to(likelihood), totals.log().to(likelihood)
 
 
@@ -60,7 +59,8 @@ def smooth(initial: Tensor, steps: Tensor, likelihood: Tensor) -> Smoothed:
     num, length, modes = likelihood.shape
     given = [values.detach().double().cpu().contiguous() for values in (steps, likelihood, filtered)]
     smoothed, moved = torch.empty_like(given[2]), given[2].new_empty(num, max(length - 1, 0), modes, modes)
-    smooth_modes(*_arrays(*given[:2]), TINY, *_arrays(given[2], smoothed, moved))
+    run: Any = smooth_modes
+    run(*_arrays(*given[:2]), TINY, *_arrays(given[2], smoothed, moved))
     return Smoothed(log_likelihood, filtered, smoothed.to(likelihood), moved.to(likelihood))
 
 
@@ -81,5 +81,5 @@ def most_probable_path(initial: Tensor, steps: Tensor, likelihood: Tensor) -> Te
     return path
 
 
-def _arrays(*values: Tensor) -> tuple[NDArray[np.float64], ...]:
+def _arrays(*values: Tensor) -> tuple[Any, ...]:
     return tuple(value.numpy() for value in values)

@@ -7,12 +7,9 @@ import pytest
 import torch
 
 from neuroprior import ContextTreePrior, MarkovPrior, Plans, Prior
-from neuroprior._compiled import compiled
+from neuroprior.priors.counts import compiled_draws as draws
 from neuroprior.priors.counts import history_prior
 from tests.support.sources import every_plan, fits, plan_number, refuses, seeded
-
-draws = compiled("neuroprior.priors.counts.compiled_draws")
-pytestmark = pytest.mark.skipif(draws is None, reason="numba is not installed")
 
 
 @pytest.fixture(autouse=True)

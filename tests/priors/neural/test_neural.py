@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from neuroprior import GRUPrior, Plans, TransformerPrior, load, save
-from neuroprior._compiled import compiled
 from neuroprior.priors.neural import gru
 from tests.support.sources import best_plan_distribution, best_plans, bits_per_action, every_plan, refuses, seeded
 
@@ -187,13 +186,13 @@ def test_refuses_settings(name):
 @pytest.mark.parametrize("lags", [1, 3])
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("takes", [{}, {"num_contexts": 3}, {"context_size": 2}])
-@pytest.mark.parametrize("compile_from", [None, 0])
-def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes, compile_from, monkeypatch):
-    """Without gradients a step has a path of its own, compiled or not; with them it is `nn.GRU`'s."""
-    monkeypatch.setattr(gru, "COMPILE_FROM", compile_from)
-    prior = GRUPrior(4, hidden_size=8, num_layers=num_layers, lags=lags, dropout=0.3, seed=1, **takes)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes, dtype, monkeypatch):
+    """Without gradients a step has a path of its own, compiled in single precision; with them that of sequences."""
+    prior = GRUPrior(4, hidden_size=8, num_layers=num_layers, lags=lags, dropout=0.3, seed=1, **takes).to(dtype)
     action = torch.randint(4, (6, batch), generator=seeded(0))
-    context = {"num_contexts": torch.arange(batch) % 3, "context_size": torch.rand(batch, 2, generator=seeded(1))}
+    features = torch.rand(batch, 2, generator=seeded(1)).to(dtype)
+    context = {"num_contexts": torch.arange(batch) % 3, "context_size": features}
     current = next((context[name] for name in takes), None)
     one_step, calls = prior._one_step, []
     monkeypatch.setattr(prior, "_one_step", lambda *given: calls.append(given) or one_step(*given))
@@ -216,31 +215,27 @@ def test_single_steps_of_a_gru_are_those_of_torch(batch, lags, num_layers, takes
     assert len(calls) == len(action)
     for one, other, third in zip(fast, plain, rough, strict=True):
         torch.testing.assert_close(one, other.detach(), atol=1e-6, rtol=1e-5)
-        torch.testing.assert_close(third.float(), one, atol=0.05, rtol=0.05)
+        torch.testing.assert_close(third.to(one), one, atol=0.05, rtol=0.05)
 
 
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("begun", [False, True])
-def test_a_compiled_sequence_of_a_gru_is_that_of_torch(num_layers, begun, monkeypatch):
+def test_a_compiled_sequence_of_a_gru_is_that_of_torch(num_layers, begun):
     """Its output, its last states, and the gradients of weights, inputs and first states."""
-    if compiled("neuroprior.priors.neural.compiled_gru") is None:
-        pytest.skip("numba is not installed")
     network = torch.nn.GRU(8, 8, num_layers, batch_first=True)
     inputs = torch.randn(5, 7, 8, generator=seeded(0), requires_grad=True)
     first = torch.randn(num_layers, 5, 8, generator=seeded(1), requires_grad=True)
+    begin, found = first if begun else None, []
     learned = [*network.parameters(), inputs, *([first] if begun else [])]
-    found = []
-    for compile_from in (None, 0):
-        monkeypatch.setattr(gru, "COMPILE_FROM", compile_from)
+    for out, last in (network(inputs, begin), gru.gru_sequence(network, inputs, begin)):
         for values in learned:
             values.grad = None
-        out, last = gru.gru_sequence(network, inputs, first if begun else None)
         (out.sin().sum() + (last**2).sum()).backward()
         found.append([out.detach(), last.detach(), *(values.grad for values in learned)])
     for plain, fast in zip(*found, strict=True):
         torch.testing.assert_close(fast, plain, atol=1e-5, rtol=1e-4)
     with torch.no_grad():
-        assert torch.allclose(gru.gru_sequence(network, inputs, first if begun else None)[0], found[0][0], atol=1e-6)
+        assert torch.allclose(gru.gru_sequence(network, inputs, begin)[0], found[0][0], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +254,6 @@ def test_a_compiled_sequence_of_a_gru_is_that_of_torch(num_layers, begun, monkey
 )
 def test_plans_that_a_compiled_loop_draws_to_their_ends_are_those_of_torch(made, context, monkeypatch):
     """With the same numbers; also past the window, with a temperature, and after a past."""
-    pytest.importorskip("numba")
     prior = GRUPrior(5, 16, **made)
     with torch.no_grad():
         for weights in prior.parameters():
@@ -267,8 +261,8 @@ def test_plans_that_a_compiled_loop_draws_to_their_ends_are_those_of_torch(made,
     rest, loops = prior.draw_rest, []
     prior.draw_rest = lambda *given: loops.append(rest(*given)) or loops[-1]
     found = []
-    for compile_from in (1, None):
-        monkeypatch.setattr(gru, "COMPILE_FROM", compile_from)
+    for draw_from in (1, 2**62):
+        monkeypatch.setattr(gru, "DRAW_FROM", draw_from)
         how = {"context": context, "past": torch.tensor([3, 1, 4]), "temperature": 0.7}
         found.append(prior.sample(3000, 12, **how, generator=seeded(4)))
     assert torch.equal(*found)
@@ -290,27 +284,21 @@ def test_other_networks_are_stepped(changed):
 
 
 @pytest.mark.parametrize("layers", [1, 2])
-def test_steps_of_many_rows_in_parts_are_those_of_few(layers, monkeypatch):
+@pytest.mark.parametrize("number", [5, 20_000])
+def test_steps_are_those_of_torch_over_the_whole_range_of_activations(layers, number):
+    """Of few rows and of many, in parts; of states that have other numbers beside them; and of none."""
     network = torch.nn.GRU(16, 16, layers, batch_first=True)
-    below, before = torch.randn(20, 16, generator=seeded(0)), torch.randn(layers, 20_000, 16, generator=seeded(1))
-    rows = torch.arange(20_000, dtype=torch.int32) % 20
     with torch.no_grad():
-        whole, _ = gru.gru_step(network, below, before, rows)
-        monkeypatch.setattr(gru, "COMPILE_FROM", None)
-        plain, _ = gru.gru_step(network, below, before, rows)
-    assert torch.allclose(whole, plain, atol=1e-5)
-
-
-def test_compiled_gates_are_those_of_torch():
-    """Over the whole range of activations, of states that have other numbers beside them."""
-    module = compiled("neuroprior.priors.neural.compiled_gru")
-    if module is None:
-        pytest.skip("numba is not installed")
-    given, rows = torch.randn(3, 3 * 16, generator=seeded(0)) * 5, torch.tensor([2, 0, 1, 1, 2], dtype=torch.int32)
-    hidden, state = torch.randn(5, 3 * 16, generator=seeded(1)) * 20, torch.rand(5, 17, generator=seeded(2)) * 2 - 1
-    fast = module.gates(given, rows, hidden, state[:, :16])
-    assert torch.allclose(fast, gru.gates(given, rows, hidden, state[:, :16]), atol=1e-6)
-    assert module.gates(given, rows[:0], hidden[:0], state[:0, :16]).shape == (0, 16)
+        for weights in network.parameters():
+            weights.mul_(8)
+    below, state = torch.randn(4, 16, generator=seeded(0)), torch.rand(layers, number, 17, generator=seeded(1)) * 2 - 1
+    before, rows = state[..., :16], torch.arange(number, dtype=torch.int32) % 4
+    with torch.no_grad():
+        out, after = gru.gru_step(network, below, before, rows)
+        plain, last = network(below[rows][:, None], before.contiguous())
+        assert gru.gru_step(network, below, before[:, :0], rows[:0])[0].shape == (0, 16)
+    assert torch.allclose(out, plain[:, 0], atol=1e-5)
+    assert torch.allclose(after, last, atol=1e-5)
 
 
 @pytest.mark.parametrize("lags", [1, 3])

@@ -40,7 +40,7 @@ MAKERS = {
     "halving": lambda prior, **how: SamplingPlanner(prior, 4, 12, num_rollouts=6, halving=True, **how),
     "exhaustive": lambda prior, **how: ExhaustivePlanner(3, num_rollouts=2, **how),
     "frontier": lambda prior, **how: FrontierPlanner(prior, 4, 12, **how),
-    "mcts": lambda prior, **how: MCTSPlanner(prior, 4, 16, compile=False, **how),
+    "mcts": lambda prior, **how: MCTSPlanner(prior, 4, 16, **how),
 }
 ONLY_SURE = ("distinct", "frontier", "mcts", "horizon")
 
