@@ -10,6 +10,7 @@ from neuroprior._hashing import row_hashes
 from neuroprior._random import gumbel
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, as_floats, join_decisions, random_best
 from neuroprior.plans import action_dtype
+from neuroprior.sampling.states import select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import World
 
@@ -97,7 +98,7 @@ class FrontierPlanner(PriorPlanner):
                 rewards = as_floats(front.rewards)
                 gained = rewards.double() @ self._weights(rewards).double()
                 front = front.merge(gained if self.objective == "return" else None)
-                logits, hidden = stepper.step_in(world, action, hidden.index_select(0, row), front.state)
+                logits, hidden = stepper.step_in(world, action, select_rows(hidden, row), front.state)
         score = torch.stack([decision.score for decision in found], 1)
         best = random_best(score, generator)
         row = torch.arange(batch, device=state.device)

@@ -8,6 +8,7 @@ from torch import Tensor
 from neuroprior._checks import is_number
 from neuroprior.planners.planner import Decision, Objective, PriorPlanner, decide, join_decisions
 from neuroprior.sampling.draws import Draw
+from neuroprior.sampling.states import State, join_rows, map_state, numbers_in, select_rows, tensors_in
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.tabular import TabularWorld
 from neuroprior.worlds.world import Rollout, World
@@ -84,11 +85,12 @@ class MCTSPlanner(PriorPlanner):
     def _state_size(self, world: World, state: Tensor) -> int:
         """Numbers in the largest state of the prior in a tree: states may grow, by as much with each action."""
         stepper, now = Stepper(self.prior, in_place=False), state[:1]
-        before = stepper.start_in(world, now)[1]
-        if before.numel() == 0 or self.length == 1:
-            return before.numel()
-        after = stepper.step_in(world, torch.zeros(1, dtype=torch.long, device=state.device), before, now)[1]
-        return before.numel() + max(after.numel() - before.numel(), 0) * (self.length - 1)
+        begun = stepper.start_in(world, now)[1]
+        before = numbers_in(begun)
+        if before == 0 or self.length == 1:
+            return before
+        after = stepper.step_in(world, torch.zeros(1, dtype=torch.long, device=state.device), begun, now)[1]
+        return before + max(numbers_in(after) - before, 0) * (self.length - 1)
 
     @torch.no_grad()
     def _plan(self, whole: bool, world: World, state: Tensor, generator: torch.Generator) -> Decision:
@@ -118,7 +120,7 @@ class _Trees:
         reward: `[B, M]`: of the step into each node.
         state: `[B, M, ...]`: of the world at each node.
         place: `[B, M]`: where the prior's state at each node is, in `kept`.
-        kept: at each depth the prior's states at the nodes there, `[room, ...]`: the states of some priors grow.
+        kept: at each depth the prior's states at the nodes there, with room for more: the states of some priors grow.
         size: `[B]`: nodes so far.
         left: `[B]`: simulator steps that may still be taken.
         over: `[B]`: whether they are too few for the plan that was to be tried next.
@@ -140,7 +142,7 @@ class _Trees:
         self.steps = planner.num_plans * planner.length
         self.left, self.over = torch.full_like(self.size, self.steps), torch.zeros_like(self.size, dtype=torch.bool)
         self.low, self.high = (self.total.new_full((batch,), sign * torch.inf) for sign in (1, -1))
-        self.kept, self.used = [hidden[:0]] * planner.length, [0] * planner.length
+        self.kept, self.used = [select_rows(hidden, slice(0))] * planner.length, [0] * planner.length
         self.place = torch.zeros(batch, 1, dtype=torch.long)
         every = torch.arange(batch)
         self._keep(every, torch.zeros_like(every), 0, self._legal(state, self.logits), hidden)
@@ -228,7 +230,7 @@ class _Trees:
         rewards = torch.nn.functional.pad(self.reward[starts[:, None], inside], (0, 1))
         states = self.state[starts[:, None], torch.nn.functional.pad(inside, (0, 1))]
         uniform, going, now = uniform.to(self.logits), rows[:0], self.state[:0, 0]
-        logits = hidden = self.logits[:0]
+        logits, hidden = self.logits[:0], self.kept[0]
         for t in range(int(depth.min()) if len(rows) else length, length):
             # All of these plans have t actions behind them, so that the states of the prior have one shape.
             fresh = (depth == t).nonzero()[:, 0]
@@ -236,8 +238,8 @@ class _Trees:
             if len(going):
                 plan[going, t] = self.draw.actions(logits, uniform[going.to(device), t]).cpu()
             if len(fresh):
-                kept = self.kept[t][self.place[own, node].to(device)]
-                hidden = torch.cat([hidden, kept]) if len(going) else kept
+                kept = select_rows(self.kept[t], self.place[own, node].to(device))
+                hidden = join_rows(hidden, kept) if len(going) else kept
             now = torch.cat([now, self.state[own.to(device), node.to(device)]])
             going = torch.cat([going, fresh])
             action, place = plan[going, t].to(device), going.to(device)
@@ -253,7 +255,7 @@ class _Trees:
             if t + 1 < length:
                 logits, hidden = self.stepper.step_in(self.world, action, hidden, now)
                 logits = self._legal(now, logits)
-                self._keep(own, new, t + 1, logits[old:], hidden[old:])
+                self._keep(own, new, t + 1, logits[old:], select_rows(hidden, slice(old, None)))
         return rewards, states
 
     def _legal(self, state: Tensor, logits: Tensor) -> Tensor:
@@ -265,7 +267,7 @@ class _Trees:
             raise ValueError("prior: its logits are NaN")
         return logits
 
-    def _keep(self, rows: Tensor, node: Tensor, depth: int, logits: Tensor, hidden: Tensor) -> None:
+    def _keep(self, rows: Tensor, node: Tensor, depth: int, logits: Tensor, hidden: State) -> None:
         """Keep what the prior predicts at new nodes `[K]`, and its states."""
         if len(rows) == 0:
             return
@@ -274,12 +276,12 @@ class _Trees:
             state = self.state[rows.to(self.device), node.to(self.device)]
             self.closed[rows, node] = ~self.world.legal_actions(state).cpu()
         first, last = self.used[depth], self.used[depth] + len(rows)
-        if last > len(self.kept[depth]):
-            room = hidden.new_empty(2 * last, *hidden.shape[1:])
+        if last > len(tensors_in(self.kept[depth])[0]):
+            room = map_state(lambda values: values.new_empty(2 * last, *values.shape[1:]), hidden)
             if first:  # else the states that are kept have no shape yet
-                room[:first] = self.kept[depth][:first]
+                map_state(lambda new, old: new[:first].copy_(old[:first]), room, self.kept[depth])
             self.kept[depth] = room
-        self.kept[depth][first:last] = hidden
+        map_state(lambda kept, new: kept[first:last].copy_(new), self.kept[depth], hidden)
         self.place[rows, node] = torch.arange(first, last)
         self.used[depth] = last
 

@@ -21,8 +21,9 @@ class Prior(SavedModule):
     """A distribution over sequences of A actions, numbered from 0.
 
     A subclass writes `start`, `step` and `fit`. Samplers and planners use `num_actions`, `start` and `step` alone.
-    `state` is ONE tensor whose first dimension is the batch, so reordering or branching is `state[index]`; its other
-    dimensions are up to the prior. The rows of one state have the same number of actions behind them.
+    `state` is a tensor, or a tuple of tensors (nested where priors hold priors), each with the batch as its first
+    dimension; `neuroprior.sampling.select_rows(state, index)` reorders and branches. The rows of one state have the
+    same number of actions behind them.
 
     `context` is the observation that actions depend on: indices below `num_contexts`, features of size `context_size`,
     or `num_patterns` active patterns; one of the three. It is given once per plan (`[N]`, `[N, C]`: that of the start)
@@ -138,7 +139,7 @@ class Prior(SavedModule):
         self.past_durations = None if past is None else PastDurations(**past)
 
     @abstractmethod
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Any]:
         """Before the first action.
 
         Args:
@@ -146,11 +147,11 @@ class Prior(SavedModule):
             context: `[N]`, `[N, C]` or `[N, F]`: that of the first action; None for a prior without context.
 
         Returns:
-            Logits `[N, A]` of the first action, and the state `[N, ...]`.
+            Logits `[N, A]` of the first action, and the state of N plans.
         """
 
     @abstractmethod
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, Any]:
         """After one more action.
 
         Args:
@@ -162,9 +163,7 @@ class Prior(SavedModule):
             Logits `[N, A]` of the next action, and the next state.
         """
 
-    def advance(
-        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
+    def advance(self, action: Tensor, state: Any, context: Tensor | None = None, room: int = 0) -> tuple[Tensor, Any]:
         """As `step`, for callers that no longer need the old state: it may be overwritten.
 
         Args:

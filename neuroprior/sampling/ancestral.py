@@ -1,6 +1,6 @@
 """Sampling plans from any prior: one by one, by prefix tree, or together with a world."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from neuroprior.sampling.draws import (
     worth_splitting,
 )
 from neuroprior.sampling.prefixes import Prefixes
-from neuroprior.sampling.rows import rows_of
+from neuroprior.sampling.states import State, numbers_in, select_rows
 from neuroprior.sampling.stepping import Steppable, Stepper, legal_logits
 from neuroprior.worlds.world import Rollout, World, join_states
 
@@ -234,30 +234,30 @@ def _sample_in_world(
     return plans.view(shape), Rollout(final.view(*shape[:2], *state.shape[1:]), rewards.view(shape), states)
 
 
-def _parts(number: int, logits: Tensor, state: Tensor, shares: bool) -> list[slice]:
+def _parts(number: int, logits: Tensor, state: State, shares: bool) -> list[slice]:
     """Parts of so many plans that are stepped together: on a CPU, as many as have states that fit a cache."""
     parts = 1
-    if logits.device.type == "cpu" and len(state):  # states that fit a cache are read several times as fast
-        together = max(CACHED // max(state[0].numel(), logits.shape[1], 1), FEWEST)
+    if logits.device.type == "cpu" and len(logits):  # states that fit a cache are read several times as fast
+        together = max(CACHED // max(numbers_in(state) // len(logits), logits.shape[1], 1), FEWEST)
         parts = max(-(-number // together), 1)
         if shares and number >= 2 * FEWEST:
             parts = -(-parts // torch.get_num_threads()) * torch.get_num_threads()
     return [slice(number * part // parts, number * (part + 1) // parts) for part in range(parts)]
 
 
-def _taken(row: Tensor, *tensors: Tensor) -> list[Tensor]:
-    """The rows `row` of each tensor."""
-    return [rows_of(tensor, row) for tensor in tensors]
+def _taken(row: Tensor, *states: Any) -> list[Any]:
+    """The rows `row` of each tensor or state."""
+    return [select_rows(state, row) for state in states]
 
 
-def _begun(row: Tensor, draw: Draw, shared: bool, *tensors: Tensor) -> tuple[Prefixes, list[Tensor]]:
-    """Plans that go on from rows `row [N]` of the tensors, and of these the rows from the first to the last.
+def _begun(row: Tensor, draw: Draw, shared: bool, *states: Any) -> tuple[Prefixes, list[Any]]:
+    """Plans that go on from rows `row [N]` of tensors or states, and of these the rows from the first to the last.
 
     Those that begin alike are stepped once where they are `shared`, unless they are few for the device.
     """
     first, behind = (int(row.min()), int(row.max()) + 1) if len(row) else (0, 0)
     plans = Prefixes(row - first, behind - first, draw.num_actions, shared and not are_few(len(row), row.device))
-    return plans, [tensor[first:behind] for tensor in tensors]
+    return plans, [select_rows(state, slice(first, behind)) for state in states]
 
 
 def _check(num_plans: int, length: int, temperature: float, batch_size: int) -> None:
@@ -319,9 +319,9 @@ def _sample_from_roots(
         if prefix.shape[1] < length:
             levels = levels_worth_splitting(len(counts), total, draw.num_actions)
             room = min(length - prefix.shape[1] - 1, levels)
-            logits, state = stepper.step(action, rows_of(state, parent), None, room)
+            logits, state = stepper.step(action, select_rows(state, parent), None, room)
     row = shuffled_rows(counts, root, draw.generator)
-    depth, begun = prefix.shape[1], rows_of(prefix, row)
+    depth, begun = prefix.shape[1], prefix[row]
     if depth == length:
         return begun
     plans = torch.empty(total, length, dtype=draw.dtype, device=counts.device)
@@ -334,7 +334,7 @@ def _sample_from_roots(
 
 
 def _sample_one_by_one(
-    stepper: Stepper, row: Tensor, logits: Tensor, state: Tensor, context: Tensor | None, steps: range, draw: Draw
+    stepper: Stepper, row: Tensor, logits: Tensor, state: State, context: Tensor | None, steps: range, draw: Draw
 ) -> Tensor:
     """The actions `[N, len(steps)]` of N plans at these `steps`; plan i continues row `row[i]` of logits and state."""
     actions = torch.empty(len(row), len(steps), dtype=draw.dtype, device=row.device)
@@ -348,7 +348,7 @@ def _sample_one_by_one(
             if k + 1 < len(steps):
                 parent, last = plans.extend(action)
                 if parent is not None:
-                    hidden = rows_of(hidden, parent)
+                    hidden = select_rows(hidden, parent)
                 if plans.row is None and context is None:
                     rest = stepper.draw_rest(last, hidden, uniform[k + 1 :, part], draw.temperature)
                     if rest is not None:

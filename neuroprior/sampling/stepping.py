@@ -11,6 +11,7 @@ from neuroprior._checks import check_same_names, is_integer
 from neuroprior._threads import one_thread
 from neuroprior.plans import is_per_step
 from neuroprior.sampling.draws import Draw, after_end, are_few
+from neuroprior.sampling.states import State
 from neuroprior.worlds.world import World, check_is_world
 
 FEWEST_TO_SHARE = 256
@@ -26,7 +27,7 @@ nothing, and on a busy machine wait for one another for milliseconds at each ope
 class Steppable(Protocol):
     """What samplers and planners need of a prior: any class with these three will do.
 
-    The state is ONE tensor whose first dimension is the batch, so that reordering and branching are `state[index]`.
+    The state is a tensor or a tuple of tensors, each with the batch as its first dimension; see `select_rows`.
 
     What a prior may offer besides, and is then used (every `neuroprior.priors.Prior` offers all of it):
 
@@ -51,10 +52,10 @@ class Steppable(Protocol):
     @property
     def num_actions(self) -> int: ...
 
-    def start(self, batch_size: int, /) -> tuple[Tensor, Tensor]:
-        """Logits `[N, A]` of the first action, and the state `[N, ...]`, for N = `batch_size` plans."""
+    def start(self, batch_size: int, /) -> tuple[Tensor, Any]:
+        """Logits `[N, A]` of the first action, and the state, for N = `batch_size` plans."""
 
-    def step(self, action: Tensor, state: Tensor, /) -> tuple[Tensor, Tensor]:
+    def step(self, action: Tensor, state: Any, /) -> tuple[Tensor, Any]:
         """Logits `[N, A]` of the next action and the next state, after `action [N]` (int64) in `state`."""
 
 
@@ -115,15 +116,13 @@ class Stepper:
                 f"context: this prior {'takes none' if context is not None else 'takes one, and none was given'}"
             )
 
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Logits `[N, A]` of the first action, and the state `[N, ...]`."""
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
+        """Logits `[N, A]` of the first action, and the state."""
         with self.threads_for(batch_size):
             logits, state = self._prior.start(batch_size) if context is None else self._prior.start(batch_size, context)
         return logits, state
 
-    def step(
-        self, action: Tensor, state: Tensor, context: Tensor | None = None, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, action: Tensor, state: State, context: Tensor | None = None, room: int = 0) -> tuple[Tensor, State]:
         """Logits `[N, A]` of the next action, and the next state; `room` more steps will follow.
 
         After the end symbol nothing else has a probability above 0.
@@ -137,19 +136,19 @@ class Stepper:
                 logits, state = self._prior.step(action, state, context)
         return after_end(logits, action, self.end), state
 
-    def draw_rest(self, action: Tensor, state: Tensor, uniform: Tensor, temperature: float) -> Tensor | None:
+    def draw_rest(self, action: Tensor, state: State, uniform: Tensor, temperature: float) -> Tensor | None:
         """The rest of N plans, `[N, T]`, where the prior draws it at once; see `Steppable`."""
         rest: Tensor | None = None if self._draw_rest is None else self._draw_rest(action, state, uniform, temperature)
         return rest
 
-    def draw_plans(self, state: Tensor, counts: Tensor, length: int, draw: Draw) -> Tensor | None:
+    def draw_plans(self, state: State, counts: Tensor, length: int, draw: Draw) -> Tensor | None:
         """Plans from few states, where the prior draws them at once; see `Steppable`."""
         if self._draw_plans is None:
             return None
         plans: Tensor | None = self._draw_plans(state, counts, length, draw.temperature, draw.generator)
         return plans
 
-    def start_in(self, world: World, state: Tensor) -> tuple[Tensor, Tensor]:
+    def start_in(self, world: World, state: Tensor) -> tuple[Tensor, State]:
         """As `start`, with the observation of `state [B, ...]` as context.
 
         Raises:
@@ -165,8 +164,8 @@ class Stepper:
         return self.start(len(state), context)
 
     def step_in(
-        self, world: World, action: Tensor, state: Tensor, reached: Tensor, room: int = 0
-    ) -> tuple[Tensor, Tensor]:
+        self, world: World, action: Tensor, state: State, reached: Tensor, room: int = 0
+    ) -> tuple[Tensor, State]:
         """As `step`, after `action` led to the world's states `reached [N, ...]`; each is observed once."""
         if self.context_per == "step" and self._advance_shared is not None and _numbered(reached):
             pair, row = (reached * self.num_actions + action).unique(return_inverse=True)

@@ -9,6 +9,7 @@ from torch import Tensor
 from neuroprior.plans import Plans, all_plans, is_per_step
 from neuroprior.priors import Prior, load, save
 from neuroprior.sampling.ancestral import sample
+from neuroprior.sampling.states import select_rows
 from neuroprior.testing.chi_square import chi_square
 from neuroprior.testing.rules import FALSE_ALARM, PRIOR_CHECKS, check_by_kind, require
 
@@ -104,13 +105,15 @@ def _check_stepping(prior: Prior, plans: Tensor, context: Tensor | None) -> None
     for t in range(length):
         kind = "no context" if context is None else f"context {list(context.shape)}"
         where = f"plans of length {length}, action {t}, {kind}"
-        require(isinstance(state, Tensor) and len(state) == num, f"state must be one tensor of {num} rows ({where})")
+        require(_has_rows(state, num), f"state must be a tensor of {num} rows, or a tuple of such tensors ({where})")
         require(logits.shape == (num, prior.num_actions), f"logits {list(logits.shape)} ({where})")
         gap = float((logits.log_softmax(-1) - whole[:, t]).abs().nan_to_num(0).max())
         require(gap < rounding, f"stepping differs from forward by {gap:.2g} nats ({where})")
         if t + 1 < length:
             given = _at(context, t + 1) if is_per_step(context) else None
-            backwards, _ = prior.step(plans[order, t], state[order], None if given is None else given[order])
+            backwards, _ = prior.step(
+                plans[order, t], select_rows(state, order), None if given is None else given[order]
+            )
             logits, state = prior.step(plans[:, t], state, given)
             gap = float((backwards[order] - logits).abs().nan_to_num(0).max())
             require(gap < rounding, f"reordering the state changes the logits by {gap:.2g} ({where})")
@@ -130,7 +133,13 @@ def _check_advancing(prior: Prior, plans: Tensor, context: Tensor | None) -> Non
                 gap = float((again - logits).abs().nan_to_num(0).max())
                 require(gap < 1e-4, f"advance differs from step by {gap:.2g} (action {t}, room {room})")
                 if t % 2:  # states that were picked out go on by themselves
-                    other = other[torch.arange(num, device=other.device)]
+                    other = select_rows(other, torch.arange(num, device=plans.device))
+
+
+def _has_rows(state: object, num: int) -> bool:
+    if isinstance(state, tuple):
+        return len(state) > 0 and all(_has_rows(part, num) for part in state)
+    return isinstance(state, Tensor) and state.dim() > 0 and len(state) == num
 
 
 def _at(context: Tensor | None, t: int) -> Tensor | None:

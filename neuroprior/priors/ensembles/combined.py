@@ -22,11 +22,11 @@ from neuroprior.priors.ensembles.mixture import (
     priors_in,
     weights_before,
 )
-from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.neural.neural import training_settings
 from neuroprior.priors.prior import Prior, as_prior, described, taken_of
 from neuroprior.priors.uniform import UniformPrior
+from neuroprior.sampling.states import State
 
 LEAST = -30.0
 """Log-probabilities of experts are at least this in the pool."""
@@ -172,22 +172,18 @@ class CombinedPrior(MixturePrior):
             for e, one in zip(aside, described_ones, strict=True):
                 e.restore(one["learned"])
             setattr(self, name, nn.ModuleList(aside).to(self.device))
-        # In files of older versions a flag: whether `fit` begins with those that are there, or chooses anew.
-        every, given = [*self.alternatives, *priors_in(self.left_out)], learned.get("given", True)
-        order = list(range(len(every))) if given is True else given or None
+        every, order = [*self.alternatives, *priors_in(self.left_out)], learned["given"]
         if order is not None and sorted(order) != list(range(len(every))):
-            raise ValueError(f"given: the numbers of {len(every)} experts are expected, not {given!r}")
+            raise ValueError(f"given: the numbers of {len(every)} experts are expected, not {order!r}")
         self.given = None if order is None else [[every[number] for number in order]]
         self._allocate()
 
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         found = [e.start(batch_size, context_for(e, context)) for e in self._experts()]
         return self._mixed_now(self.first.expand(batch_size, -1), self.tracking.expand(batch_size, -1), found)
 
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if len(state) == 0:
-            return torch.zeros(0, self.num_actions, device=self.device), state
-        weights, tracking, forecasts, *states = unpack(state, 3 + len(self.experts))
+    def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        weights, tracking, forecasts, *states = state
         found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
         taken = taken_of(forecasts, action)
         weights = after(weights, taken, self.first, 0)
@@ -195,14 +191,12 @@ class CombinedPrior(MixturePrior):
             tracking = after(tracking, taken[:, :-1], self.tracking, self.share)
         return self._mixed_now(weights, tracking, found)
 
-    def _mixed_now(
-        self, weights: Tensor, tracking: Tensor, found: list[tuple[Tensor, Tensor]]
-    ) -> tuple[Tensor, Tensor]:
+    def _mixed_now(self, weights: Tensor, tracking: Tensor, found: list[tuple[Tensor, State]]) -> tuple[Tensor, State]:
         """The logits `[N, A]` and the state, from all weights and from what the experts returned."""
         forecasts = with_pool(torch.stack([logits.log_softmax(-1) for logits, _ in found], 1), self.powers)
         if self.share:
             forecasts = torch.cat([forecasts, mixed(tracking, forecasts)[:, None]], 1)
-        return mixed(weights, forecasts), pack([weights, tracking, forecasts, *(state for _, state in found)])
+        return mixed(weights, forecasts), (weights, tracking, forecasts, *(state for _, state in found))
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:

@@ -10,9 +10,9 @@ from neuroprior._checks import check_alike_named, check_share
 from neuroprior._random import generator_on
 from neuroprior.plans import Plans
 from neuroprior.plans.folds import check_alike, fair_split, ungrouped
-from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.ensembles.stacked import context_for
 from neuroprior.priors.prior import Prior, as_prior, described, taken_of
+from neuroprior.sampling.states import State
 
 SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Candidates for the share; `fit` takes the best."""
@@ -116,15 +116,13 @@ class MixturePrior(Prior):
         for expert, own in zip(self._experts(), learned["experts"], strict=True):
             expert.restore(own)
 
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         found = [e.start(batch_size, context_for(e, context)) for e in self._experts()]
         weights = self.first.expand(batch_size, -1)
         return self._mixed(weights, found)
 
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if len(state) == 0:
-            return torch.zeros(0, self.num_actions, device=self.device), state
-        weights, forecasts, *states = unpack(state, 2 + len(self.experts))
+    def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        weights, forecasts, *states = state
         found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), states, strict=True)]
         return self._mixed(after(weights, taken_of(forecasts, action), self.first, self.share), found)
 
@@ -204,9 +202,9 @@ class MixturePrior(Prior):
         """`[N, L, E, A]`: the log-probabilities of each expert."""
         return torch.stack([e(plans, context_for(e, context)).log_softmax(-1) for e in self._experts()], 2)
 
-    def _mixed(self, weights: Tensor, found: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    def _mixed(self, weights: Tensor, found: list[tuple[Tensor, State]]) -> tuple[Tensor, State]:
         forecasts = torch.stack([logits.log_softmax(-1) for logits, _ in found], 1)
-        return mixed(weights, forecasts), pack([weights, forecasts, *(state for _, state in found)])
+        return mixed(weights, forecasts), (weights, forecasts, *(state for _, state in found))
 
 
 def priors_in(modules: nn.ModuleList) -> list[Prior]:

@@ -12,10 +12,10 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import FEWEST_UNITS, divisible, folds, in_parts, num_units
 from neuroprior.priors.counts import ContextTreePrior, HistoryPrior, MarkovPrior
-from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.neural.gru import gru_sequence
 from neuroprior.priors.neural.neural import NeuralPrior, Sizes, context_embedding
 from neuroprior.priors.prior import Prior
+from neuroprior.sampling.states import State
 
 LEAST = -6.0
 """Log-probabilities of experts are at least this in the network's inputs."""
@@ -101,8 +101,7 @@ class StackedPrior(Prior):
     def config(self) -> dict[str, Any]:
         own: dict[str, Any] = {"hidden_size": self.hidden_size, "dropout": self.dropout}
         given = self.mixer.arguments()
-        # One layer, as all had before, is left out where it was chosen: checkpoints of agents compare settings.
-        if given["num_layers"] is not None and (given["num_layers"] > 1 or "seed" in given):
+        if given["num_layers"] is not None:
             own["num_layers"] = given["num_layers"]
         own |= {"seed": given["seed"]} if given.get("seed") else {}
         return super().config | own | {"orders": list(self.orders), "depth": self.depth}
@@ -111,25 +110,25 @@ class StackedPrior(Prior):
     def learned(self) -> dict[str, Any]:
         return super().learned | {"network": self.mixer.learned}
 
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         forecasts, states = zip(*(e.start(batch_size, context_for(e, context)) for e in self._experts()), strict=True)
         ago = torch.full((batch_size, (self.num_contexts or 0) * self.num_actions), LONG_AGO, device=self.device)
         logits, hidden = self.mixer.start(batch_size, self._features(torch.stack(forecasts, 1), ago, context))
-        return logits, self._packed(hidden, states, ago, context)
+        return logits, self._state(hidden, states, ago, context)
 
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if len(state) == 0:
-            return torch.zeros(0, self.num_actions, device=self.device), state
-        hidden, before, ago, last = self._unpacked(state)
+    def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        hidden, before, ago, *known = state
         if self.num_contexts is not None:
-            assert last is not None
+            (last,) = known
             ago = ago.add(1).clamp_(max=LONG_AGO)
             ago = ago.scatter(1, (last * self.num_actions + action.long())[:, None], 1.0)
             context = last if context is None else context.long()
-        found = [e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), before, strict=True)]
+        found = [
+            e.step(action, s, context_for(e, context)) for e, s in zip(self._experts(), before.unbind(1), strict=True)
+        ]
         forecasts, states = zip(*found, strict=True)
         logits, hidden = self.mixer.step(action, hidden, self._features(torch.stack(forecasts, 1), ago, context))
-        return logits, self._packed(hidden, states, ago, context)
+        return logits, self._state(hidden, states, ago, context)
 
     def forward(self, plans: Tensor, context: Tensor | None = None) -> Tensor:
         if plans.shape[1] == 0:
@@ -195,9 +194,7 @@ class StackedPrior(Prior):
 
     def restore(self, learned: dict[str, Any]) -> None:
         super().restore(learned)
-        # What was saved when no network had more layers says nothing of it.
-        one_layer = {"window": None, "sizes": [self.hidden_size, 1, self.dropout, 1]}
-        self.mixer.restore(learned.get("network", self.mixer.learned | one_layer))
+        self.mixer.restore(learned["network"])
 
     def _forecasts(self, plans: Plans, generator: torch.Generator) -> Tensor:
         """`[N, L, E, A]`: log-probabilities of experts that did not learn from the plan they predict."""
@@ -259,14 +256,9 @@ class StackedPrior(Prior):
             last.scatter_(1, code[:, t, None], float(t))
         return ago.clamp_(max=LONG_AGO)
 
-    def _packed(self, hidden: Tensor, states: tuple[Tensor, ...], ago: Tensor, context: Tensor | None) -> Tensor:
-        """The state: the network's, each expert's, how long ago each action was taken, and the context."""
-        return pack([hidden, torch.stack(states, 1), ago, *([] if context is None else [context.long()])])
-
-    def _unpacked(self, state: Tensor) -> tuple[Tensor, list[Tensor], Tensor, Tensor | None]:
-        """The parts of a state."""
-        hidden, states, ago, *last = unpack(state, 3 + (self.num_contexts is not None))
-        return hidden, list(states.unbind(1)), ago, last[0] if last else None
+    def _state(self, hidden: State, states: tuple[Tensor, ...], ago: Tensor, context: Tensor | None) -> State:
+        """The network's state, those of the experts `[N, E]`, how long ago each action was taken, and the context."""
+        return (hidden, torch.stack(states, 1), ago, *([] if context is None else [context.long()]))
 
 
 class Mixer(NeuralPrior):

@@ -9,9 +9,9 @@ from torch import Tensor
 from neuroprior._checks import check_sizes
 from neuroprior._hashing import row_hashes
 from neuroprior.plans import Plans
-from neuroprior.priors.ensembles.packing import pack, unpack
 from neuroprior.priors.macros.macros import CRITERIA, Criterion, Macro, macros_of
 from neuroprior.priors.prior import Prior, as_prior, described
+from neuroprior.sampling.states import State, join_rows, map_state, select_rows, tensors_in
 
 
 class MacroPrior(Prior):
@@ -121,35 +121,28 @@ class MacroPrior(Prior):
         return self
 
     @torch.no_grad()  # `fit` trains the inner prior itself
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         logits, state = self._inner().start(batch_size)
         row = torch.arange(batch_size, device=logits.device)
         return self._joined([self._parses(row, logits.new_zeros(batch_size), logits, state)], batch_size)
 
     @torch.no_grad()
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        if len(state) == 0:  # of which nothing can be unpacked
-            return torch.zeros(0, self.num_actions, device=self.device), state
-        action, groups = action.long(), self._unpacked(state)
+    def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
+        action, groups = action.long(), [_Parses.unpadded(*group) for group in state]
         after = [[parses.within(action, self.symbol_actions)] for parses in groups]
         for place, parses in enumerate(groups):
             extended = self._extended(parses, action)
             # Parses with one more symbol form a group of their own, since their states may be of another size.
-            further = place + (extended.state.dim() > 1)
+            further = place + (not isinstance(extended.state, Tensor) or extended.state.dim() > 1)
             if further == len(after):
                 after.append([])
             after[further].append(extended)
-        return self._joined(_most_probable([_merged(some) for some in after], len(state), self.MOST), len(state))
+        return self._joined(_most_probable([_merged(some) for some in after], len(action), self.MOST), len(action))
 
     def _extended(self, parses: "_Parses", action: Tensor) -> "_Parses":
         """The parses with one more symbol, which begins with `action [N]`."""
         free = parses.place == 0
-        row, weight, log_probs, state = (
-            parses.row[free],
-            parses.weight[free],
-            parses.log_probs[free],
-            parses.state[free],
-        )
+        row, weight, _, log_probs, state = parses.taken(free)
         symbols = self.symbols_from[action[row]]
         parse, which = (symbols >= 0).nonzero(as_tuple=True)
         symbol = symbols[parse, which]
@@ -159,32 +152,30 @@ class MacroPrior(Prior):
         inner = self._inner()
         if len(parse) == 0:
             return parses.taken(parse)
-        logits, after = inner.step(symbol, state[parse])
+        logits, after = inner.step(symbol, select_rows(state, parse))
         found = self._parses(row[parse], weight, logits, after)
         longer = (self.symbol_actions[symbol] >= 0).sum(1) > 1
         place = torch.where(longer, symbol * self.symbol_actions.shape[1] + 1, 0)
         return found._replace(place=place)
 
-    def _parses(self, row: Tensor, weight: Tensor, logits: Tensor, state: Tensor) -> "_Parses":
+    def _parses(self, row: Tensor, weight: Tensor, logits: Tensor, state: State) -> "_Parses":
         """Parses at whose end the inner prior gives `logits`; macros that were not learned have probability 0."""
         unknown = torch.arange(logits.shape[1], device=logits.device) >= self.num_actions + len(self.macros)
         log_probs = logits.masked_fill(unknown, -torch.inf).log_softmax(-1)
         return _Parses(row, weight, torch.zeros_like(row), log_probs, state)
 
-    def _joined(self, groups: Sequence["_Parses"], batch: int) -> tuple[Tensor, Tensor]:
+    def _joined(self, groups: Sequence["_Parses"], batch: int) -> tuple[Tensor, State]:
         """Logits and state of `batch` plans: probabilities are summed over parses, whose weights then sum to one."""
         total = torch.full((batch,), -torch.inf, dtype=torch.float64, device=self.device)
         for parses in groups:
             total = torch.logaddexp(total, _log_sums(parses.weight, parses.row, batch))
         probs = torch.zeros(batch, self.num_actions, dtype=torch.float64, device=self.device)
-        parts: list[Tensor] = []
+        state: list[State] = []
         for parses in groups:
             weight = (parses.weight.double() - total[parses.row]).exp()
             probs.index_add_(0, parses.row, weight[:, None] * self._next(parses))
-            parts += parses._replace(weight=weight.log()).padded(batch)
-        logits = probs.log().float()
-        groups_of = torch.full((batch, 1), float(len(groups)), device=self.device)
-        return logits, torch.cat([groups_of, pack(parts)], 1)
+            state.append(parses._replace(weight=weight.log()).padded(batch))
+        return probs.log().float(), tuple(state)
 
     def _next(self, parses: "_Parses") -> Tensor:
         """The probabilities `[R, A]` of the next action under each parse."""
@@ -195,12 +186,6 @@ class MacroPrior(Prior):
         coming = self.symbol_actions[parses.place.div(size, rounding_mode="floor"), parses.place % size]
         certain = torch.nn.functional.one_hot(coming, self.num_actions).double()
         return torch.where((parses.place > 0)[:, None], certain, free)
-
-    def _unpacked(self, state: Tensor) -> list["_Parses"]:
-        """The parses in a state."""
-        groups = int(state[0, 0])
-        parts = unpack(state[:, 1:], 4 * groups)
-        return [_Parses.unpadded(*parts[k : k + 4]) for k in range(0, 4 * groups, 4)]
 
     def _set_macros(self, macros: Sequence[Macro]) -> None:
         """Set the macros, and the tables of their actions."""
@@ -230,18 +215,18 @@ class _Parses(NamedTuple):
         weight: `[R]`: the logarithm of the probability.
         place: `[R]`: 0 at the end of a symbol; within symbol s, before its action i: s * longest + i.
         log_probs: `[R, A + M]`: the log-probabilities of the next symbol.
-        state: `[R]` or `[R, D]`: the inner prior's state.
+        state: the inner prior's, of R plans.
     """
 
     row: Tensor
     weight: Tensor
     place: Tensor
     log_probs: Tensor
-    state: Tensor
+    state: Any
 
     def taken(self, some: Tensor) -> "_Parses":
         """Some of the parses, by index or by mask."""
-        return _Parses(*(part[some] for part in self))
+        return _Parses(*(map_state(lambda values: values[some], part) for part in self))
 
     def within(self, action: Tensor, symbol_actions: Tensor) -> "_Parses":
         """The parses within a symbol whose next action is `action [N]`."""
@@ -253,35 +238,39 @@ class _Parses(NamedTuple):
         more = (turn < size) & (symbol_actions[symbol, turn.clamp(max=size - 1)] >= 0)
         return left._replace(place=torch.where(more, left.place + 1, 0))
 
-    def padded(self, batch: int) -> list[Tensor]:
+    def padded(self, batch: int) -> tuple[State, ...]:
         """Weight, place, log_probs and state as `[batch, K, ...]`; beyond a plan's parses the weight is -inf."""
         parses = self.taken(self.row.argsort(stable=True))
         count = parses.row.bincount(minlength=batch)
         turn = torch.arange(len(parses.row), device=parses.row.device) - (count.cumsum(0) - count)[parses.row]
         wide = max(int(count.max()) if batch else 0, 1)
-        parts: list[Tensor] = []
-        for part in (parses.weight.float(), parses.place, parses.log_probs, parses.state):
-            padded = part.new_full((batch, wide, *part.shape[1:]), 0 if parts else -torch.inf)
-            padded[parses.row, turn] = part
-            parts.append(padded)
-        return parts
+
+        def pad(values: Tensor, fill: float = 0.0) -> Tensor:
+            padded = values.new_full((batch, wide, *values.shape[1:]), fill)
+            padded[parses.row, turn] = values
+            return padded
+
+        rest = (parses.place, parses.log_probs, parses.state)
+        return (pad(parses.weight.float(), -torch.inf), *(map_state(pad, part) for part in rest))
 
     @classmethod
-    def unpadded(cls, weight: Tensor, place: Tensor, log_probs: Tensor, state: Tensor) -> "_Parses":
+    def unpadded(cls, weight: Tensor, place: Tensor, log_probs: Tensor, state: State) -> "_Parses":
         """The inverse of `padded`."""
         row, turn = (weight > -torch.inf).nonzero(as_tuple=True)
-        return cls(row, *(part[row, turn] for part in (weight, place, log_probs, state)))
+        parts = (weight, place, log_probs, state)
+        return cls(row, *(map_state(lambda values: values[row, turn], part) for part in parts))
 
 
 def _merged(some: Sequence[_Parses]) -> _Parses:
     """All of these parses; those of the same plan in the same state are merged into one."""
     # The state of an empty group may be of another size.
     there = [parses for parses in some if len(parses.row)] or some[:1]
-    parses = _Parses(*(torch.cat(parts) for parts in zip(*there, strict=True)))
+    parses = _Parses(*(join_rows(*parts) for parts in zip(*there, strict=True)))
     if len(parses.row) < 2:
         return parses
-    state = parses.state.reshape(len(parses.row), -1)
-    key = torch.cat([parses.row[:, None].double(), parses.place[:, None].double(), state.double()], 1)
+    columns = [parses.row[:, None].double(), parses.place[:, None].double()]
+    columns += [values.reshape(len(parses.row), -1).double() for values in tensors_in(parses.state)]
+    key = torch.cat(columns, 1)
     _, group = row_hashes(key).unique(return_inverse=True)
     groups = int(group.max()) + 1
     first = torch.full((groups,), len(group), device=group.device)

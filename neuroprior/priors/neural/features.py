@@ -22,9 +22,6 @@ CONSTANT = 1e-6
 MOST_ROWS = 2**16
 """Of more values, so many are drawn, always the same ones: they say enough."""
 
-UNSCALED = {"mean": 0.0, "std": 1.0, "most": torch.inf}
-"""What changes nothing."""
-
 
 class Standardise(nn.Module):
     """Subtracts means and divides by standard deviations, those of the first plans that a network learned from.

@@ -1,9 +1,8 @@
 """The base of the neural priors: inputs, the window beyond the training length, and fitting."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +12,7 @@ from neuroprior._random import draw_seed, generator_on
 from neuroprior.plans import Plans, is_per_step
 from neuroprior.plans.folds import check_alike
 from neuroprior.priors.neural import cuda_graphs as recordings
-from neuroprior.priors.neural.features import UNSCALED, Standardise
+from neuroprior.priors.neural.features import Standardise
 from neuroprior.priors.prior import Prior
 from neuroprior.sampling.draws import Draw, check_possible
 
@@ -101,8 +100,6 @@ class NeuralPrior(Prior):
     Raises:
         ValueError: an argument is out of range.
     """
-
-    later: ClassVar[Mapping[str, float]] = {f"embedding.scale.{name}": value for name, value in UNSCALED.items()}
 
     actions_at_once = 2**18
     shares_steps = True

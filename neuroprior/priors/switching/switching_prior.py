@@ -17,6 +17,7 @@ from neuroprior.priors.prior import taken_of
 from neuroprior.priors.switching.forward_backward import TINY, Smoothed, most_probable_path, predict, smooth
 from neuroprior.priors.switching.mode_chains import ModeChains
 from neuroprior.priors.switching.spectral_start import spectral_modes
+from neuroprior.sampling.states import State
 
 SEGMENT = 20
 """Mean length of the random segments, a mode each, that a fit starts from."""
@@ -171,14 +172,14 @@ class SwitchingPrior(HistoryPrior):
 
     # Stepping: the state is the filtered modes and the history.
 
-    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def start(self, batch_size: int, context: Tensor | None = None) -> tuple[Tensor, State]:
         node = self.start_node.long().expand(batch_size)
         context = torch.zeros_like(node) if context is None else context.long()
         return self._forecast(self.first.expand(batch_size, -1), node, context)
 
-    def step(self, action: Tensor, state: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def step(self, action: Tensor, state: Any, context: Tensor | None = None) -> tuple[Tensor, State]:
         contexts, action = self.num_contexts or 1, action.long()
-        modes, code = state[:, :-1], state[:, -1].long()
+        modes, code = state
         node, last = code.div(contexts, rounding_mode="floor"), code % contexts
         modes = modes * self._likelihood(self.log_probs[self._row(node, last)], action)
         modes = modes / modes.sum(-1, keepdim=True).clamp(min=TINY)
@@ -186,10 +187,10 @@ class SwitchingPrior(HistoryPrior):
         modes = (modes[:, :, None] * self._matrices()[self._cell(context)]).sum(1)
         return self._forecast(modes, self.next_node.view(-1)[node * self.num_actions + action].long(), context)
 
-    def _forecast(self, modes: Tensor, node: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-        """The logits, and the state `[N, K * D + 1]`, float64: the modes before the action, and where the chain is."""
+    def _forecast(self, modes: Tensor, node: Tensor, context: Tensor) -> tuple[Tensor, State]:
+        """The logits, and the state: the modes before the action `[N, K * D]`, and where the chain is, int64 `[N]`."""
         logits = self._mixed(modes, self.log_probs[self._row(node, context)])
-        return logits, torch.cat([modes, (node * (self.num_contexts or 1) + context).double()[:, None]], -1)
+        return logits, (modes, node * (self.num_contexts or 1) + context)
 
     def _mixed(self, modes: Tensor, log_probs: Tensor) -> Tensor:
         """Logits `[..., A]` of modes `[..., K * D]` with their actions' log-probabilities `[..., K, A]`."""

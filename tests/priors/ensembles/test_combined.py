@@ -261,11 +261,6 @@ def test_experts_that_were_left_out_are_saved_and_count_all_plans(tmp_path):
         assert one.log_prob(other).equal(same.log_prob(other))
     # It tries them again when it is fitted again.
     assert [type(e) for e in again.fit(plans, generator=seeded(0)).spare] == [MarkovPrior]
-    # Files of earlier versions have none, and say only whether experts were given.
-    learned = prior.learned | {"given": True}
-    del learned["spare"], learned["left_out"]
-    again.restore(learned)
-    assert len(again.spare) == 0
 
 
 def test_all_given_experts_are_saved_for_the_next_fit(tmp_path):

@@ -19,7 +19,6 @@ from neuroprior import (
     save,
 )
 from neuroprior.priors.ensembles.mixture import divided
-from neuroprior.priors.ensembles.packing import DIGITS, pack, unpack
 from neuroprior.testing import check_prior
 from tests.support.sources import every_plan, seeded
 
@@ -164,22 +163,6 @@ def test_it_is_saved_and_loaded(tmp_path):
 def test_experts_that_do_not_fit(made, more, word):
     with pytest.raises(ValueError, match=word):
         MixturePrior(A, made, **more)
-
-
-def test_states_side_by_side():
-    parts = [
-        torch.tensor([0, 7, DIGITS - 1, DIGITS, DIGITS * 5 + 3]),
-        torch.randn(5, 2),
-        torch.randint(2**40, (5, 3)),
-        torch.randn(5, 2, 4),
-        torch.zeros(5, 0),
-    ]
-    packed = pack(parts)
-    assert packed.dtype == torch.float32
-    for before, after in zip(parts, unpack(packed, 5), strict=True):
-        assert after.shape == before.shape
-        assert after.equal(before)
-    assert all(a.equal(b[[3, 1]]) for a, b in zip(unpack(packed[[3, 1]], 5), parts, strict=True))
 
 
 @pytest.mark.parametrize(("length", "held_out"), [(1, 100), (10, 100), (80, 62), (200, 25), (500, 20)])

@@ -1,6 +1,5 @@
 """The stacked prior: its network's inputs, that experts forecast plans new to them, and what it gains."""
 
-import json
 import math
 
 import pytest
@@ -61,7 +60,7 @@ def test_its_input_is_how_long_ago_an_action_was_taken_here():
     _, state = prior.start(6, context[:, 0])
     for t in range(19):
         _, state = prior.step(actions[:, t], state, context[:, t + 1])
-        _, _, since, here = prior._unpacked(state)
+        _, _, since, here = state
         assert here.equal(context[:, t + 1])
         code = here[:, None] * A + torch.arange(A)
         assert ((since.gather(1, code) + 1).log() * 2 / 3).allclose(ago[:, t + 1], atol=1e-5)
@@ -170,16 +169,3 @@ def test_its_layers_follow_from_its_first_plans_and_are_saved(tmp_path):
         3,
         2000,
     )
-
-
-def test_models_that_were_saved_when_networks_had_one_layer_still_load(tmp_path):
-    plans = some_plans(8, 40).without_context()
-    prior = StackedPrior(A, 8, orders=(1, 2), depth=3, num_layers=1)
-    folder = save(prior.fit(plans, generator=seeded(0), max_steps=2, progress=False), tmp_path / "old")
-    description = json.loads((folder / "config.json").read_text())
-    del description["learned"]["network"]
-    (folder / "config.json").write_text(json.dumps(description))
-    again = load(folder)
-    assert again.log_prob(plans).equal(prior.log_prob(plans))
-    again.fit(plans, generator=seeded(0), max_steps=2, progress=False)
-    assert again.mixer.num_layers == 1

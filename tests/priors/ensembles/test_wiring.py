@@ -12,7 +12,6 @@ from neuroprior.priors.ensembles import stacked
 from neuroprior.priors.ensembles.candidates import NETWORKS, ORDERS, best_chain, counting_parts, fitted_experts
 from neuroprior.priors.ensembles.combined import HeldOut
 from neuroprior.priors.ensembles.mixture import SHARES, divided
-from neuroprior.priors.ensembles.packing import DIGITS, pack, unpack
 from tests.support.sources import seeded
 
 A = 3
@@ -185,18 +184,6 @@ def test_groups_stay_together_where_they_are_many():
         if whole:
             assert not set(parts[0].group.tolist()) & set(parts[1].group.tolist())
             assert len(parts[1].group.unique()) == number // 10
-
-
-def test_states_are_what_they_were():
-    """Truth values stay such, and integers integers, of any shape; states of one size are unpacked in any order."""
-    whole = torch.tensor([0, DIGITS - 1, DIGITS, 2**40 + 1, 2**48 - 1])
-    parts = [torch.rand(5, 2, 3) > 0.5, whole, torch.rand(5, 1), whole[:, None].expand(5, 4) - whole[:1], whole < 9]
-    for order in permutations(range(5), 3):
-        given = [parts[i] for i in order]
-        for before, after in zip(given, unpack(pack(given), 3), strict=True):
-            assert (before.dtype == torch.bool) == (after.dtype == torch.bool)
-            assert before.is_floating_point() == after.is_floating_point()
-            assert after.equal(before)
 
 
 def test_powers_of_experts_that_say_the_same_are_even():

@@ -1,14 +1,10 @@
 """Features are standardised before networks read them: units and missing codes make no difference."""
 
-import hashlib
-import json
-
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
-from neuroprior import GRUPrior, Plans, TransformerPrior, load, save
-from neuroprior.control import VectorGRU, VectorPlans, VectorPrior, VectorTransformer
+from neuroprior import GRUPrior, Plans, TransformerPrior
+from neuroprior.control import VectorGRU, VectorPlans, VectorTransformer
 from neuroprior.priors.neural.features import Standardise
 from tests.support.sources import seeded
 
@@ -146,32 +142,3 @@ def test_features_that_single_precision_does_not_hold_are_not_learned_from():
     with pytest.raises(ValueError, match=r"context: feature 1 of 1 .* single precision"):
         prior.fit(Plans(actions, 3, context=1.7e9 + context), generator=seeded(0), **HOW)
     prior.fit(Plans(actions, 3, context=context), generator=seeded(0), **HOW | {"max_steps": 2})
-
-
-@torch.no_grad()
-def test_files_without_means_are_read_as_before(tmp_path):
-    """Features of older networks over actions were not standardised; those over vectors were, without a limit."""
-    plans = signs(lambda x: 3 * x + 1)
-    prior = GRUPrior(2, 8, context_size=2)
-    save(prior, tmp_path / "actions")  # not trained: nothing is changed
-    _edit(tmp_path / "actions", lambda name: None if ".scale." in name else name)
-    assert load(tmp_path / "actions").log_prob(plans).equal(prior.log_prob(plans))
-    vectors = VectorGRU([-1.0], [1.0], 2, width=8)
-    vectors.features.mean.fill_(1.0)
-    vectors.features.std.fill_(3.0)
-    save(vectors, tmp_path / "vectors")
-    older = {"features.mean": "_mean", "features.std": "_std", "features.most": None}
-    _edit(tmp_path / "vectors", lambda name: older.get(name, name))
-    given = VectorPlans(torch.zeros(30, 12, 1), [-1.0], [1.0], context=plans.context)
-    assert load(tmp_path / "vectors", kind=VectorPrior).log_prob(given).equal(vectors.log_prob(given))
-
-
-def _edit(folder, renamed):
-    """Change the names of tensors in a saved prior; None: it is left out."""
-    tensors = load_file(folder / "model.safetensors")
-    kept = {new: value for name, value in tensors.items() if (new := renamed(name)) is not None}
-    assert kept.keys() != tensors.keys()
-    save_file(kept, folder / "model.safetensors")
-    config = json.loads((folder / "config.json").read_text())
-    config["sha256"] = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
-    (folder / "config.json").write_text(json.dumps(config))

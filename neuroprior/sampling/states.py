@@ -1,0 +1,51 @@
+"""States of priors: a tensor, or a tuple of states, each tensor with the batch as its first dimension."""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import torch
+from torch import Tensor
+
+from neuroprior.sampling.rows import rows_of
+
+State: TypeAlias = Any
+"""A tensor, or a tuple of states. A prior knows which it takes, so type checkers are told nothing."""
+
+
+def map_state(function: Callable[..., Tensor], *states: State) -> State:
+    """Returns the state that `function` makes of the corresponding tensors of states of one structure.
+
+    Example:
+        >>> map_state(torch.add, (torch.tensor([1]), torch.tensor([2])), (torch.tensor([10]), torch.tensor([20])))
+        (tensor([11]), tensor([22]))
+    """
+    if isinstance(states[0], Tensor):
+        return function(*states)
+    return tuple(map_state(function, *parts) for parts in zip(*states, strict=True))
+
+
+def select_rows(state: State, row: Tensor | slice) -> State:
+    """Returns the rows `row` (integers `[M]`, or a slice) of a state of N plans.
+
+    Example:
+        >>> select_rows((torch.tensor([1, 2, 3]), torch.tensor([[4], [5], [6]])), torch.tensor([2, 0]))
+        (tensor([3, 1]), tensor([[6], [4]]))
+    """
+    if isinstance(row, slice):
+        return map_state(lambda values: values[row], state)
+    return map_state(lambda values: rows_of(values, row), state)
+
+
+def join_rows(*states: State) -> State:
+    """Returns one state of the plans of all of these states, one after the other."""
+    return map_state(lambda *values: torch.cat(values), *states)
+
+
+def tensors_in(state: State) -> list[Tensor]:
+    """Returns all tensors of a state, in order."""
+    return [state] if isinstance(state, Tensor) else [values for part in state for values in tensors_in(part)]
+
+
+def numbers_in(state: State) -> int:
+    """Returns how many numbers a state of N plans has, N times those of a plan."""
+    return sum(values.numel() for values in tensors_in(state))
