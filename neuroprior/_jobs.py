@@ -3,7 +3,6 @@
 Needs joblib and rich (`neuroprior[report]`); a cluster needs dask.distributed (`neuroprior[dask]`).
 """
 
-import ast
 import hashlib
 import json
 import os
@@ -12,8 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, lru_cache, partial
-from importlib.util import find_spec
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -26,20 +24,18 @@ Result = TypeVar("Result")
 SCHEDULER_SECONDS = 10
 """In which a Dask scheduler has to answer."""
 
-PACKAGES = ("neuroprior", "eval")
-"""Packages whose source counts in `code_version`."""
-
 
 class JobRun(Generic[Job, Result]):
     """Jobs whose results are kept in a folder, so that an interrupted run can be resumed.
 
-    A result is found again only if the same was asked of the same code: the name of the folder is a digest of `asked`,
-    of the source that does the work, and of the versions of the packages it depends on.
+    A result is found again only if the same was asked of the same versions: the name of the folder is a digest of
+    `asked` and of the versions of this package and of those that it depends on. Whoever changes the code without its
+    version deletes the folder.
 
     Args:
         run: does a job and returns its result. It can be pickled, and is called in one thread.
         folder: the folder below which results are kept.
-        asked: JSON values: all that decides a result beside the job and the code.
+        asked: JSON values: all that decides a result beside the job.
         name: the name of a job's file (without its ending); it must be unique.
         save, load, suffix: how a result is written and read; JSON by default.
         packages: further packages whose version decides a result.
@@ -58,8 +54,7 @@ class JobRun(Generic[Job, Result]):
         packages: Sequence[str] = (),
     ) -> None:
         self.run, self.name, self._save, self._load, self.suffix = run, name, save, load, suffix
-        self.code = code_version(run)
-        decides = {"asked": asked, "code": self.code, "versions": versions(*packages)}
+        decides = {"asked": asked, "versions": versions(*packages)}
         digest = hashlib.sha256(json.dumps(decides, sort_keys=True, default=str).encode()).hexdigest()[:12]
         self.folder = folder / digest
         self._asked = asked
@@ -118,7 +113,7 @@ class JobRun(Generic[Job, Result]):
         return [self.read(job) for job in jobs]
 
     def _do(self, jobs: Sequence[Job], processes: int, dask: str | None, progress: "Progress") -> None:
-        call = partial(_attempt, self.run, **({"parent": os.getpid()} if dask is None else {"code": self.code}))
+        call = partial(_attempt, self.run, parent=os.getpid() if dask is None else None)
         with progress:
             for index, result in _unordered(call, jobs, processes, dask):
                 where = self.name(jobs[index])
@@ -147,14 +142,10 @@ class Failure:
         return self.kind(f"{where}: {self.message}")
 
 
-def _attempt(
-    run: Callable[[Job], Result], job: Job, index: int, code: str | None = None, parent: int | None = None
-) -> tuple[int, Any]:
+def _attempt(run: Callable[[Job], Result], job: Job, index: int, parent: int | None = None) -> tuple[int, Any]:
     """Do a job in one thread, since the number of threads changes the last digits."""
     if parent is not None and parent != os.getpid():
         _end_with(parent)
-    if code is not None and code_version(run) != code:
-        return index, Failure(ValueError("the cluster's workers have another version of the code than this program"))
     try:
         with one_thread():
             return index, run(job)
@@ -285,63 +276,6 @@ class Progress:
 def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
-
-
-def code_version(run: Callable[..., Any]) -> str:
-    """A digest of the source of a function's module and of all modules of this project that it imports.
-
-    Those with compiled loops, which `compiled` imports by name, are among them.
-    """
-    while isinstance(run, partial):
-        run = run.func
-    return _digest(getattr(run, "__module__", None) or type(run).__module__)
-
-
-@lru_cache
-def _digest(module: str) -> str:
-    found: dict[str, bytes] = {}
-    todo, met = [module], {module}
-    while todo:
-        name = todo.pop()
-        source = _source(name)
-        if source is None:
-            continue
-        found[name] = source.read_bytes()
-        new = {each for each in _imported(found[name]) if each.split(".")[0] in PACKAGES} - met
-        todo += new
-        met |= new
-    digest = hashlib.sha256()
-    for name in sorted(found):
-        digest.update(name.encode() + b"\0" + found[name] + b"\0")
-    return digest.hexdigest()
-
-
-@cache
-def _imported(source: bytes) -> frozenset[str]:
-    """The names that a source imports, found once for all code that has it: to parse takes longer than to read."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "compiled":
-            found |= {str(one.value) for one in node.args if isinstance(one, ast.Constant)}
-    return frozenset(found)
-
-
-def _source(module: str) -> Path | None:
-    """The file of a module, which is not imported for it; None for what is no module or is not written in Python."""
-    top, *rest = module.split(".")
-    spec = find_spec(top) if top != "__main__" else None
-    if spec is None:
-        return None
-    for folder in spec.submodule_search_locations or ():
-        place = Path(folder, *rest)
-        for file in (place / "__init__.py", place.with_suffix(".py")):
-            if file.is_file():
-                return file
-    return Path(spec.origin) if not rest and spec.origin and spec.origin.endswith(".py") else None
 
 
 @lru_cache

@@ -1,6 +1,5 @@
 """Jobs: on cores or on a cluster, kept in files, found again only for the same question and the same code."""
 
-import importlib
 import os
 import pickle
 import signal
@@ -16,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 
 from neuroprior import _files, _jobs
-from neuroprior._jobs import Failure, JobRun, Progress, _digest, code_version
+from neuroprior._jobs import Failure, JobRun, Progress
 from tests.support import jobs
 
 ROOT = Path(__file__).parents[1]
@@ -45,25 +44,6 @@ def test_finished_jobs_are_not_done_again(tmp_path: Path, capsys: pytest.Capture
     assert "again: 2/3 were finished before" in capsys.readouterr().err
     JobRun(run, tmp_path, {"a": 2}).do([1], processes=1)
     assert len(list(traces.iterdir())) == 4  # something else was asked
-
-
-def test_other_code_does_not_find_old_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "eval_of_test.py").write_text("def run(job):\n    return {'found': 1}\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-
-    def found() -> int:
-        """As in a process that begins now."""
-        monkeypatch.delitem(sys.modules, "eval_of_test", raising=False)
-        _digest.cache_clear()
-        importlib.invalidate_caches()
-        run = importlib.import_module("eval_of_test").run
-        result: int = JobRun(run, tmp_path / "results", {}).do([1])[0]["found"]
-        return result
-
-    assert found() == 1
-    (tmp_path / "eval_of_test.py").write_text("def run(job):\n    return {'found': 2}\n")
-    assert found() == 2
 
 
 def test_what_was_asked_is_kept_in_any_order(tmp_path: Path) -> None:
@@ -121,43 +101,6 @@ def test_progress_says_what_is_done_and_left(
         "t: 7/10 a (1:01:01, 3:03:03 left)",
         "t: 8/10 b (2:02:02, 2:02:02 left)",
     ]
-
-
-def test_the_version_of_code_counts_what_it_imports() -> None:
-    # Both depend on `neuroprior.sampling`, only one on the report.
-    from neuroprior._threads import one_thread
-    from neuroprior.priors import MarkovPrior
-
-    assert code_version(MarkovPrior) != code_version(one_thread)
-    assert code_version(partial(jobs.square, 1)) == code_version(jobs.dies)
-
-
-@pytest.mark.parametrize(
-    "line", ["import made.part", "from made import part", "from made.part import x as y", "compiled('made.part')"]
-)
-def test_the_version_of_code_follows_every_import(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "made"
-    folder.mkdir()
-    for name, text in {
-        "__init__": "",
-        "run": f"def run(job):\n    {line}\n",
-        "part": "x = 1",
-        "other": "x = 1",
-    }.items():
-        (folder / f"{name}.py").write_text(text)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr("neuroprior._jobs.PACKAGES", ("made",))
-
-    def digest() -> str:
-        _digest.cache_clear()
-        return code_version(SimpleNamespace(__module__="made.run"))
-
-    first = digest()
-    (folder / "other.py").write_text("x = 2")
-    assert digest() == first
-    (folder / "part.py").write_text("x = 2")
-    assert digest() != first
-    _digest.cache_clear()
 
 
 def test_a_job_that_fails_is_named_and_the_others_are_kept(tmp_path: Path) -> None:
