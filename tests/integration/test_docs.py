@@ -99,7 +99,7 @@ def test_the_effects_that_were_put_in(report: Path) -> None:
 
 
 def test_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
 
 
 def anchors(page: Path) -> set[str]:
