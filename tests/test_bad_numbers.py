@@ -44,7 +44,7 @@ from neuroprior.control import ICEMPlanner, MPPIPlanner, NoisePrior, ShootingPla
 from neuroprior.planners import CrossEntropyPlanner, ForagingOracle, HorizonPlanner, expected_score
 from neuroprior.plans import all_plans, folds, in_parts
 from neuroprior.priors import CombinedPrior, StackedPrior, SwitchingNetwork, SwitchingPrior
-from neuroprior.puzzles import AStarPlanner, PatternCounts
+from neuroprior.puzzles import AStarPlanner
 from neuroprior.sampling import most_probable, sample_distinct
 from neuroprior.training import Settings
 from neuroprior.values import can_reach, q_learning, tile_approximation, value_iteration
@@ -61,7 +61,7 @@ NONE_OF_THEM = [nan, True, "1"]
 """What is no number in any range."""
 
 POSITIVE = {
-    "smoothing": [partial(MarkovPrior, 3, 1), partial(PatternCounts, 3, 2)],
+    "smoothing": [partial(MarkovPrior, 3, 1)],
     "alpha": [partial(ContextTreePrior, 3)],
     "strength": [partial(CrossEntropyPlanner, UNIFORM, 3, 4)],
     "temperature": [
