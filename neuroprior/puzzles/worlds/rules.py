@@ -31,7 +31,7 @@ class Rules(NamedTuple):
         puzzle: `SOKOBAN` or `TILES`.
         width: cells in a row.
         goal: uint8 `[cells]`: the solved board of sliding tiles; of Sokoban no cells.
-        distances: float64 `[tiles, cells]`: from each cell to each tile's place, 0 for the blank; of Sokoban no rows.
+        distances: float64 `[tiles, cells]`: from each cell to each tile's place; of Sokoban no rows.
         keys: uint64 `[kinds + 1, cells]`: random numbers whose sum (exclusive or) is a position's hash; the last row is
             the mover's.
         kinds: int64 `[contents, cells]`: what a cell counts as in a pattern, below `base`.

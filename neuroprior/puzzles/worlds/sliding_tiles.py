@@ -41,7 +41,6 @@ class SlidingTilesWorld(PuzzleWorld):
         place, cell = flat.argsort()[:, None], np.arange(len(flat))
         rows, columns = place // width - cell // width, place % width - cell % width
         distances = (abs(rows) + abs(columns)).astype(np.float64)
-        distances[0] = 0
         # 1 for the tile that must go furthest up and left, and so on, row by row; 0 lies outside of the board.
         kinds = 1 + (rows + height - 1) * (2 * width - 1) + columns + width - 1
         super().__init__(
